@@ -1,0 +1,42 @@
+//! Hot-plug: a stream of what is plugged in and pulled out, whatever the source.
+//!
+//! `udev` watches the machine, `script` plays a scenario; both yield the same [`HotplugEvent`]s and
+//! nothing beyond can tell them apart.
+//!
+//! Invariant: what is attached when the stream begins is told as `Added` before anything else.
+//! Invariant: a node told twice as `Added` without a removal between is the same attachment.
+
+use std::path::PathBuf;
+
+use crate::registry::Attachment;
+use crate::time::Stamp;
+
+/// Something was plugged in or pulled out.
+#[derive(Debug, Clone, PartialEq)]
+pub enum HotplugEvent {
+    /// A node is there and may be opened: rules and permissions are in place.
+    Added(Attachment),
+    /// Everything at or below this path in sysfs is gone.
+    Removed {
+        /// A node, its USB device, or a hub above it.
+        syspath: PathBuf,
+        /// When the witness told us, for the log and the bench.
+        witnessed: Stamp,
+        /// Who told.
+        witness: Witness,
+    },
+}
+
+/// Who told of a removal.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Witness {
+    /// The kernel's own uevent.
+    Kernel,
+    /// udev's processed event.
+    Udev,
+    /// It was missing when the devices were enumerated again.
+    Enumeration,
+    /// A scenario.
+    Script,
+}

@@ -1,0 +1,11 @@
+//! `rapid`: hot-plug discovery, physical mask, streaming, synchronisation and recording for
+//! robot-learning rigs, in one binary.
+
+pub mod driver;
+pub mod hotplug;
+pub mod mask;
+pub mod modality;
+pub mod registry;
+pub mod sample;
+pub mod status;
+pub mod time;

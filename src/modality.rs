@@ -1,0 +1,67 @@
+//! Modalities: what a rig can observe, one entry of the registry each.
+//!
+//! Owns the names and numbers every other module speaks in. A [`ModalityId`] is at once the bit in
+//! the physical mask, the event id on the bus, the index into every per-modality array and the row
+//! on screen.
+//!
+//! Invariant: an id is below [`MAX_MODALITIES`].
+
+use serde::{Deserialize, Serialize};
+
+/// The most modalities one rig can have: the physical mask is one 64-bit word (paper, appendix
+/// "Physical Mask Data Format").
+pub const MAX_MODALITIES: usize = 64;
+
+/// Number of a modality, `0..64`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct ModalityId(u8);
+
+impl ModalityId {
+    /// `Some` when `bit` is below [`MAX_MODALITIES`].
+    #[must_use]
+    pub const fn new(bit: u8) -> Option<Self> {
+        if (bit as usize) < MAX_MODALITIES { Some(Self(bit)) } else { None }
+    }
+
+    /// The bit in the physical mask, `0..64`.
+    #[must_use]
+    pub const fn bit(self) -> u8 {
+        self.0
+    }
+
+    /// The index into per-modality arrays, `0..64`.
+    #[must_use]
+    pub const fn index(self) -> usize {
+        self.0 as usize
+    }
+}
+
+impl std::fmt::Display for ModalityId {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}", self.0)
+    }
+}
+
+/// What the samples of a modality hold.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ModalityKind {
+    /// Pictures, as the camera encodes them.
+    Image,
+    /// A vector of numbers per sample.
+    Scalars,
+    /// Bytes that `rapid` passes on and records without looking into them.
+    Bytes,
+}
+
+/// A modality: its name, what its samples hold, and their shape.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Modality {
+    /// The name given in `devices.toml`, for example `cam_wrist`.
+    pub name: String,
+    /// What the samples hold.
+    pub kind: ModalityKind,
+    /// Image: `[height, width]` in pixels. Scalars: `[channels]`. Bytes: empty.
+    pub shape: Vec<u32>,
+}

@@ -1,0 +1,67 @@
+//! A device that is physically there: what it says it is, and the node to open.
+//!
+//! Invariant: strings here come from the device and are not to be trusted.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use serde::Serialize;
+
+use super::scenario::SimDevice;
+
+/// What a USB device says it is, and where it is plugged in.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize)]
+pub struct UsbIdentity {
+    /// Vendor id.
+    pub vid: u16,
+    /// Product id.
+    pub pid: u16,
+    /// Serial number, if it has one.
+    pub serial: Option<String>,
+    /// Port path in the kernel's notation, for example `1-2.3`.
+    pub port: String,
+    /// Product string, if it has one.
+    pub product: Option<String>,
+}
+
+/// A node that can be opened.
+#[derive(Debug, Clone, PartialEq)]
+pub enum DeviceNode {
+    /// A V4L2 capture node, for example `/dev/video0`.
+    Video(PathBuf),
+    /// A serial line, for example `/dev/ttyACM0`.
+    Tty(PathBuf),
+    /// A simulated device.
+    Sim(Arc<SimDevice>),
+}
+
+/// One node of one attached device.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Attachment {
+    /// Path of the node in sysfs, unique among attached nodes; it lies below the path of its USB
+    /// device, which is how a removal of either is recognised.
+    pub syspath: PathBuf,
+    /// The node.
+    pub node: DeviceNode,
+    /// The device it belongs to.
+    pub usb: UsbIdentity,
+}
+
+impl Attachment {
+    /// Does the removal of `syspath` (a node, its USB device, or a hub above) take this node away?
+    #[must_use]
+    pub fn is_under(&self, syspath: &Path) -> bool {
+        self.syspath.starts_with(syspath)
+    }
+}
+
+impl DeviceNode {
+    /// The node as shown to people.
+    #[must_use]
+    pub fn label(&self) -> String {
+        match self {
+            Self::Video(path) | Self::Tty(path) => path.display().to_string(),
+            Self::Sim(device) => format!("sim:{}", device.name),
+        }
+    }
+}

@@ -1,0 +1,156 @@
+//! Scenarios: which simulated devices there are and when they are plugged, unplugged or fall silent.
+//!
+//! A simulated device enters like a real one: by a hot-plug event whose [`Attachment`] carries a
+//! [`SimDevice`], opened by `driver::open`. Nothing beyond knows the difference.
+//!
+//! [`Attachment`]: super::Attachment
+
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::time::Duration;
+
+use super::attachment::UsbIdentity;
+
+/// A whole scenario.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Scenario {
+    /// The devices that can be plugged.
+    pub devices: Vec<ScenarioDevice>,
+    /// What happens, ascending by time; the order in the file decides between equal times.
+    pub events: Vec<ScenarioEvent>,
+    /// After this time the events begin again, if given.
+    pub repeat: Option<Duration>,
+}
+
+/// A device of a scenario.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ScenarioDevice {
+    /// Name within the scenario; the registry entry it stands for unless `usb` says otherwise.
+    pub name: String,
+    /// What it says it is when plugged.
+    pub usb: UsbIdentity,
+    /// What it sends.
+    pub source: SimSource,
+    /// Plugged when the scenario begins.
+    pub plugged: bool,
+}
+
+/// What a simulated device sends.
+#[derive(Debug, Clone, PartialEq)]
+pub enum SimSource {
+    /// JPEG pictures of these dimensions in pixels; bytes are a function of seed and sequence.
+    Camera {
+        /// Pixels.
+        width: u32,
+        /// Pixels.
+        height: u32,
+        /// Frames per second.
+        fps: u32,
+        /// Chooses the pictures.
+        seed: u64,
+    },
+    /// Vectors of numbers; values are a function of seed and sequence.
+    Serial {
+        /// Numbers in a sample.
+        channels: usize,
+        /// Samples per second.
+        hz: u32,
+        /// Chooses the values.
+        seed: u64,
+    },
+    /// The samples of one topic of a recorded episode, at their recorded distances in time.
+    Replay {
+        /// The episode.
+        file: PathBuf,
+        /// The topic in it.
+        topic: String,
+        /// Wall time of the episode's beginning as recorded, ns: moment zero of the scenario.
+        begin_ns: u64,
+    },
+}
+
+/// Something that happens in a scenario.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ScenarioEvent {
+    /// When, from the beginning.
+    pub at: Duration,
+    /// Name of the device.
+    pub device: String,
+    /// What.
+    pub action: ScenarioAction,
+}
+
+/// What can happen to a simulated device.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum ScenarioAction {
+    /// Plugged in, into another port if one is given.
+    Plug {
+        /// Port path; the device's last one if absent.
+        port: Option<String>,
+    },
+    /// Pulled out.
+    Unplug,
+    /// Stays attached and sends nothing more.
+    Silence,
+    /// Sends again.
+    Resume,
+}
+
+/// A simulated device that is plugged in: its cable, shared between the script that pulls it and
+/// the driver that reads it.
+#[derive(Debug)]
+pub struct SimDevice {
+    /// Name within the scenario.
+    pub name: String,
+    /// What it sends.
+    pub source: SimSource,
+    /// The scenario's moment zero.
+    pub begun: crate::time::Stamp,
+    unplugged: AtomicBool,
+    silent: AtomicBool,
+    /// Next sequence number; it goes on over a replug, as a device with its own counter would.
+    pub sequence: AtomicU32,
+}
+
+impl SimDevice {
+    /// A device just plugged in.
+    #[must_use]
+    pub fn new(name: &str, source: SimSource, begun: crate::time::Stamp) -> Self {
+        Self {
+            name: name.to_owned(),
+            source,
+            begun,
+            unplugged: AtomicBool::new(false),
+            silent: AtomicBool::new(false),
+            sequence: AtomicU32::new(0),
+        }
+    }
+
+    /// Pulls the cable: the next read says so.
+    pub fn unplug(&self) {
+        self.unplugged.store(true, Ordering::Release);
+    }
+
+    /// Is the cable pulled?
+    #[must_use]
+    pub fn is_unplugged(&self) -> bool {
+        self.unplugged.load(Ordering::Acquire)
+    }
+
+    /// Makes the device stop or go on sending.
+    pub fn set_silent(&self, silent: bool) {
+        self.silent.store(silent, Ordering::Release);
+    }
+
+    /// Does it send nothing?
+    #[must_use]
+    pub fn is_silent(&self) -> bool {
+        self.silent.load(Ordering::Acquire)
+    }
+}
+
+impl PartialEq for SimDevice {
+    fn eq(&self, other: &Self) -> bool {
+        self.name == other.name && self.source == other.source
+    }
+}

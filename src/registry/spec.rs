@@ -1,0 +1,205 @@
+//! What `devices.toml` says once it has been checked: nothing downstream validates again.
+//!
+//! Invariant: every value here is within the range its comment states, names, topics, bits and
+//! identities are unique, and `Registry::devices` is in ascending order of bit.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use serde::Serialize;
+
+use crate::modality::{Modality, ModalityId, ModalityKind};
+
+/// A checked `devices.toml`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Registry {
+    /// The `[rig]` table.
+    pub rig: RigSpec,
+    /// One entry a modality, ascending by bit, at least one, at most 64.
+    pub devices: Vec<DeviceSpec>,
+    /// Where the text came from, for messages. `None` for the built-in registry.
+    pub path: Option<PathBuf>,
+    /// The text itself, recorded with every episode.
+    pub text: String,
+}
+
+/// The `[rig]` table.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RigSpec {
+    /// Name of the rig, default `rig`.
+    pub name: String,
+    /// Rate of the observation grid in Hz, `0.1..=1000`, default 30.
+    pub observation_hz: f64,
+    /// Half width of the window in which a sample counts as belonging to a tick, default 25 ms
+    /// (paper, section "Synchronized Subscriber").
+    pub sync_window: Duration,
+    /// How long a returned device waits after a removal before it is started, default 2 s.
+    pub cooldown: Duration,
+    /// Upper bound of the shared memory all topics may reserve, bytes, default 512 MiB.
+    pub memory_budget: u64,
+}
+
+/// One `[device.NAME]` table.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DeviceSpec {
+    /// The modality's name: `[a-z][a-z0-9_]*`, at most 64 bytes.
+    pub name: String,
+    /// Bit in the mask.
+    pub id: ModalityId,
+    /// Which USB device this is.
+    pub identity: IdentitySpec,
+    /// How it is read.
+    pub node: NodeSpec,
+    /// Topic on the bus and in the recording: `/` then `[a-zA-Z0-9_/-]*`.
+    pub topic: String,
+    /// Where on the gripper the module sits.
+    pub mount: Option<Mount>,
+    /// No sample for this long while attached: the slot says Stalled. At least 10 ms; default the
+    /// larger of 500 ms and 10 sample periods.
+    pub stall_after: Duration,
+    /// Largest payload in bytes.
+    pub max_bytes: usize,
+    /// Samples a subscriber may fall behind before the oldest is lost, `2..=4096`.
+    pub depth: usize,
+    /// What an observation holds when the device is attached but no sample lies in the window.
+    pub when_stale: WhenStale,
+}
+
+/// Which USB device an entry means.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize)]
+pub struct IdentitySpec {
+    /// USB vendor id.
+    pub vid: u16,
+    /// USB product id.
+    pub pid: u16,
+    /// Serial number as the device reports it. Takes precedence over `port`.
+    pub serial: Option<String>,
+    /// Port path in the kernel's notation, for example `1-2.3` (bus 1, port 2, port 3 of the hub).
+    pub port: Option<String>,
+}
+
+/// How a device is read.
+#[derive(Debug, Clone, PartialEq)]
+pub enum NodeSpec {
+    /// A V4L2 camera.
+    Camera(CameraSpec),
+    /// A serial line.
+    Serial(SerialSpec),
+}
+
+/// `[device.NAME.camera]`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CameraSpec {
+    /// Pixels, `1..=8192`, default 640.
+    pub width: u32,
+    /// Pixels, `1..=8192`, default 480.
+    pub height: u32,
+    /// Frames per second, `1..=1000`, default 30.
+    pub fps: u32,
+    /// Pixel format, default MJPG.
+    pub format: PixelFormat,
+    /// Controls set at start: V4L2 control name as listed by `rapid devices`, value.
+    pub controls: Vec<(String, i64)>,
+}
+
+/// Pixel formats a camera may be asked for, by their V4L2 names.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "UPPERCASE")]
+pub enum PixelFormat {
+    /// Motion JPEG.
+    Mjpg,
+    /// YUV 4:2:2 packed.
+    Yuyv,
+    /// 8-bit luminance.
+    Grey,
+}
+
+/// `[device.NAME.serial]`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SerialSpec {
+    /// Bits per second, default 115200.
+    pub baud: u32,
+    /// Where one message ends and the next begins, default `line`.
+    pub framing: Framing,
+    /// What a message holds, default `csv`.
+    pub parse: Parse,
+    /// Numbers in a message, `1..=1024`; 0 with `Parse::Raw`.
+    pub channels: usize,
+}
+
+/// Message boundaries on a serial line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Framing {
+    /// A newline ends a message; a carriage return before it is dropped.
+    Line,
+    /// Consistent overhead byte stuffing: a zero byte ends a message.
+    Cobs,
+    /// Messages of exactly this many bytes.
+    Fixed(usize),
+}
+
+/// Content of a serial message.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Parse {
+    /// Numbers separated by commas.
+    Csv,
+    /// A JSON array of numbers, or an object whose numeric values are taken in order.
+    Json,
+    /// Little-endian 32-bit floats.
+    F32le,
+    /// Not looked into.
+    Raw,
+}
+
+/// Where a module sits (paper, section "Modular hardware").
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Mount {
+    /// In front.
+    Front,
+    /// The fingertip.
+    Tip,
+    /// On top.
+    Top,
+    /// Below.
+    Bottom,
+}
+
+/// What an observation holds for an attached modality without a sample in the window.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum WhenStale {
+    /// The newest sample with its age.
+    #[default]
+    Hold,
+    /// Nothing.
+    Zero,
+}
+
+impl DeviceSpec {
+    /// What this device adds to an observation.
+    #[must_use]
+    pub fn modality(&self) -> Modality {
+        let (kind, shape) = match &self.node {
+            NodeSpec::Camera(camera) => (ModalityKind::Image, vec![camera.height, camera.width]),
+            NodeSpec::Serial(serial) if serial.parse == Parse::Raw => (ModalityKind::Bytes, Vec::new()),
+            NodeSpec::Serial(serial) => {
+                (ModalityKind::Scalars, vec![u32::try_from(serial.channels).unwrap_or(u32::MAX)])
+            }
+        };
+        Modality { name: self.name.clone(), kind, shape }
+    }
+}
+
+impl Registry {
+    /// The entry of a modality.
+    #[must_use]
+    pub fn device(&self, id: ModalityId) -> Option<&DeviceSpec> {
+        self.devices.iter().find(|device| device.id == id)
+    }
+
+    /// The entry of this name.
+    #[must_use]
+    pub fn named(&self, name: &str) -> Option<&DeviceSpec> {
+        self.devices.iter().find(|device| device.name == name)
+    }
+}

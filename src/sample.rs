@@ -1,0 +1,105 @@
+//! Samples: the header that travels beside every payload, and how payloads are encoded.
+//!
+//! Owns the header's memory layout: other processes and other languages read it as it lies in
+//! shared memory, so a change of a field is a change of the interface.
+
+use serde::{Deserialize, Serialize};
+
+/// Incarnation of an attachment: +1 each time a device of a modality is started. What an older
+/// epoch reports changes nothing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct Epoch(pub u32);
+
+impl Epoch {
+    /// The next incarnation.
+    #[must_use]
+    pub const fn next(self) -> Self {
+        Self(self.0.wrapping_add(1))
+    }
+}
+
+/// How a payload is encoded.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[repr(u32)]
+#[serde(rename_all = "lowercase")]
+pub enum Encoding {
+    /// Bytes as the device gave them.
+    Bytes = 0,
+    /// One JPEG picture.
+    Mjpeg = 1,
+    /// Packed YUV 4:2:2, 2 bytes a pixel.
+    Yuyv = 2,
+    /// 8-bit luminance, 1 byte a pixel.
+    Grey = 3,
+    /// Little-endian 64-bit floats.
+    F64 = 4,
+    /// A mask value: u64 mask, u64 sequence, little endian.
+    Mask = 5,
+}
+
+impl Encoding {
+    /// The encoding of a number found in a header; `None` if it is not one of ours.
+    #[must_use]
+    pub const fn from_raw(raw: u32) -> Option<Self> {
+        Some(match raw {
+            0 => Self::Bytes,
+            1 => Self::Mjpeg,
+            2 => Self::Yuyv,
+            3 => Self::Grey,
+            4 => Self::F64,
+            5 => Self::Mask,
+            _ => return None,
+        })
+    }
+}
+
+/// Header flag: the device or driver said that this payload is damaged.
+pub const FLAG_ERROR: u32 = 1;
+/// Header flag: the capture time comes from the kernel or the device, not from the moment of arrival.
+pub const FLAG_DEVICE_TIME: u32 = 2;
+
+/// Travels beside every payload, as iceoryx2 user header. 48 bytes, native alignment 8.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[repr(C)]
+pub struct SampleHeader {
+    /// Counts the samples of this modality within a run of `rapid`, from 0, over all epochs: a hole
+    /// is a lost sample.
+    pub seq: u64,
+    /// Capture time, `CLOCK_MONOTONIC` ns; from the kernel where it gives one.
+    pub capture_ns: u64,
+    /// When `rapid` had the bytes in hand, `CLOCK_MONOTONIC` ns.
+    pub recv_ns: u64,
+    /// The modality's number.
+    pub id: u32,
+    /// Incarnation of the attachment.
+    pub epoch: u32,
+    /// An [`Encoding`].
+    pub encoding: u32,
+    /// `FLAG_*`.
+    pub flags: u32,
+    /// Image: pixels. Otherwise 0.
+    pub width: u32,
+    /// Image: pixels. Otherwise 0.
+    pub height: u32,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_header_has_no_padding_and_48_bytes() {
+        assert_eq!(std::mem::size_of::<SampleHeader>(), 48);
+        assert_eq!(std::mem::offset_of!(SampleHeader, id), 24);
+        assert_eq!(std::mem::offset_of!(SampleHeader, height), 44);
+    }
+
+    #[test]
+    fn encodings_survive_the_header() {
+        for raw in 0..6 {
+            assert_eq!(Encoding::from_raw(raw).map(|e| e as u32), Some(raw));
+        }
+        assert_eq!(Encoding::from_raw(6), None);
+    }
+}

@@ -1,0 +1,187 @@
+//! The board: where stages report what a screen may show.
+//!
+//! One writer a fact: the rig writes slots and the mask, streams write their own counters, the
+//! recorder writes the recording. A screen only takes [`Snapshot`]s.
+//!
+//! Invariant: what is written per sample is an atomic; the locks here guard what changes a few times
+//! a second at most and are never held over anything that waits.
+
+use std::collections::VecDeque;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use tokio::sync::broadcast;
+
+use super::{DeviceStatus, Event, LogLine, RecordingStatus, SlotState, Snapshot, What};
+use crate::mask::PhysicalMask;
+use crate::modality::{MAX_MODALITIES, ModalityId};
+use crate::registry::Registry;
+use crate::sample::Epoch;
+use crate::time::Stamp;
+
+/// Log lines kept for the screen.
+const LOG_LINES: usize = 500;
+/// Events a slow reader may fall behind before it is told that it missed some.
+const EVENT_DEPTH: usize = 4096;
+
+/// Counters of one stream, written by its task alone.
+#[derive(Debug, Default)]
+pub struct StreamCounters {
+    samples: AtomicU64,
+    gaps: AtomicU64,
+    bytes: AtomicU64,
+    newest: AtomicU64,
+}
+
+impl StreamCounters {
+    /// Counts one sample of `bytes` bytes captured at `captured`, before which `lost` were lost.
+    pub fn count(&self, bytes: usize, captured: Stamp, lost: u64) {
+        self.samples.fetch_add(1, Ordering::Relaxed);
+        self.bytes.fetch_add(bytes as u64, Ordering::Relaxed);
+        self.newest.store(captured.0, Ordering::Relaxed);
+        if lost > 0 {
+            self.gaps.fetch_add(lost, Ordering::Relaxed);
+        }
+    }
+}
+
+#[derive(Debug, Clone, Default)]
+struct Slot {
+    state: SlotState,
+    epoch: Epoch,
+    detail: String,
+}
+
+/// See the module's comment.
+#[derive(Debug)]
+pub struct Board {
+    rig: String,
+    started: Stamp,
+    names: Vec<(ModalityId, String, String)>,
+    counters: Vec<StreamCounters>,
+    slots: Mutex<Vec<Slot>>,
+    mask: AtomicU64,
+    mask_sequence: AtomicU64,
+    recording: Mutex<Option<RecordingStatus>>,
+    last_episode: Mutex<Option<PathBuf>>,
+    log: Mutex<VecDeque<LogLine>>,
+    events: broadcast::Sender<Event>,
+}
+
+impl Board {
+    /// An empty board for the devices of `registry`.
+    #[must_use]
+    pub fn new(registry: &Registry) -> Self {
+        let mut counters = Vec::with_capacity(MAX_MODALITIES);
+        counters.resize_with(MAX_MODALITIES, StreamCounters::default);
+        Self {
+            rig: registry.rig.name.clone(),
+            started: Stamp::now(),
+            names: registry.devices.iter().map(|d| (d.id, d.name.clone(), d.topic.clone())).collect(),
+            counters,
+            slots: Mutex::new(vec![Slot::default(); MAX_MODALITIES]),
+            mask: AtomicU64::new(0),
+            mask_sequence: AtomicU64::new(0),
+            recording: Mutex::new(None),
+            last_episode: Mutex::new(None),
+            log: Mutex::new(VecDeque::with_capacity(LOG_LINES)),
+            events: broadcast::channel(EVENT_DEPTH).0,
+        }
+    }
+
+    /// The counters of a stream.
+    #[must_use]
+    pub fn counters(&self, id: ModalityId) -> &StreamCounters {
+        &self.counters[id.index()]
+    }
+
+    /// Reports the state of a slot.
+    pub fn set_slot(&self, id: ModalityId, state: SlotState, epoch: Epoch, detail: &str) {
+        let slot = &mut lock(&self.slots)[id.index()];
+        slot.state = state;
+        slot.epoch = epoch;
+        detail.clone_into(&mut slot.detail);
+    }
+
+    /// Reports a publication of the mask.
+    pub fn set_mask(&self, mask: PhysicalMask, sequence: u64) {
+        self.mask.store(mask.0, Ordering::Relaxed);
+        self.mask_sequence.store(sequence, Ordering::Relaxed);
+    }
+
+    /// Reports the recording in progress, or that there is none.
+    pub fn set_recording(&self, recording: Option<RecordingStatus>) {
+        *lock(&self.recording) = recording;
+    }
+
+    /// Reports the last file finished.
+    pub fn set_last_episode(&self, file: PathBuf) {
+        *lock(&self.last_episode) = Some(file);
+    }
+
+    /// Adds a line to the log; control characters become spaces, so that no text of a device can
+    /// move the cursor of a terminal.
+    pub fn log(&self, mut line: LogLine) {
+        if line.text.contains(char::is_control) {
+            line.text = line.text.replace(char::is_control, " ");
+        }
+        let mut log = lock(&self.log);
+        if log.len() == LOG_LINES {
+            log.pop_front();
+        }
+        log.push_back(line);
+    }
+
+    /// Announces an event, now, to whoever subscribed.
+    pub fn announce(&self, what: What) {
+        // An error only says that nobody listens.
+        let _ = self.events.send(Event { stamp: Stamp::now(), what });
+    }
+
+    /// All events from now on.
+    #[must_use]
+    pub fn events(&self) -> broadcast::Receiver<Event> {
+        self.events.subscribe()
+    }
+
+    /// Everything as it is now.
+    #[must_use]
+    pub fn snapshot(&self) -> Snapshot {
+        let taken = Stamp::now();
+        let slots = lock(&self.slots).clone();
+        let devices = self.names.iter().map(|(id, name, topic)| {
+            let counters = &self.counters[id.index()];
+            let slot = &slots[id.index()];
+            let newest = counters.newest.load(Ordering::Relaxed);
+            DeviceStatus {
+                name: name.clone(),
+                id: *id,
+                topic: topic.clone(),
+                state: slot.state,
+                epoch: slot.epoch,
+                detail: slot.detail.clone(),
+                samples: counters.samples.load(Ordering::Relaxed),
+                gaps: counters.gaps.load(Ordering::Relaxed),
+                bytes: counters.bytes.load(Ordering::Relaxed),
+                newest: (newest > 0).then_some(Stamp(newest)),
+            }
+        });
+        Snapshot {
+            rig: self.rig.clone(),
+            taken,
+            uptime: taken.since(self.started),
+            mask: PhysicalMask(self.mask.load(Ordering::Relaxed)),
+            mask_sequence: self.mask_sequence.load(Ordering::Relaxed),
+            devices: devices.collect(),
+            recording: lock(&self.recording).clone(),
+            last_episode: lock(&self.last_episode).clone(),
+            log: lock(&self.log).iter().cloned().collect(),
+        }
+    }
+}
+
+/// A poisoned lock here guards plain values that are whole at every moment: go on with them.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

@@ -1,0 +1,116 @@
+//! Time: capture times on the monotonic clock, and their place on the wall clock.
+//!
+//! Owns the one reading of the system's clocks. A [`Stamp`] orders samples; the wall clock, which
+//! may be set at any moment, is only ever derived from it through a [`WallClock`] fixed at one
+//! moment.
+
+use std::time::Duration;
+
+use rustix::time::{ClockId, clock_gettime};
+use serde::{Deserialize, Serialize};
+
+/// A moment on `CLOCK_MONOTONIC`, in ns.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct Stamp(pub u64);
+
+impl Stamp {
+    /// The moment of the call.
+    #[must_use]
+    pub fn now() -> Self {
+        Self(read(ClockId::Monotonic))
+    }
+
+    /// This moment plus `duration`, at most the end of time.
+    #[must_use]
+    pub fn after(self, duration: Duration) -> Self {
+        Self(self.0.saturating_add(nanoseconds(duration)))
+    }
+
+    /// This moment minus `duration`, at least zero.
+    #[must_use]
+    pub fn before(self, duration: Duration) -> Self {
+        Self(self.0.saturating_sub(nanoseconds(duration)))
+    }
+
+    /// Time from `earlier` to this moment; zero if `earlier` is in fact later.
+    #[must_use]
+    pub const fn since(self, earlier: Self) -> Duration {
+        Duration::from_nanos(self.0.saturating_sub(earlier.0))
+    }
+}
+
+/// `duration` in ns, saturating after 584 years.
+#[must_use]
+pub fn nanoseconds(duration: Duration) -> u64 {
+    u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX)
+}
+
+/// The wall clock as ns since 1970, at this moment.
+#[must_use]
+pub fn realtime_ns() -> u64 {
+    read(ClockId::Realtime)
+}
+
+/// A fixed relation between the monotonic and the wall clock, taken once, so that wall-clock times
+/// within one episode never step.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct WallClock {
+    offset_ns: i128,
+}
+
+impl WallClock {
+    /// The relation as it is now.
+    #[must_use]
+    pub fn now() -> Self {
+        // The monotonic clock is read on both sides of the wall clock; their middle belongs to it.
+        let before = read(ClockId::Monotonic);
+        let wall = read(ClockId::Realtime);
+        let after = read(ClockId::Monotonic);
+        Self { offset_ns: i128::from(wall) - i128::from(before.midpoint(after)) }
+    }
+
+    /// A relation chosen by the caller: wall ns minus monotonic ns.
+    #[must_use]
+    pub const fn with_offset(offset_ns: i128) -> Self {
+        Self { offset_ns }
+    }
+
+    /// `stamp` on the wall clock, ns since 1970; clamped to what a u64 holds.
+    #[must_use]
+    pub fn wall_ns(self, stamp: Stamp) -> u64 {
+        u64::try_from((i128::from(stamp.0) + self.offset_ns).max(0)).unwrap_or(u64::MAX)
+    }
+
+    /// The stamp of a wall-clock time; clamped to what a u64 holds.
+    #[must_use]
+    pub fn stamp(self, wall_ns: u64) -> Stamp {
+        Stamp(u64::try_from((i128::from(wall_ns) - self.offset_ns).max(0)).unwrap_or(u64::MAX))
+    }
+}
+
+fn read(clock: ClockId) -> u64 {
+    let time = clock_gettime(clock);
+    // Both clocks count up from a non-negative start: the boot, and 1970.
+    u64::try_from(time.tv_sec).unwrap_or(0) * 1_000_000_000 + u64::try_from(time.tv_nsec).unwrap_or(0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn wall_and_monotonic_convert_both_ways() {
+        let clock = WallClock::with_offset(1_700_000_000_000_000_000);
+        assert_eq!(clock.wall_ns(Stamp(5)), 1_700_000_000_000_000_005);
+        assert_eq!(clock.stamp(1_700_000_000_000_000_005), Stamp(5));
+        assert_eq!(clock.stamp(3), Stamp(0));
+    }
+
+    #[test]
+    fn arithmetic_saturates() {
+        assert_eq!(Stamp(5).before(Duration::from_secs(1)), Stamp(0));
+        assert_eq!(Stamp(u64::MAX).after(Duration::from_secs(1)), Stamp(u64::MAX));
+        assert_eq!(Stamp(1).since(Stamp(9)), Duration::ZERO);
+    }
+}
