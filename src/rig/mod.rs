@@ -1,0 +1,2 @@
+//! rig
+pub mod slot;
