@@ -9,6 +9,7 @@ mod diagnostic;
 mod identity;
 mod parse;
 pub mod scenario;
+mod scenario_file;
 mod section;
 mod spec;
 mod units;

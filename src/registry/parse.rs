@@ -19,6 +19,7 @@ use super::spec::{Registry, RigSpec};
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use device::Draft;
 
+pub(super) use device::{check_serial, is_port};
 pub(super) use file::read_file;
 
 /// The registry used when there is no file: the rig `rapid --sim` simulates.
@@ -59,9 +60,7 @@ impl Registry {
         let file = file_label(path, "devices.toml");
         let mut problems = Problems::new(file.clone(), text);
         let document = read(text, &mut problems);
-        if !problems.is_empty() {
-            return Err(problems.into_result().err().unwrap_or_else(|| nothing_registered(file)));
-        }
+        problems.check()?;
         let root = Section::new(document.get_ref(), 0, String::new());
         root.allow(&mut problems, &["rig", "device"]);
         let rig = rig(&root, &mut problems);
@@ -73,7 +72,7 @@ impl Registry {
         check_topics(&drafts, &mut problems);
         let warnings = assign_bits(&mut drafts, &mut problems);
         budget::fit(&mut drafts, rig.memory_budget, root.at_of("rig"), &mut problems);
-        problems.into_result()?;
+        problems.check()?;
         let mut devices: Vec<_> = drafts.into_iter().filter_map(Draft::finish).collect();
         devices.sort_by_key(|device| device.id);
         let registry = Self { rig, devices, path: path.map(Path::to_path_buf), text: text.to_owned() };

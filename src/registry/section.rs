@@ -63,13 +63,14 @@ impl<'a> Problems<'a> {
         self.found.is_empty()
     }
 
-    /// `Err` with all problems in the order of the file, if there are any.
-    pub(super) fn into_result(mut self) -> Result<(), RegistryErrors> {
+    /// `Err` with all problems so far in the order of the file, if there are any.
+    pub(super) fn check(&mut self) -> Result<(), RegistryErrors> {
         if self.found.is_empty() {
             return Ok(());
         }
-        self.found.sort_by_key(|diagnostic| (diagnostic.line, diagnostic.column));
-        Err(RegistryErrors { diagnostics: self.found })
+        let mut diagnostics = std::mem::take(&mut self.found);
+        diagnostics.sort_by_key(|diagnostic| (diagnostic.line, diagnostic.column));
+        Err(RegistryErrors { diagnostics })
     }
 }
 
