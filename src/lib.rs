@@ -1,6 +1,7 @@
 //! `rapid`: hot-plug discovery, physical mask, streaming, synchronisation and recording for
 //! robot-learning rigs, in one binary.
 
+pub mod commands;
 pub mod driver;
 pub mod hotplug;
 pub mod mask;

@@ -4,6 +4,7 @@
 //! attached device is which entry (`identity`), what a simulation plays (`scenario_file`) and the
 //! files udev and systemd read (`artifacts`).
 
+pub mod artifacts;
 mod attachment;
 mod diagnostic;
 mod identity;
