@@ -2,6 +2,7 @@
 //! robot-learning rigs, in one binary.
 
 pub mod bus;
+pub mod commands;
 pub mod driver;
 pub mod hotplug;
 pub mod mask;
