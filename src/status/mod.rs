@@ -6,6 +6,7 @@
 
 pub mod board;
 mod event;
+pub mod rates;
 
 use std::path::PathBuf;
 use std::time::Duration;
