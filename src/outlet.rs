@@ -49,6 +49,7 @@ impl Outlet {
     }
 
     /// Sends a piece if there is room; true if there was.
+    #[must_use = "what there is no room for is lost"]
     pub fn try_send(&self, piece: Vec<u8>) -> bool {
         self.sender.try_send(piece).is_ok()
     }

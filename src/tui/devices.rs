@@ -8,7 +8,7 @@ use ratatui::style::{Modifier, Style, Stylize};
 use ratatui::text::{Line, Span};
 
 use super::model::Model;
-use super::theme::{Theme, state_word};
+use super::theme::Theme;
 use super::view;
 use crate::status::{DeviceStatus, SlotState, Snapshot};
 use crate::text;
@@ -92,9 +92,9 @@ fn row(device: &DeviceStatus, name: usize, width: u16, model: &Model, theme: The
     let none = theme.symbol("–", "-").to_owned();
     let rate = if running { text::hertz(reading.hz) } else { none.clone() };
     let age = reading.age.filter(|_| running).map_or(none, text::age);
-    let stale = device.state == SlotState::Stalled || reading.age.is_some_and(|age| age >= Duration::from_secs(1));
+    let is_old = device.state == SlotState::Stalled || reading.age.is_some_and(|age| age >= Duration::from_secs(1));
     let gaps = if device.gaps > 0 { theme.warning() } else { theme.faint() };
-    let state = format!("{} {}", theme.state_symbol(device.state), state_word(device.state));
+    let word = format!("{} {}", theme.state_symbol(device.state), device.state.word());
     let used = BIT + name + STATE + RATE + AGE + GAPS + TOTAL + 2;
     let detail = usize::from(width).saturating_sub(used);
     let detail = text::cut(&theme.safe(&device.detail), detail, theme.ellipsis()).into_owned();
@@ -104,9 +104,9 @@ fn row(device: &DeviceStatus, name: usize, width: u16, model: &Model, theme: The
         Span::styled(format!("{:>3} ", device.id.bit()), theme.faint()),
         Span::raw(theme.column(&device.name, name)),
         Span::raw(" "),
-        Span::styled(format!("{state:width$}", width = STATE - 1), theme.state(device.state)),
+        Span::styled(format!("{word:width$}", width = STATE - 1), theme.state(device.state)),
         Span::styled(format!("{rate:>RATE$}"), figures),
-        Span::styled(format!("{age:>AGE$}"), if running && stale { theme.warning() } else { figures }),
+        Span::styled(format!("{age:>AGE$}"), if running && is_old { theme.warning() } else { figures }),
         Span::styled(format!("{:>GAPS$}", compact(device.gaps)), gaps),
         Span::styled(format!("{:>TOTAL$}", compact(device.samples)), figures),
         Span::raw("  "),
@@ -125,15 +125,14 @@ fn compact(count: u64) -> String {
 
 /// What the table has no room for.
 fn about(device: &DeviceStatus, width: u16, theme: Theme) -> Line<'static> {
-    let separator = theme.symbol(" · ", " | ");
-    let mut text = format!("{}{separator}{}", theme.safe(&device.topic), text::size(device.bytes));
+    let mut parts = vec![theme.safe(&device.topic), text::size(device.bytes)];
     if device.epoch.0 > 1 {
-        text.push_str(&format!("{separator}started {} times", device.epoch.0));
+        parts.push(format!("started {} times", device.epoch.0));
     }
     if !device.detail.is_empty() {
-        text.push_str(separator);
-        text.push_str(&theme.safe(&device.detail));
+        parts.push(theme.safe(&device.detail));
     }
+    let text = parts.join(theme.symbol(" · ", " | "));
     let arrow = theme.symbol("└ ", "` ");
     let room = usize::from(width).saturating_sub(BIT);
     let text = text::cut(&text, room.saturating_sub(2), theme.ellipsis()).into_owned();

@@ -44,7 +44,9 @@ fn keys(width: usize, model: &Model, theme: Theme) -> Line<'static> {
         room = left;
         push(&mut spans, key, theme);
     }
-    last.into_iter().for_each(|key| push(&mut spans, key, theme));
+    for key in last {
+        push(&mut spans, key, theme);
+    }
     Line::from(spans)
 }
 

@@ -16,7 +16,7 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Them
     // In this order as long as they fit; the binary form is the longest and stands back first.
     let hex = mask_hex(model, theme);
     let publication = publication(model, theme);
-    let binary = mask_binary(model, theme);
+    let binary = mask_binary(model);
     let room = width.saturating_sub(left.width() + right.width() + 2);
     let with_publication = hex.width() + publication.width() <= room;
     let with_binary = hex.width() + publication.width() + binary.width() <= room;
@@ -54,7 +54,7 @@ fn mask_hex(model: &Model, theme: Theme) -> Line<'static> {
     ])
 }
 
-fn mask_binary(model: &Model, theme: Theme) -> Line<'static> {
+fn mask_binary(model: &Model) -> Line<'static> {
     let snapshot = model.shown();
     let binary = snapshot.mask.binary(snapshot.devices.len());
     let bytes: Vec<_> = binary.as_bytes().chunks(8).map(String::from_utf8_lossy).collect();

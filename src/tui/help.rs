@@ -5,7 +5,7 @@ use ratatui::layout::{Constraint, Flex, Layout, Rect};
 use ratatui::text::{Line, Span};
 use ratatui::widgets::{Block, Clear, Padding, Paragraph};
 
-use super::theme::{Theme, state_word};
+use super::theme::Theme;
 use crate::status::SlotState;
 
 const KEYS: [(&str, &str); 8] = [
@@ -33,7 +33,7 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, theme: Theme) {
         .iter()
         .map(|(key, meaning)| Line::from(vec![Span::styled(format!("{key:<12}"), theme.title()), Span::raw(*meaning)]));
     let states = STATES.iter().map(|(state, meaning)| {
-        let word = format!("{} {:<10}", theme.state_symbol(*state), state_word(*state));
+        let word = format!("{} {:<10}", theme.state_symbol(*state), state.word());
         Line::from(vec![Span::styled(word, theme.state(*state)), Span::raw(*meaning)])
     });
     let mut lines: Vec<_> = keys.chain(states).collect();

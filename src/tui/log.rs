@@ -7,7 +7,7 @@ use ratatui::text::{Line, Span};
 use super::model::Model;
 use super::theme::Theme;
 use super::view;
-use crate::status::{Level, LogLine};
+use crate::status::LogLine;
 use crate::text;
 
 pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
@@ -40,16 +40,7 @@ fn render(line: &LogLine, width: u16, theme: Theme) -> Line<'static> {
     let text = text::cut(&theme.safe(&line.text), room, theme.ellipsis()).into_owned();
     Line::from(vec![
         Span::styled(time, theme.faint()),
-        Span::styled(format!("  {:5} ", word(line.level)), theme.level(line.level)),
+        Span::styled(format!("  {:5} ", line.level.word()), theme.level(line.level)),
         Span::styled(text, theme.level(line.level)),
     ])
-}
-
-fn word(level: Level) -> &'static str {
-    match level {
-        Level::Debug => "debug",
-        Level::Info => "info",
-        Level::Warn => "warn",
-        Level::Error => "error",
-    }
 }

@@ -73,9 +73,8 @@ impl Plan {
 /// Rows of a mask are read in bytes: as many whole groups of eight as fit.
 fn round(per_row: usize, density: Density) -> usize {
     match density {
-        Density::Named(_) => per_row.max(1),
         Density::Numbered | Density::Dots if per_row >= 8 => per_row / 8 * 8,
-        Density::Numbered | Density::Dots => per_row.max(1),
+        _ => per_row.max(1),
     }
 }
 

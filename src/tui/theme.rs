@@ -200,19 +200,6 @@ pub enum Edge {
     Recent,
 }
 
-/// The word of a state.
-#[must_use]
-pub fn state_word(state: SlotState) -> &'static str {
-    match state {
-        SlotState::Streaming => "streaming",
-        SlotState::Opening => "opening",
-        SlotState::Backoff => "backoff",
-        SlotState::Stalled => "stalled",
-        SlotState::Absent => "absent",
-        SlotState::Failed => "failed",
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -1,0 +1,4 @@
+//! Small commands that only print.
+
+pub mod completions;
+pub mod mask;
