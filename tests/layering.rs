@@ -32,6 +32,8 @@ const LAYERS: &[&[&str]] = &[
 const SIDEWAYS: &[(&str, &[&str])] = &[
     ("status", &["registry"]),
     ("app", &["tui", "headless", "logging"]),
+    // Without a screen the log is lines among the lines of the run.
+    ("logging", &["headless"]),
     ("main", &["cli", "commands"]),
     ("commands", &["cli"]),
 ];
@@ -40,7 +42,7 @@ const SIDEWAYS: &[(&str, &[&str])] = &[
 const NARROW: &[(&str, &[&str], &str)] = &[
     ("tui", &["status", "registry", "text", "outlet"], "a screen knows snapshots and commands, no stage"),
     ("headless", &["status", "registry", "text", "outlet"], "a screen knows snapshots and commands, no stage"),
-    ("logging", &["status"], "the log goes to the board and knows no stage"),
+    ("logging", &["status", "text", "outlet"], "the log goes to the board and knows no stage"),
 ];
 
 /// The homes of third-party crates: modules, or files of them (`driver/camera`).
@@ -52,7 +54,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("humantime", &["registry", "cli", "commands"]),
     ("iceoryx2", &["bus"]),
     ("jpeg_encoder", &["driver/sim"]),
-    ("libc", &["hotplug", "driver", "rig", "app"]),
+    ("libc", &["registry", "hotplug", "driver", "rig", "app"]),
     ("mcap", &["record", "driver/replay"]),
     ("nokhwa", &["driver/camera"]),
     ("ratatui", &["tui"]),
