@@ -11,8 +11,6 @@ use crate::modality::ModalityId;
 
 /// File the mask is published in, read by other processes.
 pub const MASK_PATH: &str = "/dev/shm/rapid_hardware_mask";
-/// The same as JSON, for people.
-pub const MASK_JSON_PATH: &str = "/dev/shm/rapid_hardware_mask.json";
 /// Size of the published record in bytes.
 pub const RECORD_LEN: usize = 32;
 

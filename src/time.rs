@@ -89,6 +89,34 @@ impl WallClock {
     }
 }
 
+/// A wall-clock time in UTC, to the millisecond: `2026-02-05T10:30:00.000Z` (RFC 3339).
+#[must_use]
+pub fn rfc3339(wall_ns: u64) -> String {
+    let (days, in_day) = (wall_ns / 86_400_000_000_000, wall_ns % 86_400_000_000_000 / 1_000_000);
+    let (year, month, day) = civil(days);
+    let (seconds, milliseconds) = (in_day / 1000, in_day % 1000);
+    let (hour, minute, second) = (seconds / 3600, seconds / 60 % 60, seconds % 60);
+    format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}.{milliseconds:03}Z")
+}
+
+/// Year, month and day of a number of days since 1970-01-01, in the Gregorian calendar.
+///
+/// The year is counted from March, so that the leap day is its last: then the months before any
+/// given one have 153 days for every five of them, and a cycle of 400 years has 146,097 days.
+#[must_use]
+pub const fn civil(days: u64) -> (u64, u64, u64) {
+    // 0000-03-01 lies 719,468 days before 1970-01-01.
+    let shifted = days + 719_468;
+    let (cycle, in_cycle) = (shifted / 146_097, shifted % 146_097);
+    let year_of_cycle = (in_cycle - in_cycle / 1460 + in_cycle / 36_524 - in_cycle / 146_096) / 365;
+    let in_year = in_cycle - (365 * year_of_cycle + year_of_cycle / 4 - year_of_cycle / 100);
+    let from_march = (5 * in_year + 2) / 153;
+    let day = in_year - (153 * from_march + 2) / 5 + 1;
+    let month = if from_march < 10 { from_march + 3 } else { from_march - 9 };
+    let year = cycle * 400 + year_of_cycle;
+    (if month <= 2 { year + 1 } else { year }, month, day)
+}
+
 fn read(clock: ClockId) -> u64 {
     let time = clock_gettime(clock);
     // Both clocks count up from a non-negative start: the boot, and 1970.
@@ -105,6 +133,21 @@ mod tests {
         assert_eq!(clock.wall_ns(Stamp(5)), 1_700_000_000_000_000_005);
         assert_eq!(clock.stamp(1_700_000_000_000_000_005), Stamp(5));
         assert_eq!(clock.stamp(3), Stamp(0));
+    }
+
+    #[test]
+    fn days_are_those_of_the_calendar() {
+        // Against `date -u -d @SECONDS`.
+        for (seconds, text) in [
+            (0, "1970-01-01T00:00:00.000Z"),
+            (951_782_400, "2000-02-29T00:00:00.000Z"),
+            (1_770_287_400, "2026-02-05T10:30:00.000Z"),
+            (4_107_542_399, "2100-02-28T23:59:59.000Z"),
+            (4_107_542_400, "2100-03-01T00:00:00.000Z"),
+        ] {
+            assert_eq!(rfc3339(seconds * 1_000_000_000), text);
+        }
+        assert_eq!(rfc3339(1_770_287_400_250_000_000), "2026-02-05T10:30:00.250Z");
     }
 
     #[test]

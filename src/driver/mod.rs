@@ -7,7 +7,15 @@
 //! Invariant: no driver blocks: what may block while opening runs on tokio's blocking pool.
 //! Invariant: no bytes from a device make a driver panic.
 
-use crate::registry::{DeviceNode, DeviceSpec};
+pub mod camera;
+pub mod replay;
+pub mod serial;
+pub mod sim;
+
+use std::sync::Arc;
+
+use crate::registry::scenario::{SimDevice, SimSource};
+use crate::registry::{DeviceNode, DeviceSpec, NodeSpec};
 use crate::sample::Encoding;
 use crate::time::Stamp;
 
@@ -22,7 +30,7 @@ pub struct Reading<'a> {
     pub captured: Stamp,
     /// `sample::FLAG_*`.
     pub flags: u32,
-    /// Image: pixels, otherwise 0.
+    /// Image: pixels; numbers: how many; otherwise 0.
     pub width: u32,
     /// Image: pixels, otherwise 0.
     pub height: u32,
@@ -46,7 +54,16 @@ pub enum DriverError {
 
 /// An open device.
 #[derive(Debug)]
-pub enum Driver {}
+pub enum Driver {
+    /// A V4L2 camera.
+    Camera(Box<camera::Camera>),
+    /// A serial line.
+    Serial(Box<serial::Serial>),
+    /// A device that exists only in a scenario.
+    Sim(Box<sim::Sim>),
+    /// One topic of a recorded episode.
+    Replay(Box<replay::Replay>),
+}
 
 impl Driver {
     /// Opens the node of `spec` and starts it.
@@ -54,8 +71,29 @@ impl Driver {
     /// # Errors
     /// When the node is gone, cannot be opened, or cannot do what `spec` wishes.
     pub async fn open(spec: &DeviceSpec, node: &DeviceNode) -> Result<Self, DriverError> {
-        let _ = (spec, node);
-        Err(DriverError::Fatal("no driver".to_owned()))
+        match (&spec.node, node) {
+            (NodeSpec::Camera(camera), DeviceNode::Video(path)) => {
+                Ok(Self::Camera(Box::new(camera::Camera::open(&spec.name, camera, path).await?)))
+            }
+            (NodeSpec::Serial(serial), DeviceNode::Tty(path)) => {
+                Ok(Self::Serial(Box::new(serial::Serial::open(serial, path, spec.max_bytes).await?)))
+            }
+            (_, DeviceNode::Sim(device)) => Self::open_sim(spec, device).await,
+            (NodeSpec::Camera(_), DeviceNode::Tty(path)) => {
+                Err(wrong_kind(spec, "camera", &path.display().to_string(), "serial line"))
+            }
+            (NodeSpec::Serial(_), DeviceNode::Video(path)) => {
+                Err(wrong_kind(spec, "serial line", &path.display().to_string(), "camera"))
+            }
+        }
+    }
+
+    async fn open_sim(spec: &DeviceSpec, device: &Arc<SimDevice>) -> Result<Self, DriverError> {
+        if let SimSource::Replay { .. } = device.source {
+            return Ok(Self::Replay(Box::new(replay::Replay::open(Arc::clone(device)).await?)));
+        }
+        sim::check(spec, device)?;
+        Ok(Self::Sim(Box::new(sim::Sim::open(Arc::clone(device)).await?)))
     }
 
     /// The next sample. Waits as long as the device sends nothing.
@@ -63,12 +101,39 @@ impl Driver {
     /// # Errors
     /// When the device is gone or cannot be read any more.
     pub async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
-        match *self {}
+        match self {
+            Self::Camera(driver) => driver.read().await,
+            Self::Serial(driver) => driver.read().await,
+            Self::Sim(driver) => driver.read().await,
+            Self::Replay(driver) => driver.read().await,
+        }
     }
 
     /// What was agreed with the device: format, rate, driver, for the log and the recording.
     #[must_use]
     pub fn description(&self) -> String {
-        match *self {}
+        match self {
+            Self::Camera(driver) => driver.description().to_owned(),
+            Self::Serial(driver) => driver.description().to_owned(),
+            Self::Sim(driver) => driver.description(),
+            Self::Replay(driver) => driver.description().to_owned(),
+        }
+    }
+}
+
+fn wrong_kind(spec: &DeviceSpec, wished: &str, node: &str, is: &str) -> DriverError {
+    DriverError::Fatal(format!(
+        "[device.{}] is a {wished} and {node} is a {is}: correct `node` or the identity of the entry",
+        spec.name
+    ))
+}
+
+/// Runs on tokio's blocking pool what may block while a device is opened.
+async fn unblock<T: Send + 'static>(
+    work: impl FnOnce() -> Result<T, DriverError> + Send + 'static,
+) -> Result<T, DriverError> {
+    match tokio::task::spawn_blocking(work).await {
+        Ok(result) => result,
+        Err(ended) => Err(DriverError::Retry(format!("opening ended early: {ended}"))),
     }
 }

@@ -6,7 +6,13 @@
 //! Invariant: what is attached when the stream begins is told as `Added` before anything else.
 //! Invariant: a node told twice as `Added` without a removal between is the same attachment.
 
+pub mod script;
+pub mod udev;
+
 use std::path::PathBuf;
+use std::pin::Pin;
+
+use futures::Stream;
 
 use crate::registry::Attachment;
 use crate::time::Stamp;
@@ -40,3 +46,14 @@ pub enum Witness {
     /// A scenario.
     Script,
 }
+
+/// Why plugging can no longer be watched.
+#[derive(Debug, thiserror::Error)]
+pub enum HotplugError {
+    /// The netlink sockets or sysfs.
+    #[error("watching for plugged devices: {0}; is /sys mounted, and udev running?")]
+    Io(#[from] std::io::Error),
+}
+
+/// A source of events.
+pub type HotplugStream = Pin<Box<dyn Stream<Item = Result<HotplugEvent, HotplugError>> + Send>>;

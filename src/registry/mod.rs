@@ -1,10 +1,24 @@
 //! The registry: `devices.toml`, the single point where a device is made known.
+//!
+//! Text -> `section` (tables with positions) -> `parse` -> [`Registry`]; from it follow which
+//! attached device is which entry (`identity`), what a simulation plays (`scenario_file`) and the
+//! files udev and systemd read (`artifacts`).
 
+pub mod artifacts;
 mod attachment;
+mod diagnostic;
+mod identity;
+mod parse;
 pub mod scenario;
+mod scenario_file;
+mod section;
 mod spec;
+mod units;
 
 pub use attachment::{Attachment, DeviceNode, UsbIdentity};
+pub use diagnostic::{Diagnostic, RegistryErrors};
+pub use identity::{Assigner, Assignment, Detached, Explanation};
+pub use parse::{BUILTIN, Loaded};
 pub use spec::{
     CameraSpec, DeviceSpec, Framing, IdentitySpec, Mount, NodeSpec, Parse, PixelFormat, Registry, RigSpec, SerialSpec,
     WhenStale,

@@ -1,7 +1,8 @@
 //! What `devices.toml` says once it has been checked: nothing downstream validates again.
 //!
-//! Invariant: every value here is within the range its comment states, names, topics, bits and
-//! identities are unique, and `Registry::devices` is in ascending order of bit.
+//! Invariant: every value here is within the range its comment states; names, topics and bits are
+//! unique; no two entries of one kind of node mean the same unit; `Registry::devices` is in
+//! ascending order of bit.
 
 use std::path::PathBuf;
 use std::time::Duration;

@@ -40,6 +40,11 @@ impl StreamCounters {
         self.samples.fetch_add(1, Ordering::Relaxed);
         self.bytes.fetch_add(bytes as u64, Ordering::Relaxed);
         self.newest.store(captured.0, Ordering::Relaxed);
+        self.lose(lost);
+    }
+
+    /// Counts samples that were lost.
+    pub fn lose(&self, lost: u64) {
         if lost > 0 {
             self.gaps.fetch_add(lost, Ordering::Relaxed);
         }
@@ -108,6 +113,12 @@ impl Board {
     pub fn set_mask(&self, mask: PhysicalMask, sequence: u64) {
         self.mask.store(mask.0, Ordering::Relaxed);
         self.mask_sequence.store(sequence, Ordering::Relaxed);
+    }
+
+    /// Publications of the mask so far.
+    #[must_use]
+    pub fn mask_sequence(&self) -> u64 {
+        self.mask_sequence.load(Ordering::Relaxed)
     }
 
     /// Reports the recording in progress, or that there is none.

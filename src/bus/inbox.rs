@@ -1,0 +1,71 @@
+//! An inbox: every topic of the rig, for one consumer.
+
+use std::time::Duration;
+
+use iceoryx2::port::listener::Listener;
+use iceoryx2::port::subscriber::Subscriber;
+
+use super::{BusError, EventFactory, Service, TopicFactory, TopicId, TopicSpec, topic_error};
+use crate::sample::SampleHeader;
+
+/// A consumer of every topic. Samples wait in shared memory until they are drained.
+pub struct Inbox {
+    topics: Vec<Subscription>,
+    wake: Listener<Service>,
+}
+
+struct Subscription {
+    id: TopicId,
+    name: String,
+    subscriber: Subscriber<Service, [u8], SampleHeader>,
+}
+
+impl std::fmt::Debug for Inbox {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_list().entries(self.topics.iter().map(|topic| &topic.name)).finish()
+    }
+}
+
+impl Inbox {
+    pub(super) fn open(topics: &[(TopicSpec, TopicFactory)], wake: &EventFactory<Service>) -> Result<Self, BusError> {
+        let subscribe = |(spec, factory): &(TopicSpec, TopicFactory)| {
+            let subscriber = factory
+                .subscriber_builder()
+                .buffer_size(spec.depth)
+                .create()
+                .map_err(|error| topic_error(&spec.name, &error))?;
+            Ok(Subscription { id: spec.id, name: spec.name.clone(), subscriber })
+        };
+        let topics = topics.iter().map(subscribe).collect::<Result<Vec<_>, BusError>>()?;
+        let wake = wake.listener_builder().create().map_err(|error| topic_error(super::WAKE_SERVICE, &error))?;
+        Ok(Self { topics, wake })
+    }
+
+    /// Blocks until a modality was published or `timeout` passed, whichever is first. The mask alone
+    /// wakes nobody.
+    ///
+    /// # Errors
+    /// When the event service is broken.
+    pub fn wait(&self, timeout: Duration) -> Result<(), BusError> {
+        self.wake.timed_wait(|_| {}, timeout).map(|_| ()).map_err(|error| topic_error(super::WAKE_SERVICE, &error))
+    }
+
+    /// Hands over every sample that waits, oldest first within a topic; the bytes are lent from
+    /// shared memory for the call.
+    ///
+    /// # Errors
+    /// When a topic cannot be read; what was handed over before stays handed over.
+    pub fn drain(&self, take: &mut dyn FnMut(TopicId, &SampleHeader, &[u8])) -> Result<(), BusError> {
+        for topic in &self.topics {
+            loop {
+                let received = topic
+                    .subscriber
+                    .receive()
+                    .map_err(|error| BusError::Transfer { topic: topic.name.clone(), reason: format!("{error:?}") })?;
+                let Some(sample) = received else { break };
+                take(topic.id, sample.user_header(), sample.payload());
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,64 @@
+//! Topics: name, depth and memory of each, decided once from the registry.
+
+use crate::modality::ModalityId;
+use crate::registry::DeviceSpec;
+
+/// Topic of the physical mask, on the bus and in recordings.
+pub const MASK_TOPIC: &str = "/rapid/mask";
+/// 4 s of mask at 500 Hz: as long as a consumer may be held up without losing one.
+const MASK_DEPTH: usize = 2048;
+/// u64 mask and u64 sequence.
+const MASK_BYTES: usize = 16;
+
+/// Which topic.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum TopicId {
+    /// Samples of a modality.
+    Modality(ModalityId),
+    /// The physical mask.
+    Mask,
+}
+
+/// A topic as it is opened.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TopicSpec {
+    /// Which.
+    pub id: TopicId,
+    /// Service name.
+    pub name: String,
+    /// Samples a subscriber may fall behind.
+    pub depth: usize,
+    /// Largest payload in bytes.
+    pub max_bytes: usize,
+}
+
+impl TopicSpec {
+    pub(super) fn of_device(device: &DeviceSpec) -> Self {
+        Self {
+            id: TopicId::Modality(device.id),
+            name: device.topic.clone(),
+            depth: device.depth,
+            max_bytes: device.max_bytes,
+        }
+    }
+
+    pub(super) fn mask() -> Self {
+        Self { id: TopicId::Mask, name: MASK_TOPIC.to_owned(), depth: MASK_DEPTH, max_bytes: MASK_BYTES }
+    }
+
+    /// Samples in the pool.
+    ///
+    /// Every subscriber's queue holds the newest `depth` samples at most, so the queues of all of
+    /// them together hold no more than `depth` different ones; beside these each may hold a few, and
+    /// the writer one. iceoryx2's own bound counts every queue as if it held other samples.
+    pub(super) fn pool_samples(&self) -> usize {
+        self.depth + super::MAX_SUBSCRIBERS * super::MAX_BORROWED + 2
+    }
+
+    /// Bytes of the pool.
+    #[must_use]
+    pub fn pool_bytes(&self) -> u64 {
+        let sample = self.max_bytes + size_of::<crate::sample::SampleHeader>();
+        (self.pool_samples() as u64).saturating_mul(sample as u64)
+    }
+}

@@ -1,0 +1,89 @@
+//! A topic's writer: one copy from the driver's buffer into shared memory.
+
+use iceoryx2::port::LoanError;
+use iceoryx2::port::notifier::Notifier;
+use iceoryx2::port::publisher::Publisher;
+use iceoryx2::prelude::*;
+
+use super::{BusError, EventFactory, Service, TopicFactory, TopicId, TopicSpec, topic_error};
+use crate::sample::SampleHeader;
+
+/// The one writer of a topic.
+pub struct Writer {
+    topic: String,
+    max_bytes: usize,
+    publisher: Publisher<Service, [u8], SampleHeader>,
+    wake: Option<Notifier<Service>>,
+}
+
+impl std::fmt::Debug for Writer {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Writer").field("topic", &self.topic).finish_non_exhaustive()
+    }
+}
+
+impl Writer {
+    pub(super) fn open(
+        spec: &TopicSpec,
+        factory: &TopicFactory,
+        wake: &EventFactory<Service>,
+    ) -> Result<Self, BusError> {
+        let pool = spec.pool_samples();
+        let publisher = factory
+            .publisher_builder()
+            .initial_max_slice_len(spec.max_bytes)
+            .allocation_strategy(AllocationStrategy::Static)
+            .max_loaned_samples(1)
+            .override_sample_preallocation(move |_| pool)
+            // A reader that does not keep up loses samples; the writer never waits for it.
+            .backpressure_strategy(BackpressureStrategy::DiscardData)
+            .create()
+            .map_err(|error| topic_error(&spec.name, &error))?;
+        let event = match spec.id {
+            TopicId::Modality(modality) => Some(modality.index()),
+            // Consumers find the mask when they look; 500 wake-ups a second would tell them nothing.
+            TopicId::Mask => None,
+        };
+        let wake = event
+            .map(|event| {
+                wake.notifier_builder()
+                    .default_event_id(EventId::new(event))
+                    .create()
+                    .map_err(|error| topic_error(&spec.name, &error))
+            })
+            .transpose()?;
+        Ok(Self { topic: spec.name.clone(), max_bytes: spec.max_bytes, publisher, wake })
+    }
+
+    /// Publishes one sample and wakes the consumers.
+    ///
+    /// # Errors
+    /// When the payload is larger than the topic allows, or the pool is exhausted because a
+    /// subscriber that died still holds samples.
+    pub fn publish(&self, header: SampleHeader, payload: &[u8]) -> Result<(), BusError> {
+        if payload.len() > self.max_bytes {
+            let (size, max) = (payload.len(), self.max_bytes);
+            return Err(BusError::TooLarge { topic: self.topic.clone(), size, max });
+        }
+        let mut sample =
+            self.publisher.loan_slice_uninit(payload.len()).map_err(|error| self.transfer(&describe(error)))?;
+        *sample.user_header_mut() = header;
+        sample.write_from_slice(payload).send().map_err(|error| self.transfer(&format!("{error:?}")))?;
+        if let Some(wake) = &self.wake {
+            // A consumer that cannot be woken looks by itself soon after; the sample is not lost.
+            let _ = wake.notify();
+        }
+        Ok(())
+    }
+
+    fn transfer(&self, reason: &str) -> BusError {
+        BusError::Transfer { topic: self.topic.clone(), reason: reason.to_owned() }
+    }
+}
+
+fn describe(error: LoanError) -> String {
+    match error {
+        LoanError::OutOfMemory => "the pool is exhausted: a subscriber holds too many samples".to_owned(),
+        other => format!("{other:?}"),
+    }
+}

@@ -1,0 +1,201 @@
+//! `rapid check`: what the registry says, or everything that is wrong with it.
+
+use std::io::{self, Write};
+use std::path::Path;
+
+use serde::Serialize;
+
+use super::{Format, Outcome};
+use crate::registry::{
+    DeviceSpec, Diagnostic, Framing, IdentitySpec, Loaded, Mount, NodeSpec, Parse, PixelFormat, Registry,
+};
+
+/// Reads the registry at `path` and writes its entries, or every problem, to `out`.
+///
+/// # Errors
+/// When `out` cannot be written to.
+pub fn check(path: &Path, format: Format, out: &mut dyn Write) -> io::Result<Outcome> {
+    match (Registry::load(path), format) {
+        (Ok(loaded), Format::Text) => {
+            table(&loaded, out)?;
+            let count = loaded.registry.devices.len();
+            let devices = if count == 1 { "device" } else { "devices" };
+            writeln!(out, "{}: {count} {devices}, ok", path.display())?;
+            Ok(Outcome::Done)
+        }
+        (Ok(loaded), Format::Json) => {
+            for device in &loaded.registry.devices {
+                line(out, &Line::Device(row(device)))?;
+            }
+            for warning in &loaded.warnings {
+                line(out, &Line::Warning(warning))?;
+            }
+            Ok(Outcome::Done)
+        }
+        (Err(errors), Format::Text) => {
+            writeln!(out, "{errors}")?;
+            let count = errors.diagnostics.len();
+            writeln!(out, "{}: {count} {}", path.display(), if count == 1 { "problem" } else { "problems" })?;
+            Ok(Outcome::BadConfiguration)
+        }
+        (Err(errors), Format::Json) => {
+            for error in &errors.diagnostics {
+                line(out, &Line::Error(error))?;
+            }
+            Ok(Outcome::BadConfiguration)
+        }
+    }
+}
+
+/// One line of JSON.
+#[derive(Serialize)]
+#[serde(tag = "kind", rename_all = "lowercase")]
+enum Line<'a> {
+    Device(Row<'a>),
+    Warning(&'a Diagnostic),
+    Error(&'a Diagnostic),
+}
+
+#[derive(Serialize)]
+struct Row<'a> {
+    bit: u8,
+    name: &'a str,
+    node: &'static str,
+    #[serde(flatten)]
+    identity: &'a IdentitySpec,
+    slot: Option<Mount>,
+    topic: &'a str,
+    format: String,
+    max_bytes: usize,
+    depth: usize,
+}
+
+fn row(device: &DeviceSpec) -> Row<'_> {
+    let (node, format) = match &device.node {
+        NodeSpec::Camera(camera) => {
+            let format = match camera.format {
+                PixelFormat::Mjpg => "MJPG",
+                PixelFormat::Yuyv => "YUYV",
+                PixelFormat::Grey => "GREY",
+            };
+            ("camera", format!("{}x{}@{} {format}", camera.width, camera.height, camera.fps))
+        }
+        NodeSpec::Serial(serial) => {
+            let framing = match serial.framing {
+                Framing::Line => "line".to_owned(),
+                Framing::Cobs => "cobs".to_owned(),
+                Framing::Fixed(bytes) => format!("fixed {bytes}"),
+            };
+            let content = match serial.parse {
+                Parse::Csv => format!("csv x{}", serial.channels),
+                Parse::Json => format!("json x{}", serial.channels),
+                Parse::F32le => format!("f32le x{}", serial.channels),
+                Parse::Raw => "raw".to_owned(),
+            };
+            ("serial", format!("{} baud {framing} {content}", serial.baud))
+        }
+    };
+    Row {
+        bit: device.id.bit(),
+        name: &device.name,
+        node,
+        identity: &device.identity,
+        slot: device.mount,
+        topic: &device.topic,
+        format,
+        max_bytes: device.max_bytes,
+        depth: device.depth,
+    }
+}
+
+fn line(out: &mut dyn Write, line: &Line<'_>) -> io::Result<()> {
+    serde_json::to_writer(&mut *out, line)?;
+    writeln!(out)
+}
+
+fn table(loaded: &Loaded, out: &mut dyn Write) -> io::Result<()> {
+    let header = ["bit", "name", "node", "identity", "topic", "format"].map(str::to_owned);
+    let mut rows = vec![header];
+    for device in &loaded.registry.devices {
+        let row = row(device);
+        let place = match (&row.identity.serial, &row.identity.port) {
+            (Some(serial), _) => format!(" serial {}", serial.escape_debug()),
+            (None, Some(port)) => format!(" port {port}"),
+            (None, None) => " any unit".to_owned(),
+        };
+        let identity = format!("{:04x}:{:04x}{place}", row.identity.vid, row.identity.pid);
+        let cells = [row.bit.to_string(), row.name.into(), row.node.into(), identity, row.topic.into(), row.format];
+        rows.push(cells);
+    }
+    let mut widths = [0; 6];
+    for row in &rows {
+        for (width, cell) in widths.iter_mut().zip(row) {
+            *width = cell.chars().count().max(*width);
+        }
+    }
+    for row in &rows {
+        let cells: Vec<String> = row.iter().zip(widths).map(|(cell, width)| format!("{cell:<width$}")).collect();
+        writeln!(out, "{}", cells.join("  ").trim_end())?;
+    }
+    for warning in &loaded.warnings {
+        writeln!(out, "warning: {warning}")?;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn checked(text: &str, format: Format) -> (Outcome, String) {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("devices.toml");
+        std::fs::write(&path, text).unwrap();
+        let mut out = Vec::new();
+        let outcome = check(&path, format, &mut out).unwrap();
+        (outcome, String::from_utf8(out).unwrap().replace(&path.display().to_string(), "devices.toml"))
+    }
+
+    #[test]
+    fn a_good_registry_is_listed() {
+        let (outcome, text) = checked(crate::registry::BUILTIN, Format::Text);
+        assert_eq!(outcome, Outcome::Done);
+        assert_eq!(
+            text,
+            "bit  name         node    identity                  topic                  format\n\
+             0    cam_wrist    camera  046d:0825 serial CAM00A1  /rapid/camera/wrist    640x480@30 MJPG\n\
+             1    tactile_tip  camera  2bc5:0501 serial TAC00B1  /rapid/camera/tactile  320x240@30 MJPG\n\
+             2    motor_state  serial  2e8a:000a serial MOT00C1  /rapid/serial/motor    115200 baud line csv x3\n\
+             devices.toml: 3 devices, ok\n"
+        );
+    }
+
+    #[test]
+    fn warnings_and_problems_are_told_and_problems_are_bad_configuration() {
+        let (outcome, text) = checked("[device.a]\nvid = \"1\"\npid = \"2\"\nnode = \"camera\"\n", Format::Text);
+        assert_eq!(outcome, Outcome::Done);
+        assert!(text.contains("warning: devices.toml:1:9: [device.a] no bit given, it gets bit 0"), "{text}");
+        assert!(text.ends_with("devices.toml: 1 device, ok\n"), "{text}");
+        let (outcome, text) = checked("[device.a]\nvid = \"1\"\npid = \"2\"\nnode = \"camrea\"\n", Format::Text);
+        assert_eq!(outcome, Outcome::BadConfiguration);
+        assert_eq!(
+            text,
+            "devices.toml:4:8: [device.a] unknown node \"camrea\"\n    fix: did you mean \"camera\"?\n\
+             devices.toml: 1 problem\n"
+        );
+    }
+
+    #[test]
+    fn json_is_one_object_a_line() {
+        let (_, text) = checked(crate::registry::BUILTIN, Format::Json);
+        let rows: Vec<serde_json::Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+        assert_eq!(rows.len(), 3);
+        assert_eq!(rows[0]["kind"], "device");
+        assert_eq!(rows[0]["serial"], "CAM00A1");
+        assert_eq!(rows[2]["format"], "115200 baud line csv x3");
+        let (outcome, text) = checked("[device.a]\n", Format::Json);
+        assert_eq!(outcome, Outcome::BadConfiguration);
+        let first: serde_json::Value = serde_json::from_str(text.lines().next().unwrap()).unwrap();
+        assert_eq!((&first["kind"], &first["line"]), (&"error".into(), &1.into()));
+    }
+}

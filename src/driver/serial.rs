@@ -1,0 +1,245 @@
+//! Serial lines: bytes in, messages cut out of them, numbers read from each message.
+//!
+//! A message that is malformed (overlong, badly stuffed, wrong count, not numbers) is skipped and
+//! counted in `lost` of the next reading; it never ends the stream. What arrives before the first
+//! message boundary after opening is the tail of a message and dropped without being counted.
+//! `nan` and `inf` in a message are values like any other and are passed on as they are.
+//!
+//! Invariant: memory is bounded by the longest permitted message, whatever the device sends.
+//! Invariant: a stamp is the moment the bytes that completed the message came into our hands; a
+//! serial line gives no earlier one.
+
+mod framing;
+mod parse;
+
+use std::path::Path;
+
+use tokio::io::AsyncReadExt as _;
+use tokio_serial::{ClearBuffer, SerialPort as _, SerialStream};
+
+use self::framing::{Cut, Framer};
+use super::{DriverError, Reading, unblock};
+use crate::registry::{Framing, Parse, SerialSpec};
+use crate::sample::Encoding;
+use crate::time::Stamp;
+
+/// Bytes taken from the kernel at once.
+const INBOX: usize = 4096;
+/// Longest message of a text format without many channels.
+const SHORT_MESSAGE: usize = 4096;
+/// The longest a number in text may reasonably be, with its separator; JSON keys included.
+const TEXT_PER_CHANNEL: usize = 64;
+
+/// An open serial line.
+#[derive(Debug)]
+pub struct Serial {
+    stream: SerialStream,
+    decoder: Decoder,
+    inbox: Box<[u8; INBOX]>,
+    /// `inbox[taken..filled]` is still to be looked at.
+    taken: usize,
+    filled: usize,
+    /// When the bytes in `inbox` arrived.
+    arrived: Stamp,
+    lost: u64,
+    description: String,
+}
+
+impl Serial {
+    /// Opens the line at `path` for ourselves alone. `max_bytes` bounds a raw message.
+    ///
+    /// Opening a USB serial adapter or CDC-ACM device raises DTR, which restarts some boards.
+    ///
+    /// # Errors
+    /// When the line is gone, held by another program, not permitted, or cannot be set up.
+    pub async fn open(spec: &SerialSpec, path: &Path, max_bytes: usize) -> Result<Self, DriverError> {
+        let decoder = Decoder::new(spec, max_bytes);
+        let description = format!("{} at {} baud, {}", path.display(), spec.baud, decoder.description());
+        let path = path.to_owned();
+        let baud = spec.baud;
+        let stream = unblock(move || open_line(&path, baud)).await?;
+        Ok(Self {
+            stream,
+            decoder,
+            inbox: Box::new([0; INBOX]),
+            taken: 0,
+            filled: 0,
+            arrived: Stamp::default(),
+            lost: 0,
+            description,
+        })
+    }
+
+    /// The next message.
+    ///
+    /// # Errors
+    /// [`DriverError::Gone`] when the line hung up.
+    pub async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
+        while !self.decode() {
+            // A dropped future leaves the bytes either in the kernel or in the inbox.
+            let count = self.stream.read(&mut self.inbox[..]).await.map_err(|error| read_error(&error))?;
+            if count == 0 {
+                return Err(DriverError::Gone);
+            }
+            self.arrived = Stamp::now();
+            (self.taken, self.filled) = (0, count);
+        }
+        let lost = std::mem::take(&mut self.lost);
+        Ok(self.decoder.reading(self.arrived, lost))
+    }
+
+    /// Takes bytes from the inbox until a good message is complete.
+    fn decode(&mut self) -> bool {
+        while let Some(bytes) = self.inbox.get(self.taken..self.filled)
+            && !bytes.is_empty()
+        {
+            let (taken, decoded) = self.decoder.feed(bytes);
+            self.taken += taken;
+            match decoded {
+                Decoded::Nothing => {}
+                Decoded::Message => return true,
+                Decoded::Malformed => self.lost += 1,
+            }
+        }
+        false
+    }
+
+    /// What was opened, and how it is read.
+    #[must_use]
+    pub fn description(&self) -> &str {
+        &self.description
+    }
+}
+
+/// From bytes to readings, without I/O.
+#[derive(Debug)]
+struct Decoder {
+    framer: Framer,
+    parse: Parse,
+    values: Vec<f64>,
+    output: Vec<u8>,
+    /// `Framing::Fixed` only: the last message was refused, and bytes are being let go one by one
+    /// until a message fits again.
+    slipping: bool,
+}
+
+/// What came of feeding bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Decoded {
+    /// More bytes are needed.
+    Nothing,
+    /// A message can be fetched by `reading`.
+    Message,
+    /// A message was refused.
+    Malformed,
+}
+
+impl Decoder {
+    fn new(spec: &SerialSpec, max_bytes: usize) -> Self {
+        let limit = match (spec.framing, spec.parse) {
+            (Framing::Fixed(length), _) => length,
+            (_, Parse::Raw) => max_bytes,
+            (_, Parse::F32le) => spec.channels * 4,
+            (_, Parse::Csv | Parse::Json) => SHORT_MESSAGE.max(spec.channels * TEXT_PER_CHANNEL),
+        };
+        Self {
+            framer: Framer::new(spec.framing, limit),
+            parse: spec.parse,
+            values: vec![0.0; spec.channels],
+            output: Vec::with_capacity(spec.channels * 8),
+            slipping: false,
+        }
+    }
+
+    /// Consumes bytes up to the end of at most one message.
+    fn feed(&mut self, bytes: &[u8]) -> (usize, Decoded) {
+        let (taken, cut) = self.framer.feed(bytes);
+        let decoded = match cut {
+            Cut::Open => Decoded::Nothing,
+            Cut::Malformed => Decoded::Malformed,
+            Cut::Message if self.accepts() => {
+                self.slipping = false;
+                Decoded::Message
+            }
+            Cut::Message if self.framer.slip() => {
+                let first = !std::mem::replace(&mut self.slipping, true);
+                if first { Decoded::Malformed } else { Decoded::Nothing }
+            }
+            Cut::Message => Decoded::Malformed,
+        };
+        (taken, decoded)
+    }
+
+    fn accepts(&mut self) -> bool {
+        if self.parse == Parse::Raw {
+            return true;
+        }
+        if !parse::numbers(self.parse, self.framer.message(), &mut self.values) {
+            return false;
+        }
+        self.output.clear();
+        self.output.extend(self.values.iter().flat_map(|value| value.to_le_bytes()));
+        true
+    }
+
+    fn reading(&self, captured: Stamp, lost: u64) -> Reading<'_> {
+        let (bytes, encoding, width) = match self.parse {
+            Parse::Raw => (self.framer.message(), Encoding::Bytes, 0),
+            _ => (self.output.as_slice(), Encoding::F64, u32::try_from(self.values.len()).unwrap_or(u32::MAX)),
+        };
+        Reading { bytes, encoding, captured, flags: 0, width, height: 0, lost }
+    }
+
+    fn description(&self) -> String {
+        let content = match self.parse {
+            Parse::Csv => "comma-separated numbers",
+            Parse::Json => "numbers in JSON",
+            Parse::F32le => "32-bit floats",
+            Parse::Raw => return format!("bytes in {}", self.framer.description()),
+        };
+        format!("{} {content} in {}", self.values.len(), self.framer.description())
+    }
+}
+
+fn open_line(path: &Path, baud: u32) -> Result<SerialStream, DriverError> {
+    let Some(name) = path.to_str() else {
+        return Err(DriverError::Fatal(format!("{}: the path is not UTF-8", path.display())));
+    };
+    let stream =
+        SerialStream::open(&tokio_serial::new(name, baud).exclusive(true)).map_err(|error| open_error(path, &error))?;
+    // Whatever waited in the kernel is older than this opening.
+    let _ = stream.clear(ClearBuffer::Input);
+    Ok(stream)
+}
+
+fn open_error(path: &Path, error: &tokio_serial::Error) -> DriverError {
+    let shown = path.display();
+    match error.kind() {
+        // serialport tells EBUSY, from TIOCEXCL or from its lock, as `NoDevice`.
+        tokio_serial::ErrorKind::NoDevice if path.exists() => {
+            DriverError::Retry(format!("{shown} is held by another program: end it (`fuser {shown}` names it)"))
+        }
+        tokio_serial::ErrorKind::NoDevice | tokio_serial::ErrorKind::Io(std::io::ErrorKind::NotFound) => {
+            DriverError::Gone
+        }
+        tokio_serial::ErrorKind::Io(std::io::ErrorKind::PermissionDenied) => DriverError::Fatal(format!(
+            "{shown} may not be opened: add the user to group dialout (`sudo usermod -aG dialout $USER`, then log in \
+             again) or install the udev rules (`rapid artifacts --install`)"
+        )),
+        // ENODEV, ENXIO and EIO arrive without their number; a node that is gone tells them apart.
+        _ if !path.exists() => DriverError::Gone,
+        _ => DriverError::Retry(format!("{shown} at {baud_hint}: {error}", baud_hint = "the wished settings")),
+    }
+}
+
+/// EIO, ENODEV and ENXIO are what a line reports whose device is gone.
+fn read_error(error: &std::io::Error) -> DriverError {
+    const GONE: [i32; 4] = [libc::EIO, libc::ENODEV, libc::ENXIO, libc::EBADF];
+    match error.raw_os_error() {
+        Some(number) if GONE.contains(&number) => DriverError::Gone,
+        _ => DriverError::Retry(format!("reading the line: {error}")),
+    }
+}
+
+#[cfg(test)]
+mod tests;

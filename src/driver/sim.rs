@@ -1,0 +1,316 @@
+//! Simulated devices: what a scenario plugs in.
+//!
+//! Samples lie on an absolute grid in time that begins with the scenario, so nothing drifts, and
+//! their bytes are a function of seed and sequence, so a test can say what a recording must hold.
+//! Time is tokio's: under a paused clock a scenario runs as fast as it is read.
+//!
+//! Invariant: the sequence goes on over a replug; a number that is skipped is told in `lost`.
+
+use std::f64::consts::TAU;
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, OnceLock};
+use std::time::Duration;
+
+use jpeg_encoder::{ColorType, Encoder};
+use tokio::time::Instant;
+
+use super::{DriverError, Reading, unblock};
+use crate::registry::scenario::{SimDevice, SimSource};
+use crate::registry::{DeviceSpec, NodeSpec};
+use crate::sample::{Encoding, FLAG_DEVICE_TIME};
+use crate::time::Stamp;
+
+/// Different pictures a simulated camera has.
+const PICTURES: u32 = 8;
+const JPEG_QUALITY: u8 = 80;
+/// Pictures a camera keeps for a reader that is late, as many as the real driver has buffers.
+const CAMERA_BACKLOG: u64 = 4;
+/// Time a serial line keeps for a reader that is late: the kernel's buffer outlasts this.
+const SERIAL_BACKLOG: Duration = Duration::from_secs(1);
+/// How soon a pulled cable or a silence is noticed, at the latest.
+const NOTICE: Duration = Duration::from_millis(10);
+
+/// A running simulated device.
+#[derive(Debug)]
+pub struct Sim {
+    device: Arc<SimDevice>,
+    content: Content,
+    grid: Grid,
+    /// Number of the next sample on the grid, counted from the scenario's beginning.
+    next: u64,
+    backlog: u64,
+    payload: Vec<u8>,
+}
+
+#[derive(Debug)]
+enum Content {
+    Pictures(Pictures),
+    Values { channels: usize, seed: u64 },
+}
+
+impl Sim {
+    /// Starts the device at the next point of its grid.
+    ///
+    /// # Errors
+    /// When a picture of these dimensions cannot be made.
+    pub async fn open(device: Arc<SimDevice>) -> Result<Self, DriverError> {
+        let (content, rate, backlog) = match device.source {
+            SimSource::Camera { width, height, fps, seed } => {
+                let pictures = unblock(move || Pictures::new(width, height, seed)).await?;
+                (Content::Pictures(pictures), fps, CAMERA_BACKLOG)
+            }
+            SimSource::Serial { channels, hz, seed } => {
+                (Content::Values { channels, seed }, hz, SERIAL_BACKLOG.as_secs() * u64::from(hz.max(1)))
+            }
+            SimSource::Replay { .. } => {
+                return Err(DriverError::Fatal(format!("{} is a recording, not a simulated device", device.name)));
+            }
+        };
+        let capacity = match &content {
+            Content::Pictures(pictures) => pictures.largest(),
+            Content::Values { channels, .. } => channels * 8,
+        };
+        let grid = Grid { begun: device.begun, rate: u64::from(rate.max(1)) };
+        let next = grid.first_after(stamp_of(Instant::now()));
+        Ok(Self { device, content, grid, next, backlog, payload: Vec::with_capacity(capacity) })
+    }
+
+    /// The next sample.
+    ///
+    /// # Errors
+    /// [`DriverError::Gone`] once the cable is pulled.
+    pub async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
+        let lost = self.next_due().await?;
+        // Nothing waits from here on: a future that is dropped has taken no sample.
+        let skipped = u32::try_from(lost).unwrap_or(u32::MAX);
+        let sequence = self.device.sequence.fetch_add(skipped.wrapping_add(1), Ordering::AcqRel).wrapping_add(skipped);
+        let captured = self.grid.stamp(self.next);
+        self.next += 1;
+        let (encoding, width, height) = match &self.content {
+            Content::Pictures(pictures) => {
+                pictures.write(sequence, &mut self.payload);
+                (Encoding::Mjpeg, pictures.width, pictures.height)
+            }
+            Content::Values { channels, seed } => {
+                write_values(*channels, *seed, sequence, &mut self.payload);
+                (Encoding::F64, u32::try_from(*channels).unwrap_or(u32::MAX), 0)
+            }
+        };
+        Ok(Reading { bytes: &self.payload, encoding, captured, flags: FLAG_DEVICE_TIME, width, height, lost })
+    }
+
+    /// Waits until the next sample is due; tells how many the device had to drop before it because
+    /// nobody read them.
+    async fn next_due(&mut self) -> Result<u64, DriverError> {
+        loop {
+            if self.device.is_unplugged() {
+                return Err(DriverError::Gone);
+            }
+            let now = Instant::now();
+            if self.device.is_silent() {
+                // A silent device makes no samples: its sequence stands still, nothing is lost.
+                self.next = self.next.max(self.grid.first_after(stamp_of(now)));
+                tokio::time::sleep_until(now + NOTICE.min(self.grid.period())).await;
+                continue;
+            }
+            let due = self.grid.stamp(self.next);
+            let now_stamp = stamp_of(now);
+            if due <= now_stamp {
+                let newest = self.grid.first_after(now_stamp).saturating_sub(1);
+                let lost = newest.saturating_sub(self.next).saturating_sub(self.backlog);
+                self.next += lost;
+                return Ok(lost);
+            }
+            tokio::time::sleep_until((now + due.since(now_stamp)).min(now + NOTICE)).await;
+        }
+    }
+
+    /// What the device is.
+    #[must_use]
+    pub fn description(&self) -> String {
+        match self.device.source {
+            SimSource::Camera { width, height, fps, .. } => {
+                format!("simulated camera, MJPG {width}x{height} at {fps} fps")
+            }
+            SimSource::Serial { channels, hz, .. } => format!("simulated serial line, {channels} numbers at {hz} Hz"),
+            SimSource::Replay { .. } => String::from("recording"),
+        }
+    }
+}
+
+/// Does the scenario's device send what the registry says?
+///
+/// # Errors
+/// When kind, picture size or number of channels differ: what follows is laid out by the registry.
+pub(super) fn check(spec: &DeviceSpec, device: &SimDevice) -> Result<(), DriverError> {
+    let (sends, wished) = match (&device.source, &spec.node) {
+        (SimSource::Camera { width, height, .. }, NodeSpec::Camera(camera)) => {
+            if (*width, *height) == (camera.width, camera.height) {
+                return Ok(());
+            }
+            (format!("{width}x{height} pictures"), format!("{}x{}", camera.width, camera.height))
+        }
+        (SimSource::Serial { channels, .. }, NodeSpec::Serial(serial)) => {
+            if *channels == serial.channels {
+                return Ok(());
+            }
+            (format!("{channels} numbers"), serial.channels.to_string())
+        }
+        (SimSource::Camera { .. }, NodeSpec::Serial(_)) => (String::from("pictures"), String::from("a serial line")),
+        (SimSource::Serial { .. }, NodeSpec::Camera(_)) => (String::from("numbers"), String::from("a camera")),
+        (SimSource::Replay { .. }, _) => return Ok(()),
+    };
+    Err(DriverError::Fatal(format!(
+        "the scenario's device {} sends {sends}, [device.{}] says {wished}: make them equal",
+        device.name, spec.name
+    )))
+}
+
+/// The bytes a simulated device sends as number `sequence`, made anew; `None` for a recording.
+#[must_use]
+pub fn frame(source: &SimSource, sequence: u32) -> Option<Vec<u8>> {
+    let mut payload = Vec::new();
+    match *source {
+        SimSource::Camera { width, height, seed, .. } => {
+            let picture = encode(width, height, seed, sequence % PICTURES).ok()?;
+            write_picture(&picture, seed, sequence, &mut payload);
+        }
+        SimSource::Serial { channels, seed, .. } => write_values(channels, seed, sequence, &mut payload),
+        SimSource::Replay { .. } => return None,
+    }
+    Some(payload)
+}
+
+/// `channels` numbers as little-endian 64-bit floats: the sequence, then sines that differ by seed
+/// and channel.
+fn write_values(channels: usize, seed: u64, sequence: u32, payload: &mut Vec<u8>) {
+    payload.clear();
+    for channel in 0..channels {
+        let value = if channel == 0 {
+            f64::from(sequence)
+        } else {
+            let phase = (seed % 1_000) as f64 / 1_000.0 + channel as f64 / 7.0;
+            (TAU * (f64::from(sequence % 100_000) / 100.0 + phase)).sin()
+        };
+        payload.extend_from_slice(&value.to_le_bytes());
+    }
+}
+
+/// Pictures encoded once, when the device is opened.
+#[derive(Debug)]
+struct Pictures {
+    width: u32,
+    height: u32,
+    seed: u64,
+    encoded: Vec<Vec<u8>>,
+}
+
+impl Pictures {
+    fn new(width: u32, height: u32, seed: u64) -> Result<Self, DriverError> {
+        let encoded = (0..PICTURES).map(|index| encode(width, height, seed, index)).collect::<Result<_, _>>()?;
+        Ok(Self { width, height, seed, encoded })
+    }
+
+    fn largest(&self) -> usize {
+        // 64 bytes hold the comment at its longest.
+        self.encoded.iter().map(Vec::len).max().unwrap_or(0) + 64
+    }
+
+    fn write(&self, sequence: u32, payload: &mut Vec<u8>) {
+        let picture = self.encoded.get((sequence % PICTURES) as usize).map_or(&[][..], Vec::as_slice);
+        write_picture(picture, self.seed, sequence, payload);
+    }
+}
+
+/// The picture with a comment segment after its start of image (JPEG, ITU-T T.81 B.2.4.5: marker
+/// FFFE, length of what follows it as big-endian u16 with its own two bytes).
+fn write_picture(picture: &[u8], seed: u64, sequence: u32, payload: &mut Vec<u8>) {
+    use std::io::Write as _;
+    let (start, rest) = picture.split_at(picture.len().min(2));
+    payload.clear();
+    payload.extend_from_slice(start);
+    payload.extend_from_slice(&[0xff, 0xfe, 0, 0]);
+    let at = payload.len();
+    // A Vec takes every write.
+    let _ = write!(payload, "rapid-sim {seed} {sequence}");
+    let length = u16::try_from(payload.len() - at + 2).unwrap_or(u16::MAX).to_be_bytes();
+    if let Some(place) = payload.get_mut(at - 2..at) {
+        place.copy_from_slice(&length);
+    }
+    payload.extend_from_slice(rest);
+}
+
+/// A gradient tinted by the seed, with a bright square that moves from picture to picture.
+fn encode(width: u32, height: u32, seed: u64, index: u32) -> Result<Vec<u8>, DriverError> {
+    let unmade = || DriverError::Fatal(format!("a simulated picture cannot be {width}x{height}: use 1..=8192 pixels"));
+    let (Ok(narrow_width), Ok(narrow_height)) = (u16::try_from(width), u16::try_from(height)) else {
+        return Err(unmade());
+    };
+    if !(1..=8192).contains(&width) || !(1..=8192).contains(&height) {
+        return Err(unmade());
+    }
+    let side = (width.min(height) / 4).max(1);
+    let left = (width - side.min(width)) * index / PICTURES;
+    let top = height / 3;
+    let tint = seed.to_le_bytes()[0];
+    let mut pixels = Vec::with_capacity((width * height * 3) as usize);
+    for y in 0..height {
+        let down = (y * 255 / height).to_le_bytes()[0];
+        for x in 0..width {
+            let inside = (left..left + side).contains(&x) && (top..top + side).contains(&y);
+            let across = (x * 255 / width).to_le_bytes()[0];
+            pixels.extend_from_slice(&if inside { [255, 240, 32] } else { [across, down, tint] });
+        }
+    }
+    let mut encoded = Vec::new();
+    Encoder::new(&mut encoded, JPEG_QUALITY)
+        .encode(&pixels, narrow_width, narrow_height, ColorType::Rgb)
+        .map_err(|_| unmade())?;
+    Ok(encoded)
+}
+
+/// Points in time `1 / rate` apart, from the scenario's beginning; computed from the point's number
+/// so that a period that is no whole number of ns does not drift.
+#[derive(Debug, Clone, Copy)]
+struct Grid {
+    begun: Stamp,
+    rate: u64,
+}
+
+impl Grid {
+    fn stamp(self, point: u64) -> Stamp {
+        let after = u128::from(point) * 1_000_000_000 / u128::from(self.rate);
+        Stamp(self.begun.0.saturating_add(u64::try_from(after).unwrap_or(u64::MAX)))
+    }
+
+    /// The first point later than `now`.
+    fn first_after(self, now: Stamp) -> u64 {
+        let Some(elapsed) = now.0.checked_sub(self.begun.0) else { return 0 };
+        let estimate = u128::from(elapsed) * u128::from(self.rate) / 1_000_000_000;
+        let mut point = u64::try_from(estimate).unwrap_or(u64::MAX);
+        // The rounding in `stamp` puts a point up to 1 ns early: the estimate is at most one short.
+        while self.stamp(point) <= now && point < u64::MAX {
+            point += 1;
+        }
+        point
+    }
+
+    fn period(self) -> Duration {
+        Duration::from_nanos(1_000_000_000 / self.rate)
+    }
+}
+
+/// The stamp of a moment on tokio's clock. `std`'s `Instant` is `CLOCK_MONOTONIC` on Linux, so one
+/// offset holds for the whole process; with a paused clock, stamps stand still and leap with it.
+pub(super) fn stamp_of(instant: Instant) -> Stamp {
+    static ANCHOR: OnceLock<(std::time::Instant, Stamp)> = OnceLock::new();
+    let (origin, stamp) = *ANCHOR.get_or_init(|| (std::time::Instant::now(), Stamp::now()));
+    let instant = instant.into_std();
+    match instant.checked_duration_since(origin) {
+        Some(later) => stamp.after(later),
+        None => stamp.before(origin.duration_since(instant)),
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,192 @@
+//! A scenario played as hot-plug events.
+
+use std::collections::{HashMap, VecDeque};
+use std::path::PathBuf;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::task::{Context, Poll, ready};
+use std::time::Duration;
+
+use futures::Stream;
+use tokio::time::{Instant, Sleep, sleep_until};
+
+use super::{HotplugError, HotplugEvent, Witness};
+use crate::registry::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, SimDevice};
+use crate::registry::{Attachment, DeviceNode};
+use crate::time::Stamp;
+
+/// Plays a [`Scenario`] on tokio's clock, from the moment it is made.
+#[derive(Debug)]
+pub struct Script {
+    devices: Vec<ScenarioDevice>,
+    plugged: HashMap<String, (PathBuf, Arc<SimDevice>)>,
+    /// Where the counter of an unplugged device stands: it goes on when it is plugged again.
+    sequences: HashMap<String, u32>,
+    events: Vec<ScenarioEvent>,
+    next: usize,
+    round: Instant,
+    repeat: Option<Duration>,
+    begun: Stamp,
+    timer: Pin<Box<Sleep>>,
+    queue: VecDeque<HotplugEvent>,
+}
+
+impl Script {
+    /// Begins: what is plugged at the start is told at once.
+    #[must_use]
+    pub fn new(scenario: Scenario) -> Self {
+        let round = Instant::now();
+        let mut script = Self {
+            devices: scenario.devices,
+            plugged: HashMap::new(),
+            sequences: HashMap::new(),
+            events: scenario.events,
+            next: 0,
+            round,
+            repeat: scenario.repeat,
+            begun: Stamp::now(),
+            timer: Box::pin(sleep_until(round)),
+            queue: VecDeque::new(),
+        };
+        for device in script.devices.iter().filter(|d| d.plugged).map(|d| d.name.clone()).collect::<Vec<_>>() {
+            script.plug(&device, None);
+        }
+        script
+    }
+
+    fn play(&mut self, event: &ScenarioEvent) {
+        match &event.action {
+            ScenarioAction::Plug { port } => self.plug(&event.device, port.as_deref()),
+            ScenarioAction::Unplug => self.unplug(&event.device),
+            ScenarioAction::Silence => self.set_silent(&event.device, true),
+            ScenarioAction::Resume => self.set_silent(&event.device, false),
+        }
+    }
+
+    fn plug(&mut self, name: &str, port: Option<&str>) {
+        let Some(device) = self.devices.iter_mut().find(|device| device.name == name) else { return };
+        if self.plugged.contains_key(name) {
+            return;
+        }
+        if let Some(port) = port {
+            port.clone_into(&mut device.usb.port);
+        }
+        let sim = Arc::new(SimDevice::new(name, device.source.clone(), self.begun));
+        sim.sequence.store(self.sequences.get(name).copied().unwrap_or(0), Ordering::Relaxed);
+        let syspath = PathBuf::from("/sim").join(&device.usb.port);
+        self.plugged.insert(name.to_owned(), (syspath.clone(), Arc::clone(&sim)));
+        let (node, usb) = (DeviceNode::Sim(sim), device.usb.clone());
+        self.queue.push_back(HotplugEvent::Added(Attachment { syspath, node, usb }));
+    }
+
+    fn unplug(&mut self, name: &str) {
+        let Some((syspath, sim)) = self.plugged.remove(name) else { return };
+        sim.unplug();
+        self.sequences.insert(name.to_owned(), sim.sequence.load(Ordering::Relaxed));
+        let (witnessed, witness) = (Stamp::now(), Witness::Script);
+        self.queue.push_back(HotplugEvent::Removed { syspath, witnessed, witness });
+    }
+
+    fn set_silent(&self, name: &str, silent: bool) {
+        if let Some((_, sim)) = self.plugged.get(name) {
+            sim.set_silent(silent);
+        }
+    }
+
+    /// When the next event is due; `None` when the scenario is over.
+    fn due(&mut self) -> Option<Instant> {
+        if self.next == self.events.len() {
+            let repeat = self.repeat.filter(|_| !self.events.is_empty())?;
+            self.round += repeat;
+            self.next = 0;
+        }
+        Some(self.round + self.events.get(self.next)?.at)
+    }
+}
+
+impl Stream for Script {
+    type Item = Result<HotplugEvent, HotplugError>;
+
+    fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
+        loop {
+            if let Some(event) = self.queue.pop_front() {
+                return Poll::Ready(Some(Ok(event)));
+            }
+            // The stream of a finished scenario goes on without events, like that of a machine
+            // nobody plugs anything into.
+            let Some(due) = self.due() else { return Poll::Pending };
+            self.timer.as_mut().reset(due);
+            ready!(self.timer.as_mut().poll(context));
+            let event = self.events[self.next].clone();
+            self.next += 1;
+            self.play(&event);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::registry::UsbIdentity;
+    use crate::registry::scenario::SimSource;
+    use futures::StreamExt;
+
+    fn device(name: &str, port: &str, plugged: bool) -> ScenarioDevice {
+        ScenarioDevice {
+            name: name.into(),
+            usb: UsbIdentity { vid: 1, pid: 2, serial: None, port: port.into(), product: None },
+            source: SimSource::Serial { channels: 1, hz: 100, seed: 1 },
+            plugged,
+        }
+    }
+
+    fn event(at: u64, device: &str, action: ScenarioAction) -> ScenarioEvent {
+        ScenarioEvent { at: Duration::from_millis(at), device: device.into(), action }
+    }
+
+    fn word(event: &HotplugEvent) -> String {
+        match event {
+            HotplugEvent::Added(attachment) => format!("+{}", attachment.usb.port),
+            HotplugEvent::Removed { syspath, .. } => format!("-{}", syspath.display()),
+        }
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn events_come_in_order_at_their_times_and_repeat() {
+        let begin = Instant::now();
+        let mut script = Script::new(Scenario {
+            devices: vec![device("a", "1-1", true), device("b", "1-2", false)],
+            events: vec![
+                event(100, "a", ScenarioAction::Unplug),
+                event(100, "b", ScenarioAction::Plug { port: None }),
+                event(300, "a", ScenarioAction::Plug { port: Some("1-3".into()) }),
+                event(350, "b", ScenarioAction::Unplug),
+            ],
+            repeat: Some(Duration::from_secs(1)),
+        });
+        let mut got = Vec::new();
+        for _ in 0..7 {
+            let event = script.next().await.expect("endless").expect("no error");
+            got.push(format!("{}@{}", word(&event), begin.elapsed().as_millis()));
+        }
+        assert_eq!(
+            got,
+            ["+1-1@0", "-/sim/1-1@100", "+1-2@100", "+1-3@300", "-/sim/1-2@350", "-/sim/1-3@1100", "+1-2@1100"]
+        );
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_pulled_device_knows_it_at_once() {
+        let mut script = Script::new(Scenario {
+            devices: vec![device("a", "1-1", true)],
+            events: vec![event(5, "a", ScenarioAction::Silence), event(10, "a", ScenarioAction::Unplug)],
+            repeat: None,
+        });
+        let Some(Ok(HotplugEvent::Added(attachment))) = script.next().await else { panic!("no device") };
+        let DeviceNode::Sim(sim) = attachment.node else { panic!("not simulated") };
+        assert!(!sim.is_silent() && !sim.is_unplugged());
+        assert!(matches!(script.next().await, Some(Ok(HotplugEvent::Removed { .. }))));
+        assert!(sim.is_silent() && sim.is_unplugged());
+    }
+}

@@ -1,0 +1,240 @@
+//! The MCAP file of an episode: its channels and what is written to them.
+//!
+//! Invariant: every channel the registry lets expect is in the file from the start, so that a
+//! modality that never appears is still named.
+//! Invariant: only whole chunks reach the file: what a crash leaves ends between two records, save
+//! for a write that the crash cut in two.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{self, BufWriter, Write};
+
+use mcap::records::{MessageHeader, Metadata};
+use mcap::write::NoSeek;
+use mcap::{Attachment, McapError, WriteOptions, Writer};
+
+use super::encode::{self, EventText};
+use super::schema::{self, PROTOBUF, SampleSchema, Schema};
+use crate::mask::PhysicalMask;
+use crate::modality::{MAX_MODALITIES, ModalityId};
+use crate::registry::Registry;
+use crate::sample::SampleHeader;
+use crate::status::Level;
+use crate::sync::Observation;
+use crate::time::{Stamp, WallClock};
+
+/// Topic of the physical mask.
+pub(super) const MASK_TOPIC: &str = "/rapid/mask";
+/// Topic of the frame index.
+pub(super) const FRAME_TOPIC: &str = "/rapid/frame";
+/// Topic of events.
+pub(super) const EVENT_TOPIC: &str = "/rapid/event";
+/// Topic of the log.
+pub(super) const LOG_TOPIC: &str = "/rapid/log";
+
+/// Uncompressed bytes after which a chunk is closed. The writer keeps one chunk in memory.
+const CHUNK_BYTES: u64 = 1 << 20;
+/// Gathers the small records between chunks (message indexes) into one write.
+const BUFFER_BYTES: usize = 64 << 10;
+
+/// What an episode's bytes go to.
+pub trait Sink: Write + Send {
+    /// Returns once everything written is on the disk.
+    ///
+    /// # Errors
+    /// When the disk does not take it.
+    fn sync(&mut self) -> io::Result<()>;
+}
+
+impl Sink for File {
+    fn sync(&mut self) -> io::Result<()> {
+        self.sync_all()
+    }
+}
+
+/// See the module's comment.
+pub(super) struct EpisodeFile {
+    writer: Writer<NoSeek<BufWriter<Box<dyn Sink>>>>,
+    clock: WallClock,
+    message: Vec<u8>,
+    tracks: Vec<Option<Track>>,
+    mask: u16,
+    frame: u16,
+    event: u16,
+    log: u16,
+    /// Messages written.
+    pub(super) messages: u64,
+    /// Payload bytes of samples written.
+    pub(super) bytes: u64,
+}
+
+/// The channels of one modality: one, unless its device sends what the registry did not announce.
+struct Track {
+    name: String,
+    topic: String,
+    metadata: BTreeMap<String, String>,
+    channels: [Option<u16>; SampleSchema::COUNT],
+}
+
+impl EpisodeFile {
+    /// Begins a file: header, metadata, `devices.toml`, channels.
+    pub(super) fn begin(
+        sink: Box<dyn Sink>,
+        registry: &Registry,
+        clock: WallClock,
+        begin: Stamp,
+        metadata: BTreeMap<String, String>,
+    ) -> io::Result<Self> {
+        // JPEG does not compress and raw frames are rare: no codec, so that the thread's time goes
+        // into the disk and every reader can read. Without seeking the writer keeps a chunk in
+        // memory until it is whole.
+        let options = WriteOptions::new()
+            .compression(None)
+            .chunk_size(Some(CHUNK_BYTES))
+            .disable_seeking(true)
+            .library(concat!("rapid/", env!("CARGO_PKG_VERSION")));
+        let sink = NoSeek::new(BufWriter::with_capacity(BUFFER_BYTES, sink));
+        let mut writer = Writer::with_options(sink, options).map_err(io_error)?;
+        writer.write_metadata(&Metadata { name: "rapid".to_owned(), metadata }).map_err(io_error)?;
+        let wall_ns = clock.wall_ns(begin);
+        writer
+            .attach(&Attachment {
+                log_time: wall_ns,
+                create_time: wall_ns,
+                name: "devices.toml".to_owned(),
+                media_type: "application/toml".to_owned(),
+                data: registry.text.as_bytes().into(),
+            })
+            .map_err(io_error)?;
+
+        let none = BTreeMap::new();
+        let mask = add_channel(&mut writer, schema::MASK, MASK_TOPIC, &none)?;
+        let frame = add_channel(&mut writer, schema::FRAME, FRAME_TOPIC, &none)?;
+        let event = add_channel(&mut writer, schema::EVENT, EVENT_TOPIC, &none)?;
+        let log = add_channel(&mut writer, schema::LOG, LOG_TOPIC, &none)?;
+        let mut tracks = Vec::new();
+        tracks.resize_with(MAX_MODALITIES, || None);
+        let mut file =
+            Self { writer, clock, message: Vec::new(), tracks, mask, frame, event, log, messages: 0, bytes: 0 };
+        for device in &registry.devices {
+            let kind = serde_json::to_value(device.modality().kind).ok();
+            let kind = kind.as_ref().and_then(|kind| kind.as_str()).unwrap_or_default().to_owned();
+            let metadata = BTreeMap::from([
+                ("modality".to_owned(), device.name.clone()),
+                ("bit".to_owned(), device.id.to_string()),
+                ("kind".to_owned(), kind),
+            ]);
+            let (name, topic) = (device.name.clone(), device.topic.clone());
+            let mut track = Track { name, topic, metadata, channels: [None; SampleSchema::COUNT] };
+            track.channel(&mut file.writer, SampleSchema::expected(device))?;
+            if let Some(place) = file.tracks.get_mut(device.id.index()) {
+                *place = Some(track);
+            }
+        }
+        Ok(file)
+    }
+
+    /// Writes a sample; one of a modality that is not registered is not written.
+    pub(super) fn sample(&mut self, id: ModalityId, header: &SampleHeader, payload: &[u8]) -> io::Result<()> {
+        let Some(Some(track)) = self.tracks.get_mut(id.index()) else { return Ok(()) };
+        let schema = SampleSchema::of(header, payload);
+        let channel = track.channel(&mut self.writer, schema)?;
+        let log_time = self.clock.wall_ns(Stamp(header.capture_ns));
+        encode::sample(&mut self.message, schema, log_time, &track.name, header, payload);
+        self.bytes += payload.len() as u64;
+        self.write(channel, header.seq, log_time, Stamp(header.recv_ns))
+    }
+
+    /// Writes a publication of the mask.
+    pub(super) fn mask(&mut self, header: &SampleHeader, mask: PhysicalMask, sequence: u64) -> io::Result<()> {
+        let log_time = self.clock.wall_ns(Stamp(header.capture_ns));
+        encode::mask(&mut self.message, log_time, mask, sequence);
+        self.write(self.mask, sequence, log_time, Stamp(header.recv_ns))
+    }
+
+    /// Writes a tick of the frame index, for which samples received until `deadline` counted.
+    pub(super) fn frame(&mut self, index: u64, observation: &Observation, deadline: Stamp) -> io::Result<()> {
+        let log_time = self.clock.wall_ns(observation.tick);
+        encode::frame(&mut self.message, log_time, index, observation);
+        self.write(self.frame, index, log_time, deadline)
+    }
+
+    /// Writes an event.
+    pub(super) fn event(&mut self, number: u64, stamp: Stamp, text: &EventText<'_>) -> io::Result<()> {
+        let log_time = self.clock.wall_ns(stamp);
+        encode::event(&mut self.message, log_time, text);
+        self.write(self.event, number, log_time, stamp)
+    }
+
+    /// Writes a line of the log.
+    pub(super) fn log(&mut self, number: u64, stamp: Stamp, level: Level, text: &str) -> io::Result<()> {
+        let log_time = self.clock.wall_ns(stamp);
+        encode::log(&mut self.message, log_time, level, text);
+        self.write(self.log, number, log_time, stamp)
+    }
+
+    /// Hands everything written so far to the kernel: from then on it survives the end of this
+    /// process. It does not wait for the disk, which may take seconds; a loss of power can take
+    /// what the kernel has not written back yet.
+    pub(super) fn flush(&mut self) -> io::Result<()> {
+        self.writer.flush().map_err(io_error)
+    }
+
+    /// Ends the file with the summary and waits for the disk.
+    pub(super) fn finish(mut self, summary: BTreeMap<String, String>) -> io::Result<()> {
+        let summary = Metadata { name: "rapid/summary".to_owned(), metadata: summary };
+        self.writer.write_metadata(&summary).map_err(io_error)?;
+        self.writer.finish().map_err(io_error)?;
+        let buffered = self.writer.into_inner().into_inner();
+        let mut sink = buffered.into_inner().map_err(io::IntoInnerError::into_error)?;
+        sink.sync()
+    }
+
+    fn write(&mut self, channel_id: u16, sequence: u64, log_time: u64, published: Stamp) -> io::Result<()> {
+        let header = MessageHeader {
+            channel_id,
+            // MCAP has 32 bits for it: the lower ones.
+            sequence: (sequence & u64::from(u32::MAX)) as u32,
+            log_time,
+            publish_time: self.clock.wall_ns(published),
+        };
+        self.writer.write_to_known_channel(&header, &self.message).map_err(io_error)?;
+        self.messages += 1;
+        Ok(())
+    }
+}
+
+impl Track {
+    fn channel(
+        &mut self,
+        writer: &mut Writer<NoSeek<BufWriter<Box<dyn Sink>>>>,
+        schema: SampleSchema,
+    ) -> io::Result<u16> {
+        if let Some(Some(channel)) = self.channels.get(schema.index()) {
+            return Ok(*channel);
+        }
+        let channel = add_channel(writer, schema.schema(), &self.topic, &self.metadata)?;
+        if let Some(place) = self.channels.get_mut(schema.index()) {
+            *place = Some(channel);
+        }
+        Ok(channel)
+    }
+}
+
+fn add_channel(
+    writer: &mut Writer<NoSeek<BufWriter<Box<dyn Sink>>>>,
+    schema: Schema,
+    topic: &str,
+    metadata: &BTreeMap<String, String>,
+) -> io::Result<u16> {
+    let schema_id = writer.add_schema(schema.name, PROTOBUF, schema.data).map_err(io_error)?;
+    writer.add_channel(schema_id, topic, PROTOBUF, metadata).map_err(io_error)
+}
+
+/// The system's own error where there is one: it says more than the writer's.
+fn io_error(error: McapError) -> io::Error {
+    match error {
+        McapError::Io(error) => error,
+        other => io::Error::other(other),
+    }
+}

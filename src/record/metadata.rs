@@ -1,0 +1,111 @@
+//! What a file says about itself: the metadata records `rapid` at its beginning and
+//! `rapid/summary` at its end. Values are text; those that are JSON say so here.
+
+use std::collections::BTreeMap;
+
+use serde_json::{Map, Value, json};
+
+use super::episode::EpisodeRequest;
+use super::session::{Attached, Tally};
+use crate::modality::ModalityId;
+use crate::registry::{Registry, WhenStale};
+use crate::time::{Stamp, WallClock};
+
+/// The record at the beginning.
+///
+/// JSON: `layout` `{name: bit}`, `modalities` `[{name, bit, topic, kind, shape, when_stale}]`,
+/// `serials` `{name: serial or null}` of what was attached when the episode began, `tags`
+/// `{key: value}`.
+pub(super) fn beginning(
+    registry: &Registry,
+    request: &EpisodeRequest,
+    attached: &Attached,
+    clock: WallClock,
+    begin: Stamp,
+) -> BTreeMap<String, String> {
+    let layout: Map<String, Value> =
+        registry.devices.iter().map(|device| (device.name.clone(), device.id.bit().into())).collect();
+    let modalities: Vec<Value> = registry
+        .devices
+        .iter()
+        .map(|device| {
+            let modality = device.modality();
+            let when_stale = match device.when_stale {
+                WhenStale::Hold => "hold",
+                WhenStale::Zero => "zero",
+            };
+            json!({
+                "name": device.name, "bit": device.id.bit(), "topic": device.topic,
+                "kind": modality.kind, "shape": modality.shape, "when_stale": when_stale,
+            })
+        })
+        .collect();
+    let tags: Map<String, Value> =
+        request.tags.iter().map(|(key, value)| (key.clone(), value.clone().into())).collect();
+    text_map([
+        ("software", concat!("rapid ", env!("CARGO_PKG_VERSION")).to_owned()),
+        ("rig", registry.rig.name.clone()),
+        ("task", request.task.clone()),
+        ("tags", Value::Object(tags).to_string()),
+        ("layout", Value::Object(layout).to_string()),
+        ("modalities", Value::Array(modalities).to_string()),
+        ("serials", json!(attached).to_string()),
+        ("registry", registry.text.clone()),
+        ("observation_hz", registry.rig.observation_hz.to_string()),
+        ("sync_window_ns", registry.rig.sync_window.as_nanos().to_string()),
+        ("begin_wall_ns", clock.wall_ns(begin).to_string()),
+        ("begin_monotonic_ns", begin.0.to_string()),
+        ("wall_minus_monotonic_ns", clock.wall_ns(Stamp(0)).to_string()),
+    ])
+}
+
+/// What the record at the end says.
+#[derive(Debug)]
+pub(super) struct Ending<'a> {
+    /// Length in seconds.
+    pub(super) seconds: f64,
+    /// Messages written, those of the frame index included.
+    pub(super) messages: u64,
+    /// Ticks written.
+    pub(super) frames: u64,
+    /// Events that came faster than they were read.
+    pub(super) events_missed: u64,
+    /// Publications of the mask lost.
+    pub(super) masks_dropped: u64,
+    /// Counts of each modality.
+    pub(super) tallies: &'a [Tally],
+    /// Serials of everything that was attached at some time.
+    pub(super) seen: &'a Attached,
+}
+
+/// The record at the end.
+///
+/// JSON: `modalities` `{name: {samples, bytes, dropped, damaged}}`, `serials` as at the beginning,
+/// of whatever was attached at some time.
+pub(super) fn end(registry: &Registry, ending: &Ending<'_>) -> BTreeMap<String, String> {
+    let tally = |id: ModalityId| ending.tallies.get(id.index()).copied().unwrap_or_default();
+    let modalities: Map<String, Value> = registry
+        .devices
+        .iter()
+        .map(|device| {
+            let Tally { samples, bytes, dropped, damaged, .. } = tally(device.id);
+            let said = json!({"samples": samples, "bytes": bytes, "dropped": dropped, "damaged": damaged});
+            (device.name.clone(), said)
+        })
+        .collect();
+    let dropped = ending.tallies.iter().fold(0_u64, |sum, tally| sum.saturating_add(tally.dropped));
+    text_map([
+        ("duration_s", ending.seconds.to_string()),
+        ("messages", ending.messages.to_string()),
+        ("frames", ending.frames.to_string()),
+        ("dropped", dropped.to_string()),
+        ("masks_dropped", ending.masks_dropped.to_string()),
+        ("events_missed", ending.events_missed.to_string()),
+        ("modalities", Value::Object(modalities).to_string()),
+        ("serials", json!(ending.seen).to_string()),
+    ])
+}
+
+fn text_map<const N: usize>(pairs: [(&str, String); N]) -> BTreeMap<String, String> {
+    pairs.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
+}

@@ -1,0 +1,53 @@
+//! Recording: one episode, one MCAP file, with the mask and the frame index beside every sample.
+//!
+//! `recorder` runs the `writer` thread, which owns the file: it takes what the bus hands over
+//! ([`Source`]), `session` decides what belongs to the episode and which frame it belongs to,
+//! `file` writes it. `inspect` reads such a file back.
+//!
+//! Invariant: only the `writer` thread touches a file of an episode, and nothing waits for it but
+//! who asks it to start or to stop.
+//! Invariant: a file without `.partial` at its end is finished; one that exists is never replaced.
+//! Invariant: what could not be recorded is counted and said.
+
+pub mod encode;
+mod episode;
+mod file;
+mod metadata;
+mod recorder;
+pub mod schema;
+mod session;
+mod source;
+#[cfg(test)]
+mod tests;
+
+use std::path::PathBuf;
+
+pub use episode::{EpisodeReport, EpisodeRequest};
+pub use file::Sink;
+pub use recorder::{Recorder, RecorderConfig};
+pub use source::{Source, SourceTopic};
+
+/// Why an episode cannot be recorded.
+#[derive(Debug, thiserror::Error)]
+pub enum RecordError {
+    /// The folder to write to is not there, and neither is the one above it.
+    #[error("{}: no such folder, and none above it to make it in: create it or choose another with --out", .0.display())]
+    NoFolder(PathBuf),
+    /// The folder or a file in it cannot be used.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// Folder or file.
+        path: PathBuf,
+        /// What the system says.
+        source: std::io::Error,
+    },
+    /// There is an episode in progress.
+    #[error("already recording {}", .0.display())]
+    Busy(PathBuf),
+    /// There is no episode in progress.
+    #[error("not recording")]
+    Idle,
+    /// The `writer` thread has ended.
+    #[error("the writer thread has ended; the log says why")]
+    Ended,
+}

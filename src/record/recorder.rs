@@ -1,0 +1,379 @@
+//! The `writer` thread and the handle to it.
+//!
+//! The thread takes samples from the bus all the time, so that an episode begins with an empty
+//! queue; while there is no episode it throws them away.
+//!
+//! Invariant: an episode in progress is finished whatever ends the thread: the last handle dropped,
+//! an error of the disk, a panic.
+
+use std::any::Any;
+use std::fs::File;
+use std::io;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::mpsc::{self, Receiver, Sender, TryRecvError};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use tokio::sync::broadcast::{self, error::TryRecvError as EventError};
+use tokio::sync::oneshot;
+
+use super::RecordError;
+use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest};
+use super::file::Sink;
+use super::session::{Attached, Beginning, MaskHistory, Session};
+use super::source::{Source, SourceTopic};
+use crate::mask::PhysicalMask;
+use crate::modality::MAX_MODALITIES;
+use crate::registry::Registry;
+use crate::sample::SampleHeader;
+use crate::status::{Board, Event, Level, What};
+use crate::time::{Stamp, WallClock};
+
+/// Longest wait for samples: what an order, an event or a due frame may have to wait.
+const TURN: Duration = Duration::from_millis(20);
+/// How often what was written is handed to the kernel: what a kill can take.
+const FLUSH_EVERY: Duration = Duration::from_secs(1);
+/// How often the board is told.
+const STATUS_EVERY: Duration = Duration::from_millis(200);
+/// Least distance of two complaints about the bus.
+const COMPLAIN_EVERY: Duration = Duration::from_secs(5);
+
+type Reply<T> = oneshot::Sender<Result<T, RecordError>>;
+type Opener = Box<dyn FnMut(File) -> Box<dyn Sink> + Send>;
+
+/// What the thread works with.
+pub struct RecorderConfig {
+    /// What may be recorded.
+    pub registry: Arc<Registry>,
+    /// Where the state of the recording is reported, and events come from.
+    pub board: Arc<Board>,
+    /// Makes the sink of an episode of the file opened for it; the file itself unless a test wants
+    /// the disk to fail.
+    pub sink: Opener,
+}
+
+impl RecorderConfig {
+    /// Episodes of `registry`, reported on `board`, written to their files.
+    #[must_use]
+    pub fn new(registry: Arc<Registry>, board: Arc<Board>) -> Self {
+        Self { registry, board, sink: Box::new(|file| Box::new(file)) }
+    }
+}
+
+enum Order {
+    Start(EpisodeRequest, Reply<PathBuf>),
+    Stop(Reply<EpisodeReport>),
+}
+
+/// The handle. Dropping it ends an episode in progress and waits for its file, some 150 ms and
+/// what the disk takes.
+#[derive(Debug)]
+pub struct Recorder {
+    orders: Option<Sender<Order>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Recorder {
+    /// Starts the `writer` thread. Events are recorded that are announced from now on.
+    ///
+    /// # Errors
+    /// When the system gives no thread.
+    pub fn spawn(source: impl Source + 'static, config: RecorderConfig) -> io::Result<Self> {
+        let (orders, inbox) = mpsc::channel();
+        let events = config.board.events();
+        let thread = std::thread::Builder::new().name("writer".to_owned()).spawn(move || {
+            Writer::new(config, inbox, events).run(source);
+        })?;
+        Ok(Self { orders: Some(orders), thread: Some(thread) })
+    }
+
+    /// Begins an episode; returns the name its file will have.
+    ///
+    /// # Errors
+    /// When there is one in progress, or its file cannot be made.
+    pub async fn start(&self, request: EpisodeRequest) -> Result<PathBuf, RecordError> {
+        self.ask(|reply| Order::Start(request, reply)).await
+    }
+
+    /// Ends the episode in progress at this moment; returns once its file is closed. An episode
+    /// whose duration has already ended it is waited for all the same.
+    ///
+    /// # Errors
+    /// When there is none.
+    pub async fn stop(&self) -> Result<EpisodeReport, RecordError> {
+        self.ask(Order::Stop).await
+    }
+
+    async fn ask<T>(&self, order: impl FnOnce(Reply<T>) -> Order) -> Result<T, RecordError> {
+        let (reply, answer) = oneshot::channel();
+        let orders = self.orders.as_ref().ok_or(RecordError::Ended)?;
+        orders.send(order(reply)).map_err(|_| RecordError::Ended)?;
+        answer.await.unwrap_or(Err(RecordError::Ended))
+    }
+}
+
+impl Drop for Recorder {
+    fn drop(&mut self) {
+        self.orders = None;
+        if let Some(thread) = self.thread.take() {
+            // A panic of the thread has been caught and told there.
+            let _ = thread.join();
+        }
+    }
+}
+
+/// The thread's own state.
+struct Writer {
+    config: RecorderConfig,
+    inbox: Receiver<Order>,
+    events: broadcast::Receiver<Event>,
+    streams: Streams,
+    attached: Attached,
+    session: Option<Session>,
+    waiting: Vec<Reply<EpisodeReport>>,
+    flushed: Stamp,
+    reported: Stamp,
+    complained: Option<Stamp>,
+}
+
+/// What is kept of the samples that pass, recording or not.
+struct Streams {
+    masks: MaskHistory,
+    /// Sequence number expected next, by modality.
+    next: [Option<u64>; MAX_MODALITIES],
+    next_mask: Option<u64>,
+}
+
+enum Turn {
+    Again,
+    Last,
+}
+
+impl Writer {
+    fn new(config: RecorderConfig, inbox: Receiver<Order>, events: broadcast::Receiver<Event>) -> Self {
+        let streams = Streams { masks: MaskHistory::new(), next: [None; MAX_MODALITIES], next_mask: None };
+        Self {
+            config,
+            inbox,
+            events,
+            streams,
+            attached: Attached::new(),
+            session: None,
+            waiting: Vec::new(),
+            flushed: Stamp::default(),
+            reported: Stamp::default(),
+            complained: None,
+        }
+    }
+
+    fn run(mut self, mut source: impl Source) {
+        loop {
+            // Unwinding leaves a session whole: it is only ever replaced or taken as a whole, and
+            // what of it was half written is for its file to refuse.
+            match catch_unwind(AssertUnwindSafe(|| self.turn(&mut source))) {
+                Ok(Turn::Again) => {}
+                Ok(Turn::Last) => return,
+                Err(panic) => {
+                    let text = format!("the writer thread panicked: {}", panic_text(panic.as_ref()));
+                    self.complain(Level::Error, text.clone());
+                    self.finish(Stamp::now(), Some(text));
+                    return;
+                }
+            }
+        }
+    }
+
+    fn turn(&mut self, source: &mut impl Source) -> Turn {
+        if let Err(error) = source.wait(TURN) {
+            self.complain_about_bus(&error);
+            // What cannot be waited on is looked at regularly instead.
+            std::thread::sleep(TURN);
+        }
+        // Read before the drain: what was received by then has been taken after it.
+        let now = Stamp::now();
+        let Self { streams, session, .. } = self;
+        let drained =
+            source.drain(&mut |topic, header, payload| streams.take(session.as_mut(), topic, header, payload));
+        if let Err(error) = drained {
+            self.complain_about_bus(&error);
+        }
+        self.take_events();
+        let open = self.take_orders();
+        self.advance(now);
+        match (open, &self.session) {
+            (false, None) => Turn::Last,
+            _ => Turn::Again,
+        }
+    }
+
+    fn take_events(&mut self) {
+        loop {
+            match self.events.try_recv() {
+                Ok(event) => {
+                    match &event.what {
+                        What::Attach { device, serial, .. } => {
+                            self.attached.insert(device.clone(), serial.clone());
+                        }
+                        What::Detach { device, .. } => {
+                            self.attached.remove(device);
+                        }
+                        _ => {}
+                    }
+                    if let Some(session) = &mut self.session {
+                        session.event(&event);
+                    }
+                }
+                Err(EventError::Lagged(count)) => {
+                    if let Some(session) = &mut self.session {
+                        session.missed_events(count);
+                    }
+                }
+                Err(EventError::Empty | EventError::Closed) => return,
+            }
+        }
+    }
+
+    /// Does what is asked; says whether a handle is left to ask more.
+    fn take_orders(&mut self) -> bool {
+        loop {
+            match self.inbox.try_recv() {
+                Ok(Order::Start(request, reply)) => {
+                    let started = self.start(&request);
+                    // Whoever asked may have gone.
+                    let _ = reply.send(started);
+                }
+                Ok(Order::Stop(reply)) => match &mut self.session {
+                    Some(session) => {
+                        session.end_at(Stamp::now());
+                        self.waiting.push(reply);
+                    }
+                    None => {
+                        let _ = reply.send(Err(RecordError::Idle));
+                    }
+                },
+                Err(TryRecvError::Empty) => return true,
+                Err(TryRecvError::Disconnected) => {
+                    if let Some(session) = &mut self.session {
+                        session.end_at(Stamp::now());
+                    }
+                    return false;
+                }
+            }
+        }
+    }
+
+    fn start(&mut self, request: &EpisodeRequest) -> Result<PathBuf, RecordError> {
+        if let Some(session) = &self.session {
+            return Err(RecordError::Busy(session.name().to_owned()));
+        }
+        let clock = WallClock::now();
+        let begin = Stamp::now();
+        let (path, file) = EpisodePath::create(&request.out, &request.task, clock.wall_ns(begin))?;
+        let (finished, partial) = (path.finished.clone(), path.partial.clone());
+        let beginning = Beginning {
+            registry: Arc::clone(&self.config.registry),
+            board: Arc::clone(&self.config.board),
+            request,
+            path,
+            sink: (self.config.sink)(file),
+            attached: &self.attached,
+            clock,
+            begin,
+        };
+        let session = Session::begin(beginning, &self.streams.masks)
+            .map_err(|source| RecordError::Io { path: partial, source })?;
+        self.config.board.set_recording(Some(session.status(begin)));
+        self.config.board.announce(What::Recording { file: finished.clone() });
+        self.session = Some(session);
+        (self.flushed, self.reported) = (begin, begin);
+        Ok(finished)
+    }
+
+    fn advance(&mut self, now: Stamp) {
+        let Some(session) = &mut self.session else { return };
+        session.advance(now, &self.streams.masks);
+        if now.since(self.flushed) >= FLUSH_EVERY {
+            session.flush();
+            self.flushed = now;
+        }
+        if session.is_over(now) {
+            self.finish(now, None);
+            return;
+        }
+        if now.since(self.reported) >= STATUS_EVERY && !session.is_ending(now) {
+            self.config.board.set_recording(Some(session.status(now)));
+            self.reported = now;
+        }
+    }
+
+    fn finish(&mut self, now: Stamp, reason: Option<String>) {
+        let Some(session) = self.session.take() else { return };
+        let report = session.finish(now, &self.streams.masks, reason);
+        let board = &self.config.board;
+        board.set_recording(None);
+        board.set_last_episode(report.file.clone());
+        let EpisodeReport { file, seconds, messages, bytes, dropped, error } = report.clone();
+        if let Some(error) = &error {
+            tracing::error!(file = %file.display(), %error, "episode not whole");
+        }
+        board.announce(What::Episode { file, seconds, messages, bytes, dropped, error });
+        for reply in self.waiting.drain(..) {
+            let _ = reply.send(Ok(report.clone()));
+        }
+    }
+
+    fn complain_about_bus(&mut self, error: &str) {
+        let now = Stamp::now();
+        if self.complained.is_none_or(|at| now.since(at) >= COMPLAIN_EVERY) {
+            self.complained = Some(now);
+            self.complain(Level::Error, format!("recorder: {error}"));
+        }
+    }
+
+    fn complain(&self, level: Level, text: String) {
+        tracing::error!("{text}");
+        self.config.board.announce(What::Log { level, text });
+    }
+}
+
+impl Streams {
+    fn take(&mut self, session: Option<&mut Session>, topic: SourceTopic, header: &SampleHeader, payload: &[u8]) {
+        match topic {
+            SourceTopic::Modality(id) => {
+                let lost = self.next.get_mut(id.index()).map_or(0, |next| hole(next, header.seq));
+                if let Some(session) = session {
+                    session.sample(id, header, payload, lost);
+                }
+            }
+            SourceTopic::Mask => {
+                let Some((mask, sequence)) = read_mask(payload) else { return };
+                let lost = hole(&mut self.next_mask, sequence);
+                self.masks.push(header, mask, sequence);
+                if let Some(session) = session {
+                    session.mask(header, mask, sequence, lost);
+                }
+            }
+        }
+    }
+}
+
+/// How many sequence numbers are missing before `seq`. One below the expected is a publisher that
+/// began anew: nothing is known to be missing.
+fn hole(next: &mut Option<u64>, seq: u64) -> u64 {
+    let lost = next.map_or(0, |next| seq.saturating_sub(next));
+    *next = Some(seq.wrapping_add(1));
+    lost
+}
+
+fn read_mask(payload: &[u8]) -> Option<(PhysicalMask, u64)> {
+    let (mask, rest) = payload.split_first_chunk()?;
+    let (sequence, _) = rest.split_first_chunk()?;
+    Some((PhysicalMask(u64::from_le_bytes(*mask)), u64::from_le_bytes(*sequence)))
+}
+
+fn panic_text(panic: &(dyn Any + Send)) -> &str {
+    let text = panic.downcast_ref::<&str>().copied();
+    text.or_else(|| panic.downcast_ref::<String>().map(String::as_str)).unwrap_or("no message")
+}

@@ -1,0 +1,368 @@
+//! An episode in progress: what belongs to it, which frame it belongs to, and how it ends.
+//!
+//! Time, in capture time of the monotonic clock:
+//!
+//! 1. The episode holds what was captured in `begin..end`; `end` is fixed by the duration asked for
+//!    or by the moment of the stop. One mask more is written, captured before `begin`: the one in
+//!    force when the episode began.
+//! 2. Tick `k` of the observation grid is `begin + k / observation_hz`; ticks before `end` are
+//!    written.
+//! 3. A tick is evaluated once, of what was received by its deadline, `tick + sync_window +`
+//!    [`SETTLE`], under the mask last published at or before the tick. The deadline is the frame's
+//!    `publish_time`: whoever reads the file can choose the same samples again.
+//! 4. A sample received after its tick's deadline is in the file and in no frame.
+//! 5. The file is closed [`SETTLE`] `+` [`GRACE`] after `end`. A sample captured before `end` that
+//!    arrives later than that is lost and not counted: nobody knows of it.
+//! 6. A damaged sample is recorded and counted, and belongs to no frame.
+//!
+//! Invariant: every sample a frame names was written to the file before the frame.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::io;
+use std::sync::Arc;
+use std::time::Duration;
+
+use super::encode::EventText;
+use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest};
+use super::file::{EpisodeFile, Sink};
+use super::metadata::{self, Ending};
+use crate::mask::PhysicalMask;
+use crate::modality::{MAX_MODALITIES, ModalityId};
+use crate::registry::Registry;
+use crate::sample::{Epoch, FLAG_ERROR, SampleHeader};
+use crate::status::{Board, Event, Level, RecordingStatus, What};
+use crate::sync::{Grid, SyncModality, SyncSample, Synchronizer};
+use crate::time::{Stamp, WallClock};
+
+/// How long after its capture a sample may arrive and still belong to its frame. The slowest we
+/// know: a camera at 15 Hz stamps the start of exposure and delivers after exposure, transfer and
+/// one frame in the kernel's queue, some 70 ms later.
+pub(super) const SETTLE: Duration = Duration::from_millis(100);
+/// What has been received may still lie on the bus for this long.
+pub(super) const GRACE: Duration = Duration::from_millis(20);
+/// How often losses of one modality are announced at most.
+const ANNOUNCE_EVERY: Duration = Duration::from_secs(1);
+/// Samples of a modality that may arrive while those of a whole queue are being written.
+const RING_SLACK: usize = 1024;
+/// Publications of the mask remembered: 16 s at 500 Hz, more than any queue of it holds.
+const MASKS: usize = 8192;
+
+/// Serial of every device attached, by its modality's name.
+pub(super) type Attached = BTreeMap<String, Option<String>>;
+
+/// Counts of one modality in one episode.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Tally {
+    /// Samples written.
+    pub(super) samples: u64,
+    /// Payload bytes written.
+    pub(super) bytes: u64,
+    /// Samples lost: holes in the sequence numbers.
+    pub(super) dropped: u64,
+    /// Samples the driver called damaged.
+    pub(super) damaged: u64,
+    /// Of `dropped`, those not announced yet.
+    unannounced: u64,
+    announced: Option<Stamp>,
+}
+
+/// The last publications of the mask, in the order of publication.
+#[derive(Debug)]
+pub(super) struct MaskHistory(VecDeque<(SampleHeader, PhysicalMask, u64)>);
+
+impl MaskHistory {
+    pub(super) fn new() -> Self {
+        Self(VecDeque::with_capacity(MASKS))
+    }
+
+    pub(super) fn push(&mut self, header: &SampleHeader, mask: PhysicalMask, sequence: u64) {
+        if self.0.len() == MASKS {
+            self.0.pop_front();
+        }
+        self.0.push_back((*header, mask, sequence));
+    }
+
+    /// The publication in force at `stamp`: the last one at or before it.
+    fn at(&self, stamp: Stamp) -> Option<&(SampleHeader, PhysicalMask, u64)> {
+        self.0.iter().rev().find(|(header, ..)| header.capture_ns <= stamp.0)
+    }
+}
+
+/// See the module's comment.
+pub(super) struct Session {
+    registry: Arc<Registry>,
+    board: Arc<Board>,
+    path: EpisodePath,
+    file: EpisodeFile,
+    begin: Stamp,
+    end: Option<Stamp>,
+    grid: Grid,
+    next_tick: u64,
+    sync: Synchronizer<()>,
+    tallies: Vec<Tally>,
+    masks_dropped: u64,
+    events: u64,
+    events_missed: u64,
+    seen: Attached,
+    /// The first error of the file: from then on nothing is written.
+    failed: Option<io::Error>,
+}
+
+/// What a session begins with.
+pub(super) struct Beginning<'a> {
+    pub(super) registry: Arc<Registry>,
+    pub(super) board: Arc<Board>,
+    pub(super) request: &'a EpisodeRequest,
+    pub(super) path: EpisodePath,
+    pub(super) sink: Box<dyn Sink>,
+    pub(super) attached: &'a Attached,
+    pub(super) clock: WallClock,
+    pub(super) begin: Stamp,
+}
+
+impl Session {
+    /// Begins an episode and writes what stands at its beginning.
+    pub(super) fn begin(beginning: Beginning<'_>, masks: &MaskHistory) -> io::Result<Self> {
+        let Beginning { registry, board, request, path, sink, attached, clock, begin } = beginning;
+        let said = metadata::beginning(&registry, request, attached, clock, begin);
+        let mut file = EpisodeFile::begin(sink, &registry, clock, begin, said)?;
+        if let Some((header, mask, sequence)) = masks.at(begin) {
+            file.mask(header, *mask, *sequence)?;
+        }
+        let modalities: Vec<SyncModality> = registry
+            .devices
+            .iter()
+            .map(|device| SyncModality {
+                id: device.id,
+                when_stale: device.when_stale,
+                capacity: device.depth.saturating_add(RING_SLACK),
+            })
+            .collect();
+        Ok(Self {
+            sync: Synchronizer::new(&modalities, registry.rig.sync_window),
+            grid: Grid::new(begin, registry.rig.observation_hz),
+            end: request.duration.map(|duration| begin.after(duration)),
+            registry,
+            board,
+            path,
+            file,
+            begin,
+            next_tick: 0,
+            tallies: vec![Tally::default(); MAX_MODALITIES],
+            masks_dropped: 0,
+            events: 0,
+            events_missed: 0,
+            seen: attached.clone(),
+            failed: None,
+        })
+    }
+
+    /// Takes a sample that `lost` others before it did not reach.
+    pub(super) fn sample(&mut self, id: ModalityId, header: &SampleHeader, payload: &[u8], lost: u64) {
+        if !self.holds(Stamp(header.capture_ns)) || self.failed.is_some() {
+            return;
+        }
+        if let Err(error) = self.file.sample(id, header, payload) {
+            self.failed = Some(error);
+            return;
+        }
+        let Some(tally) = self.tallies.get_mut(id.index()) else { return };
+        tally.samples += 1;
+        tally.bytes += payload.len() as u64;
+        // Saturating: the numbers come from whoever publishes.
+        tally.dropped = tally.dropped.saturating_add(lost);
+        tally.unannounced = tally.unannounced.saturating_add(lost);
+        if header.flags & FLAG_ERROR != 0 {
+            tally.damaged += 1;
+            return;
+        }
+        let sample = SyncSample {
+            capture: Stamp(header.capture_ns),
+            recv: Stamp(header.recv_ns),
+            seq: header.seq,
+            epoch: Epoch(header.epoch),
+            keep: (),
+        };
+        self.sync.push(id, sample);
+    }
+
+    /// Takes a publication of the mask.
+    pub(super) fn mask(&mut self, header: &SampleHeader, mask: PhysicalMask, sequence: u64, lost: u64) {
+        if !self.holds(Stamp(header.capture_ns)) || self.failed.is_some() {
+            return;
+        }
+        self.masks_dropped = self.masks_dropped.saturating_add(lost);
+        self.failed = self.file.mask(header, mask, sequence).err();
+    }
+
+    /// Takes an event.
+    pub(super) fn event(&mut self, event: &Event) {
+        if let What::Attach { device, serial, .. } = &event.what {
+            self.seen.insert(device.clone(), serial.clone());
+        }
+        if !self.holds(event.stamp) || self.failed.is_some() {
+            return;
+        }
+        self.failed = self.write_event(event).err();
+        self.events += 1;
+    }
+
+    /// Counts events that came faster than they were read.
+    pub(super) fn missed_events(&mut self, count: u64) {
+        self.events_missed += count;
+    }
+
+    /// Writes the frames whose deadline has passed by `now`, everything received before which was
+    /// taken, and announces losses.
+    pub(super) fn advance(&mut self, now: Stamp, masks: &MaskHistory) {
+        let ticks = self.end.map_or(u64::MAX, |end| self.grid.ticks_before(end));
+        while self.failed.is_none() && self.next_tick < ticks && now >= self.deadline(self.next_tick).after(GRACE) {
+            self.write_frame(masks);
+        }
+        self.announce_losses(|tally| tally.announced.is_none_or(|at| now.since(at) >= ANNOUNCE_EVERY), now);
+    }
+
+    /// Fixes the end of the episode, if it is not fixed to an earlier moment.
+    pub(super) fn end_at(&mut self, end: Stamp) {
+        let end = end.max(self.begin);
+        self.end = Some(self.end.map_or(end, |fixed| fixed.min(end)));
+    }
+
+    /// Is it time to [`Self::finish`]?
+    pub(super) fn is_over(&self, now: Stamp) -> bool {
+        self.failed.is_some() || self.end.is_some_and(|end| now >= end.after(SETTLE).after(GRACE))
+    }
+
+    /// Is the end of the episode fixed by now?
+    pub(super) fn is_ending(&self, now: Stamp) -> bool {
+        self.end.is_some_and(|end| now >= end)
+    }
+
+    /// Hands what was written to the kernel.
+    pub(super) fn flush(&mut self) {
+        if self.failed.is_none() {
+            self.failed = self.file.flush().err();
+        }
+    }
+
+    /// Writes what is left, ends the file and gives it its name. `reason` says why the episode is
+    /// not whole although its file may be.
+    pub(super) fn finish(mut self, now: Stamp, masks: &MaskHistory, reason: Option<String>) -> EpisodeReport {
+        let end = self.end.unwrap_or(now).min(now).max(self.begin);
+        let ticks = self.grid.ticks_before(end);
+        while self.failed.is_none() && self.next_tick < ticks {
+            self.write_frame(masks);
+        }
+        self.announce_losses(|_| true, now);
+        let seconds = end.since(self.begin).as_secs_f64();
+        let dropped = self.dropped();
+        let messages = self.file.messages;
+        let ending = Ending {
+            seconds,
+            messages,
+            frames: self.next_tick,
+            events_missed: self.events_missed,
+            masks_dropped: self.masks_dropped,
+            tallies: &self.tallies,
+            seen: &self.seen,
+        };
+        let closed = match self.failed {
+            None => self.file.finish(metadata::end(&self.registry, &ending)).and_then(|()| self.path.publish()),
+            Some(error) => Err(error),
+        };
+        let (file, error) = match closed {
+            Ok(()) => (self.path.finished, reason),
+            Err(error) => {
+                let file = self.path.partial;
+                let text = match reason {
+                    Some(reason) => format!("{reason}; {}: {error}", file.display()),
+                    None => format!("{}: {error}", file.display()),
+                };
+                (file, Some(text))
+            }
+        };
+        let bytes = std::fs::metadata(&file).map_or(0, |metadata| metadata.len());
+        EpisodeReport { file, seconds, messages, bytes, dropped, error }
+    }
+
+    /// For the screen.
+    pub(super) fn status(&self, now: Stamp) -> RecordingStatus {
+        RecordingStatus {
+            file: self.path.finished.clone(),
+            elapsed: self.end.unwrap_or(now).min(now).since(self.begin),
+            messages: self.file.messages,
+            bytes: self.file.bytes,
+            dropped: self.dropped(),
+        }
+    }
+
+    /// The file's name once it is finished.
+    pub(super) fn name(&self) -> &std::path::Path {
+        &self.path.finished
+    }
+
+    fn dropped(&self) -> u64 {
+        self.tallies.iter().fold(0, |sum, tally| sum.saturating_add(tally.dropped))
+    }
+
+    fn holds(&self, capture: Stamp) -> bool {
+        capture >= self.begin && self.end.is_none_or(|end| capture < end)
+    }
+
+    fn deadline(&self, tick: u64) -> Stamp {
+        self.grid.tick(tick).after(self.registry.rig.sync_window).after(SETTLE)
+    }
+
+    fn write_frame(&mut self, masks: &MaskHistory) {
+        let (index, deadline) = (self.next_tick, self.deadline(self.next_tick));
+        let tick = self.grid.tick(index);
+        // Before the first publication nothing is known to be present.
+        let mask = masks.at(tick).map_or(PhysicalMask::EMPTY, |(_, mask, _)| *mask);
+        let observation = self.sync.observe(tick, deadline, mask);
+        self.failed = self.file.frame(index, observation, deadline).err();
+        self.next_tick += 1;
+    }
+
+    fn write_event(&mut self, event: &Event) -> io::Result<()> {
+        let json = serde_json::to_value(event)?;
+        let field = |name| json.get(name).and_then(serde_json::Value::as_str).unwrap_or_default();
+        let text = describe(&event.what);
+        let said = EventText { kind: field("event"), device: field("device"), text: &text, json: &json.to_string() };
+        self.file.event(self.events, event.stamp, &said)?;
+        if let What::Log { level, text } = &event.what {
+            self.file.log(self.events, event.stamp, *level, text)?;
+        }
+        Ok(())
+    }
+
+    fn announce_losses(&mut self, due: impl Fn(&Tally) -> bool, now: Stamp) {
+        for device in &self.registry.devices {
+            let Some(tally) = self.tallies.get_mut(device.id.index()) else { continue };
+            if tally.unannounced > 0 && due(tally) {
+                let text = format!("{}: {} samples lost on the way to the file", device.name, tally.unannounced);
+                self.board.announce(What::Log { level: Level::Warn, text });
+                tally.unannounced = 0;
+                tally.announced = Some(now);
+            }
+        }
+    }
+}
+
+/// An event for people.
+fn describe(what: &What) -> String {
+    match what {
+        What::Attach { device, node, port, serial, .. } => match serial {
+            Some(serial) => format!("{device} attached: {node}, port {port}, serial {serial}"),
+            None => format!("{device} attached: {node}, port {port}"),
+        },
+        What::Detach { device, witness, .. } => format!("{device} detached, told by {witness}"),
+        What::State { device, state, mask, detail, .. } => {
+            let state = format!("{state:?}").to_lowercase();
+            format!("{device} {state}, mask {mask}: {detail}")
+        }
+        What::Unregistered { device, reason } => format!("{device} not registered: {reason}"),
+        What::Recording { file } => format!("recording {}", file.display()),
+        What::Episode { file, .. } => format!("finished {}", file.display()),
+        What::Log { text, .. } => text.clone(),
+    }
+}

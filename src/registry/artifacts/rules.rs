@@ -1,0 +1,124 @@
+//! `99-rapid.rules`: a stable name `/dev/rapid/<name>` for the node of every entry.
+//!
+//! Rule syntax: udev(7). A match value in double quotes is a shell glob if it contains `*`, `?` or
+//! `[`, alternatives are separated by `|`, and `\"` stands for a quote (systemd,
+//! `src/udev/udev-rules.c`: `rule_line_add_token`, `udev_rule_parse_value`). Match values undergo
+//! no `%` or `$` substitution; assigned values do, but those are only names we have validated.
+
+use std::fmt::Write as _;
+
+use super::HEADER;
+use crate::registry::spec::{DeviceSpec, NodeSpec, Registry};
+
+/// The rules of a whole registry.
+pub(super) fn rules(registry: &Registry) -> String {
+    let mut text = format!(
+        "{HEADER}\n\
+         # Stable names for the rig's devices: /dev/rapid/<name>.\n\
+         # The uaccess builtin is named here because 73-seat-late.rules, which runs it for the tag, is\n\
+         # read before this file.\n"
+    );
+    for device in &registry.devices {
+        let usb = &device.identity;
+        // Writing to a String cannot fail.
+        let _ = writeln!(text, "\n# {}: {:04x}:{:04x}", device.name, usb.vid, usb.pid);
+        let _ = match identify(registry, device) {
+            Ok(identity) => writeln!(text, "{}", rule(device, &identity)),
+            Err(reason) => writeln!(text, "# No stable name: {reason}."),
+        };
+    }
+    text
+}
+
+/// The matches that single out an entry's unit among all others, or why there are none.
+pub(super) fn identify(registry: &Registry, device: &DeviceSpec) -> Result<String, String> {
+    let usb = &device.identity;
+    if let Some(serial) = &usb.serial {
+        return match quoted_match(serial) {
+            Some(serial) => Ok(format!(", ATTRS{{serial}}==\"{serial}\"")),
+            None => Err("its serial number contains characters that a udev rule cannot match exactly; \
+                         identify it by its port to get one"
+                .to_owned()),
+        };
+    }
+    if let Some(port) = &usb.port {
+        // Validated to consist of digits, `-` and `.`.
+        return Ok(format!(", KERNELS==\"{port}\""));
+    }
+    let same_model = |other: &&DeviceSpec| {
+        (other.identity.vid, other.identity.pid) == (usb.vid, usb.pid) && subsystem(other) == subsystem(device)
+    };
+    if registry.devices.iter().filter(same_model).count() == 1 {
+        return Ok(String::new());
+    }
+    Err("several entries are of this model and this one has neither serial number nor port".to_owned())
+}
+
+fn rule(device: &DeviceSpec, identity: &str) -> String {
+    // A camera has several nodes; index 0 is the one that captures pictures.
+    let (index, group) = match device.node {
+        NodeSpec::Camera(_) => (", ATTR{index}==\"0\"", "video"),
+        NodeSpec::Serial(_) => ("", "dialout"),
+    };
+    format!(
+        "SUBSYSTEM==\"{}\"{index}, ATTRS{{idVendor}}==\"{:04x}\", ATTRS{{idProduct}}==\"{:04x}\"{identity}, \
+         SYMLINK+=\"rapid/{}\", GROUP=\"{group}\", MODE=\"0660\", TAG+=\"uaccess\", RUN{{builtin}}+=\"uaccess\"",
+        subsystem(device),
+        device.identity.vid,
+        device.identity.pid,
+        device.name,
+    )
+}
+
+const fn subsystem(device: &DeviceSpec) -> &'static str {
+    match device.node {
+        NodeSpec::Camera(_) => "video4linux",
+        NodeSpec::Serial(_) => "tty",
+    }
+}
+
+/// `value` as a pattern that matches exactly itself. `None` where that cannot be written in a way
+/// every version of udev reads alike: quotes and backslashes, whose treatment changed with the
+/// versions, `|`, which always separates, and everything but printable ASCII.
+fn quoted_match(value: &str) -> Option<String> {
+    // An empty pattern matches devices without the attribute.
+    if value.is_empty() {
+        return None;
+    }
+    let mut pattern = String::with_capacity(value.len());
+    for c in value.chars() {
+        match c {
+            '"' | '\\' | '|' => return None,
+            '*' | '?' | '[' => {
+                pattern.push('[');
+                pattern.push(c);
+                pattern.push(']');
+            }
+            ' '..='~' => pattern.push(c),
+            _ => return None,
+        }
+    }
+    Some(pattern)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_pattern_matches_itself_or_is_not_written() {
+        for (value, expected) in [
+            ("CAM00A1", Some("CAM00A1")),
+            ("a b%k$env{X}'#,=", Some("a b%k$env{X}'#,=")),
+            ("A*", Some("A[*]")),
+            ("?[x]", Some("[?][[]x]")),
+            ("a\"b", None),
+            ("a\\", None),
+            ("a|b", None),
+            ("\u{fc}", None),
+            ("a\nb", None),
+        ] {
+            assert_eq!(quoted_match(value).as_deref(), expected, "{value:?}");
+        }
+    }
+}

@@ -1,0 +1,140 @@
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use proptest::prelude::*;
+use yaml_rust2::{Yaml, YamlLoader};
+
+use super::*;
+
+fn text_of(all: &[Artifact], path: &str) -> String {
+    all.iter().find(|artifact| artifact.path == Path::new(path)).unwrap().contents.clone()
+}
+
+fn rule_lines(rules: &str) -> Vec<&str> {
+    rules.lines().filter(|line| !line.is_empty() && !line.starts_with('#')).collect()
+}
+
+fn with_serial(serial: &str) -> Registry {
+    let mut registry = Registry::builtin();
+    registry.devices[0].identity.serial = Some(serial.to_owned());
+    registry
+}
+
+#[test]
+fn the_repository_holds_what_devices_toml_gives() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("udev");
+    let all = artifacts(&Registry::builtin());
+    for artifact in &all {
+        let path = folder.join(&artifact.path);
+        let found = std::fs::read_to_string(&path).unwrap_or_default();
+        assert_eq!(found, artifact.contents, "{}: run `rapid artifacts`", path.display());
+    }
+    let expected: BTreeSet<_> = all.iter().map(|artifact| folder.join(&artifact.path)).collect();
+    let here = |dir: &Path| std::fs::read_dir(dir).unwrap().map(|entry| entry.unwrap().path()).collect::<Vec<_>>();
+    let found: BTreeSet<_> =
+        here(&folder).into_iter().chain(here(&folder.join(DESCRIPTORS))).filter(|path| path.is_file()).collect();
+    assert_eq!(found, expected);
+}
+
+#[test]
+fn a_unit_is_named_by_serial_by_port_or_as_the_only_one_of_its_model() {
+    let text = r#"
+        [device.one]
+        vid = "0001"
+        pid = "0001"
+        port = "1-2.3"
+        node = "camera"
+        [device.two]
+        vid = "0002"
+        pid = "0002"
+        node = "serial"
+        [device.two.serial]
+        channels = 1
+        [device.three]
+        vid = "0003"
+        pid = "0003"
+        node = "camera"
+        [device.four]
+        vid = "0003"
+        pid = "0003"
+        node = "camera"
+    "#;
+    let registry = Registry::parse(text, None).unwrap().registry;
+    let rules = text_of(&artifacts(&registry), "99-rapid.rules");
+    assert_eq!(
+        rule_lines(&rules),
+        [
+            "SUBSYSTEM==\"video4linux\", ATTR{index}==\"0\", ATTRS{idVendor}==\"0001\", ATTRS{idProduct}==\"0001\", \
+             KERNELS==\"1-2.3\", SYMLINK+=\"rapid/one\", GROUP=\"video\", MODE=\"0660\", TAG+=\"uaccess\", \
+             RUN{builtin}+=\"uaccess\"",
+            "SUBSYSTEM==\"tty\", ATTRS{idVendor}==\"0002\", ATTRS{idProduct}==\"0002\", SYMLINK+=\"rapid/two\", \
+             GROUP=\"dialout\", MODE=\"0660\", TAG+=\"uaccess\", RUN{builtin}+=\"uaccess\"",
+        ]
+    );
+    assert_eq!(rules.matches("# No stable name: several entries are of this model").count(), 2);
+    let descriptor = text_of(&artifacts(&registry), "descriptors/three.yaml");
+    assert!(descriptor.contains("\npath: null\n"), "{descriptor}");
+}
+
+#[test]
+fn a_serial_number_that_no_rule_can_match_gets_a_comment() {
+    let rules = text_of(&artifacts(&with_serial("a\", RUN+=\"reboot")), "99-rapid.rules");
+    assert_eq!(rule_lines(&rules).len(), 2);
+    assert!(rules.contains("# No stable name: its serial number contains characters"));
+    assert!(!rules.contains("reboot"));
+}
+
+fn strings<'y>(yaml: &'y Yaml, keys: &[&str]) -> Option<&'y str> {
+    keys.iter().fold(yaml, |yaml, key| &yaml[*key]).as_str()
+}
+
+/// Shell glob of the three characters we write (`[x]`) against a text.
+fn matches_exactly(pattern: &str, text: &str) -> bool {
+    let mut literal = String::new();
+    let mut rest = pattern;
+    while let Some(c) = rest.chars().next() {
+        let bracket = rest.strip_prefix('[').and_then(|after| Some((after.chars().next()?, after.get(1..2)?)));
+        match bracket {
+            Some((inner, "]")) => {
+                literal.push(inner);
+                rest = &rest[3..];
+            }
+            _ => {
+                assert!(!"*?[".contains(c), "an open glob in {pattern:?}");
+                literal.push(c);
+                rest = &rest[c.len_utf8()..];
+            }
+        }
+    }
+    literal == text
+}
+
+proptest! {
+    #[test]
+    fn no_serial_number_adds_a_line_or_matches_another(
+        serial in prop_oneof![any::<String>(), "[ -~]{1,20}", "[*?\\[\\]a\"|\\\\]{1,8}"],
+    ) {
+        let all = artifacts(&with_serial(&serial));
+        let rules = text_of(&all, "99-rapid.rules");
+        let lines = rule_lines(&rules);
+        prop_assert_eq!(rules.lines().filter(|line| line.starts_with("# cam_wrist")).count(), 1);
+        prop_assert!(lines.len() == 3 || lines.len() == 2);
+        if lines.len() == 3 {
+            let after = lines[0].split_once("ATTRS{serial}==\"").unwrap().1;
+            let pattern = after.split_once("\", SYMLINK+=\"rapid/cam_wrist\", GROUP").unwrap().0;
+            prop_assert!(!pattern.contains('"'));
+            prop_assert!(matches_exactly(pattern, &serial));
+        } else {
+            prop_assert!(rules.contains("# No stable name"));
+        }
+        let descriptor = YamlLoader::load_from_str(&text_of(&all, "descriptors/cam_wrist.yaml")).unwrap();
+        let [yaml] = descriptor.as_slice() else { panic!("one document") };
+        prop_assert_eq!(strings(yaml, &["identity", "serial"]), Some(serial.as_str()));
+        prop_assert_eq!(strings(yaml, &["identity", "vid"]), Some("046d"));
+        prop_assert_eq!(strings(yaml, &["module"]), Some("cam_wrist"));
+        prop_assert_eq!(strings(yaml, &["topic"]), Some("/rapid/camera/wrist"));
+        prop_assert_eq!(strings(yaml, &["slot"]), Some("top"));
+        prop_assert_eq!(yaml["bit"].as_i64(), Some(0));
+        prop_assert_eq!(yaml["sensors"][0]["width"].as_i64(), Some(640));
+    }
+}

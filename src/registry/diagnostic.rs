@@ -1,0 +1,87 @@
+//! What is wrong in a file a person wrote, said so that the person can mend it.
+//!
+//! Invariant: text taken from the file is shown escaped: no file can send control characters to a
+//! terminal.
+
+use std::fmt;
+
+use serde::Serialize;
+
+/// One problem of a configuration or scenario file.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Diagnostic {
+    /// The file as the user named it.
+    pub file: String,
+    /// Line from 1; 0 when the problem is the file itself.
+    pub line: usize,
+    /// Column in characters from 1; 0 when the problem is the file itself.
+    pub column: usize,
+    /// The table it is about, for example `device.cam_wrist`.
+    pub entry: Option<String>,
+    /// What is wrong.
+    pub message: String,
+    /// What to do about it.
+    pub fix: Option<String>,
+}
+
+impl fmt::Display for Diagnostic {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}", self.file)?;
+        if self.line > 0 {
+            write!(f, ":{}:{}", self.line, self.column)?;
+        }
+        write!(f, ": ")?;
+        if let Some(entry) = &self.entry {
+            write!(f, "[{entry}] ")?;
+        }
+        write!(f, "{}", self.message)?;
+        if let Some(fix) = &self.fix {
+            write!(f, "\n    fix: {fix}")?;
+        }
+        Ok(())
+    }
+}
+
+/// Everything that is wrong in one file, in the order of the file. Never empty.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{}", self.listing())]
+pub struct RegistryErrors {
+    /// The problems.
+    pub diagnostics: Vec<Diagnostic>,
+}
+
+impl RegistryErrors {
+    /// A problem with a file as a whole.
+    pub(super) fn whole_file(file: String, message: impl Into<String>, fix: impl Into<String>) -> Self {
+        let message = message.into();
+        Self { diagnostics: vec![Diagnostic { file, line: 0, column: 0, entry: None, message, fix: Some(fix.into()) }] }
+    }
+
+    fn listing(&self) -> String {
+        self.diagnostics.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n")
+    }
+}
+
+/// The name in `known` that was probably meant by `given`.
+pub(super) fn nearest<'k>(given: &str, known: impl IntoIterator<Item = &'k str>) -> Option<&'k str> {
+    let given = given.to_lowercase();
+    // Comparing takes the product of the lengths: no name we know is nearly this long.
+    if given.len() > 100 {
+        return None;
+    }
+    let allowed = (given.chars().count() / 3).max(1);
+    known
+        .into_iter()
+        .map(|name| (strsim::damerau_levenshtein(&given, &name.to_lowercase()), name))
+        .filter(|(distance, _)| *distance <= allowed)
+        .min_by_key(|(distance, _)| *distance)
+        .map(|(_, name)| name)
+}
+
+/// The fix for a name that is not known: the nearest one, or all there are.
+pub(super) fn did_you_mean(given: &str, known: &[&str], what: &str) -> String {
+    match nearest(given, known.iter().copied()) {
+        Some(name) => format!("did you mean \"{name}\"?"),
+        None => format!("{what}: {}", known.join(", ")),
+    }
+}

@@ -1,0 +1,379 @@
+//! Which attached device is which entry of the registry.
+//!
+//! Pure: told what is attached and detached, says which modality begins and which ends.
+//!
+//! 1. A unit with the vid, pid and serial number of an entry belongs to that entry alone.
+//! 2. Otherwise a unit at the port of an entry that has a port and no serial number belongs to it.
+//! 3. Otherwise it is one of the interchangeable units of the entries with neither: it takes the
+//!    entry it had last, if that is free (recognised by its serial number if it has one, otherwise
+//!    by its port), or the free entry with the lowest bit, and stays there while plugged.
+//!
+//! A unit whose entry is taken waits: a device may be seen in its new port before its old port is
+//! seen empty. It begins when the entry is freed.
+//!
+//! Invariant: an entry has at most one node, a node at most one entry.
+//! Invariant: two units never collapse into one entry, and one unit (one port) never takes two
+//! entries of one kind.
+
+use std::collections::VecDeque;
+use std::path::Path;
+
+use super::attachment::{Attachment, DeviceNode, UsbIdentity};
+use super::scenario::SimSource;
+use super::spec::{DeviceSpec, IdentitySpec, NodeSpec, Registry};
+use crate::modality::ModalityId;
+
+/// What an attached node is to the rig.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Assignment {
+    /// It is this entry.
+    Entry(ModalityId),
+    /// It fits an entry that is taken, and takes over when that is freed.
+    Waiting {
+        /// For people.
+        reason: String,
+    },
+    /// No entry means this device.
+    Unregistered {
+        /// For people: what the nearest entries ask for.
+        reason: String,
+    },
+    /// Its device is registered, but this node is not the one the entry reads.
+    WrongNode {
+        /// For people.
+        reason: String,
+    },
+}
+
+/// What a removal changes.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Detached {
+    /// Modalities whose node is gone, ascending by bit.
+    pub freed: Vec<ModalityId>,
+    /// Nodes that waited and now are an entry, perhaps one just freed.
+    pub assigned: Vec<(ModalityId, Attachment)>,
+}
+
+/// What a node would be, for `rapid devices`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Explanation {
+    /// The entries it fits, best rule first.
+    pub fits: Vec<ModalityId>,
+    /// Which entry and why, or what the nearest entries ask for; one line each.
+    pub reasons: Vec<String>,
+}
+
+/// Matches attached nodes to the entries of a registry.
+#[derive(Debug, Clone)]
+pub struct Assigner {
+    /// Ascending by bit.
+    entries: Vec<Entry>,
+    /// In the order they were attached.
+    attached: Vec<Node>,
+    /// Which interchangeable unit had which entry last, oldest first.
+    remembered: VecDeque<(UsbIdentity, ModalityId)>,
+}
+
+#[derive(Debug, Clone)]
+struct Entry {
+    id: ModalityId,
+    name: String,
+    identity: IdentitySpec,
+    kind: Kind,
+}
+
+#[derive(Debug, Clone)]
+struct Node {
+    attachment: Attachment,
+    assigned: Option<ModalityId>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    Camera,
+    Serial,
+}
+
+/// The rule above by which a unit fits an entry.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Rule {
+    Serial,
+    Port,
+    Model,
+}
+
+/// A rig never sees more units of one kind than this; a device that makes up serial numbers does.
+const MOST_REMEMBERED: usize = 256;
+
+impl Assigner {
+    /// With nothing attached.
+    #[must_use]
+    pub fn new(registry: &Registry) -> Self {
+        let mut entries: Vec<_> = registry.devices.iter().map(Entry::new).collect();
+        entries.sort_by_key(|entry| entry.id);
+        Self { entries, attached: Vec::new(), remembered: VecDeque::new() }
+    }
+
+    /// Is another device known at this node's path? Its removal was missed: detach that path first,
+    /// to learn which modality ends.
+    #[must_use]
+    pub fn replaces(&self, attachment: &Attachment) -> bool {
+        self.attached
+            .iter()
+            .any(|node| node.attachment.syspath == attachment.syspath && node.attachment.usb != attachment.usb)
+    }
+
+    /// A node is there. Told twice of the same node, says the same.
+    pub fn attach(&mut self, attachment: &Attachment) -> Assignment {
+        let known = self.attached.iter().position(|node| node.attachment.syspath == attachment.syspath);
+        if let Some(node) = known.and_then(|index| self.attached.get_mut(index)) {
+            if node.attachment.usb == attachment.usb
+                && let Some(id) = node.assigned
+            {
+                node.attachment = attachment.clone();
+                return Assignment::Entry(id);
+            }
+            let syspath = &attachment.syspath;
+            self.attached.retain(|node| node.attachment.syspath != *syspath);
+        }
+        let assignment = self.choose(attachment);
+        let assigned = match &assignment {
+            Assignment::Entry(id) => Some(*id),
+            // Kept: it may begin when an entry is freed.
+            Assignment::Waiting { .. } | Assignment::WrongNode { .. } => None,
+            Assignment::Unregistered { .. } => return assignment,
+        };
+        self.place(Node { attachment: attachment.clone(), assigned });
+        assignment
+    }
+
+    /// Everything at or below `syspath` is gone.
+    pub fn detach(&mut self, syspath: &Path) -> Detached {
+        let mut detached = Detached::default();
+        self.attached.retain(|node| {
+            let gone = node.attachment.is_under(syspath);
+            if gone {
+                detached.freed.extend(node.assigned);
+            }
+            !gone
+        });
+        detached.freed.sort_unstable();
+        detached.assigned = self.promote();
+        detached
+    }
+
+    /// The node that is entry `id` now.
+    #[must_use]
+    pub fn attached_as(&self, id: ModalityId) -> Option<&Attachment> {
+        self.attached.iter().find(|node| node.assigned == Some(id)).map(|node| &node.attachment)
+    }
+
+    /// What a node would be if every entry were free.
+    #[must_use]
+    pub fn explain(&self, attachment: &Attachment) -> Explanation {
+        let fitting = self.fitting(attachment);
+        if fitting.is_empty() {
+            return Explanation { fits: Vec::new(), reasons: self.near_misses(attachment) };
+        }
+        let reasons = fitting.iter().map(|(rule, entry)| match rule {
+            Rule::Serial => format!("vid:pid and serial number are those of [device.{}]", entry.name),
+            Rule::Port => format!("vid:pid and port are those of [device.{}]", entry.name),
+            Rule::Model => format!("vid:pid are those of [device.{}], which takes any such unit", entry.name),
+        });
+        Explanation { reasons: reasons.collect(), fits: fitting.iter().map(|(_, entry)| entry.id).collect() }
+    }
+
+    fn choose(&self, attachment: &Attachment) -> Assignment {
+        let fitting = self.fitting(attachment);
+        let Some((rule, best)) = fitting.first() else { return self.refuse(attachment) };
+        if let Some(other) = self.other_node(attachment) {
+            let name = self.name(other.assigned);
+            let reason = format!("[device.{name}] already reads another node of this device");
+            return Assignment::WrongNode { reason };
+        }
+        let free = |id: ModalityId| self.attached_as(id).is_none();
+        let chosen = match rule {
+            Rule::Serial | Rule::Port => Some(best.id).filter(|id| free(*id)),
+            Rule::Model => {
+                let mut pool = fitting.iter().map(|(_, entry)| entry.id).filter(|id| free(*id));
+                let last = self.recall(&attachment.usb).into_iter().find(|id| pool.clone().any(|free| free == *id));
+                last.or_else(|| pool.next())
+            }
+        };
+        match chosen {
+            Some(id) => Assignment::Entry(id),
+            None if *rule == Rule::Model => {
+                Assignment::Waiting { reason: format!("every entry of this model is taken ({})", names(&fitting)) }
+            }
+            None => Assignment::Waiting {
+                reason: format!("[device.{}] is taken by a unit at port {}", best.name, self.port_of(best.id)),
+            },
+        }
+    }
+
+    /// The entries a node fits by the best rule that applies, ascending by bit.
+    fn fitting(&self, attachment: &Attachment) -> Vec<(Rule, &Entry)> {
+        let usb = &attachment.usb;
+        let fits: Vec<_> = self
+            .entries
+            .iter()
+            .filter(|entry| entry.reads(&attachment.node))
+            .filter_map(|entry| Some((rule(&entry.identity, usb)?, entry)))
+            .collect();
+        let best = fits.iter().map(|(rule, _)| *rule).min();
+        fits.into_iter().filter(|(rule, _)| Some(*rule) == best).collect()
+    }
+
+    /// Another node of the same unit that already is an entry this one fits: a camera may offer
+    /// several capture nodes.
+    fn other_node(&self, attachment: &Attachment) -> Option<&Node> {
+        let usb = &attachment.usb;
+        self.attached.iter().find(|node| {
+            let other = &node.attachment.usb;
+            let same_unit = (other.vid, other.pid, &other.port) == (usb.vid, usb.pid, &usb.port);
+            let entry = self.entries.iter().find(|entry| Some(entry.id) == node.assigned);
+            same_unit && other.serial == usb.serial && entry.is_some_and(|entry| entry.reads(&attachment.node))
+        })
+    }
+
+    fn refuse(&self, attachment: &Attachment) -> Assignment {
+        let entry = self.entries.iter().find(|entry| rule(&entry.identity, &attachment.usb).is_some());
+        if let Some(entry) = entry {
+            let label = attachment.node.label();
+            let reason = format!("[device.{}] reads its {}, not {label}", entry.name, entry.kind.label());
+            return Assignment::WrongNode { reason };
+        }
+        Assignment::Unregistered { reason: self.near_misses(attachment).join("; ") }
+    }
+
+    fn near_misses(&self, attachment: &Attachment) -> Vec<String> {
+        let usb = &attachment.usb;
+        let same_model = |entry: &&Entry| (entry.identity.vid, entry.identity.pid) == (usb.vid, usb.pid);
+        let mut reasons: Vec<String> = self
+            .entries
+            .iter()
+            .filter(same_model)
+            .map(|entry| {
+                let name = &entry.name;
+                match (&entry.identity.serial, &entry.identity.port) {
+                    (Some(serial), _) if usb.serial.as_deref() != Some(serial) => {
+                        let says = usb.serial.as_ref().map_or("has none".to_owned(), |own| format!("says {own:?}"));
+                        format!("vid:pid match [device.{name}], but its serial is {serial:?} and this unit {says}")
+                    }
+                    (None, Some(port)) if *port != usb.port => {
+                        format!(
+                            "vid:pid match [device.{name}], but its port is {port} and this unit is at {:?}",
+                            usb.port
+                        )
+                    }
+                    _ => format!("it is [device.{name}], which reads its {}", entry.kind.label()),
+                }
+            })
+            .collect();
+        if reasons.is_empty() {
+            reasons.push(format!("no entry has vid:pid {:04x}:{:04x}", usb.vid, usb.pid));
+        }
+        reasons
+    }
+
+    /// Entries this unit had before, the best guess first.
+    fn recall(&self, usb: &UsbIdentity) -> Vec<ModalityId> {
+        let newest = |same: &dyn Fn(&UsbIdentity) -> bool| -> Vec<ModalityId> {
+            let model = |past: &UsbIdentity| (past.vid, past.pid) == (usb.vid, usb.pid);
+            let found = self.remembered.iter().rev().filter(|(past, _)| model(past) && same(past));
+            found.map(|(_, id)| *id).collect()
+        };
+        // Cheap devices share one serial number: the port tells twins apart.
+        let mut ids = newest(&|past| past.serial == usb.serial && past.port == usb.port);
+        if usb.serial.is_some() {
+            ids.extend(newest(&|past| past.serial == usb.serial));
+        }
+        ids
+    }
+
+    fn place(&mut self, node: Node) {
+        if let Some(id) = node.assigned {
+            let usb = node.attachment.usb.clone();
+            self.remembered.retain(|(past, _)| {
+                (past.vid, past.pid, &past.serial, &past.port) != (usb.vid, usb.pid, &usb.serial, &usb.port)
+            });
+            self.remembered.push_back((usb, id));
+            if self.remembered.len() > MOST_REMEMBERED {
+                self.remembered.pop_front();
+            }
+        }
+        self.attached.push(node);
+    }
+
+    /// Gives free entries to the nodes that wait, those that came first first.
+    fn promote(&mut self) -> Vec<(ModalityId, Attachment)> {
+        let mut begun = Vec::new();
+        let waiting: Vec<Attachment> =
+            self.attached.iter().filter(|node| node.assigned.is_none()).map(|node| node.attachment.clone()).collect();
+        for attachment in waiting {
+            let Assignment::Entry(id) = self.choose(&attachment) else { continue };
+            self.attached.retain(|node| node.attachment.syspath != attachment.syspath);
+            self.place(Node { attachment: attachment.clone(), assigned: Some(id) });
+            begun.push((id, attachment));
+        }
+        begun
+    }
+
+    fn name(&self, id: Option<ModalityId>) -> &str {
+        self.entries.iter().find(|entry| Some(entry.id) == id).map_or("", |entry| entry.name.as_str())
+    }
+
+    fn port_of(&self, id: ModalityId) -> String {
+        self.attached_as(id).map_or_else(String::new, |node| format!("{:?}", node.usb.port))
+    }
+}
+
+impl Entry {
+    fn new(device: &DeviceSpec) -> Self {
+        let kind = match device.node {
+            NodeSpec::Camera(_) => Kind::Camera,
+            NodeSpec::Serial(_) => Kind::Serial,
+        };
+        Self { id: device.id, name: device.name.clone(), identity: device.identity.clone(), kind }
+    }
+
+    fn reads(&self, node: &DeviceNode) -> bool {
+        match node {
+            DeviceNode::Video(_) => self.kind == Kind::Camera,
+            DeviceNode::Tty(_) => self.kind == Kind::Serial,
+            DeviceNode::Sim(device) => match device.source {
+                SimSource::Camera { .. } => self.kind == Kind::Camera,
+                SimSource::Serial { .. } => self.kind == Kind::Serial,
+                // A recorded topic stands for whatever recorded it.
+                SimSource::Replay { .. } => true,
+            },
+        }
+    }
+}
+
+impl Kind {
+    const fn label(self) -> &'static str {
+        match self {
+            Self::Camera => "camera",
+            Self::Serial => "serial line",
+        }
+    }
+}
+
+fn rule(entry: &IdentitySpec, usb: &UsbIdentity) -> Option<Rule> {
+    if (entry.vid, entry.pid) != (usb.vid, usb.pid) {
+        return None;
+    }
+    match (&entry.serial, &entry.port) {
+        (Some(serial), _) => (usb.serial.as_ref() == Some(serial)).then_some(Rule::Serial),
+        (None, Some(port)) => (usb.port == *port).then_some(Rule::Port),
+        (None, None) => Some(Rule::Model),
+    }
+}
+
+fn names(fitting: &[(Rule, &Entry)]) -> String {
+    fitting.iter().map(|(_, entry)| entry.name.as_str()).collect::<Vec<_>>().join(", ")
+}
+
+#[cfg(test)]
+mod tests;

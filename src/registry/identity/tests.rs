@@ -1,0 +1,305 @@
+use std::collections::BTreeSet;
+use std::path::PathBuf;
+
+use proptest::prelude::*;
+
+use super::*;
+
+/// One camera by serial, one by port, two interchangeable, and a composite of camera and tty.
+fn registry() -> Registry {
+    let text = r#"
+        [device.by_serial]
+        vid = "0001"
+        pid = "0001"
+        serial = "A"
+        node = "camera"
+        bit = 0
+        [device.by_port]
+        vid = "0001"
+        pid = "0001"
+        port = "1-9"
+        node = "camera"
+        bit = 1
+        [device.any_low]
+        vid = "0002"
+        pid = "0002"
+        node = "camera"
+        bit = 2
+        [device.any_high]
+        vid = "0002"
+        pid = "0002"
+        node = "camera"
+        bit = 3
+        [device.both_camera]
+        vid = "0003"
+        pid = "0003"
+        serial = "C"
+        node = "camera"
+        bit = 4
+        [device.both_tty]
+        vid = "0003"
+        pid = "0003"
+        serial_number = "C"
+        node = "serial"
+        bit = 5
+        [device.both_tty.serial]
+        channels = 1
+    "#;
+    Registry::parse(text, None).unwrap().registry
+}
+
+fn id(bit: u8) -> ModalityId {
+    ModalityId::new(bit).unwrap()
+}
+
+fn entry(bit: u8) -> Assignment {
+    Assignment::Entry(id(bit))
+}
+
+fn unit(model: u16, serial: Option<&str>, port: &str) -> UsbIdentity {
+    UsbIdentity { vid: model, pid: model, serial: serial.map(str::to_owned), port: port.to_owned(), product: None }
+}
+
+fn video(number: u32, usb: UsbIdentity) -> Attachment {
+    let syspath = PathBuf::from(format!("/sys/devices/usb1/{}/video4linux/video{number}", usb.port));
+    Attachment { syspath, node: DeviceNode::Video(format!("/dev/video{number}").into()), usb }
+}
+
+fn tty(usb: UsbIdentity) -> Attachment {
+    let syspath = PathBuf::from(format!("/sys/devices/usb1/{}/tty/ttyACM0", usb.port));
+    Attachment { syspath, node: DeviceNode::Tty("/dev/ttyACM0".into()), usb }
+}
+
+fn device_path(port: &str) -> PathBuf {
+    PathBuf::from(format!("/sys/devices/usb1/{port}"))
+}
+
+fn waits(assignment: &Assignment) -> bool {
+    matches!(assignment, Assignment::Waiting { .. })
+}
+
+#[test]
+fn a_serial_number_decides_before_a_port() {
+    let mut assigner = Assigner::new(&registry());
+    assert_eq!(assigner.attach(&video(0, unit(1, Some("A"), "1-9"))), entry(0));
+    assert_eq!(assigner.detach(&device_path("1-9")).freed, [id(0)]);
+    assert_eq!(assigner.attach(&video(0, unit(1, Some("B"), "1-9"))), entry(1));
+}
+
+#[test]
+fn a_stranger_of_a_known_model_is_told_what_differs() {
+    let mut assigner = Assigner::new(&registry());
+    let Assignment::Unregistered { reason } = assigner.attach(&video(0, unit(1, Some("B\n"), "1-2"))) else {
+        panic!("it must not match");
+    };
+    assert_eq!(
+        reason,
+        "vid:pid match [device.by_serial], but its serial is \"A\" and this unit says \"B\\n\"; \
+         vid:pid match [device.by_port], but its port is 1-9 and this unit is at \"1-2\""
+    );
+    assert_eq!(
+        assigner.attach(&video(1, unit(7, None, "1-3"))),
+        Assignment::Unregistered { reason: "no entry has vid:pid 0007:0007".to_owned() }
+    );
+}
+
+#[test]
+fn a_device_in_a_new_port_waits_until_its_old_port_is_seen_empty() {
+    let mut assigner = Assigner::new(&registry());
+    assert_eq!(assigner.attach(&video(0, unit(1, Some("A"), "1-2"))), entry(0));
+    let moved = video(1, unit(1, Some("A"), "1-3"));
+    assert_eq!(
+        assigner.attach(&moved),
+        Assignment::Waiting { reason: "[device.by_serial] is taken by a unit at port \"1-2\"".to_owned() }
+    );
+    let expected = Detached { freed: vec![id(0)], assigned: vec![(id(0), moved.clone())] };
+    assert_eq!(assigner.detach(&device_path("1-2")), expected);
+    assert_eq!(assigner.attached_as(id(0)), Some(&moved));
+}
+
+#[test]
+fn interchangeable_units_take_entries_in_order_and_return_to_their_own() {
+    let mut assigner = Assigner::new(&registry());
+    assert_eq!(assigner.attach(&video(0, unit(2, None, "1-5"))), entry(2));
+    assert_eq!(assigner.attach(&video(1, unit(2, None, "1-4"))), entry(3));
+    let third = video(2, unit(2, None, "1-6"));
+    assert!(waits(&assigner.attach(&third)));
+    assert_eq!(assigner.detach(&third.syspath), Detached::default());
+    assigner.detach(&device_path("1-5"));
+    assigner.detach(&device_path("1-4"));
+    assert_eq!(assigner.attach(&video(0, unit(2, None, "1-4"))), entry(3));
+    assert_eq!(assigner.attach(&video(1, unit(2, None, "1-5"))), entry(2));
+}
+
+#[test]
+fn a_unit_with_a_serial_number_returns_to_its_entry_in_any_port() {
+    let mut assigner = Assigner::new(&registry());
+    assert_eq!(assigner.attach(&video(0, unit(2, Some("X"), "1-5"))), entry(2));
+    assert_eq!(assigner.attach(&video(1, unit(2, Some("Y"), "1-4"))), entry(3));
+    assigner.detach(Path::new("/sys/devices/usb1"));
+    assert_eq!(assigner.attach(&video(0, unit(2, Some("Y"), "1-5"))), entry(3));
+    assert_eq!(assigner.attach(&video(1, unit(2, Some("X"), "1-4"))), entry(2));
+}
+
+#[test]
+fn twins_with_one_serial_number_do_not_collapse_and_are_told_apart_by_port() {
+    let mut assigner = Assigner::new(&registry());
+    assert_eq!(assigner.attach(&video(0, unit(2, Some("0001"), "1-5"))), entry(2));
+    assert_eq!(assigner.attach(&video(1, unit(2, Some("0001"), "1-4"))), entry(3));
+    assigner.detach(Path::new("/sys/devices/usb1"));
+    assert_eq!(assigner.attach(&video(0, unit(2, Some("0001"), "1-4"))), entry(3));
+    assert_eq!(assigner.attach(&video(1, unit(2, Some("0001"), "1-5"))), entry(2));
+}
+
+#[test]
+fn a_second_capture_node_is_not_a_second_unit_but_may_take_over() {
+    let mut assigner = Assigner::new(&registry());
+    let first = video(0, unit(2, None, "1-5"));
+    let second = video(1, unit(2, None, "1-5"));
+    assert_eq!(assigner.attach(&first), entry(2));
+    assert_eq!(
+        assigner.attach(&second),
+        Assignment::WrongNode { reason: "[device.any_low] already reads another node of this device".to_owned() }
+    );
+    assert_eq!(assigner.attach(&video(2, unit(2, None, "1-6"))), entry(3));
+    let taken_over = Detached { freed: vec![id(2)], assigned: vec![(id(2), second)] };
+    assert_eq!(assigner.detach(&first.syspath), taken_over);
+}
+
+#[test]
+fn the_nodes_of_a_composite_device_go_to_their_own_entries() {
+    let mut assigner = Assigner::new(&registry());
+    assert_eq!(assigner.attach(&tty(unit(3, Some("C"), "1-7"))), entry(5));
+    assert_eq!(assigner.attach(&video(0, unit(3, Some("C"), "1-7"))), entry(4));
+    assert_eq!(assigner.detach(&device_path("1-7")).freed, [id(4), id(5)]);
+    let wrong = assigner.attach(&tty(unit(2, None, "1-8")));
+    assert_eq!(
+        wrong,
+        Assignment::WrongNode { reason: "[device.any_low] reads its camera, not /dev/ttyACM0".to_owned() }
+    );
+}
+
+#[test]
+fn a_node_told_twice_is_one_node_and_a_missed_removal_is_seen() {
+    let mut assigner = Assigner::new(&registry());
+    let node = video(0, unit(2, None, "1-5"));
+    assert_eq!(assigner.attach(&node), entry(2));
+    assert_eq!(assigner.attach(&node), entry(2));
+    assert!(!assigner.replaces(&node));
+    let mut other = node.clone();
+    other.usb = unit(1, Some("A"), "1-5");
+    assert!(assigner.replaces(&other));
+    assert_eq!(assigner.detach(&other.syspath).freed, [id(2)]);
+    assert_eq!(assigner.attach(&other), entry(0));
+}
+
+#[test]
+fn explanations_name_every_entry_that_fits() {
+    let assigner = Assigner::new(&registry());
+    let explanation = assigner.explain(&video(0, unit(2, None, "1-5")));
+    assert_eq!(explanation.fits, [id(2), id(3)]);
+    assert_eq!(explanation.reasons[0], "vid:pid are those of [device.any_low], which takes any such unit");
+    let stranger = assigner.explain(&video(0, unit(3, None, "1-5")));
+    assert_eq!(
+        stranger.reasons[0],
+        "vid:pid match [device.both_camera], but its serial is \"C\" and this unit has none"
+    );
+}
+
+#[derive(Debug, Clone)]
+enum Step {
+    Attach(Attachment),
+    Detach(PathBuf),
+}
+
+fn any_step() -> impl Strategy<Value = Step> {
+    let serial = prop_oneof![Just(None), Just(Some("A")), Just(Some("B")), Just(Some("C"))];
+    let attach = (1_u16..=4, serial, 5_u32..=9, 0_u32..3).prop_map(|(model, serial, port, node)| {
+        let usb = unit(model, serial, &format!("1-{port}"));
+        Step::Attach(if node == 2 { tty(usb) } else { video(node, usb) })
+    });
+    let detach = prop_oneof![
+        8 => (5_u32..=9).prop_map(|port| device_path(&format!("1-{port}"))),
+        2 => (5_u32..=9).prop_map(|port| device_path(&format!("1-{port}/video4linux/video0"))),
+        1 => Just(PathBuf::from("/sys/devices/usb1")),
+    ];
+    prop_oneof![3 => attach, 2 => detach.prop_map(Step::Detach)]
+}
+
+/// What the rig believes, built only from what the assigner said.
+#[derive(Default)]
+struct Believed(Vec<(ModalityId, Attachment)>);
+
+impl Believed {
+    fn apply(&mut self, assigner: &mut Assigner, step: Step) {
+        match step {
+            Step::Attach(attachment) => {
+                if assigner.replaces(&attachment) {
+                    self.detach(assigner, &attachment.syspath);
+                }
+                if let Assignment::Entry(id) = assigner.attach(&attachment) {
+                    self.0.retain(|(_, known)| known.syspath != attachment.syspath);
+                    self.0.push((id, attachment));
+                }
+            }
+            Step::Detach(path) => self.detach(assigner, &path),
+        }
+    }
+
+    fn detach(&mut self, assigner: &mut Assigner, path: &Path) {
+        let detached = assigner.detach(path);
+        for id in detached.freed {
+            let (_, gone) = self.0.remove(self.0.iter().position(|(known, _)| *known == id).unwrap());
+            assert!(gone.is_under(path), "{id} was freed without cause");
+        }
+        assert!(self.0.iter().all(|(_, known)| !known.is_under(path)), "a node below {path:?} was not freed");
+        self.0.extend(detached.assigned);
+    }
+}
+
+proptest! {
+    #[test]
+    fn what_was_said_is_what_is_true(steps in prop::collection::vec(any_step(), 0..40)) {
+        let mut assigner = Assigner::new(&registry());
+        let mut believed = Believed::default();
+        for step in steps {
+            believed.apply(&mut assigner, step);
+            let ids: BTreeSet<_> = believed.0.iter().map(|(id, _)| *id).collect();
+            let paths: BTreeSet<_> = believed.0.iter().map(|(_, node)| node.syspath.clone()).collect();
+            prop_assert_eq!(ids.len(), believed.0.len(), "an entry has two nodes");
+            prop_assert_eq!(paths.len(), believed.0.len(), "a node has two entries");
+            for entry in &registry().devices {
+                let said = believed.0.iter().find(|(id, _)| *id == entry.id).map(|(_, node)| node);
+                prop_assert_eq!(assigner.attached_as(entry.id), said);
+            }
+            for (id, node) in &believed.0 {
+                prop_assert!(assigner.explain(node).fits.contains(id), "{} does not fit", id);
+            }
+            // As many interchangeable cameras run as there are units and entries for.
+            let units: BTreeSet<_> = assigner
+                .attached
+                .iter()
+                .filter(|node| node.attachment.usb.vid == 2 && matches!(node.attachment.node, DeviceNode::Video(_)))
+                .map(|node| (node.attachment.usb.port.clone(), node.attachment.usb.serial.clone()))
+                .collect();
+            let running = believed.0.iter().filter(|(id, _)| matches!(id.bit(), 2 | 3)).count();
+            prop_assert_eq!(running, units.len().min(2));
+        }
+    }
+
+    #[test]
+    fn with_serial_numbers_the_order_of_plugging_does_not_matter(
+        plugged in prop::sample::subsequence(vec![0_usize, 1, 2], 0..=3).prop_shuffle(),
+    ) {
+        let units = [
+            video(0, unit(1, Some("A"), "1-5")),
+            video(1, unit(3, Some("C"), "1-6")),
+            tty(unit(3, Some("C"), "1-6")),
+        ];
+        let expected = [entry(0), entry(4), entry(5)];
+        let mut assigner = Assigner::new(&registry());
+        for index in plugged {
+            prop_assert_eq!(&assigner.attach(&units[index]), &expected[index]);
+        }
+    }
+}

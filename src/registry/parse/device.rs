@@ -1,0 +1,421 @@
+//! One `[device.NAME]` table.
+
+use std::time::Duration;
+
+use crate::modality::{MAX_MODALITIES, ModalityId};
+use crate::registry::diagnostic::{did_you_mean, nearest};
+use crate::registry::section::{At, Problems, Section};
+use crate::registry::spec::{
+    CameraSpec, DeviceSpec, Framing, IdentitySpec, Mount, NodeSpec, Parse, PixelFormat, SerialSpec, WhenStale,
+};
+
+/// Kinds of node this version has a driver for.
+const BUILT_IN: [(&str, Kind); 2] = [("camera", Kind::Camera), ("serial", Kind::Serial)];
+/// Kinds of node that are designed but have no driver in this version.
+const PLANNED: [&str; 3] = ["can", "lan", "process"];
+/// Keys that only planned kinds of node have.
+const PLANNED_KEYS: [&str; 6] = ["can", "lan", "process", "on_attach", "on_detach", "heartbeat"];
+const KEYS: [&str; 14] = [
+    "vid",
+    "pid",
+    "serial",
+    "serial_number",
+    "port",
+    "node",
+    "topic",
+    "bit",
+    "slot",
+    "stall_after",
+    "max_bytes",
+    "depth",
+    "when_stale",
+    "camera",
+];
+
+/// How a device is read, without the settings.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Kind {
+    Camera,
+    Serial,
+}
+
+/// An entry as far as it could be read.
+#[derive(Debug)]
+pub(super) struct Draft<'a> {
+    pub(super) name: String,
+    pub(super) section: Section<'a>,
+    pub(super) identity: Option<IdentitySpec>,
+    pub(super) kind: Option<Kind>,
+    node: Option<NodeSpec>,
+    pub(super) topic: String,
+    pub(super) bit: Option<At<u8>>,
+    pub(super) id: Option<ModalityId>,
+    mount: Option<Mount>,
+    stall_after: Duration,
+    pub(super) max_bytes: u64,
+    pub(super) depth: u64,
+    /// The depth was written in the file and is not ours to lower.
+    pub(super) depth_written: bool,
+    when_stale: WhenStale,
+}
+
+impl Draft<'_> {
+    /// The entry; `None` only if a problem with it was reported.
+    pub(super) fn finish(self) -> Option<DeviceSpec> {
+        Some(DeviceSpec {
+            name: self.name,
+            id: self.id?,
+            identity: self.identity?,
+            node: self.node?,
+            topic: self.topic,
+            mount: self.mount,
+            stall_after: self.stall_after,
+            max_bytes: usize::try_from(self.max_bytes).ok()?,
+            depth: usize::try_from(self.depth).ok()?,
+            when_stale: self.when_stale,
+        })
+    }
+
+    pub(super) fn default_topic(&self) -> String {
+        default_topic(self.kind, &self.name)
+    }
+
+    /// The key the serial number is written under.
+    pub(super) fn serial_key(&self) -> &'static str {
+        if self.section.has("serial_number") { "serial_number" } else { "serial" }
+    }
+
+    pub(super) fn is_camera(&self) -> bool {
+        self.kind == Some(Kind::Camera)
+    }
+}
+
+/// Reads one entry.
+pub(super) fn read<'a>(name: &str, section: Section<'a>, problems: &mut Problems<'_>) -> Draft<'a> {
+    check_name(name, &section, problems);
+    check_keys(&section, problems);
+    let kind = kind(&section, problems);
+    let identity = identity(&section, problems);
+    let node = match kind {
+        Some(Kind::Camera) => Some(NodeSpec::Camera(camera(&section, problems))),
+        Some(Kind::Serial) => serial(&section, problems).map(NodeSpec::Serial),
+        None => None,
+    };
+    let topic = topic(&section, problems).unwrap_or_else(|| default_topic(kind, name));
+    let bit = section
+        .integer(problems, "bit", 0..=MAX_MODALITIES as i64 - 1)
+        .and_then(|bit| Some(At { at: bit.at, value: u8::try_from(bit.value).ok()? }));
+    let slots = [("front", Mount::Front), ("tip", Mount::Tip), ("top", Mount::Top), ("bottom", Mount::Bottom)];
+    let mount = section.choice(problems, "slot", &slots);
+    let when_stale = section
+        .choice(problems, "when_stale", &[("hold", WhenStale::Hold), ("zero", WhenStale::Zero)])
+        .unwrap_or_default();
+    let stall = Duration::from_millis(10)..=Duration::from_secs(3600);
+    let stall_after = section.duration(problems, "stall_after", stall).unwrap_or_else(|| default_stall(node.as_ref()));
+    let max_bytes = max_bytes(&section, node.as_ref(), problems);
+    let written = section.integer(problems, "depth", 2..=4096).and_then(|depth| u64::try_from(depth.value).ok());
+    Draft {
+        name: name.to_owned(),
+        identity,
+        kind,
+        topic,
+        bit,
+        id: None,
+        mount,
+        stall_after,
+        max_bytes,
+        depth: written.unwrap_or_else(|| default_depth(node.as_ref())),
+        depth_written: written.is_some(),
+        when_stale,
+        node,
+        section,
+    }
+}
+
+fn check_name(name: &str, section: &Section<'_>, problems: &mut Problems<'_>) {
+    let legal = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
+    let begins = name.starts_with(|c: char| c.is_ascii_lowercase());
+    if begins && name.len() <= 64 && name.chars().all(legal) {
+        return;
+    }
+    let better: String = name.to_lowercase().chars().map(|c| if legal(c) { c } else { '_' }).take(64).collect();
+    let fix = if better.starts_with(|c: char| c.is_ascii_lowercase()) {
+        format!("use lower-case letters, digits and `_`, at most 64, for example [device.{better}]")
+    } else {
+        "begin with a lower-case letter; then lower-case letters, digits and `_`, at most 64".to_owned()
+    };
+    problems.report(section.at, &section.entry, format!("{name:?} cannot be a modality's name"), fix);
+}
+
+fn check_keys(section: &Section<'_>, problems: &mut Problems<'_>) {
+    for (at, key, _) in section.fields() {
+        if KEYS.contains(&key) {
+            continue;
+        }
+        if PLANNED_KEYS.contains(&key) {
+            let fix = "remove it; this version reads camera and serial devices";
+            problems.report(at, &section.entry, format!("{key:?} is not supported by this version of rapid"), fix);
+        } else {
+            let fix = did_you_mean(key, &KEYS, "known keys here");
+            problems.report(at, &section.entry, format!("unknown key {key:?}"), fix);
+        }
+    }
+}
+
+fn kind(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<Kind> {
+    if !section.has("node") {
+        section.missing(problems, "node", "write node = \"camera\" or node = \"serial\"");
+        return None;
+    }
+    let text = section.text(problems, "node")?.value;
+    let found = BUILT_IN.iter().find(|(name, _)| *name == text).map(|(_, kind)| *kind);
+    if found.is_some() {
+        return found;
+    }
+    let fix = match nearest(text, BUILT_IN.map(|(name, _)| name)) {
+        Some(name) if !PLANNED.contains(&text) => format!("did you mean \"{name}\"?"),
+        _ => "built in are \"camera\" and \"serial\"; remove the entry until then".to_owned(),
+    };
+    let message = if PLANNED.contains(&text) {
+        format!("node {text:?} is not supported by this version of rapid")
+    } else if fix.starts_with("did") {
+        format!("unknown node {text:?}")
+    } else {
+        format!("node {text:?} is not built in, and programs as nodes are not supported by this version of rapid")
+    };
+    section.report(problems, "node", message, fix);
+    None
+}
+
+fn identity(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<IdentitySpec> {
+    for key in ["vid", "pid"] {
+        if !section.has(key) {
+            let fix = format!("write the four hexadecimal digits lsusb shows, for example {key} = \"046d\"");
+            section.missing(problems, key, &fix);
+        }
+    }
+    let vid = section.usb_id(problems, "vid");
+    let pid = section.usb_id(problems, "pid");
+    let serial = serial_number(section, problems);
+    let port = section.text(problems, "port").filter(|port| {
+        let legal = is_port(port.value);
+        if !legal {
+            let fix = "write it as the kernel does, bus-port.port, for example port = \"1-2.3\"; `lsusb -t` shows it";
+            section.report(problems, "port", format!("{:?} is not a USB port path", port.value), fix);
+        }
+        legal
+    });
+    let port = port.map(|port| port.value.to_owned());
+    Some(IdentitySpec { vid: vid?, pid: pid?, serial, port })
+}
+
+/// `serial = "..."`, or `serial_number = "..."` where `serial` is the table of the serial line: in
+/// TOML one key cannot be both.
+fn serial_number(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<String> {
+    let as_text = section.has("serial") && !section.is_table("serial");
+    if as_text && section.has("serial_number") {
+        let message = "serial and serial_number are the same thing".to_owned();
+        section.report(problems, "serial_number", message, "keep one of the two");
+    }
+    let key = if as_text { "serial" } else { "serial_number" };
+    let serial = section.text(problems, key)?.value;
+    match check_serial(serial) {
+        Ok(()) => Some(serial.to_owned()),
+        Err((message, fix)) => {
+            section.report(problems, key, message, fix);
+            None
+        }
+    }
+}
+
+/// A serial number ends up in rules and descriptors: it must at least be one line of text.
+pub(crate) fn check_serial(serial: &str) -> Result<(), (String, &'static str)> {
+    /// A USB string descriptor holds at most 126 UTF-16 units.
+    const LONGEST: usize = 126;
+    if serial.is_empty() {
+        return Err(("the serial number is empty".to_owned(), "remove the key if the device has none"));
+    }
+    if serial.chars().any(|c| c.is_control() || matches!(c, '\u{2028}' | '\u{2029}' | '\u{feff}')) {
+        return Err((
+            format!("the serial number {serial:?} contains control characters"),
+            "identify the device by its port instead: port = \"1-2.3\"",
+        ));
+    }
+    if serial.encode_utf16().count() > LONGEST {
+        return Err((
+            "the serial number is longer than a USB device can report".to_owned(),
+            "copy it from `rapid devices` or `lsusb -v`: at most 126 characters",
+        ));
+    }
+    Ok(())
+}
+
+/// `1-2.3`: bus, port at the root hub, ports at the hubs below (at most 5 hubs in a row, USB 2.0
+/// section 4.1.1).
+pub(crate) fn is_port(text: &str) -> bool {
+    let number = |part: &str| {
+        (1..=3).contains(&part.len()) && part.bytes().all(|byte| byte.is_ascii_digit()) && !part.starts_with('0')
+    };
+    let Some((bus, ports)) = text.split_once('-') else { return false };
+    number(bus) && ports.split('.').count() <= 6 && ports.split('.').all(number)
+}
+
+fn camera(section: &Section<'_>, problems: &mut Problems<'_>) -> CameraSpec {
+    if section.is_table("serial") {
+        let fix = "remove the table, or write node = \"serial\"";
+        section.report(problems, "serial", "a camera has no [...serial] table".to_owned(), fix);
+    }
+    let mut camera = CameraSpec { width: 640, height: 480, fps: 30, format: PixelFormat::Mjpg, controls: Vec::new() };
+    let Some(table) = section.table(problems, "camera") else { return camera };
+    table.allow(problems, &["width", "height", "fps", "format", "controls"]);
+    let mut integer = |key, most, default| {
+        table.integer(problems, key, 1..=most).and_then(|found| u32::try_from(found.value).ok()).unwrap_or(default)
+    };
+    camera.width = integer("width", 8192, camera.width);
+    camera.height = integer("height", 8192, camera.height);
+    camera.fps = integer("fps", 1000, camera.fps);
+    let formats = [("MJPG", PixelFormat::Mjpg), ("YUYV", PixelFormat::Yuyv), ("GREY", PixelFormat::Grey)];
+    camera.format = table.choice(problems, "format", &formats).unwrap_or(camera.format);
+    if let Some(controls) = table.table(problems, "controls") {
+        for (_, name, _) in controls.fields() {
+            if let Some(value) = controls.integer(problems, name, i64::MIN..=i64::MAX) {
+                camera.controls.push((name.to_owned(), value.value));
+            }
+        }
+    }
+    camera
+}
+
+fn serial(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<SerialSpec> {
+    if section.has("camera") {
+        let fix = "remove the table, or write node = \"camera\"";
+        section.report(problems, "camera", "a serial line has no [...camera] table".to_owned(), fix);
+    }
+    if !section.is_table("serial") {
+        let fix = format!("write [{}] with channels = the count of numbers in a message", section.child("serial"));
+        section.missing(problems, "the table of the serial line", &fix);
+        return None;
+    }
+    let table = section.table(problems, "serial")?;
+    table.allow(problems, &["baud", "framing", "parse", "channels"]);
+    let baud =
+        table.integer(problems, "baud", 50..=12_000_000).map_or(Some(115_200), |baud| baud.value.try_into().ok());
+    let framing = framing(&table, problems).unwrap_or(Framing::Line);
+    let parses = [("csv", Parse::Csv), ("json", Parse::Json), ("f32le", Parse::F32le), ("raw", Parse::Raw)];
+    let parse = table.choice(problems, "parse", &parses).unwrap_or(Parse::Csv);
+    let channels = table.integer(problems, "channels", 1..=1024).and_then(|count| usize::try_from(count.value).ok());
+    if parse == Parse::Raw {
+        if table.has("channels") {
+            let fix = "remove channels, or write parse = \"csv\", \"json\" or \"f32le\"";
+            table.report(problems, "channels", "raw messages are not looked into and have no channels".to_owned(), fix);
+        }
+        return Some(SerialSpec { baud: baud?, framing, parse, channels: 0 });
+    }
+    if !table.has("channels") {
+        table.missing(problems, "channels", "write channels = the count of numbers in a message");
+    }
+    let channels = channels?;
+    if let (Parse::F32le, Framing::Fixed(bytes)) = (parse, framing)
+        && bytes != 4 * channels
+    {
+        let message = format!("{channels} channels of f32le take {} bytes, not {bytes}", 4 * channels);
+        table.report(problems, "framing", message, format!("write framing = \"fixed {}\"", 4 * channels));
+    }
+    if let (Parse::F32le, Framing::Line) = (parse, framing) {
+        let message = "f32le messages cannot be framed by lines: a number may contain a newline".to_owned();
+        table.report(problems, "framing", message, format!("write framing = \"fixed {}\" or \"cobs\"", 4 * channels));
+    }
+    Some(SerialSpec { baud: baud?, framing, parse, channels })
+}
+
+fn framing(table: &Section<'_>, problems: &mut Problems<'_>) -> Option<Framing> {
+    /// More than any message of the devices this is for; bounds the buffer.
+    const LONGEST: usize = 65_536;
+    let text = table.text(problems, "framing")?.value;
+    match text.split_once(' ') {
+        None if text == "line" => return Some(Framing::Line),
+        None if text == "cobs" => return Some(Framing::Cobs),
+        Some(("fixed", bytes)) => {
+            if let Some(bytes) = bytes.trim().parse().ok().filter(|bytes| (1..=LONGEST).contains(bytes)) {
+                return Some(Framing::Fixed(bytes));
+            }
+            let message = format!("{:?} is not a message length", bytes.trim());
+            table.report(problems, "framing", message, format!("write \"fixed N\" with N from 1 to {LONGEST} bytes"));
+            return None;
+        }
+        _ => {}
+    }
+    let word = text.split(' ').next().unwrap_or_default();
+    let fix = match nearest(word, ["line", "cobs", "fixed"]) {
+        Some("fixed") => "write \"fixed N\" with N bytes a message, for example \"fixed 12\"".to_owned(),
+        Some(name) => format!("did you mean \"{name}\"?"),
+        None => "write one of: line, cobs, fixed N".to_owned(),
+    };
+    table.report(problems, "framing", format!("unknown framing {text:?}"), fix);
+    None
+}
+
+fn default_topic(kind: Option<Kind>, name: &str) -> String {
+    let kind = BUILT_IN.iter().find(|(_, built_in)| Some(*built_in) == kind).map_or("device", |(kind, _)| kind);
+    format!("/rapid/{kind}/{name}")
+}
+
+fn topic(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<String> {
+    /// Longest name of an iceoryx2 service is 255 bytes.
+    const LONGEST: usize = 200;
+    let topic = section.text(problems, "topic")?.value;
+    let legal = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '/');
+    let (message, fix) = if !topic.starts_with('/') {
+        (format!("topic {topic:?} does not begin with `/`"), format!("write {:?}", format!("/{topic}")))
+    } else if let Some(odd) = topic.chars().find(|c| !legal(*c)) {
+        (format!("topic {topic:?} contains {odd:?}"), "use letters, digits, `_`, `-` and `/`".to_owned())
+    } else if topic.ends_with('/') || topic.contains("//") {
+        (format!("topic {topic:?} has an empty part"), "write one `/` between names and none at the end".to_owned())
+    } else if topic.len() > LONGEST {
+        ("the topic is too long".to_owned(), format!("use at most {LONGEST} characters"))
+    } else {
+        return Some(topic.to_owned());
+    };
+    section.report(problems, "topic", message, fix);
+    None
+}
+
+/// Half a second, or ten periods of a slow camera; a serial line's rate is not known.
+fn default_stall(node: Option<&NodeSpec>) -> Duration {
+    const LEAST: Duration = Duration::from_millis(500);
+    match node {
+        Some(NodeSpec::Camera(camera)) => (Duration::from_secs(10) / camera.fps.max(1)).max(LEAST),
+        _ => LEAST,
+    }
+}
+
+fn max_bytes(section: &Section<'_>, node: Option<&NodeSpec>, problems: &mut Problems<'_>) -> u64 {
+    /// A JPEG picture of a small, noisy scene with its tables can exceed two bytes a pixel.
+    const SMALLEST_JPEG: u64 = 64 << 10;
+    let (default, least) = match node {
+        Some(NodeSpec::Camera(camera)) => {
+            let pixels = u64::from(camera.width) * u64::from(camera.height);
+            match camera.format {
+                PixelFormat::Mjpg => ((2 * pixels).max(SMALLEST_JPEG), 1024),
+                PixelFormat::Yuyv => (2 * pixels, 2 * pixels),
+                PixelFormat::Grey => (pixels, pixels),
+            }
+        }
+        Some(NodeSpec::Serial(serial)) => match (serial.parse, serial.framing) {
+            (Parse::Raw, Framing::Fixed(bytes)) => (bytes as u64, bytes as u64),
+            (Parse::Raw, _) => (4096, 1),
+            // Numbers travel as 64-bit floats.
+            _ => (8 * serial.channels as u64, 8 * serial.channels as u64),
+        },
+        None => (1, 1),
+    };
+    section.size(problems, "max_bytes", least..=256 << 20).unwrap_or(default)
+}
+
+/// About two seconds of pictures; a serial line may send a thousand samples a second.
+fn default_depth(node: Option<&NodeSpec>) -> u64 {
+    match node {
+        Some(NodeSpec::Camera(camera)) => (2 * u64::from(camera.fps)).clamp(16, 1024),
+        _ => 2048,
+    }
+}

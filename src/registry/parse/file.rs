@@ -1,0 +1,100 @@
+//! Getting the text of a configuration file, safely.
+
+use std::fs::{File, OpenOptions};
+use std::io::{ErrorKind, Read};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::path::Path;
+
+use crate::registry::diagnostic::RegistryErrors;
+use crate::registry::section::file_label;
+
+/// No registry is this large; the wrong file may be.
+const LARGEST: u64 = 1 << 20;
+
+/// The text of a file a person wrote. `when_missing` is the fix when there is none.
+pub(crate) fn read_file(path: &Path, when_missing: &str) -> Result<String, RegistryErrors> {
+    let label = file_label(Some(path), "");
+    let problem = |message: String, fix: String| RegistryErrors::whole_file(label.clone(), message, fix);
+    // Without waiting: opening a named pipe would wait for its writer.
+    let opened = OpenOptions::new().read(true).custom_flags(libc::O_NONBLOCK | libc::O_NOCTTY).open(path);
+    let mut file: File = opened.map_err(|error| match error.kind() {
+        ErrorKind::NotFound => problem("there is no such file".to_owned(), when_missing.to_owned()),
+        ErrorKind::PermissionDenied => problem(
+            "it may not be read by this user".to_owned(),
+            format!("ls -l {label} shows who may; chmod a+r {label} lets everyone"),
+        ),
+        _ => problem(format!("it cannot be opened: {error}"), "name another file".to_owned()),
+    })?;
+    let cannot_read =
+        |error: std::io::Error| problem(format!("it cannot be read: {error}"), "name another file".into());
+    let metadata = file.metadata().map_err(cannot_read)?;
+    if metadata.is_dir() {
+        return Err(problem("it is a directory".to_owned(), format!("name the file in it: {label}/devices.toml")));
+    }
+    if !metadata.is_file() {
+        return Err(problem("it is not a regular file".to_owned(), "name a file on disk".to_owned()));
+    }
+    let euid = rustix::process::geteuid().as_raw();
+    if let Some((message, fix)) = distrust(metadata.mode(), metadata.uid(), euid, &label) {
+        return Err(problem(message, fix));
+    }
+    let mut bytes = Vec::new();
+    file.by_ref().take(LARGEST + 1).read_to_end(&mut bytes).map_err(cannot_read)?;
+    if bytes.len() as u64 > LARGEST {
+        return Err(problem("it is larger than 1MiB".to_owned(), "is it the right file?".to_owned()));
+    }
+    String::from_utf8(bytes).map_err(|error| {
+        let line = error.as_bytes().iter().take(error.utf8_error().valid_up_to()).filter(|b| **b == b'\n').count() + 1;
+        problem(format!("it is not UTF-8 text (line {line})"), format!("iconv -f latin1 -t utf-8 {label}"))
+    })
+}
+
+/// As root we run with rights that whoever may write the file would gain.
+fn distrust(mode: u32, owner: u32, euid: u32, label: &str) -> Option<(String, String)> {
+    if euid != 0 {
+        return None;
+    }
+    if owner != 0 {
+        let message = format!("it belongs to user {owner}, who could change what root runs");
+        return Some((message, format!("chown root {label}")));
+    }
+    if mode & 0o022 != 0 {
+        let message = format!("other users may write to it (mode {:04o})", mode & 0o7777);
+        return Some((message, format!("chmod go-w {label}")));
+    }
+    None
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_root_distrusts_and_only_what_others_may_write() {
+        assert_eq!(distrust(0o100_666, 1000, 1000, "f"), None);
+        assert_eq!(distrust(0o100_644, 0, 0, "f"), None);
+        let fix = |mode, owner| distrust(mode, owner, 0, "f").map(|(_, fix)| fix);
+        assert_eq!(fix(0o100_664, 0).as_deref(), Some("chmod go-w f"));
+        assert_eq!(fix(0o100_646, 0).as_deref(), Some("chmod go-w f"));
+        assert_eq!(fix(0o100_644, 1000).as_deref(), Some("chown root f"));
+    }
+
+    #[test]
+    fn what_is_no_text_file_is_refused_with_a_reason() {
+        let dir = tempfile::tempdir().unwrap();
+        let message = |path: &Path| read_file(path, "write one").unwrap_err().to_string();
+        let missing = dir.path().join("none.toml");
+        assert_eq!(message(&missing), format!("{}: there is no such file\n    fix: write one", missing.display()));
+        assert!(message(dir.path()).contains("it is a directory"));
+        let path = dir.path().join("devices.toml");
+        std::fs::write(&path, b"a = 1\nb = \"\xff\"\n").unwrap();
+        assert!(message(&path).contains("it is not UTF-8 text (line 2)"), "{}", message(&path));
+        std::fs::write(&path, vec![b'#'; 1 + (1 << 20)]).unwrap();
+        assert!(message(&path).contains("larger than 1MiB"));
+        std::fs::write(&path, "a = 1\n").unwrap();
+        assert_eq!(read_file(&path, "").unwrap(), "a = 1\n");
+        let pipe = dir.path().join("pipe");
+        rustix::fs::mknodat(rustix::fs::CWD, &pipe, rustix::fs::FileType::Fifo, 0o600.into(), 0).unwrap();
+        assert!(message(&pipe).contains("not a regular file"));
+    }
+}

@@ -1,0 +1,124 @@
+//! Durations and sizes as people write them: a number and a unit.
+
+use std::time::Duration;
+
+const DURATIONS: [(&str, f64); 7] =
+    [("ns", 1e-9), ("us", 1e-6), ("ms", 1e-3), ("s", 1.0), ("min", 60.0), ("m", 60.0), ("h", 3600.0)];
+
+const SIZES: [(&str, u64); 7] = [
+    ("B", 1),
+    ("kB", 1_000),
+    ("MB", 1_000_000),
+    ("GB", 1_000_000_000),
+    ("KiB", 1 << 10),
+    ("MiB", 1 << 20),
+    ("GiB", 1 << 30),
+];
+
+/// `25ms`, `1.5s`, `2 min`. `None` without a unit, or when it is no duration.
+pub(super) fn parse_duration(text: &str) -> Option<Duration> {
+    let (number, unit) = split(text)?;
+    let (_, seconds) = DURATIONS.into_iter().find(|(name, _)| *name == unit)?;
+    // Rounded to whole ns: 0.025 s is not exactly representable.
+    let nanoseconds = (number * seconds * 1e9).round();
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "checked to be within 0..=1e18")]
+    (0.0..=1e18).contains(&nanoseconds).then(|| Duration::from_nanos(nanoseconds as u64))
+}
+
+/// `512MiB`, `64 KiB`, `2MB`. `None` without a unit, or when it is no size.
+pub(super) fn parse_size(text: &str) -> Option<u64> {
+    let (number, unit) = split(text)?;
+    let (_, bytes) = SIZES.into_iter().find(|(name, _)| name.eq_ignore_ascii_case(unit))?;
+    let total = (number * bytes as f64).round();
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "checked to be within 0..=2^60")]
+    (0.0..=1_152_921_504_606_846_976.0).contains(&total).then_some(total as u64)
+}
+
+fn split(text: &str) -> Option<(f64, &str)> {
+    let text = text.trim();
+    let end = text.find(|c: char| !(c.is_ascii_digit() || c == '.'))?;
+    let (number, unit) = text.split_at(end);
+    Some((number.parse().ok()?, unit.trim_start()))
+}
+
+/// A duration in its largest whole unit.
+pub(super) fn show_duration(duration: Duration) -> String {
+    let nanoseconds = duration.as_nanos();
+    for (unit, in_ns) in
+        [("h", 3_600_000_000_000), ("min", 60_000_000_000), ("s", 1_000_000_000), ("ms", 1_000_000), ("us", 1_000)]
+    {
+        if nanoseconds >= in_ns && nanoseconds.is_multiple_of(in_ns) {
+            return format!("{}{unit}", nanoseconds / in_ns);
+        }
+    }
+    if nanoseconds == 0 { "0s".to_owned() } else { format!("{nanoseconds}ns") }
+}
+
+/// A size in the largest binary unit of which it is at least one, to one decimal.
+pub(super) fn show_size(bytes: u64) -> String {
+    for (unit, shift) in [("GiB", 30), ("MiB", 20), ("KiB", 10)] {
+        let one = 1_u64 << shift;
+        if bytes >= one {
+            let whole = bytes.is_multiple_of(one);
+            return if whole {
+                format!("{}{unit}", bytes / one)
+            } else {
+                format!("{:.1}{unit}", bytes as f64 / one as f64)
+            };
+        }
+    }
+    format!("{bytes}B")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn durations_need_a_number_and_a_unit() {
+        for (text, expected) in [
+            ("25ms", Some(Duration::from_millis(25))),
+            ("1.5s", Some(Duration::from_millis(1500))),
+            ("2 min", Some(Duration::from_secs(120))),
+            ("0s", Some(Duration::ZERO)),
+            ("250us", Some(Duration::from_micros(250))),
+            ("25", None),
+            ("", None),
+            ("ms", None),
+            ("-5ms", None),
+            ("1..5s", None),
+            ("5 lightyears", None),
+            ("999999999999999999h", None),
+            ("1e3s", None),
+        ] {
+            assert_eq!(parse_duration(text), expected, "{text:?}");
+        }
+    }
+
+    #[test]
+    fn sizes_need_a_number_and_a_unit() {
+        for (text, expected) in [
+            ("512MiB", Some(512 << 20)),
+            ("64 kib", Some(64 << 10)),
+            ("2MB", Some(2_000_000)),
+            ("1.5GiB", Some(3 << 29)),
+            ("4096B", Some(4096)),
+            ("4096", None),
+            ("MiB", None),
+            ("99999999999999GiB", None),
+        ] {
+            assert_eq!(parse_size(text), expected, "{text:?}");
+        }
+    }
+
+    #[test]
+    fn what_is_shown_can_be_read_again() {
+        for ms in [1_u64, 25, 500, 2_000, 60_000, 90_000, 3_600_000] {
+            let duration = Duration::from_millis(ms);
+            assert_eq!(parse_duration(&show_duration(duration)), Some(duration));
+        }
+        assert_eq!(show_size(512 << 20), "512MiB");
+        assert_eq!(show_size(614_400), "600KiB");
+        assert_eq!(show_size(1_500_000), "1.4MiB");
+    }
+}

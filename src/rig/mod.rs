@@ -1,0 +1,24 @@
+//! The rig: turns hot-plug events into running device streams and the physical mask.
+//!
+//! One task owns every slot. It takes hot-plug events, the reports and ends of streams, commands and
+//! deadlines, applies them to the slots, and does what the slots say.
+//!
+//! Invariant: only this module decides the mask.
+//! Invariant: nothing here waits for a device; a stream that is to end is told so and forgotten.
+//! Invariant: the end of a stream, by value or by panic, is an event like any other.
+
+mod owner;
+pub mod presence;
+pub mod slot;
+mod stream;
+
+pub use owner::{Rig, RigError};
+
+use crate::modality::ModalityId;
+
+/// What the rig may be asked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RigCommand {
+    /// Start a failed device again.
+    Restart(ModalityId),
+}

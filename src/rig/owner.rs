@@ -1,0 +1,375 @@
+//! The task that owns all slots.
+
+use std::collections::HashMap;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
+use std::time::Duration;
+
+use futures::StreamExt;
+use tokio::sync::mpsc;
+use tokio::task::{Id, JoinError, JoinSet};
+use tokio::time::{Instant, MissedTickBehavior, interval, sleep, timeout};
+use tokio_util::sync::CancellationToken;
+
+use super::RigCommand;
+use super::presence::{JsonDevice, Presence, PresenceError};
+use super::slot::{Effects, End, Input, Slot};
+use super::stream::{Report, Reported, Stream};
+use crate::bus::{Bus, TopicId, Writer};
+use crate::hotplug::{HotplugError, HotplugEvent, HotplugStream, Witness};
+use crate::mask::PhysicalMask;
+use crate::modality::ModalityId;
+use crate::registry::{Assigner, Assignment, Attachment, DeviceSpec, Registry};
+use crate::sample::Epoch;
+use crate::status::{Board, Level, SlotState, What};
+use crate::time::Stamp;
+
+/// The JSON file is written this often, and at every change.
+const JSON_PERIOD: Duration = Duration::from_secs(1);
+/// At the end, streams have this long to close their devices before they are abandoned.
+const STOP_LIMIT: Duration = Duration::from_millis(500);
+/// Reports that may wait; streams report a few times in their life.
+const REPORT_DEPTH: usize = 1024;
+
+/// Why the rig cannot go on.
+#[derive(Debug, thiserror::Error)]
+pub enum RigError {
+    /// Plugging can no longer be watched.
+    #[error(transparent)]
+    Hotplug(#[from] HotplugError),
+    /// The mask cannot be published.
+    #[error(transparent)]
+    Presence(#[from] PresenceError),
+}
+
+/// Owner of every device's life and of the mask.
+#[derive(Debug)]
+pub struct Rig {
+    modalities: Vec<Modality>,
+    assigner: Assigner,
+    presence: Presence,
+    board: Arc<Board>,
+    mask: PhysicalMask,
+    streams: JoinSet<(End, String)>,
+    /// Which stream a task is.
+    tasks: HashMap<Id, (ModalityId, Epoch)>,
+    reports: mpsc::Sender<Reported>,
+}
+
+/// A slot and what belongs to it.
+#[derive(Debug)]
+struct Modality {
+    spec: Arc<DeviceSpec>,
+    slot: Slot<Attachment>,
+    writer: Arc<Writer>,
+    sequence: Arc<AtomicU64>,
+    /// Tells the running stream to end.
+    stop: CancellationToken,
+    /// What was agreed with the device, or why it does not run.
+    detail: String,
+}
+
+impl Rig {
+    /// A rig with every slot empty, which publishes through `presence`.
+    #[must_use]
+    pub fn new(registry: &Registry, bus: &Bus, presence: Presence, board: Arc<Board>) -> Self {
+        let modality = |spec: &DeviceSpec| {
+            let writer = bus.writer(TopicId::Modality(spec.id))?;
+            Some(Modality {
+                spec: Arc::new(spec.clone()),
+                slot: Slot::new(registry.rig.cooldown),
+                writer,
+                sequence: Arc::new(AtomicU64::new(0)),
+                stop: CancellationToken::new(),
+                detail: String::new(),
+            })
+        };
+        Self {
+            // The bus was opened from the same registry: it has a writer for each of them.
+            modalities: registry.devices.iter().filter_map(modality).collect(),
+            assigner: Assigner::new(registry),
+            presence,
+            board,
+            mask: PhysicalMask::EMPTY,
+            streams: JoinSet::new(),
+            tasks: HashMap::new(),
+            reports: mpsc::channel(1).0,
+        }
+    }
+
+    /// Runs until `shutdown`, then ends every stream. The mask stays published, as it was, until
+    /// the rig is dropped: what is recorded to the end has its mask beside it.
+    ///
+    /// # Errors
+    /// When plugging can no longer be watched.
+    pub async fn run(
+        &mut self,
+        mut hotplug: HotplugStream,
+        mut commands: mpsc::Receiver<RigCommand>,
+        shutdown: CancellationToken,
+    ) -> Result<(), RigError> {
+        let (reports, mut reported) = mpsc::channel(REPORT_DEPTH);
+        self.reports = reports;
+        let mut json = interval(JSON_PERIOD);
+        json.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let result = loop {
+            let deadline = self.next_deadline();
+            tokio::select! {
+                // Shutdown first, then the earliest witnesses of an unplug, then the rest.
+                biased;
+                () = shutdown.cancelled() => break Ok(()),
+                Some(ended) = self.streams.join_next_with_id(), if !self.streams.is_empty() => self.stream_ended(ended),
+                event = hotplug.next() => match event {
+                    Some(Ok(event)) => self.hotplug(event),
+                    Some(Err(error)) => break Err(error.into()),
+                    None => break Ok(()),
+                },
+                Some((id, epoch, report)) = reported.recv() => self.report(id, epoch, report),
+                Some(RigCommand::Restart(id)) = commands.recv() => self.apply(id, Input::Restart),
+                () = sleep(deadline.since(Stamp::now())) => self.deadlines_passed(),
+                _ = json.tick() => self.write_json(),
+            }
+        };
+        self.stop_streams().await;
+        result
+    }
+
+    fn hotplug(&mut self, event: HotplugEvent) {
+        match event {
+            HotplugEvent::Added(attachment) => {
+                if self.assigner.replaces(&attachment) {
+                    self.removed(&attachment.syspath, "enumeration");
+                }
+                match self.assigner.attach(&attachment) {
+                    Assignment::Entry(id) => self.attached(id, attachment),
+                    Assignment::Waiting { reason } | Assignment::Unregistered { reason } => {
+                        let usb = &attachment.usb;
+                        let serial = usb.serial.as_deref().unwrap_or("no serial");
+                        let device = format!("{:04x}:{:04x} ({serial}) at {}", usb.vid, usb.pid, usb.port);
+                        tracing::info!(%device, %reason, "not used");
+                        self.board.announce(What::Unregistered { device, reason });
+                    }
+                    Assignment::WrongNode { reason } => tracing::debug!(%reason, "node not used"),
+                }
+            }
+            HotplugEvent::Removed { syspath, witness, .. } => self.removed(
+                &syspath,
+                match witness {
+                    Witness::Kernel => "kernel",
+                    Witness::Udev => "udev",
+                    Witness::Enumeration => "enumeration",
+                    Witness::Script => "script",
+                },
+            ),
+        }
+    }
+
+    fn attached(&mut self, id: ModalityId, attachment: Attachment) {
+        let Some(modality) = self.modality(id) else { return };
+        if modality.slot.attached() == Some(&attachment) {
+            return;
+        }
+        let what = What::Attach {
+            device: modality.spec.name.clone(),
+            bit: id,
+            node: attachment.node.label(),
+            port: attachment.usb.port.clone(),
+            serial: attachment.usb.serial.clone(),
+        };
+        self.board.announce(what);
+        self.apply(id, Input::Attached(attachment));
+    }
+
+    fn removed(&mut self, syspath: &Path, witness: &str) {
+        let detached = self.assigner.detach(syspath);
+        for id in detached.freed {
+            // Where the stream was first, the unplug has been told already.
+            if self.modality(id).is_some_and(|modality| modality.slot.state() != SlotState::Absent) {
+                self.announce_detach(id, witness);
+            }
+            self.apply(id, Input::Detached);
+        }
+        for (id, attachment) in detached.assigned {
+            self.attached(id, attachment);
+        }
+    }
+
+    fn announce_detach(&mut self, id: ModalityId, witness: &str) {
+        let Some(modality) = self.modality(id) else { return };
+        let (device, witness) = (modality.spec.name.clone(), witness.to_owned());
+        self.board.announce(What::Detach { device, bit: id, witness });
+    }
+
+    fn stream_ended(&mut self, ended: Result<(Id, (End, String)), JoinError>) {
+        let (task, end, reason) = match ended {
+            Ok((task, (end, reason))) => (task, end, reason),
+            Err(error) if error.is_panic() => {
+                (error.id(), End::Retry, "its reader panicked; please report this".to_owned())
+            }
+            Err(error) => (error.id(), End::Retry, error.to_string()),
+        };
+        let Some((id, epoch)) = self.tasks.remove(&task) else { return };
+        let Some(modality) = self.modality(id) else { return };
+        if modality.slot.epoch() != epoch {
+            return;
+        }
+        modality.detail = reason;
+        if end == End::Gone && modality.slot.state() != SlotState::Absent {
+            self.announce_detach(id, "stream");
+        }
+        self.apply(id, Input::Ended(epoch, end));
+    }
+
+    fn report(&mut self, id: ModalityId, epoch: Epoch, report: Report) {
+        let Some(modality) = self.modality(id) else { return };
+        if modality.slot.epoch() != epoch {
+            return;
+        }
+        match report {
+            Report::Opened(description) => {
+                modality.detail = description;
+                self.show(id);
+            }
+            Report::Started => self.apply(id, Input::Started(epoch)),
+            Report::Stalled => self.apply(id, Input::Stalled(epoch)),
+            Report::Resumed => self.apply(id, Input::Resumed(epoch)),
+            Report::Refused(reason) => {
+                let text = format!("{}: samples are lost: {reason}", modality.spec.name);
+                tracing::error!("{text}");
+                self.board.announce(What::Log { level: Level::Error, text });
+            }
+        }
+    }
+
+    fn deadlines_passed(&mut self) {
+        let now = Stamp::now();
+        let due = |modality: &&Modality| modality.slot.deadline().is_some_and(|deadline| deadline <= now);
+        for id in self.modalities.iter().filter(due).map(|modality| modality.spec.id).collect::<Vec<_>>() {
+            self.apply(id, Input::Timer);
+        }
+    }
+
+    /// The next moment a slot wants to be woken; far away if none does.
+    fn next_deadline(&self) -> Stamp {
+        let deadlines = self.modalities.iter().filter_map(|modality| modality.slot.deadline());
+        deadlines.min().unwrap_or_else(|| Stamp::now().after(Duration::from_secs(3600)))
+    }
+
+    /// Applies an input to a slot, does what it says, and publishes the mask if it changed.
+    fn apply(&mut self, id: ModalityId, input: Input<Attachment>) {
+        let now = Stamp::now();
+        let Some(modality) = self.modality(id) else { return };
+        let before = modality.slot.state();
+        let Effects { stop, start } = modality.slot.apply(input, now);
+        let (state, present) = (modality.slot.state(), modality.slot.is_present());
+        // The mask comes before everything else that an unplug brings with it.
+        let mask = self.mask.with(id, present);
+        if mask != self.mask {
+            self.mask = mask;
+            self.presence.publish(mask);
+        }
+        let Some(modality) = self.modality(id) else { return };
+        if stop.is_some() {
+            modality.stop.cancel();
+        }
+        if state == SlotState::Backoff
+            && let Some(deadline) = modality.slot.deadline()
+        {
+            let wait = deadline.since(now).as_secs_f64();
+            let reason = if modality.detail.is_empty() { "cooldown" } else { modality.detail.as_str() };
+            modality.detail = format!("{reason}; starts in {wait:.1} s");
+        }
+        if state == SlotState::Absent {
+            modality.detail.clear();
+        }
+        if let Some((epoch, attachment)) = start {
+            modality.detail = format!("opening {}", attachment.node.label());
+            self.start(id, epoch, attachment);
+        }
+        if state != before {
+            self.show(id);
+            self.announce_state(id);
+            self.write_json();
+        }
+    }
+
+    fn start(&mut self, id: ModalityId, epoch: Epoch, attachment: Attachment) {
+        let (board, reports) = (Arc::clone(&self.board), self.reports.clone());
+        let Some(modality) = self.modality(id) else { return };
+        modality.stop = CancellationToken::new();
+        let stream = Stream {
+            spec: Arc::clone(&modality.spec),
+            attachment,
+            epoch,
+            writer: Arc::clone(&modality.writer),
+            sequence: Arc::clone(&modality.sequence),
+            board,
+            reports,
+            stop: modality.stop.clone(),
+        };
+        let task = self.streams.spawn(stream.run());
+        self.tasks.insert(task.id(), (id, epoch));
+    }
+
+    fn show(&mut self, id: ModalityId) {
+        let board = Arc::clone(&self.board);
+        let Some(modality) = self.modality(id) else { return };
+        board.set_slot(id, modality.slot.state(), modality.slot.epoch(), &modality.detail);
+    }
+
+    fn announce_state(&mut self, id: ModalityId) {
+        let (mask, count, board) = (self.mask, self.modalities.len(), Arc::clone(&self.board));
+        let Some(modality) = self.modality(id) else { return };
+        let (device, detail, state) = (modality.spec.name.clone(), modality.detail.clone(), modality.slot.state());
+        match state {
+            SlotState::Failed => tracing::error!(%device, %detail, "failed"),
+            SlotState::Stalled => tracing::warn!(%device, "stalled: attached, but no samples come"),
+            SlotState::Backoff => tracing::warn!(%device, %detail, "waits"),
+            _ => tracing::info!(%device, ?state, %detail),
+        }
+        board.announce(What::State { device, bit: id, state, mask: mask.hex(count), detail });
+    }
+
+    fn write_json(&self) {
+        let device = |modality: &Modality| JsonDevice {
+            name: modality.spec.name.clone(),
+            bit: modality.spec.id,
+            online: modality.slot.is_present(),
+            usb_connected: modality.slot.attached().is_some(),
+            state: modality.slot.state(),
+        };
+        let devices: Vec<_> = self.modalities.iter().map(device).collect();
+        let sequence = self.board.mask_sequence();
+        if let Err(error) = self.presence.write_json(self.mask, sequence, &devices) {
+            tracing::debug!(%error, "the mask's JSON file is not written");
+        }
+    }
+
+    /// Tells every stream to end and gives them a moment to close their devices.
+    async fn stop_streams(&mut self) {
+        for modality in &self.modalities {
+            modality.stop.cancel();
+        }
+        let until = Instant::now() + STOP_LIMIT;
+        while !self.streams.is_empty() {
+            let left = until.saturating_duration_since(Instant::now());
+            let Ok(Some(ended)) = timeout(left, self.streams.join_next_with_id()).await else {
+                let slow = self.tasks.values().filter_map(|(id, _)| self.name(*id)).collect::<Vec<_>>().join(", ");
+                tracing::warn!(devices = %slow, "did not close in time and are abandoned");
+                self.streams.detach_all();
+                return;
+            };
+            let task = ended.map_or_else(|error| error.id(), |(task, _)| task);
+            self.tasks.remove(&task);
+        }
+    }
+
+    fn name(&self, id: ModalityId) -> Option<&str> {
+        self.modalities.iter().find(|modality| modality.spec.id == id).map(|modality| modality.spec.name.as_str())
+    }
+
+    fn modality(&mut self, id: ModalityId) -> Option<&mut Modality> {
+        self.modalities.iter_mut().find(|modality| modality.spec.id == id)
+    }
+}

@@ -1,0 +1,189 @@
+//! The mask's file: made without following links, locked, written so that no reader sees half.
+
+use std::fs::File;
+use std::io::ErrorKind;
+use std::os::unix::fs::{FileExt, MetadataExt};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{Ordering, fence};
+
+use rustix::fs::{FlockOperation, Mode, OFlags};
+use rustix::io::Errno;
+
+use crate::mask::{MaskRecord, MaskRecordError, PhysicalMask, RECORD_LEN};
+
+/// A publisher that dies between making and locking a file leaves the next one to try again.
+const TRIES: usize = 10;
+/// A reader that meets a write in progress tries again.
+const READ_TRIES: usize = 1000;
+
+/// Why the mask cannot be published or read.
+#[derive(Debug, thiserror::Error)]
+pub enum PresenceError {
+    /// Another process publishes there.
+    #[error(
+        "{path}: another rapid{} publishes the physical mask of this rig; end it first, or give this one \
+         another name with --instance", pid.map(|pid| format!(" (pid {pid})")).unwrap_or_default()
+    )]
+    Taken {
+        /// The file.
+        path: PathBuf,
+        /// Who, if it can be found out.
+        pid: Option<u32>,
+    },
+    /// Something other than our own file lies there.
+    #[error("{path}: {what}; remove it: rm {path}")]
+    Foreign {
+        /// The file.
+        path: PathBuf,
+        /// What it is.
+        what: &'static str,
+    },
+    /// The file cannot be made, written or read.
+    #[error("{path}: {error}")]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system says.
+        error: std::io::Error,
+    },
+    /// Nobody publishes there.
+    #[error("{path}: there is no physical mask: no rapid runs on this machine")]
+    NotPublished {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The file does not hold a mask.
+    #[error("{path}: {error}")]
+    Record {
+        /// The file.
+        path: PathBuf,
+        /// Why not.
+        error: MaskRecordError,
+    },
+    /// A write was in progress at every look: its writer died in it.
+    #[error("{path}: the record is torn: its writer died while writing")]
+    Torn {
+        /// The file.
+        path: PathBuf,
+    },
+}
+
+/// The published file, held open and locked.
+#[derive(Debug)]
+pub(super) struct MaskFile {
+    path: PathBuf,
+    file: File,
+    record: MaskRecord,
+}
+
+impl MaskFile {
+    /// Makes the file, or takes over one whose process died.
+    pub(super) fn create(path: &Path, device_count: u8) -> Result<Self, PresenceError> {
+        let file = take(path)?;
+        let record = MaskRecord { device_count, generation: 0, mask: PhysicalMask::EMPTY, realtime_ns: 0, sequence: 0 };
+        let io = |error| PresenceError::Io { path: path.to_owned(), error };
+        // A whole record of the dead process stays readable until it is overwritten.
+        if file.metadata().map_err(io)?.len() != RECORD_LEN as u64 {
+            file.set_len(0).map_err(io)?;
+            file.write_all_at(&record.to_bytes(), 0).map_err(io)?;
+        }
+        Ok(Self { path: path.to_owned(), file, record })
+    }
+
+    /// Publishes `mask`; the sequence number it got.
+    pub(super) fn publish(&mut self, mask: PhysicalMask, realtime_ns: u64) -> std::io::Result<u64> {
+        self.record.generation = self.record.generation.wrapping_add(2);
+        self.record.mask = mask;
+        self.record.realtime_ns = realtime_ns;
+        self.record.sequence += 1;
+        let bytes = self.record.to_bytes();
+        let odd = self.record.generation.wrapping_sub(1).to_le_bytes();
+        // A reader maps the page or reads it on another core: the order of the three writes is what
+        // makes the generation mean something. The head, with the magic, goes with the first.
+        let mut head = [0; 8];
+        head.copy_from_slice(&bytes[..8]);
+        head[6..8].copy_from_slice(&odd);
+        self.file.write_all_at(&head, 0)?;
+        fence(Ordering::SeqCst);
+        self.file.write_all_at(&bytes[8..], 8)?;
+        fence(Ordering::SeqCst);
+        self.file.write_all_at(&bytes[6..8], 6)?;
+        Ok(self.record.sequence)
+    }
+}
+
+impl Drop for MaskFile {
+    fn drop(&mut self) {
+        // While the lock is held, so that nobody else's file is removed.
+        let _ = std::fs::remove_file(&self.path);
+    }
+}
+
+fn take(path: &Path) -> Result<File, PresenceError> {
+    let io = |error: Errno| PresenceError::Io { path: path.to_owned(), error: error.into() };
+    let foreign = |what| PresenceError::Foreign { path: path.to_owned(), what };
+    for _ in 0..TRIES {
+        let flags = OFlags::RDWR | OFlags::CREATE | OFlags::NOFOLLOW | OFlags::CLOEXEC | OFlags::NONBLOCK;
+        let mode = Mode::RUSR | Mode::WUSR | Mode::RGRP | Mode::ROTH;
+        let file = match rustix::fs::open(path, flags, mode) {
+            Ok(descriptor) => File::from(descriptor),
+            Err(Errno::LOOP) => return Err(foreign("it is a symbolic link, and rapid follows none there")),
+            Err(Errno::ISDIR) => return Err(foreign("it is a folder")),
+            Err(error) => return Err(io(error)),
+        };
+        let opened = file.metadata().map_err(|error| PresenceError::Io { path: path.to_owned(), error })?;
+        if !opened.is_file() || opened.nlink() > 1 {
+            return Err(foreign("it is not an ordinary file of its own"));
+        }
+        match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {
+            Ok(()) => {}
+            Err(Errno::WOULDBLOCK) => {
+                return Err(PresenceError::Taken { path: path.to_owned(), pid: holder(opened.ino()) });
+            }
+            Err(error) => return Err(io(error)),
+        }
+        // A publisher that ended meanwhile has removed the name: what we locked is no longer there.
+        if std::fs::symlink_metadata(path).is_ok_and(|named| named.ino() == opened.ino()) {
+            // The mode asked for at creation is subject to the umask; readers need all of it.
+            rustix::fs::fchmod(&file, mode).map_err(io)?;
+            return Ok(file);
+        }
+    }
+    Err(PresenceError::Taken { path: path.to_owned(), pid: None })
+}
+
+/// Who holds a lock on the file with this inode, from /proc/locks (proc(5)): the fifth field is the
+/// pid, the sixth `major:minor:inode`.
+fn holder(inode: u64) -> Option<u32> {
+    let locks = std::fs::read_to_string("/proc/locks").ok()?;
+    locks.lines().find_map(|line| {
+        let fields: Vec<&str> = line.split_whitespace().collect();
+        let [_, "FLOCK", _, "WRITE", pid, file, ..] = fields[..] else { return None };
+        (file.rsplit(':').next()?.parse() == Ok(inode)).then(|| pid.parse().ok())?
+    })
+}
+
+/// Reads the published record, whole.
+///
+/// # Errors
+/// When nobody publishes at `path`, or what lies there is not a mask.
+pub fn read_mask(path: &Path) -> Result<MaskRecord, PresenceError> {
+    let io = |error: std::io::Error| match error.kind() {
+        ErrorKind::NotFound => PresenceError::NotPublished { path: path.to_owned() },
+        _ => PresenceError::Io { path: path.to_owned(), error },
+    };
+    let file = File::open(path).map_err(io)?;
+    for _ in 0..READ_TRIES {
+        let mut bytes = [0; RECORD_LEN];
+        file.read_exact_at(&mut bytes, 0).map_err(io)?;
+        fence(Ordering::SeqCst);
+        let mut generation = [0; 2];
+        file.read_exact_at(&mut generation, 6).map_err(io)?;
+        if bytes[6] % 2 == 0 && bytes[6..8] == generation {
+            return MaskRecord::from_bytes(&bytes)
+                .map_err(|error| PresenceError::Record { path: path.to_owned(), error });
+        }
+        std::thread::yield_now();
+    }
+    Err(PresenceError::Torn { path: path.to_owned() })
+}

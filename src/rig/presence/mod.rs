@@ -1,0 +1,179 @@
+//! Presence: publishes the physical mask for other processes, at 500 Hz and at every change.
+//!
+//! A named thread, `mask`, keeps the beat on absolute deadlines of 2 ms; it owns the file in shared
+//! memory and the mask's topic on the bus. The rig tells it a new mask by an atomic and a wake-up
+//! and never waits for it.
+//!
+//! Invariant: nothing the thread does can be held up by a device, a disk or a child process.
+//! Invariant: a reader that compares the generation before and after never sees a torn record.
+//! Invariant: one publisher a file: a lock says so, and dies with its process.
+
+mod file;
+mod json;
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use thread_priority::unix::{
+    RealtimeThreadSchedulePolicy, ThreadSchedulePolicy, set_thread_priority_and_policy, thread_native_id,
+};
+use thread_priority::{ThreadPriority, ThreadPriorityValue};
+
+use crate::bus::Writer;
+use crate::mask::PhysicalMask;
+use crate::sample::{Encoding, SampleHeader};
+use crate::status::Board;
+use crate::time::{Stamp, realtime_ns};
+
+pub use file::{PresenceError, read_mask};
+pub use json::{JsonDevice, json_path};
+
+use file::MaskFile;
+
+/// Time between two publications: 500 Hz (paper, section "Physical Mask Generator").
+pub const PERIOD: Duration = Duration::from_millis(2);
+/// `SampleHeader::id` of a mask sample: no modality.
+pub const MASK_ID: u32 = u32::MAX;
+/// Above ordinary threads, below the kernel's own interrupt threads (50).
+const FIFO_PRIORITY: u8 = 40;
+
+/// The publisher. Dropping it publishes an empty mask and removes the files.
+#[derive(Debug)]
+pub struct Presence {
+    shared: Arc<Shared>,
+    thread: Option<JoinHandle<()>>,
+    json: PathBuf,
+}
+
+#[derive(Debug, Default)]
+struct Shared {
+    mask: AtomicU64,
+    stop: AtomicBool,
+}
+
+impl Presence {
+    /// Takes the file at `path` and begins to publish an empty mask of `device_count` devices.
+    ///
+    /// # Errors
+    /// When another live process publishes there (its pid is named), or the file cannot be made.
+    pub fn start(path: &Path, device_count: u8, writer: Arc<Writer>, board: Arc<Board>) -> Result<Self, PresenceError> {
+        let file = MaskFile::create(path, device_count)?;
+        let shared = Arc::new(Shared::default());
+        let beat = Beat { shared: Arc::clone(&shared), file, writer, board };
+        let thread = std::thread::Builder::new()
+            .name("mask".to_owned())
+            .spawn(move || beat.run())
+            .map_err(|error| PresenceError::Io { path: path.clone(), error })?;
+        Ok(Self { shared, thread: Some(thread), json: json_path(&path) })
+    }
+
+    /// Publishes `mask` at once, and from then on at every beat. Does not wait.
+    pub fn publish(&self, mask: PhysicalMask) {
+        self.shared.mask.store(mask.0, Ordering::Release);
+        if let Some(thread) = &self.thread {
+            thread.thread().unpark();
+        }
+    }
+
+    /// Writes the file for people: a temporary one, renamed.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn write_json(&self, mask: PhysicalMask, sequence: u64, devices: &[JsonDevice]) -> Result<(), PresenceError> {
+        json::write(&self.json, mask, sequence, devices)
+    }
+}
+
+impl Drop for Presence {
+    fn drop(&mut self) {
+        self.shared.mask.store(0, Ordering::Release);
+        self.shared.stop.store(true, Ordering::Release);
+        if let Some(thread) = self.thread.take() {
+            thread.thread().unpark();
+            // The thread never waits for anything but its deadline. A panic of its own was reported
+            // by the hook; there is nothing to add here.
+            let _ = thread.join();
+        }
+        let _ = std::fs::remove_file(&self.json);
+    }
+}
+
+/// What the thread owns.
+struct Beat {
+    shared: Arc<Shared>,
+    file: MaskFile,
+    writer: Arc<Writer>,
+    board: Arc<Board>,
+}
+
+impl Beat {
+    fn run(mut self) {
+        match use_fifo() {
+            Ok(()) => tracing::debug!("thread mask runs under SCHED_FIFO"),
+            Err(reason) => tracing::debug!(reason, "thread mask runs under the ordinary scheduler"),
+        }
+        let mut due = Stamp::now();
+        let mut published = None;
+        let mut failed = false;
+        loop {
+            let stop = self.shared.stop.load(Ordering::Acquire);
+            let mask = PhysicalMask(self.shared.mask.load(Ordering::Acquire));
+            let now = Stamp::now();
+            if now < due && published == Some(mask) && !stop {
+                std::thread::park_timeout(due.since(now));
+                continue;
+            }
+            match self.publish(mask, now) {
+                Ok(()) => failed = false,
+                Err(error) if !failed => {
+                    // Once, not 500 times a second.
+                    failed = true;
+                    tracing::error!(%error, "the physical mask is not published");
+                }
+                Err(_) => {}
+            }
+            published = Some(mask);
+            if stop {
+                return;
+            }
+            if now >= due {
+                due = due.after(PERIOD);
+                if due <= now {
+                    // Held up for a period or more: go on from here rather than in a burst.
+                    due = now.after(PERIOD);
+                }
+            }
+        }
+    }
+
+    fn publish(&mut self, mask: PhysicalMask, now: Stamp) -> Result<(), String> {
+        let sequence = self.file.publish(mask, realtime_ns()).map_err(|error| error.to_string())?;
+        self.board.set_mask(mask, sequence);
+        let header = SampleHeader {
+            seq: sequence,
+            capture_ns: now.0,
+            recv_ns: now.0,
+            id: MASK_ID,
+            encoding: Encoding::Mask as u32,
+            ..SampleHeader::default()
+        };
+        let mut payload = [0; 16];
+        payload[..8].copy_from_slice(&mask.0.to_le_bytes());
+        payload[8..].copy_from_slice(&sequence.to_le_bytes());
+        self.writer.publish(header, &payload).map_err(|error| error.to_string())
+    }
+}
+
+/// Puts the calling thread under `SCHED_FIFO`, which needs `CAP_SYS_NICE` or an `RLIMIT_RTPRIO`.
+fn use_fifo() -> Result<(), String> {
+    let priority = ThreadPriorityValue::try_from(FIFO_PRIORITY)?;
+    let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
+    set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Crossplatform(priority), policy)
+        .map_err(|error| format!("{error:?}"))
+}
+
+#[cfg(test)]
+mod tests;

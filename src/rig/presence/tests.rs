@@ -1,0 +1,106 @@
+use super::*;
+use std::sync::atomic::AtomicU32;
+
+/// A path of this test's own in shared memory.
+fn path() -> PathBuf {
+    static NEXT: AtomicU32 = AtomicU32::new(0);
+    let number = NEXT.fetch_add(1, Ordering::Relaxed);
+    PathBuf::from(format!("/dev/shm/rapid_test_mask_{}_{number}", std::process::id()))
+}
+
+#[test]
+fn what_is_published_is_read_back_and_goes_with_the_publisher() {
+    let path = path();
+    let mut file = MaskFile::create(&path, 3).expect("create");
+    for round in 1..=5 {
+        file.publish(PhysicalMask(round), 1_000 + round).expect("publish");
+        let record = read_mask(&path).expect("read");
+        assert_eq!((record.mask.0, record.sequence, record.realtime_ns), (round, round, 1_000 + round));
+        assert_eq!((record.device_count, record.generation % 2), (3, 0));
+    }
+    assert_eq!(std::fs::metadata(&path).expect("file").len(), 32);
+    drop(file);
+    assert!(matches!(read_mask(&path), Err(PresenceError::NotPublished { .. })));
+}
+
+#[test]
+fn a_second_publisher_is_told_the_pid_of_the_first() {
+    let path = path();
+    let _first = MaskFile::create(&path, 1).expect("first");
+    let error = MaskFile::create(&path, 1).expect_err("second");
+    assert!(error.to_string().contains(&format!("(pid {})", std::process::id())), "{error}");
+}
+
+#[test]
+fn the_file_of_a_dead_process_is_taken_over() {
+    let path = path();
+    std::fs::write(&path, [0xff; 7]).expect("leftover");
+    let mut file = MaskFile::create(&path, 1).expect("take over");
+    file.publish(PhysicalMask(1), 1).expect("publish");
+    assert_eq!(read_mask(&path).expect("read").sequence, 1);
+}
+
+#[test]
+fn links_are_not_followed() {
+    let (path, target) = (path(), path());
+    std::fs::write(&target, "precious").expect("target");
+    std::os::unix::fs::symlink(&target, &path).expect("link");
+    let error = MaskFile::create(&path, 1).expect_err("link");
+    assert!(matches!(error, PresenceError::Foreign { .. }), "{error}");
+    assert_eq!(std::fs::read_to_string(&target).expect("target"), "precious");
+    std::fs::remove_file(&path).expect("clean");
+    std::fs::hard_link(&target, &path).expect("hard link");
+    assert!(matches!(MaskFile::create(&path, 1), Err(PresenceError::Foreign { .. })));
+    assert_eq!(std::fs::read_to_string(&target).expect("target"), "precious");
+    std::fs::remove_file(&path).expect("clean");
+    std::fs::remove_file(&target).expect("clean");
+}
+
+#[test]
+fn a_reader_never_sees_a_torn_record() {
+    let path = path();
+    let mut file = MaskFile::create(&path, 64).expect("create");
+    file.publish(PhysicalMask(1), 1).expect("publish");
+    let done = Arc::new(AtomicBool::new(false));
+    let reader = std::thread::spawn({
+        let (path, done) = (path.clone(), Arc::clone(&done));
+        move || {
+            let mut seen = 0_u32;
+            while !done.load(Ordering::Relaxed) {
+                let record = read_mask(&path).expect("read");
+                assert_eq!((record.mask.0, record.realtime_ns), (record.sequence, record.sequence));
+                seen += 1;
+            }
+            seen
+        }
+    });
+    for value in 2..200_000 {
+        file.publish(PhysicalMask(value), value).expect("publish");
+    }
+    done.store(true, Ordering::Relaxed);
+    assert!(reader.join().expect("no torn record") > 0);
+}
+
+#[test]
+fn the_json_document_has_the_papers_fields() {
+    let path = json_path(&path());
+    let bit = crate::modality::ModalityId::new(0).expect("below 64");
+    let device = JsonDevice {
+        name: "cam".into(),
+        bit,
+        online: true,
+        usb_connected: true,
+        state: crate::status::SlotState::Streaming,
+    };
+    json::write(&path, PhysicalMask(1), 9, &[device]).expect("write");
+    let document: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).expect("file")).expect("json");
+    std::fs::remove_file(&path).expect("clean");
+    assert_eq!(document["mask"], "0x01");
+    assert_eq!(document["mask_binary"], "00000001");
+    assert_eq!((&document["device_count"], &document["online_count"]), (&1.into(), &1.into()));
+    assert_eq!(document["sequence"], 9);
+    assert_eq!(document["devices"][0]["name"], "cam");
+    assert_eq!(document["devices"][0]["usb_connected"], true);
+    let timestamp = document["timestamp"].as_str().expect("text");
+    assert!(timestamp.starts_with("20") && timestamp.ends_with('Z'), "{timestamp}");
+}

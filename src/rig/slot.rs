@@ -1,0 +1,258 @@
+//! A slot: the life of one modality's device, as a pure state machine.
+//!
+//! | state     | attached | running | bit | waits for                            |
+//! |-----------|----------|---------|-----|--------------------------------------|
+//! | Absent    | no (*)   | no      | 0   | an attachment                        |
+//! | Opening   | yes      | yes     | 0   | the first sample                     |
+//! | Streaming | yes      | yes     | 1   |                                      |
+//! | Stalled   | yes      | yes     | 1   | a sample, or the end of the stream   |
+//! | Backoff   | yes      | no      | 0   | the end of the cooldown or back-off  |
+//! | Failed    | yes      | no      | 0   | a replug, or a restart by hand       |
+//!
+//! (*) When the stream is the first to notice an unplug, the slot is Absent at once while hot-plug
+//! has yet to confirm it. If no removal comes within the cooldown, the device was never gone and is
+//! started again.
+//!
+//! Invariant: what carries an older epoch changes nothing.
+//! Invariant: a cooldown delays an attachment and never drops it.
+//! Invariant: no clock, no I/O: time comes in as an argument.
+
+use std::time::Duration;
+
+use crate::sample::Epoch;
+use crate::status::SlotState;
+use crate::time::Stamp;
+
+/// A stream that ends while its device is attached is started again this many times...
+const MAX_RESTARTS: usize = 5;
+/// ...within this time, then the slot has failed.
+const RESTART_WINDOW: Duration = Duration::from_secs(60);
+/// Delay before the first restart; each further one in the window waits twice as long.
+const FIRST_BACKOFF: Duration = Duration::from_millis(500);
+
+/// What happens to a slot. `A` is an attachment.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Input<A> {
+    /// A device of this modality was plugged in.
+    Attached(A),
+    /// It was pulled out.
+    Detached,
+    /// The stream delivered its first sample.
+    Started(Epoch),
+    /// Samples have stopped.
+    Stalled(Epoch),
+    /// Samples come again.
+    Resumed(Epoch),
+    /// The stream ended.
+    Ended(Epoch, End),
+    /// A user wants the device started again.
+    Restart,
+    /// Time passed; see [`Slot::deadline`].
+    Timer,
+}
+
+/// How a stream ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum End {
+    /// The device is no longer there.
+    Gone,
+    /// Starting again may help.
+    Retry,
+    /// Starting again cannot help.
+    Fatal,
+}
+
+/// What is to be done after an input.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Effects<A> {
+    /// Tell this stream to end; do not wait for it.
+    pub stop: Option<Epoch>,
+    /// Start a stream.
+    pub start: Option<(Epoch, A)>,
+}
+
+impl<A> Effects<A> {
+    const NONE: Self = Self { stop: None, start: None };
+}
+
+/// See the module's comment.
+#[derive(Debug, Clone)]
+pub struct Slot<A> {
+    state: SlotState,
+    epoch: Epoch,
+    attached: Option<A>,
+    /// When the last removal was first noticed.
+    removed: Option<Stamp>,
+    /// When something must be done without any input.
+    deadline: Option<Stamp>,
+    /// Restarts within [`RESTART_WINDOW`], oldest first.
+    restarts: Vec<Stamp>,
+    cooldown: Duration,
+}
+
+impl<A: Clone> Slot<A> {
+    /// An empty slot.
+    #[must_use]
+    pub fn new(cooldown: Duration) -> Self {
+        Self {
+            state: SlotState::Absent,
+            epoch: Epoch(0),
+            attached: None,
+            removed: None,
+            deadline: None,
+            restarts: Vec::with_capacity(MAX_RESTARTS),
+            cooldown,
+        }
+    }
+
+    /// The state.
+    #[must_use]
+    pub const fn state(&self) -> SlotState {
+        self.state
+    }
+
+    /// Incarnation of the newest stream.
+    #[must_use]
+    pub const fn epoch(&self) -> Epoch {
+        self.epoch
+    }
+
+    /// The bit in the physical mask.
+    #[must_use]
+    pub const fn is_present(&self) -> bool {
+        matches!(self.state, SlotState::Streaming | SlotState::Stalled)
+    }
+
+    /// What hot-plug says is attached.
+    #[must_use]
+    pub const fn attached(&self) -> Option<&A> {
+        self.attached.as_ref()
+    }
+
+    /// When [`Input::Timer`] is to be applied, if nothing happens before.
+    #[must_use]
+    pub const fn deadline(&self) -> Option<Stamp> {
+        self.deadline
+    }
+
+    /// Takes one input and says what is to be done.
+    pub fn apply(&mut self, input: Input<A>, now: Stamp) -> Effects<A> {
+        match input {
+            Input::Attached(attachment) => self.attach(attachment, now),
+            Input::Detached => self.detach(now),
+            Input::Started(epoch) if self.is_current(epoch) => self.enter_if(SlotState::Opening, SlotState::Streaming),
+            Input::Stalled(epoch) if self.is_current(epoch) => self.enter_if(SlotState::Streaming, SlotState::Stalled),
+            Input::Resumed(epoch) if self.is_current(epoch) => self.enter_if(SlotState::Stalled, SlotState::Streaming),
+            Input::Ended(epoch, end) if self.is_current(epoch) => self.end(end, now),
+            Input::Started(_) | Input::Stalled(_) | Input::Resumed(_) | Input::Ended(..) => Effects::NONE,
+            Input::Restart => self.restart_by_hand(now),
+            Input::Timer => self.timer(now),
+        }
+    }
+
+    /// Is this the stream that is running now?
+    fn is_current(&self, epoch: Epoch) -> bool {
+        self.is_running() && epoch == self.epoch
+    }
+
+    const fn is_running(&self) -> bool {
+        matches!(self.state, SlotState::Opening | SlotState::Streaming | SlotState::Stalled)
+    }
+
+    fn attach(&mut self, attachment: A, now: Stamp) -> Effects<A> {
+        // A new attachment over one whose removal was never told replaces it.
+        let stop = self.is_running().then_some(self.epoch);
+        self.attached = Some(attachment);
+        self.restarts.clear();
+        let ready = self.removed.map_or(now, |removed| removed.after(self.cooldown));
+        if now < ready {
+            self.wait_until(ready);
+            return Effects { stop, start: None };
+        }
+        Effects { stop, ..self.start() }
+    }
+
+    fn detach(&mut self, now: Stamp) -> Effects<A> {
+        let stop = self.is_running().then_some(self.epoch);
+        // The stream may have noticed first: the cooldown counts from the first witness.
+        if self.attached.is_some() && self.state != SlotState::Absent {
+            self.removed = Some(now);
+        }
+        self.attached = None;
+        self.restarts.clear();
+        self.enter(SlotState::Absent);
+        Effects { stop, start: None }
+    }
+
+    fn end(&mut self, end: End, now: Stamp) -> Effects<A> {
+        match end {
+            End::Gone => {
+                self.removed = Some(now);
+                self.enter(SlotState::Absent);
+                self.deadline = Some(now.after(self.cooldown));
+            }
+            End::Fatal => self.enter(SlotState::Failed),
+            End::Retry => {
+                self.restarts.retain(|restart| now.since(*restart) < RESTART_WINDOW);
+                if self.restarts.len() == MAX_RESTARTS {
+                    self.enter(SlotState::Failed);
+                } else {
+                    let backoff = FIRST_BACKOFF * (1 << self.restarts.len());
+                    self.restarts.push(now);
+                    self.wait_until(now.after(backoff));
+                }
+            }
+        }
+        Effects::NONE
+    }
+
+    fn restart_by_hand(&mut self, now: Stamp) -> Effects<A> {
+        if !matches!(self.state, SlotState::Failed | SlotState::Backoff) {
+            return Effects::NONE;
+        }
+        self.restarts.clear();
+        // The cooldown protects the electronics and is not the user's to skip.
+        let ready = self.removed.map_or(now, |removed| removed.after(self.cooldown));
+        if now < ready {
+            self.wait_until(ready);
+            return Effects::NONE;
+        }
+        self.start()
+    }
+
+    fn timer(&mut self, now: Stamp) -> Effects<A> {
+        if self.deadline.is_none_or(|deadline| now < deadline) {
+            return Effects::NONE;
+        }
+        self.deadline = None;
+        self.start()
+    }
+
+    /// Starts what is attached, if anything is.
+    fn start(&mut self) -> Effects<A> {
+        let Some(attachment) = self.attached.clone() else { return Effects::NONE };
+        self.epoch = self.epoch.next();
+        self.enter(SlotState::Opening);
+        Effects { stop: None, start: Some((self.epoch, attachment)) }
+    }
+
+    fn wait_until(&mut self, deadline: Stamp) {
+        self.enter(SlotState::Backoff);
+        self.deadline = Some(deadline);
+    }
+
+    fn enter_if(&mut self, from: SlotState, to: SlotState) -> Effects<A> {
+        if self.state == from {
+            self.enter(to);
+        }
+        Effects::NONE
+    }
+
+    const fn enter(&mut self, state: SlotState) {
+        self.state = state;
+        self.deadline = None;
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,309 @@
+use super::*;
+use SlotState::{Absent, Backoff, Failed, Opening, Stalled, Streaming};
+use proptest::prelude::*;
+
+const COOLDOWN: Duration = Duration::from_secs(2);
+
+fn ms(ms: u64) -> Stamp {
+    Stamp(1_000_000_000_000 + ms * 1_000_000)
+}
+
+/// A slot brought into `state` by legal inputs, at 0 ms, with attachment `a` and epoch 1 where it
+/// has run.
+fn slot_in(state: SlotState) -> Slot<char> {
+    let mut slot = Slot::new(COOLDOWN);
+    let inputs: &[Input<char>] = match state {
+        Absent => &[],
+        Opening => &[Input::Attached('a')],
+        Streaming => &[Input::Attached('a'), Input::Started(Epoch(1))],
+        Stalled => &[Input::Attached('a'), Input::Started(Epoch(1)), Input::Stalled(Epoch(1))],
+        Backoff => &[Input::Attached('a'), Input::Ended(Epoch(1), End::Retry)],
+        Failed => &[Input::Attached('a'), Input::Ended(Epoch(1), End::Fatal)],
+    };
+    for input in inputs {
+        slot.apply(input.clone(), ms(0));
+    }
+    assert_eq!(slot.state(), state);
+    slot
+}
+
+fn stop(epoch: u32) -> Effects<char> {
+    Effects { stop: Some(Epoch(epoch)), start: None }
+}
+
+fn start(epoch: u32, attachment: char) -> Effects<char> {
+    Effects { stop: None, start: Some((Epoch(epoch), attachment)) }
+}
+
+#[test]
+fn every_transition_of_the_current_epoch() {
+    let e = Epoch(1);
+    let none = Effects::NONE;
+    let replace = Effects { stop: Some(e), start: Some((Epoch(2), 'b')) };
+    // (from, input, to, effects), every state with every input, all at 10 ms. The back-off of the
+    // state Backoff ends at 500 ms.
+    let table = [
+        (Absent, Input::Attached('b'), Opening, start(1, 'b')),
+        (Absent, Input::Detached, Absent, none.clone()),
+        (Absent, Input::Started(e), Absent, none.clone()),
+        (Absent, Input::Stalled(e), Absent, none.clone()),
+        (Absent, Input::Resumed(e), Absent, none.clone()),
+        (Absent, Input::Ended(e, End::Gone), Absent, none.clone()),
+        (Absent, Input::Ended(e, End::Retry), Absent, none.clone()),
+        (Absent, Input::Ended(e, End::Fatal), Absent, none.clone()),
+        (Absent, Input::Restart, Absent, none.clone()),
+        (Absent, Input::Timer, Absent, none.clone()),
+        (Opening, Input::Attached('b'), Opening, replace.clone()),
+        (Opening, Input::Detached, Absent, stop(1)),
+        (Opening, Input::Started(e), Streaming, none.clone()),
+        (Opening, Input::Stalled(e), Opening, none.clone()),
+        (Opening, Input::Resumed(e), Opening, none.clone()),
+        (Opening, Input::Ended(e, End::Gone), Absent, none.clone()),
+        (Opening, Input::Ended(e, End::Retry), Backoff, none.clone()),
+        (Opening, Input::Ended(e, End::Fatal), Failed, none.clone()),
+        (Opening, Input::Restart, Opening, none.clone()),
+        (Opening, Input::Timer, Opening, none.clone()),
+        (Streaming, Input::Attached('b'), Opening, replace.clone()),
+        (Streaming, Input::Detached, Absent, stop(1)),
+        (Streaming, Input::Started(e), Streaming, none.clone()),
+        (Streaming, Input::Stalled(e), Stalled, none.clone()),
+        (Streaming, Input::Resumed(e), Streaming, none.clone()),
+        (Streaming, Input::Ended(e, End::Gone), Absent, none.clone()),
+        (Streaming, Input::Ended(e, End::Retry), Backoff, none.clone()),
+        (Streaming, Input::Ended(e, End::Fatal), Failed, none.clone()),
+        (Streaming, Input::Restart, Streaming, none.clone()),
+        (Streaming, Input::Timer, Streaming, none.clone()),
+        (Stalled, Input::Attached('b'), Opening, replace),
+        (Stalled, Input::Detached, Absent, stop(1)),
+        (Stalled, Input::Started(e), Stalled, none.clone()),
+        (Stalled, Input::Stalled(e), Stalled, none.clone()),
+        (Stalled, Input::Resumed(e), Streaming, none.clone()),
+        (Stalled, Input::Ended(e, End::Gone), Absent, none.clone()),
+        (Stalled, Input::Ended(e, End::Retry), Backoff, none.clone()),
+        (Stalled, Input::Ended(e, End::Fatal), Failed, none.clone()),
+        (Stalled, Input::Restart, Stalled, none.clone()),
+        (Stalled, Input::Timer, Stalled, none.clone()),
+        (Backoff, Input::Attached('b'), Opening, start(2, 'b')),
+        (Backoff, Input::Detached, Absent, none.clone()),
+        (Backoff, Input::Started(e), Backoff, none.clone()),
+        (Backoff, Input::Stalled(e), Backoff, none.clone()),
+        (Backoff, Input::Resumed(e), Backoff, none.clone()),
+        (Backoff, Input::Ended(e, End::Gone), Backoff, none.clone()),
+        (Backoff, Input::Ended(e, End::Retry), Backoff, none.clone()),
+        (Backoff, Input::Ended(e, End::Fatal), Backoff, none.clone()),
+        (Backoff, Input::Restart, Opening, start(2, 'a')),
+        (Backoff, Input::Timer, Backoff, none.clone()),
+        (Failed, Input::Attached('b'), Opening, start(2, 'b')),
+        (Failed, Input::Detached, Absent, none.clone()),
+        (Failed, Input::Started(e), Failed, none.clone()),
+        (Failed, Input::Stalled(e), Failed, none.clone()),
+        (Failed, Input::Resumed(e), Failed, none.clone()),
+        (Failed, Input::Ended(e, End::Gone), Failed, none.clone()),
+        (Failed, Input::Ended(e, End::Retry), Failed, none.clone()),
+        (Failed, Input::Ended(e, End::Fatal), Failed, none.clone()),
+        (Failed, Input::Restart, Opening, start(2, 'a')),
+        (Failed, Input::Timer, Failed, none),
+    ];
+    assert_eq!(table.len(), 6 * 10);
+    for (from, input, to, effects) in table {
+        let mut slot = slot_in(from);
+        let got = slot.apply(input.clone(), ms(10));
+        assert_eq!((slot.state(), &got), (to, &effects), "{from:?} {input:?}");
+        assert_eq!(slot.is_present(), matches!(to, Streaming | Stalled), "{from:?} {input:?}");
+    }
+}
+
+#[test]
+fn an_older_epoch_changes_nothing_in_any_state() {
+    for state in [Absent, Opening, Streaming, Stalled, Backoff, Failed] {
+        for old in [Epoch(0), Epoch(9)] {
+            for input in [
+                Input::Started(old),
+                Input::Stalled(old),
+                Input::Resumed(old),
+                Input::Ended(old, End::Gone),
+                Input::Ended(old, End::Retry),
+                Input::Ended(old, End::Fatal),
+            ] {
+                let mut slot = slot_in(state);
+                let deadline = slot.deadline();
+                assert_eq!(slot.apply(input.clone(), ms(10)), Effects::NONE);
+                assert_eq!((slot.state(), slot.deadline()), (state, deadline), "{input:?}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_cooldown_delays_a_replug_and_counts_from_the_first_witness() {
+    let mut slot = slot_in(Streaming);
+    slot.apply(Input::Ended(Epoch(1), End::Gone), ms(1000));
+    assert_eq!(slot.state(), Absent);
+    assert_eq!(slot.apply(Input::Detached, ms(1050)), Effects::NONE);
+    assert_eq!(slot.apply(Input::Attached('b'), ms(1300)), Effects::NONE);
+    assert_eq!((slot.state(), slot.deadline()), (Backoff, Some(ms(3000))));
+    assert_eq!(slot.apply(Input::Timer, ms(2999)), Effects::NONE);
+    assert_eq!(slot.apply(Input::Timer, ms(3000)), start(2, 'b'));
+    assert_eq!(slot.deadline(), None);
+}
+
+#[test]
+fn after_the_cooldown_a_replug_starts_at_once() {
+    let mut slot = slot_in(Streaming);
+    slot.apply(Input::Detached, ms(1000));
+    assert_eq!(slot.apply(Input::Attached('b'), ms(3000)), start(2, 'b'));
+}
+
+#[test]
+fn bounces_within_the_cooldown_end_with_what_is_attached_last() {
+    let mut slot = slot_in(Streaming);
+    slot.apply(Input::Detached, ms(0));
+    slot.apply(Input::Attached('b'), ms(100));
+    slot.apply(Input::Detached, ms(200));
+    slot.apply(Input::Attached('c'), ms(300));
+    assert_eq!(slot.deadline(), Some(ms(2200)));
+    assert_eq!(slot.apply(Input::Timer, ms(2200)), start(2, 'c'));
+}
+
+#[test]
+fn a_stream_that_was_wrong_about_an_unplug_is_started_again() {
+    let mut slot = slot_in(Streaming);
+    slot.apply(Input::Ended(Epoch(1), End::Gone), ms(0));
+    assert_eq!(slot.apply(Input::Timer, ms(2000)), start(2, 'a'));
+}
+
+#[test]
+fn restarts_back_off_and_give_up_after_five_in_a_minute() {
+    let mut slot = slot_in(Opening);
+    let mut now = 0;
+    for (n, backoff) in [500, 1000, 2000, 4000, 8000].into_iter().enumerate() {
+        let epoch = Epoch(u32::try_from(n).expect("small") + 1);
+        slot.apply(Input::Ended(epoch, End::Retry), ms(now));
+        assert_eq!(slot.deadline(), Some(ms(now + backoff)));
+        now += backoff;
+        assert_eq!(slot.apply(Input::Timer, ms(now)), start(epoch.0 + 1, 'a'));
+    }
+    slot.apply(Input::Ended(Epoch(6), End::Retry), ms(now));
+    assert_eq!((slot.state(), slot.deadline()), (Failed, None));
+}
+
+#[test]
+fn a_stream_that_held_for_a_minute_begins_with_the_short_backoff_again() {
+    let mut slot = slot_in(Backoff);
+    slot.apply(Input::Timer, ms(500));
+    slot.apply(Input::Started(Epoch(2)), ms(600));
+    slot.apply(Input::Ended(Epoch(2), End::Retry), ms(61_000));
+    assert_eq!(slot.deadline(), Some(ms(61_500)));
+}
+
+/// What the world does to a slot.
+#[derive(Debug, Clone)]
+enum Happens {
+    Attach(char),
+    Detach,
+    Report(u32, u8),
+    Restart,
+    Wait(u64),
+}
+
+fn happens() -> impl Strategy<Value = Happens> {
+    prop_oneof![
+        proptest::char::range('a', 'd').prop_map(Happens::Attach),
+        Just(Happens::Detach),
+        (0_u32..6, 0_u8..6).prop_map(|(age, kind)| Happens::Report(age, kind)),
+        Just(Happens::Restart),
+        (0_u64..4000).prop_map(Happens::Wait),
+    ]
+}
+
+/// Lets a slot settle with a device that works: timers run, a started stream delivers.
+fn settle(slot: &mut Slot<char>, now: &mut Stamp) {
+    for _ in 0..32 {
+        let effects = match (slot.state(), slot.deadline()) {
+            (Opening, _) => slot.apply(Input::Started(slot.epoch()), *now),
+            (Stalled, _) => slot.apply(Input::Resumed(slot.epoch()), *now),
+            (_, Some(deadline)) => {
+                *now = (*now).max(deadline);
+                slot.apply(Input::Timer, *now)
+            }
+            _ => return,
+        };
+        assert!(effects.stop.is_none(), "settling never stops a stream");
+    }
+    panic!("the slot never settles: {slot:?}");
+}
+
+proptest! {
+    /// Whatever happened, in whatever order, with reports of streams old and new: once a device
+    /// that works has been attached, it streams; once it is gone, the slot is absent.
+    #[test]
+    fn the_settled_state_depends_only_on_what_is_attached(
+        history in proptest::collection::vec(happens(), 0..60),
+        last in proptest::option::of(proptest::char::range('a', 'd')),
+    ) {
+        let mut slot = Slot::new(COOLDOWN);
+        let mut now = ms(0);
+        let mut running = None;
+        let mut attached = None;
+        for event in history {
+            let input = match event {
+                Happens::Attach(device) if attached.is_none() => { attached = Some(device); Input::Attached(device) }
+                Happens::Attach(_) => continue,
+                Happens::Detach => { attached = None; Input::Detached }
+                Happens::Restart => Input::Restart,
+                Happens::Wait(wait) => { now = now.after(Duration::from_millis(wait)); Input::Timer }
+                Happens::Report(age, kind) => {
+                    let epoch = Epoch(slot.epoch().0.saturating_sub(age));
+                    match kind {
+                        0 => Input::Started(epoch),
+                        1 => Input::Stalled(epoch),
+                        2 => Input::Resumed(epoch),
+                        3 => Input::Ended(epoch, End::Gone),
+                        4 => Input::Ended(epoch, End::Retry),
+                        _ => Input::Ended(epoch, End::Fatal),
+                    }
+                }
+            };
+            let before = slot.epoch();
+            let effects = slot.apply(input, now);
+            // At most one stream runs, and a new one always has a new epoch.
+            if let Some(epoch) = effects.stop { prop_assert_eq!(running.take(), Some(epoch)); }
+            if let Some((epoch, device)) = effects.start {
+                prop_assert!(epoch > before);
+                prop_assert_eq!(Some(device), attached, "only what is attached is started");
+                running = Some(epoch);
+            }
+            if !slot.is_running() { running = None; }
+            prop_assert!(attached.is_some() || slot.state() == Absent, "nothing attached, yet {:?}", slot.state());
+            prop_assert!(!slot.is_present() || attached.is_some());
+        }
+        // The last word: the device is pulled, and perhaps one is plugged in.
+        slot.apply(Input::Detached, now);
+        if let Some(device) = last { slot.apply(Input::Attached(device), now); }
+        settle(&mut slot, &mut now);
+        prop_assert_eq!(slot.attached().copied(), last);
+        prop_assert_eq!(slot.state(), if last.is_some() { Streaming } else { Absent });
+    }
+
+    /// As above without the last word: a history in which no stream failed needs none.
+    #[test]
+    fn no_replug_is_lost_however_fast(history in proptest::collection::vec(happens(), 0..60)) {
+        let mut slot = Slot::new(COOLDOWN);
+        let mut now = ms(0);
+        let mut attached = None;
+        for event in history {
+            let input = match event {
+                Happens::Attach(device) => { attached = Some(device); Input::Attached(device) }
+                Happens::Detach => { attached = None; Input::Detached }
+                Happens::Wait(wait) => { now = now.after(Duration::from_millis(wait)); Input::Timer }
+                Happens::Report(age, 3) => Input::Ended(Epoch(slot.epoch().0.saturating_sub(age)), End::Gone),
+                Happens::Report(age, _) => Input::Started(Epoch(slot.epoch().0.saturating_sub(age))),
+                Happens::Restart => Input::Restart,
+            };
+            slot.apply(input, now);
+        }
+        settle(&mut slot, &mut now);
+        prop_assert_eq!(slot.attached().copied(), attached);
+        prop_assert_eq!(slot.state(), if attached.is_some() { Streaming } else { Absent });
+    }
+}

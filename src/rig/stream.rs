@@ -1,0 +1,171 @@
+//! A stream: one device being read, from the opening of its node to its end.
+//!
+//! Invariant: between two samples a stream allocates nothing, locks nothing and logs nothing.
+//! Invariant: a stream that was told to stop publishes no more.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use tokio::sync::mpsc;
+use tokio::time::{Instant, sleep_until, timeout};
+use tokio_util::sync::CancellationToken;
+
+use super::slot::End;
+use crate::bus::Writer;
+use crate::driver::{Driver, DriverError, Reading};
+use crate::registry::{Attachment, DeviceSpec};
+use crate::sample::{Epoch, SampleHeader};
+use crate::status::Board;
+use crate::time::Stamp;
+
+/// A device that does not open within this time is tried again.
+const OPEN_LIMIT: Duration = Duration::from_secs(10);
+
+/// What a stream tells the rig while it runs.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Report {
+    /// The node is open; what was agreed with the device.
+    Opened(String),
+    /// The first sample was published.
+    Started,
+    /// Nothing came for `DeviceSpec::stall_after`.
+    Stalled,
+    /// Samples come again.
+    Resumed,
+    /// A sample could not be published; told once an epoch.
+    Refused(String),
+}
+
+/// A report with its sender.
+pub(super) type Reported = (crate::modality::ModalityId, Epoch, Report);
+
+/// Everything a stream needs.
+#[derive(Debug)]
+pub(super) struct Stream {
+    pub(super) spec: Arc<DeviceSpec>,
+    pub(super) attachment: Attachment,
+    pub(super) epoch: Epoch,
+    pub(super) writer: Arc<Writer>,
+    /// Next sequence number of the modality, over all its epochs.
+    pub(super) sequence: Arc<AtomicU64>,
+    pub(super) board: Arc<Board>,
+    pub(super) reports: mpsc::Sender<Reported>,
+    pub(super) stop: CancellationToken,
+}
+
+impl Stream {
+    /// Reads the device until it ends or the stream is told to stop. The reason is for people.
+    pub(super) async fn run(self) -> (End, String) {
+        let stop = self.stop.clone();
+        let stopped = || (End::Gone, "stopped".to_owned());
+        tokio::select! {
+            biased;
+            () = stop.cancelled() => stopped(),
+            end = self.read() => end,
+        }
+    }
+
+    async fn read(self) -> (End, String) {
+        let opened = timeout(OPEN_LIMIT, Driver::open(&self.spec, &self.attachment.node)).await;
+        let mut driver = match opened {
+            Ok(Ok(driver)) => driver,
+            Ok(Err(error)) => return end(error),
+            Err(_) => return (End::Retry, format!("did not open within {} s", OPEN_LIMIT.as_secs())),
+        };
+        self.report(Report::Opened(driver.description())).await;
+        let mut pulse = Pulse::Silent;
+        let mut refused = false;
+        let stall = sleep_until(Instant::now() + self.spec.stall_after);
+        tokio::pin!(stall);
+        // The timer is looked at when it fires, not set anew at every sample.
+        let mut newest = Instant::now();
+        loop {
+            tokio::select! {
+                biased;
+                reading = driver.read() => {
+                    let reading = match reading {
+                        Ok(reading) => reading,
+                        Err(error) => return end(error),
+                    };
+                    newest = Instant::now();
+                    match self.publish(&reading) {
+                        Ok(()) => {}
+                        Err(reason) if !refused => {
+                            refused = true;
+                            self.report(Report::Refused(reason)).await;
+                        }
+                        Err(_) => {}
+                    }
+                    if pulse != Pulse::Beating {
+                        let report = if pulse == Pulse::Silent { Report::Started } else { Report::Resumed };
+                        pulse = Pulse::Beating;
+                        self.report(report).await;
+                    }
+                }
+                () = &mut stall => {
+                    let due = newest + self.spec.stall_after;
+                    if due > Instant::now() {
+                        stall.as_mut().reset(due);
+                        continue;
+                    }
+                    if pulse == Pulse::Beating {
+                        pulse = Pulse::Stalled;
+                        self.report(Report::Stalled).await;
+                    }
+                    stall.as_mut().reset(Instant::now() + self.spec.stall_after);
+                }
+            }
+        }
+    }
+
+    /// One copy, from the driver's buffer into shared memory.
+    fn publish(&self, reading: &Reading<'_>) -> Result<(), String> {
+        // What the device says it lost leaves a hole, so that every consumer can see it.
+        let seq = self.sequence.fetch_add(reading.lost + 1, Ordering::Relaxed) + reading.lost;
+        let header = SampleHeader {
+            seq,
+            capture_ns: reading.captured.0,
+            recv_ns: Stamp::now().0,
+            id: u32::from(self.spec.id.bit()),
+            epoch: self.epoch.0,
+            encoding: reading.encoding as u32,
+            flags: reading.flags,
+            width: reading.width,
+            height: reading.height,
+        };
+        let counters = self.board.counters(self.spec.id);
+        match self.writer.publish(header, reading.bytes) {
+            Ok(()) => {
+                counters.count(reading.bytes.len(), reading.captured, reading.lost);
+                Ok(())
+            }
+            Err(error) => {
+                counters.lose(reading.lost + 1);
+                Err(error.to_string())
+            }
+        }
+    }
+
+    /// The rig reads its reports at once; the channel is full only if it has ended.
+    async fn report(&self, report: Report) {
+        let _ = self.reports.send((self.spec.id, self.epoch, report)).await;
+    }
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Pulse {
+    /// No sample yet.
+    Silent,
+    Beating,
+    Stalled,
+}
+
+fn end(error: DriverError) -> (End, String) {
+    let how = match error {
+        DriverError::Gone => End::Gone,
+        DriverError::Retry(_) => End::Retry,
+        DriverError::Fatal(_) => End::Fatal,
+    };
+    (how, error.to_string())
+}

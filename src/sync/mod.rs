@@ -1,0 +1,157 @@
+//! Synchronisation: which sample of each modality belongs to a tick of the observation grid.
+//!
+//! Owns the rings of recent samples and the rules by which one is chosen; samples go in by
+//! [`Synchronizer::push`] in any order, an [`Observation`] comes out per tick. The recorder's frame
+//! index and a policy use the same code on the same [`Grid`].
+//!
+//! Invariant: pure: no clock, no input or output; the caller says what time it is.
+//! Invariant: the result depends on which samples are in the rings, never on the order or the
+//! moments in which they were pushed.
+//! Invariant: nothing here allocates after construction.
+
+mod grid;
+mod observation;
+mod ring;
+#[cfg(test)]
+mod tests;
+
+use std::time::Duration;
+
+use crate::mask::PhysicalMask;
+use crate::modality::{MAX_MODALITIES, ModalityId};
+use crate::registry::WhenStale;
+use crate::sample::Epoch;
+use crate::time::{Stamp, nanoseconds};
+
+pub use grid::Grid;
+pub use observation::{Handle, Observation, Slot};
+pub use ring::{Ring, SyncSample};
+
+/// A modality as the synchroniser needs to know it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SyncModality {
+    /// Its number.
+    pub id: ModalityId,
+    /// What an observation holds when it is attached but no sample lies in the window.
+    pub when_stale: WhenStale,
+    /// Samples kept, at least 1: those of the longest time between a sample's capture and the
+    /// evaluation of the last tick that may want it.
+    pub capacity: usize,
+}
+
+/// See the module's comment.
+///
+/// The rules, for a tick and a moment `now` at which it is evaluated:
+///
+/// 1. A sample counts only if it was received and captured by `now`.
+/// 2. A sample of an older epoch than the newest epoch that counts by rule 1 does not count: what
+///    was seen before the device was last attached says nothing about what is attached.
+/// 3. Bit clear in the mask: absent. Not valid, not stale, nothing kept, whatever the ring holds.
+/// 4. Bit set: of the samples that count, the one captured nearest to the tick is chosen if it lies
+///    within the window (both ends included); of two equally near the earlier, then the one of the
+///    lower sequence number. Valid.
+/// 5. Bit set, nothing in the window: stale, not valid. `Hold` gives the newest sample captured at
+///    or before the tick, if there is one; `Zero` gives none.
+#[derive(Debug)]
+pub struct Synchronizer<T> {
+    window_ns: u64,
+    lanes: Vec<Lane<T>>,
+    /// Position in `lanes` of each modality.
+    lane_of: [Option<usize>; MAX_MODALITIES],
+    observation: Observation,
+}
+
+#[derive(Debug)]
+struct Lane<T> {
+    when_stale: WhenStale,
+    ring: Ring<T>,
+}
+
+impl<T> Synchronizer<T> {
+    /// A synchroniser with empty rings. `window` is the half width: 25 ms means within +-25 ms. Of
+    /// a modality given twice only the first counts.
+    #[must_use]
+    pub fn new(modalities: &[SyncModality], window: Duration) -> Self {
+        let mut lane_of = [None; MAX_MODALITIES];
+        let mut lanes = Vec::with_capacity(modalities.len());
+        let mut ids = Vec::with_capacity(modalities.len());
+        for modality in modalities {
+            let lane = &mut lane_of[modality.id.index()];
+            if lane.is_none() {
+                *lane = Some(lanes.len());
+                lanes.push(Lane { when_stale: modality.when_stale, ring: Ring::new(modality.capacity) });
+                ids.push(modality.id);
+            }
+        }
+        Self { window_ns: nanoseconds(window), lanes, lane_of, observation: Observation::new(&ids) }
+    }
+
+    /// Keeps a sample of a modality; the oldest one pushed makes room. Samples of a modality that
+    /// is not registered are not kept. A sample known to be damaged is not to be pushed.
+    pub fn push(&mut self, id: ModalityId, sample: SyncSample<T>) {
+        if let Some(lane) = self.lane_of[id.index()].and_then(|lane| self.lanes.get_mut(lane)) {
+            lane.ring.push(sample);
+        }
+    }
+
+    /// Chooses the samples of `tick` by what was known at `now`, under the `mask` in force at the
+    /// tick.
+    pub fn observe(&mut self, tick: Stamp, now: Stamp, mask: PhysicalMask) -> &Observation {
+        self.observation.tick = tick;
+        self.observation.mask = mask;
+        for (lane, slot) in self.lanes.iter().zip(&mut self.observation.slots) {
+            let present = mask.contains(slot.id);
+            slot.clear(present);
+            if present {
+                lane.choose(tick, now, self.window_ns, slot);
+            }
+        }
+        &self.observation
+    }
+
+    /// The last observation.
+    #[must_use]
+    pub fn observation(&self) -> &Observation {
+        &self.observation
+    }
+
+    /// The sample a slot of the last observation names, until the next push.
+    #[must_use]
+    pub fn sample(&self, slot: &Slot) -> Option<&SyncSample<T>> {
+        let lane = self.lanes.get(self.lane_of[slot.id.index()]?)?;
+        lane.ring.get(slot.handle?)
+    }
+
+    /// Forgets all samples.
+    pub fn clear(&mut self) {
+        for lane in &mut self.lanes {
+            lane.ring.clear();
+        }
+    }
+}
+
+impl<T> Lane<T> {
+    fn choose(&self, tick: Stamp, now: Stamp, window_ns: u64, slot: &mut Slot) {
+        let known = || self.ring.iter().filter(move |(_, s)| s.recv <= now && s.capture <= now);
+        let epoch = known().map(|(_, s)| s.epoch).max().unwrap_or(Epoch(0));
+        let current = || known().filter(move |(_, s)| s.epoch == epoch);
+
+        let nearest = current()
+            .filter(|(_, s)| s.capture.0.abs_diff(tick.0) <= window_ns)
+            .min_by_key(|(_, s)| (s.capture.0.abs_diff(tick.0), s.capture, s.seq));
+        if let Some((handle, sample)) = nearest {
+            slot.valid = true;
+            slot.hold(handle, sample, tick);
+            return;
+        }
+        slot.stale = true;
+        if self.when_stale == WhenStale::Zero {
+            return;
+        }
+        let newest =
+            current().filter(|(_, s)| s.capture <= tick).max_by_key(|(_, s)| (s.capture, std::cmp::Reverse(s.seq)));
+        if let Some((handle, sample)) = newest {
+            slot.hold(handle, sample, tick);
+        }
+    }
+}
