@@ -1,0 +1,46 @@
+# `make` lists the targets. Everything a target needs that is not in the repository comes through `make setup`.
+SHELL := bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+.NOTPARALLEL:
+.PHONY: help setup setup-build demo test lint check bench clean
+
+# A toolchain just installed by rustup is not on the PATH of a shell that was open before.
+export PATH := $(PATH):$(HOME)/.cargo/bin
+TARGET := $(or $(CARGO_TARGET_DIR),$(CURDIR)/target)
+CACHE := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/rapid
+DEMO_DIR := demo-episodes
+
+help: ## this list
+	@sed -n 's/^\([a-z-]*\):[^#]*## /\1|/p' Makefile | while IFS='|' read -r name what; do printf 'make %-12s %s\n' "$$name" "$$what"; done
+
+setup: ## everything that building, running and testing need; a second run changes nothing
+	@scripts/setup.sh build test
+
+setup-build: ## only what building and running need
+	@scripts/setup.sh build
+
+demo: setup-build ## build, then the simulated rig: the monitor on a terminal, otherwise a 10 s episode
+	cargo build --release --locked
+	@if [ -t 0 ] && [ -t 1 ]; then exec '$(TARGET)/release/rapid' --sim; else scripts/demo.sh '$(TARGET)/release/rapid' $(DEMO_DIR); fi
+
+# The dev profile is optimised a little because the virtual bench runs this very binary under software emulation.
+test: setup lint ## set up, format, lints, all tests
+	cargo build --locked
+	RAPID_BIN='$(TARGET)/debug/rapid' RAPID_PYTHON='$(CACHE)/venv/bin/python' cargo test --locked --workspace --no-fail-fast
+
+lint: ## format and clippy
+	cargo fmt --all --check
+	cargo clippy --locked --workspace --all-targets -- -D warnings
+
+check: setup-build lint ## lints, documentation, licences, bans, sources and known vulnerabilities of the dependencies
+	RUSTDOCFLAGS='-D warnings' cargo doc --locked --workspace --no-deps
+	scripts/deny.sh
+
+bench: setup ## print figures from the virtual bench; nothing passes or fails
+	cargo build --release --locked
+	RAPID_BIN='$(TARGET)/release/rapid' cargo run --release --locked -p vbench --bin vbench-cycles
+
+clean: ## remove what was built here (what setup fetched stays)
+	cargo clean
+	rm -rf $(DEMO_DIR)

@@ -1,0 +1,152 @@
+#!/usr/bin/env bash
+# Brings a Debian or Ubuntu machine that has git, make and a Rust toolchain to where `rapid` builds, runs and is tested.
+#
+#     setup.sh [build] [test]
+#
+# build: what building and running need. test: the rest - lint tools, the Python that reads episodes and topics from
+# outside, the pinned onnxruntime library, the virtual bench with its guest image.
+#
+# Every step looks first and does nothing when it is done already. Whatever is fetched lies outside the tree in
+# ${XDG_CACHE_HOME:-~/.cache}/rapid, is checked against the hashes pinned in the tree, and gets its final name last:
+# a run that was interrupted leaves nothing that a later one would take for whole.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+
+readonly ORT_VERSION=1.24.4
+readonly CACHE="${XDG_CACHE_HOME:-$HOME/.cache}/rapid"
+readonly VENV="$CACHE/venv"
+
+# pkg-config, libudev-dev: crate udev. libclang-dev: the V4L2 bindings. libstdc++6: onnxruntime at run time.
+readonly BUILD_PACKAGES=(gcc libc6-dev pkg-config libudev-dev libclang-dev libstdc++6)
+readonly TEST_PACKAGES=(python3 python3-venv)
+
+changed=0
+
+say() { printf 'setup: %s\n' "$*"; }
+die() { printf 'setup: %s\n' "$*" >&2; exit 1; }
+did() { changed=1; say "$@"; }
+
+main() {
+    [[ $# -gt 0 ]] || set -- build
+    mkdir -p "$CACHE"
+    # Two runs at once would fetch the same things into the same place.
+    exec 9>"$CACHE/setup.lock"
+    flock 9
+    rm -rf "$CACHE"/onnxruntime.partial.*
+
+    for part in "$@"; do
+        case "$part" in
+            build) toolchain; packages "${BUILD_PACKAGES[@]}" ;;
+            test) lint_tools; test_packages; python_venv; onnxruntime; guest_image ;;
+            *) die "unknown part '$part': build or test" ;;
+        esac
+    done
+    if [[ $changed = 0 ]]; then say "nothing to do ($*)"; else say "done ($*)"; fi
+}
+
+toolchain() {
+    command -v cargo >/dev/null || die "no cargo: install a Rust toolchain with rustup, then run this again"
+}
+
+lint_tools() {
+    if cargo fmt --version >/dev/null 2>&1 && cargo clippy --version >/dev/null 2>&1; then return; fi
+    command -v rustup >/dev/null || die "no rustfmt or clippy beside cargo, and no rustup to add them"
+    did "adding rustfmt and clippy to the toolchain"
+    rustup component add rustfmt clippy
+}
+
+test_packages() {
+    local list=tests/vbench/image/packages.txt wanted=("${TEST_PACKAGES[@]}")
+    if [[ -f $list ]]; then
+        mapfile -t -O "${#wanted[@]}" wanted < <(sed 's/#.*//' "$list" | tr -s '[:space:]' '\n' | sed '/^$/d')
+    fi
+    packages "${wanted[@]}"
+}
+
+# Installs those of the packages that are missing; asks for root only then.
+packages() {
+    local missing=() package
+    if ! command -v dpkg-query >/dev/null; then
+        say "this is not Debian or Ubuntu: make sure that there is what these packages hold: $*"
+        return
+    fi
+    for package in "$@"; do
+        [[ $(dpkg-query -W -f='${db:Status-Status}' "$package" 2>/dev/null) = installed ]] || missing+=("$package")
+    done
+    [[ ${#missing[@]} -gt 0 ]] || return 0
+
+    local as_root=()
+    if [[ $(id -u) != 0 ]]; then
+        command -v sudo >/dev/null || die "as root, run: apt-get install ${missing[*]}"
+        as_root=(sudo)
+    fi
+    did "installing with apt: ${missing[*]}"
+    "${as_root[@]}" apt-get update -q
+    "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -q --no-install-recommends "${missing[@]}"
+}
+
+# The virtual environment is whole when its stamp, written last, names the present requirements and its Python runs.
+python_venv() {
+    local requirements=tests/python/requirements.txt stamp
+    # iceoryx2 is published for x86-64 alone.
+    local imports='import mcap'
+    [[ $(uname -m) != x86_64 ]] || imports='import iceoryx2, mcap'
+    stamp=$(sha256sum <"$requirements")
+    if [[ $(cat "$VENV/stamp" 2>/dev/null) = "$stamp" ]] && "$VENV/bin/python" -c "$imports" 2>/dev/null; then
+        return
+    fi
+    did "making the Python environment of the tests: $VENV"
+    rm -rf "$VENV"
+    python3 -m venv "$VENV"
+    "$VENV/bin/python" -m pip install --quiet --disable-pip-version-check --only-binary=:all: --require-hashes -r "$requirements"
+    "$VENV/bin/python" -c "$imports"
+    echo "$stamp" >"$VENV/stamp"
+}
+
+onnxruntime() {
+    local arch library dir partial
+    arch=$(uname -m)
+    library=libonnxruntime.so.$ORT_VERSION
+    dir=$CACHE/onnxruntime/$ORT_VERSION-$arch
+    if ! grep -q "  $arch/$library\$" scripts/onnxruntime.sha256; then
+        say "no onnxruntime is pinned for $arch: left out"
+        return
+    fi
+    if [[ -f $dir/$library ]] && checked "$dir" "$arch/$library"; then return; fi
+
+    did "fetching onnxruntime $ORT_VERSION for $arch: $dir/$library"
+    partial=$(mktemp -d "$CACHE/onnxruntime.partial.XXXXXX")
+    # shellcheck disable=SC2064  # the folder of now, not of then
+    trap "rm -rf '$partial'" EXIT
+    # The library in the wheel does not depend on the Python the wheel is for; one is named so that every machine
+    # gets the same bytes.
+    "$VENV/bin/python" -m pip download --quiet --disable-pip-version-check --no-deps --only-binary=:all: \
+        --python-version 3.12 --implementation cp --abi cp312 \
+        --platform "manylinux_2_27_$arch" --platform "manylinux_2_28_$arch" \
+        --dest "$partial" "onnxruntime==$ORT_VERSION"
+    local wheels=("$partial"/*.whl)
+    checked "$partial" "$arch/$(basename "${wheels[0]}")" || die "${wheels[0]##*/} is not the wheel that is pinned in scripts/onnxruntime.sha256"
+    "$VENV/bin/python" -m zipfile -e "${wheels[0]}" "$partial/wheel"
+    cp "$partial/wheel/onnxruntime/capi/$library" "$partial/$library"
+    checked "$partial" "$arch/$library" || die "$library is not the one that is pinned in scripts/onnxruntime.sha256"
+    mkdir -p "$dir"
+    mv "$partial/$library" "$dir/$library"
+    rm -rf "$partial"
+    trap - EXIT
+}
+
+# Does the file in folder $1 have the hash pinned for $2 (ARCH/FILE)?
+checked() {
+    local want have
+    want=$(awk -v name="$2" '$2 == name { print $1 }' scripts/onnxruntime.sha256)
+    have=$(sha256sum <"$1/${2#*/}")
+    [[ -n $want && ${have%% *} = "$want" ]]
+}
+
+# The virtual bench brings its own builder, which looks for itself whether there is anything to do.
+guest_image() {
+    local build=tests/vbench/image/build.sh
+    [[ ! -x $build ]] || "$build"
+}
+
+main "$@"

@@ -1,0 +1,536 @@
+//! The architecture as data, and a check that the sources keep to it.
+//!
+//! Modules lie in layers and import downwards only. Every third-party crate has one home. `unsafe`
+//! lives at the edge. Files stay readable in one sitting.
+//!
+//! What is read are tokens, not text: comments and strings do not count, macros do. Items under
+//! `#[cfg(test)]` are left out: a test may build its subject from whatever it likes.
+//!
+//! A new module gets a line in [`LAYERS`], a new dependency one in [`HOMES`]; if a change needs more
+//! than that to pass, the change is what is wrong.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+use proc_macro2::{Delimiter, TokenStream, TokenTree};
+
+/// Modules by layer, lowest first. A module sees those of lower layers.
+const LAYERS: &[&[&str]] = &[
+    &["modality", "mask", "sample", "time", "action"],
+    &["registry", "status", "text", "outlet"],
+    &["hotplug", "driver", "bus", "sync"],
+    &["rig", "record", "policy", "control"],
+    &["app", "tui", "headless", "logging"],
+    &["main", "cli", "commands"],
+];
+
+/// Imports within a layer. All nouns of layer 0 may speak of each other besides.
+const SIDEWAYS: &[(&str, &[&str])] = &[
+    ("status", &["registry"]),
+    ("app", &["tui", "headless", "logging"]),
+    // Without a screen the log is lines among the lines of the run.
+    ("logging", &["headless"]),
+    ("main", &["cli", "commands"]),
+    ("commands", &["cli"]),
+];
+
+/// Modules that see less than their layer would let them: besides layer 0 only these.
+const NARROW: &[(&str, &[&str], &str)] = &[
+    ("tui", &["status", "registry", "text", "outlet"], "a screen knows snapshots and commands, no stage"),
+    ("headless", &["status", "registry", "text", "outlet"], "a screen knows snapshots and commands, no stage"),
+    ("logging", &["status", "text", "outlet"], "the log goes to the board and knows no stage"),
+];
+
+/// The homes of third-party crates: modules, or files of them (`driver/camera`).
+const HOMES: &[(&str, &[&str])] = &[
+    ("clap", &["cli", "main", "commands"]),
+    ("clap_complete", &["cli", "main", "commands"]),
+    ("crossterm", &["tui"]),
+    ("futures", &["hotplug", "driver", "bus", "rig", "record", "app", "tui", "headless", "commands"]),
+    ("humantime", &["registry", "cli", "commands"]),
+    ("iceoryx2", &["bus"]),
+    ("jpeg_encoder", &["driver/sim"]),
+    ("libc", &["registry", "hotplug", "driver", "rig", "app"]),
+    ("mcap", &["record", "driver/replay"]),
+    ("nokhwa", &["driver/camera"]),
+    ("ratatui", &["tui"]),
+    ("rustix", &["time", ABOVE_NOUNS]),
+    ("serde", &[ANYWHERE]),
+    ("serde_json", &[ABOVE_NOUNS]),
+    ("thiserror", &[ANYWHERE]),
+    ("tokio", &[ABOVE_NOUNS]),
+    ("tokio_serial", &["driver/serial"]),
+    ("tokio_util", &[ABOVE_NOUNS]),
+    ("toml", &["registry"]),
+    ("tracing", &[ABOVE_NOUNS]),
+    ("tracing_subscriber", &["logging"]),
+    ("udev", &["hotplug/udev"]),
+    ("unicode_segmentation", &["text"]),
+    ("unicode_width", &["text"]),
+    ("v4l", &["driver/camera"]),
+];
+const ANYWHERE: &str = "*";
+const ABOVE_NOUNS: &str = "layers 1 and up";
+
+/// Where `unsafe` may stand: at the borders to the kernel and to shared memory.
+const UNSAFE_HOMES: &[&str] = &["driver", "bus"];
+
+/// Lines of a file that are not tests.
+const MAX_LINES: usize = 400;
+
+/// Macros that write where a screen may be.
+const PRINTING: &[&str] = &["print", "println", "eprint", "eprintln", "dbg"];
+
+#[test]
+fn the_sources_keep_to_the_architecture() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
+    let mut files = BTreeMap::new();
+    collect(&root, &root, &mut files).unwrap();
+    assert!(files.contains_key(Path::new("lib.rs")), "no src/lib.rs under {}", root.display());
+
+    let violations = check_tree(&files);
+    let list: Vec<String> = violations.iter().map(ToString::to_string).collect();
+    assert!(list.is_empty(), "{} violations of the table in tests/layering.rs:\n{}", list.len(), list.join("\n"));
+}
+
+#[test]
+fn every_dependency_has_a_home() {
+    let manifest = Path::new(env!("CARGO_MANIFEST_DIR")).join("Cargo.toml");
+    let manifest: toml::Table = fs::read_to_string(manifest).unwrap().parse().unwrap();
+    let dependencies = manifest["dependencies"].as_table().unwrap();
+    let homeless: Vec<_> =
+        dependencies.keys().filter(|name| !HOMES.iter().any(|(home, _)| *home == name.replace('-', "_"))).collect();
+    assert!(homeless.is_empty(), "Cargo.toml depends on {homeless:?}: name their homes in HOMES");
+}
+
+/// Something that breaks a rule, and which.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+struct Violation {
+    file: PathBuf,
+    line: usize,
+    rule: String,
+}
+
+impl fmt::Display for Violation {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "src/{}:{}: {}", self.file.display(), self.line, self.rule)
+    }
+}
+
+/// Every `.rs` file below `dir`, by its path from `root`.
+fn collect(root: &Path, dir: &Path, files: &mut BTreeMap<PathBuf, String>) -> io::Result<()> {
+    for entry in fs::read_dir(dir)? {
+        let path = entry?.path();
+        if path.is_dir() {
+            collect(root, &path, files)?;
+        } else if path.extension().is_some_and(|extension| extension == "rs") {
+            let text = fs::read_to_string(&path)?;
+            files.insert(path.strip_prefix(root).unwrap_or(&path).to_owned(), text);
+        }
+    }
+    Ok(())
+}
+
+fn check_tree(files: &BTreeMap<PathBuf, String>) -> Vec<Violation> {
+    let read: Vec<Source> = files.iter().map(|(path, text)| Source::read(path, text)).collect();
+    let tests: BTreeSet<&Vec<String>> = read.iter().flat_map(|source| &source.test_modules).collect();
+    let mut violations: Vec<Violation> = read
+        .iter()
+        .filter(|source| !tests.iter().any(|test| source.module.starts_with(test)))
+        .flat_map(check)
+        .collect();
+    violations.sort();
+    violations.dedup();
+    violations
+}
+
+/// What the rules need to know of one file.
+struct Source {
+    file: PathBuf,
+    /// `driver/camera.rs` is `["driver", "camera"]`, `lib.rs` is `[]`.
+    module: Vec<String>,
+    /// Paths named, with `crate`, `self` and `super` resolved to `crate`.
+    paths: Vec<(usize, Vec<String>)>,
+    /// Lines with the word `unsafe`.
+    unsafe_lines: Vec<usize>,
+    /// Lines with a macro that prints, and its name.
+    prints: Vec<(usize, String)>,
+    /// Modules declared, at the top level of the file.
+    declared: BTreeSet<String>,
+    /// Modules in files of their own that exist only in tests.
+    test_modules: Vec<Vec<String>>,
+    lines: usize,
+}
+
+impl Source {
+    fn read(file: &Path, text: &str) -> Self {
+        let mut module: Vec<String> = file.iter().map(|part| part.to_string_lossy().into_owned()).collect();
+        let name = module.pop().unwrap_or_default();
+        match name.trim_end_matches(".rs") {
+            "mod" | "lib" => {}
+            stem => module.push(stem.to_owned()),
+        }
+        let mut source = Self {
+            file: file.to_owned(),
+            module: module.clone(),
+            paths: Vec::new(),
+            unsafe_lines: Vec::new(),
+            prints: Vec::new(),
+            declared: BTreeSet::new(),
+            test_modules: Vec::new(),
+            lines: text.lines().count(),
+        };
+        let tokens = TokenStream::from_str(text).unwrap_or_else(|error| panic!("src/{}: {error}", file.display()));
+        // main.rs is a crate of its own that sees the library by name.
+        if module == ["main"] {
+            module.clear();
+        }
+        source.walk(tokens, &module);
+        source
+    }
+
+    fn walk(&mut self, tokens: TokenStream, module: &[String]) {
+        let tokens: Vec<TokenTree> = tokens.into_iter().collect();
+        let mut at = 0;
+        while let Some(token) = tokens.get(at) {
+            if let Some(end) = cfg_test_item(&tokens, at) {
+                self.leave_out(&tokens[at..end], module);
+                at = end;
+                continue;
+            }
+            at = match token {
+                TokenTree::Group(group) => {
+                    self.walk(group.stream(), module);
+                    at + 1
+                }
+                TokenTree::Ident(word) => self.word(&word.to_string(), &tokens, at, module),
+                _ => at + 1,
+            };
+        }
+    }
+
+    /// Reads what begins with the word at `at`; returns where to go on.
+    fn word(&mut self, word: &str, tokens: &[TokenTree], at: usize, module: &[String]) -> usize {
+        let line = tokens[at].span().start().line;
+        match word {
+            "unsafe" => self.unsafe_lines.push(line),
+            "mod" => return self.mod_item(&tokens[at + 1..], module).map_or(at + 1, |taken| at + 1 + taken),
+            // Not `impl Trait + use<'a>`.
+            "use" if !is_punct(tokens.get(at + 1), '<') => {
+                let end = tokens[at..].iter().position(|t| is_punct(Some(t), ';')).map_or(tokens.len(), |n| at + n);
+                self.tree(&tokens[at + 1..end], &[], module);
+                return end;
+            }
+            _ if PRINTING.contains(&word) && is_punct(tokens.get(at + 1), '!') => {
+                self.prints.push((line, word.to_owned()));
+            }
+            _ if is_path_sep(tokens, at + 1) && !is_after_generics(tokens, at) => {
+                return self.inline_path(tokens, at, module);
+            }
+            _ => {}
+        }
+        at + 1
+    }
+
+    /// What follows `mod`: a name, and the module's body if it is here. Returns how many tokens that was.
+    fn mod_item(&mut self, rest: &[TokenTree], module: &[String]) -> Option<usize> {
+        let TokenTree::Ident(name) = rest.first()? else { return None };
+        if module == self.module {
+            self.declared.insert(name.to_string());
+        }
+        let Some(TokenTree::Group(body)) = rest.get(1) else { return Some(1) };
+        let inner: Vec<String> = module.iter().cloned().chain([name.to_string()]).collect();
+        self.walk(body.stream(), &inner);
+        Some(2)
+    }
+
+    /// A path in an expression or a type: `crate::status::Board::new`. Returns where it ends.
+    fn inline_path(&mut self, tokens: &[TokenTree], start: usize, module: &[String]) -> usize {
+        let line = tokens[start].span().start().line;
+        let mut path = Vec::new();
+        let mut at = start;
+        while let Some(TokenTree::Ident(word)) = tokens.get(at) {
+            path.push(word.to_string());
+            at += 1;
+            if !is_path_sep(tokens, at) {
+                break;
+            }
+            at += 2;
+        }
+        self.name(line, &path, module);
+        at
+    }
+
+    /// A tree of a `use`: commas, braces, `as`, `*`.
+    fn tree(&mut self, tokens: &[TokenTree], prefix: &[String], module: &[String]) {
+        for branch in tokens.split(|token| is_punct(Some(token), ',')) {
+            let mut path = prefix.to_vec();
+            let mut whole = true;
+            let mut line = 0;
+            for token in branch {
+                line = if line == 0 { token.span().start().line } else { line };
+                match token {
+                    TokenTree::Ident(word) if word == "as" => break,
+                    TokenTree::Ident(word) => path.push(word.to_string()),
+                    TokenTree::Group(group) if group.delimiter() == Delimiter::Brace => {
+                        let inner: Vec<TokenTree> = group.stream().into_iter().collect();
+                        self.tree(&inner, &path, module);
+                        whole = false;
+                    }
+                    _ => {}
+                }
+            }
+            if whole && !branch.is_empty() {
+                self.name(line, &path, module);
+            }
+        }
+    }
+
+    fn name(&mut self, line: usize, path: &[String], module: &[String]) {
+        let mut base: Option<Vec<String>> = None;
+        let mut rest = path;
+        while let Some((first, tail)) = rest.split_first() {
+            base = Some(match (first.as_str(), base) {
+                ("crate", None) => Vec::new(),
+                ("self", None) => module.to_vec(),
+                ("super", known) => {
+                    let mut up = known.unwrap_or_else(|| module.to_vec());
+                    up.pop();
+                    up
+                }
+                ("self", known @ Some(_)) => known.unwrap_or_default(),
+                ("rapid", None) if self.module == ["main"] => Vec::new(),
+                (_, known) => {
+                    base = known;
+                    break;
+                }
+            });
+            rest = tail;
+        }
+        let resolved = match base {
+            Some(base) => ["crate".to_owned()].into_iter().chain(base).chain(rest.iter().cloned()).collect(),
+            None => path.to_vec(),
+        };
+        self.paths.push((line, resolved));
+    }
+
+    fn leave_out(&mut self, item: &[TokenTree], module: &[String]) {
+        if let [.., TokenTree::Ident(word), TokenTree::Ident(name), TokenTree::Punct(_)] = item
+            && word == "mod"
+        {
+            self.test_modules.push(module.iter().cloned().chain([name.to_string()]).collect());
+        }
+        let (Some(first), Some(last)) = (item.first(), item.last()) else { return };
+        let item = last.span().end().line - first.span().start().line + 1;
+        self.lines = self.lines.saturating_sub(item);
+    }
+}
+
+/// If `#[cfg(test)]` stands here, the end of the item it belongs to.
+fn cfg_test_item(tokens: &[TokenTree], at: usize) -> Option<usize> {
+    let (TokenTree::Punct(hash), TokenTree::Group(attribute)) = (tokens.get(at)?, tokens.get(at + 1)?) else {
+        return None;
+    };
+    let text: String = attribute.stream().to_string().split_whitespace().collect();
+    if hash.as_char() != '#' || text != "cfg(test)" {
+        return None;
+    }
+    let end = tokens[at + 2..].iter().position(|token| match token {
+        TokenTree::Punct(punct) => punct.as_char() == ';',
+        TokenTree::Group(group) => group.delimiter() == Delimiter::Brace,
+        _ => false,
+    })?;
+    Some(at + 2 + end + 1)
+}
+
+fn is_punct(token: Option<&TokenTree>, wanted: char) -> bool {
+    matches!(token, Some(TokenTree::Punct(punct)) if punct.as_char() == wanted)
+}
+
+fn is_path_sep(tokens: &[TokenTree], at: usize) -> bool {
+    is_punct(tokens.get(at), ':') && is_punct(tokens.get(at + 1), ':')
+}
+
+/// `Vec::<u8>::new`, `<T as Trait>::make`: what stands here belongs to a type, and is no crate or module.
+fn is_after_generics(tokens: &[TokenTree], at: usize) -> bool {
+    let arrow = at >= 4 && is_punct(tokens.get(at - 4), '-');
+    at >= 3 && is_path_sep(tokens, at - 2) && is_punct(tokens.get(at - 3), '>') && !arrow
+}
+
+fn check(source: &Source) -> Vec<Violation> {
+    let mut rules: Vec<(usize, String)> = Vec::new();
+    let place = source.module.join("/");
+    let home = source.module.first().map(String::as_str);
+
+    if source.lines > MAX_LINES {
+        rules.push((1, format!("{} lines that are not tests, {MAX_LINES} are the most", source.lines)));
+    }
+    for line in &source.unsafe_lines {
+        if !UNSAFE_HOMES.iter().any(|allowed| is_within(&place, allowed)) {
+            rules.push((*line, format!("`unsafe` outside {}", UNSAFE_HOMES.join("/ and ") + "/")));
+        }
+    }
+    for (line, word) in &source.prints {
+        rules.push((*line, format!("`{word}!`: write to a given `impl io::Write`")));
+    }
+    // The crate's root only declares modules and gives names.
+    if let Some(home) = home {
+        if layer(home).is_none() {
+            rules.push((1, format!("module `{home}` has no layer: give it one in LAYERS")));
+        } else {
+            for (line, path) in &source.paths {
+                rules.extend(import(home, path).map(|rule| (*line, rule)));
+                rules.extend(third_party(source, &place, path).map(|rule| (*line, rule)));
+            }
+        }
+    }
+    rules.into_iter().map(|(line, rule)| Violation { file: source.file.clone(), line, rule }).collect()
+}
+
+fn layer(module: &str) -> Option<usize> {
+    LAYERS.iter().position(|layer| layer.contains(&module))
+}
+
+/// What is wrong with `home` naming `path`.
+fn import(home: &str, path: &[String]) -> Option<String> {
+    let [root, target, ..] = path else { return None };
+    let target = target.as_str();
+    // Names that are no modules are the crate's own re-exports.
+    let (from, to) = (layer(home)?, layer(target)?);
+    if root != "crate" || target == home {
+        return None;
+    }
+    let edge = format!("`{home}` (layer {from}) imports `{target}` (layer {to})");
+    if to > from {
+        return Some(format!("{edge}: imports point down only"));
+    }
+    if to == from {
+        let sideways = SIDEWAYS.iter().any(|(module, seen)| *module == home && seen.contains(&target));
+        return (from > 0 && !sideways).then(|| format!("{edge}: modules of this layer do not import one another"));
+    }
+    let (_, seen, why) = NARROW.iter().find(|(module, ..)| *module == home)?;
+    (to > 0 && !seen.contains(&target)).then(|| format!("{edge}: {why}"))
+}
+
+/// What is wrong with the file at `place` naming the crate `path` begins with.
+fn third_party(source: &Source, place: &str, path: &[String]) -> Option<String> {
+    let name = path.first()?;
+    // `mod udev;` in hotplug/mod.rs: the name means the module there.
+    if source.declared.contains(name) {
+        return None;
+    }
+    let (_, homes) = HOMES.iter().find(|(dependency, _)| dependency == name)?;
+    let at_home = homes.iter().any(|home| match *home {
+        ANYWHERE => true,
+        ABOVE_NOUNS => source.module.first().and_then(|module| layer(module)).is_some_and(|layer| layer > 0),
+        module => is_within(place, module),
+    });
+    (!at_home).then(|| format!("crate `{name}` is used outside its home: {}", homes.join(", ")))
+}
+
+fn is_within(place: &str, module: &str) -> bool {
+    place.strip_prefix(module).is_some_and(|rest| rest.is_empty() || rest.starts_with('/'))
+}
+
+mod the_check_itself {
+    use super::*;
+
+    /// The violations of one file, as `line: rule`.
+    fn found(file: &str, text: &str) -> Vec<String> {
+        let files = BTreeMap::from([(PathBuf::from(file), text.to_owned())]);
+        check_tree(&files).into_iter().map(|v| format!("{}: {}", v.line, v.rule)).collect()
+    }
+
+    #[track_caller]
+    fn finds(file: &str, text: &str, expected: &[&str]) {
+        let found = found(file, text);
+        assert_eq!(found.len(), expected.len(), "{file}: found {found:#?}, expected {expected:#?}");
+        for (found, expected) in found.iter().zip(expected) {
+            assert!(found.starts_with(expected), "{file}: found {found:?}, expected {expected:?}");
+        }
+    }
+
+    #[test]
+    fn imports_upwards_and_sideways_are_found() {
+        finds("mask.rs", "use crate::modality::ModalityId;", &[]);
+        finds("mask.rs", "use crate::registry::Registry;", &["1: `mask` (layer 0) imports `registry` (layer 1): imp"]);
+        finds("bus/mod.rs", "use crate::driver::Reading;", &["1: `bus` (layer 2) imports `driver` (layer 2): mod"]);
+        finds("rig/stream.rs", "\n\nuse crate::record::Writer;", &["3: `rig` (layer 3) imports `record`"]);
+        finds("status/mod.rs", "use crate::registry::Registry;", &[]);
+        finds("registry/mod.rs", "use crate::status::Board;", &["1: `registry` (layer 1) imports `status`"]);
+        finds("app.rs", "use crate::{tui, rig, record, headless};", &[]);
+        finds("tui/view.rs", "use crate::status::Snapshot;", &[]);
+        finds("tui/view.rs", "use crate::rig::Rig;", &["1: `tui` (layer 4) imports `rig` (layer 3): a screen"]);
+    }
+
+    #[test]
+    fn every_way_to_write_a_path_is_seen() {
+        let nested =
+            "use crate::{\n    time::Stamp,\n    registry::{\n        Registry,\n        spec as other,\n    },\n};";
+        finds(
+            "sample.rs",
+            nested,
+            &["4: `sample` (layer 0) imports `registry`", "5: `sample` (layer 0) imports `registry`"],
+        );
+        finds("sample.rs", "fn f() { let b = crate::status::Board::new(); }", &["1: `sample`"]);
+        finds("sample.rs", "type A = Vec<crate::status::Board>;", &["1: `sample`"]);
+        finds("sample.rs", "fn f() { select! { _ = async { crate::rig::run().await } => {} } }", &["1: `sample`"]);
+        finds("sample.rs", "use super::status::Board;", &["1: `sample`"]);
+        finds("driver/serial.rs", "use super::super::sync::Ring;", &["1: `driver`"]);
+        finds("driver/serial.rs", "use super::camera::Camera; use self::inner::X;", &[]);
+        finds("driver/mod.rs", "mod inner { fn f() { super::super::bus::open() } }", &["1: `driver`"]);
+        finds("sample.rs", "pub use crate::status::*;", &["1: `sample`"]);
+        finds("main.rs", "use rapid::app; fn f() { rapid::commands::run() }", &[]);
+    }
+
+    #[test]
+    fn comments_strings_and_tests_do_not_count() {
+        finds(
+            "sample.rs",
+            "// use crate::rig::Rig;\n/// [`crate::rig::Rig`]\nconst A: &str = \"crate::rig::Rig unsafe\";",
+            &[],
+        );
+        finds("sample.rs", "#[cfg(test)]\nmod tests {\n use crate::rig::Rig;\n fn f() { println!() }\n}", &[]);
+        finds("sample.rs", "#[cfg(not(test))]\nmod x { use crate::rig::Rig; }", &["2: `sample`"]);
+        let files = BTreeMap::from([
+            (PathBuf::from("sync/ring.rs"), "#[cfg(test)]\nmod tests;".to_owned()),
+            (PathBuf::from("sync/ring/tests.rs"), "use crate::rig::Rig;".to_owned()),
+        ]);
+        assert_eq!(check_tree(&files), []);
+    }
+
+    #[test]
+    fn a_crate_outside_its_home_is_found() {
+        finds("hotplug/udev.rs", "use udev::MonitorBuilder;", &[]);
+        finds("hotplug/mod.rs", "mod udev;\nfn f() { udev::watch() }", &[]);
+        finds("hotplug/lan.rs", "fn f() -> ::udev::Device { <A as B>::udev::c() }", &["1: crate `udev`"]);
+        finds("hotplug/lan.rs", "fn f() -> impl Future<Output = ()> + use<'_> { udev::c() }", &["1: crate `udev`"]);
+        finds(
+            "hotplug/lan.rs",
+            "fn f(d: &::udev::Device) {}",
+            &["1: crate `udev` is used outside its home: hotplug/udev"],
+        );
+        finds("driver/camera/capture.rs", "use v4l::Device;", &[]);
+        finds("driver/camerax.rs", "use v4l::Device;", &["1: crate `v4l`"]);
+        finds("rig/mod.rs", "use {iceoryx2::prelude::*, std::io};", &["1: crate `iceoryx2`"]);
+        finds("mask.rs", "use tokio::sync::watch;", &["1: crate `tokio`"]);
+        finds("time.rs", "use rustix::time::ClockId;", &[]);
+        finds("sample.rs", "use rustix::time::ClockId;", &["1: crate `rustix`"]);
+    }
+
+    #[test]
+    fn unsafe_prints_and_long_files_are_found() {
+        finds("bus/mod.rs", "fn f() { unsafe { g() } }", &[]);
+        finds("rig/mod.rs", "fn f() {\n unsafe { g() } }", &["2: `unsafe` outside driver/ and bus/"]);
+        finds("rig/mod.rs", "fn f() { if a { println!(\"x\") } }", &["1: `println!`"]);
+        let long = "//\n".repeat(MAX_LINES);
+        finds("rig/mod.rs", &long, &[]);
+        finds("rig/mod.rs", &format!("{long}//\n"), &["1: 401 lines"]);
+        finds("rig/mod.rs", &format!("{long}#[cfg(test)]\nmod tests {{\n}}\n"), &[]);
+        finds("utils.rs", "", &["1: module `utils` has no layer"]);
+    }
+}
