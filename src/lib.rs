@@ -1,8 +1,11 @@
 //! `rapid`: hot-plug discovery, physical mask, streaming, synchronisation and recording for
 //! robot-learning rigs, in one binary.
 
+pub mod app;
 pub mod bus;
+pub mod cli;
 pub mod commands;
+pub mod dispatch;
 pub mod driver;
 pub mod headless;
 pub mod hotplug;
