@@ -213,10 +213,9 @@ fn start_screen(
     };
     let run = headless::run(board, stop, options, std::io::stdout());
     tokio::spawn(async move {
-        let outcome = run.await.map_err(AppError::Output);
-        // A reader that has gone ends the output, not the recording: nobody asks to quit here.
+        // Lines cannot ask for anything.
         drop(commands);
-        outcome
+        run.await.map_err(AppError::Output)
     })
 }
 
@@ -253,6 +252,7 @@ impl Conductor {
             _ => None,
         };
         let mut begin_episode = self.record;
+        let mut screen_ended = false;
         loop {
             tokio::select! {
                 biased;
@@ -261,8 +261,13 @@ impl Conductor {
                     // Its outcome is taken when everything is taken down.
                     return Ok(());
                 }
-                outcome = &mut running.screen => {
-                    return outcome.unwrap_or(Err(AppError::Panicked("the screen")));
+                outcome = &mut running.screen, if !screen_ended => {
+                    outcome.unwrap_or(Err(AppError::Panicked("the screen")))?;
+                    // Nobody reads the output any more. An episode is worth more than its log lines.
+                    if !self.record {
+                        return Ok(());
+                    }
+                    screen_ended = true;
                 }
                 Some(command) = running.asked.recv() => match command {
                     Command::ToggleRecording => self.toggle().await?,
