@@ -48,7 +48,9 @@ impl Columns {
                 let separator = if detail.is_empty() { "" } else { "   " };
                 (device, Some(bit), word, format!("{detail}{separator}mask {mask}"))
             }
-            What::Unregistered { device, reason } => (device, None, palette.warn(&pad("unregistered")), reason.clone()),
+            What::Unregistered { device, reason } => {
+                (&"usb".to_owned(), None, palette.warn(&pad("unregistered")), format!("{device}   {reason}"))
+            }
             What::Recording { file } => {
                 (&"episode".to_owned(), None, palette.good(&pad("recording")), file.display().to_string())
             }

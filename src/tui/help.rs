@@ -11,7 +11,7 @@ use crate::status::SlotState;
 const KEYS: [(&str, &str); 8] = [
     ("space", "start an episode, end the one in progress"),
     ("up, down", "select a device"),
-    ("r", "start the selected device again, if it failed"),
+    ("r", "restart the selected device, if it failed"),
     ("p", "pause the view; everything else goes on"),
     ("pgup, pgdn", "scroll the log; esc goes to its end"),
     ("?", "this help"),
