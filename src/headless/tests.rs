@@ -73,9 +73,9 @@ fn lines_for_people_have_their_columns() {
     let lines: Vec<_> = all_events().into_iter().map(|what| columns.line(&event(what), WALL_NS)).collect();
     insta::assert_snapshot!(lines.join("\n"), @r#"
     22:13:20.000Z  cam_wrist  bit 0   attached      /dev/video0 port 1-2.3 serial CAM [2J00
-    22:13:20.000Z  cam_wrist  bit 0   streaming     /dev/video0 MJPG 640x480@30   mask 0x05
+    22:13:20.000Z  cam_wrist  bit 0   streaming     /dev/video0 MJPG 640x480@30    mask 0x05
     22:13:20.000Z  tof        bit 12  detached      told by kernel
-    22:13:20.000Z  tof        bit 12  absent        mask 0x05
+    22:13:20.000Z  tof        bit 12  absent                                       mask 0x05
     22:13:20.000Z  usb                unregistered  046d:0825  X   no entry has this serial
     22:13:20.000Z  episode            recording     out/a.mcap
     22:13:20.000Z  episode            finished      out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped
@@ -175,7 +175,7 @@ async fn what_is_announced_before_the_end_is_printed_and_summed_up() {
     shutdown.cancel();
     output.await.unwrap();
     let text = kept.text();
-    assert!(text.contains("cam_wrist  bit 0   streaming     /dev/video0   mask 0x05\n"), "{text}");
+    assert!(text.contains("cam_wrist  bit 0   streaming     /dev/video0                    mask 0x05\n"), "{text}");
     assert!(text.contains("episode out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped\n"), "{text}");
     assert!(text.contains("cam_wrist    0          1"), "{text}");
 }

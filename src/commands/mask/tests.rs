@@ -87,7 +87,7 @@ async fn a_watch_prints_changes_and_the_publishers_end_and_return() {
     22:13:20.131Z  0x01  00000001  +cam_wrist
     22:13:20.137Z  0x06  00000110  -cam_wrist +cam_top +tof [2J
     22:13:20.139Z  the publisher is gone: no such file
-    22:13:20.143Z  0x06  00000110  
+    22:13:20.143Z  0x06  00000110  the publisher is back
     22:13:20.149Z  the publisher is gone: no such file
     "#);
 }
