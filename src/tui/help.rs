@@ -2,6 +2,7 @@
 
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Flex, Layout, Rect};
+use ratatui::style::Modifier;
 use ratatui::text::{Line, Span};
 use ratatui::widgets::{Block, Clear, Padding, Paragraph};
 
@@ -48,7 +49,7 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, theme: Theme) {
     let block = Block::bordered()
         .border_set(theme.border())
         .border_style(theme.faint())
-        .title(Span::styled(" Keys and states ", theme.title()))
+        .title(Span::styled(" Keys and states ", theme.title().remove_modifier(Modifier::DIM)))
         .padding(Padding::horizontal(1));
     frame.render_widget(Clear, middle);
     frame.render_widget(Paragraph::new(lines).block(block), middle);
