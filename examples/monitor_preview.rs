@@ -1,17 +1,19 @@
 //! The monitor on a board that nobody but this program writes: for looking at the screen.
 //!
 //! `cargo run --example monitor_preview [DEVICES]` shows up to 64 devices (default 6) that come, go,
-//! stall and fail; space starts and ends a pretended episode.
+//! stall and fail; space starts and ends a pretended episode. With `--headless` or `--json` behind
+//! it, the same is printed for 40 seconds.
 
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use rapid::headless::{self, HeadlessOptions};
 use rapid::mask::PhysicalMask;
 use rapid::modality::ModalityId;
 use rapid::registry::{CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, WhenStale};
 use rapid::sample::Epoch;
-use rapid::status::{Board, Command, Level, LogLine, RecordingStatus, SlotState};
+use rapid::status::{Board, Command, Level, LogLine, RecordingStatus, SlotState, What};
 use rapid::time::{Stamp, realtime_ns};
 use rapid::tui;
 use tokio::sync::mpsc;
@@ -26,7 +28,26 @@ async fn main() -> Result<(), tui::TuiError> {
     let (sender, commands) = mpsc::channel(8);
     let shutdown = CancellationToken::new();
     let rig = tokio::spawn(pretend(Arc::clone(&board), count, commands, shutdown.clone()));
-    let outcome = tui::run(board, sender, shutdown.clone()).await;
+    let form = std::env::args().nth(2);
+    let outcome = match form {
+        Some(form) => {
+            let duration = Duration::from_secs(40);
+            let json = form == "--json";
+            let options = HeadlessOptions { json, progress: true, duration: Some(duration), ..Default::default() };
+            let output = headless::run(board, shutdown.clone(), options, std::io::stdout());
+            // It stands for whoever ends the run; when the output ended before, there is nothing to end.
+            let end = async {
+                tokio::time::sleep(duration).await;
+                shutdown.cancel();
+            };
+            tokio::select! {
+                biased;
+                outcome = output => outcome.map_err(tui::TuiError::Gone),
+                () = async { end.await; std::future::pending().await } => Ok(()),
+            }
+        }
+        None => tui::run(board, sender, shutdown.clone()).await,
+    };
     shutdown.cancel();
     // It ends by the token.
     let _ = rig.await;
@@ -102,6 +123,13 @@ async fn pretend(board: Arc<Board>, count: u8, mut commands: mpsc::Receiver<Comm
             if state != *before {
                 *before = state;
                 board.set_slot(id, state, Epoch(1), detail(state));
+                board.announce(What::State {
+                    device: NAMES.get(index).copied().unwrap_or("sensor").to_owned(),
+                    bit: id,
+                    state,
+                    mask: board.snapshot().mask.hex(usize::from(count)),
+                    detail: detail(state).to_owned(),
+                });
                 let level = if state == SlotState::Failed { Level::Error } else { Level::Info };
                 say(&board, level, format!("bit {bit} is {state:?}, {}", detail(state)));
             }

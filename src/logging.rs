@@ -268,6 +268,23 @@ mod tests {
     }
 
     #[test]
+    fn text_lines_replace_a_progress_line_on_the_same_terminal() {
+        use crate::headless::style::Palette;
+        let line = LogLine { wall_ns: 1_700_000_000_123_000_000, level: Level::Warn, text: "late".to_owned() };
+        let sink = StderrSink { form: Stderr::Text, palette: Palette::Plain, before: "" };
+        assert_eq!(sink.render(&line), "22:13:20.123Z  warn   late\n");
+        let sink = StderrSink { form: Stderr::Text, palette: Palette::Plain, before: ERASE_LINE };
+        assert_eq!(sink.render(&line), "\r\x1b[K22:13:20.123Z  warn   late\n");
+    }
+
+    #[test]
+    fn a_wrong_filter_is_named() {
+        let board = Arc::new(crate::status::literal::board(&["cam"]));
+        let error = init(board, Some("rapid=loud"), Stderr::Nothing).unwrap_err();
+        assert!(error.to_string().starts_with("RAPID_LOG: "), "{error}");
+    }
+
+    #[test]
     fn json_lines_are_objects_and_long_lines_are_cut() {
         let sink = StderrSink { form: Stderr::Json, palette: crate::headless::style::Palette::Plain, before: "" };
         let line = LogLine { wall_ns: 1_700_000_000_123_000_000, level: Level::Warn, text: "a \"b\"".to_owned() };

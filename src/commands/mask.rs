@@ -223,6 +223,7 @@ struct Seen {
 #[derive(Debug)]
 enum Change {
     Mask { record: MaskRecord, before: PhysicalMask },
+    Back(MaskRecord),
     Gone(String),
 }
 
@@ -239,7 +240,10 @@ impl Seen {
             return None;
         }
         (self.mask, self.sequence) = (record.mask, record.sequence);
-        (returned || before != record.mask).then_some(Change::Mask { record, before })
+        if returned {
+            return Some(Change::Back(record));
+        }
+        (before != record.mask).then_some(Change::Mask { record, before })
     }
 
     fn gone(&mut self, reason: &str) -> Option<Change> {
@@ -256,37 +260,35 @@ impl Change {
     ) -> io::Result<String> {
         let palette = options.palette;
         match self {
-            Self::Mask { record, .. } if options.json => Ok(render_json(record, names().as_deref(), now_ns)? + "\n"),
+            Self::Mask { record, .. } | Self::Back(record) if options.json => {
+                Ok(render_json(record, names().as_deref(), now_ns)? + "\n")
+            }
             Self::Gone(reason) if options.json => {
                 Ok(format!("{}\n", serde_json::json!({ "gone": reason, "time": text::rfc3339(now_ns) })))
             }
             Self::Mask { record, before } => {
                 let layout = names();
-                let changed = record.mask.0 ^ before.0;
-                let edges: Vec<_> = (0..64_u8)
-                    .filter(|bit| changed >> bit & 1 == 1)
-                    .map(|bit| {
-                        let name = name(bit, layout.as_deref());
-                        match record.mask.0 >> bit & 1 {
-                            1 => palette.good(&format!("+{name}")),
-                            _ => palette.bad(&format!("-{name}")),
-                        }
+                let changed = (0..64_u8).filter(|bit| (record.mask.0 ^ before.0) >> bit & 1 == 1);
+                let edges: Vec<_> = changed
+                    .map(|bit| match (record.mask.0 >> bit & 1, name(bit, layout.as_deref())) {
+                        (1, name) => palette.good(&format!("+{name}")),
+                        (_, name) => palette.bad(&format!("-{name}")),
                     })
                     .collect();
-                let count = usize::from(record.device_count);
-                Ok(format!(
-                    "{}  {}  {}  {}\n",
-                    palette.faint(&text::time_of_day(record.realtime_ns)),
-                    record.mask.hex(count),
-                    record.mask.binary(count),
-                    edges.join(" ")
-                ))
+                Ok(watched(record, &edges.join(" "), palette))
             }
+            Self::Back(record) => Ok(watched(record, &palette.good("the publisher is back"), palette)),
             Self::Gone(reason) => {
                 Ok(format!("{}  {}\n", palette.faint(&text::time_of_day(now_ns)), palette.bad(&text::plain(reason))))
             }
         }
     }
+}
+
+fn watched(record: &MaskRecord, remark: &str, palette: Palette) -> String {
+    let count = usize::from(record.device_count);
+    let time = palette.faint(&text::time_of_day(record.realtime_ns));
+    format!("{time}  {}  {}  {remark}\n", record.mask.hex(count), record.mask.binary(count))
 }
 
 #[cfg(test)]

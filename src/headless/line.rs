@@ -28,6 +28,8 @@ pub(super) struct Columns {
     pub(super) palette: Palette,
 }
 
+/// Columns of the detail of a state; a longer one pushes the mask to the right.
+const DETAIL: usize = 28;
 /// Columns of the word that says what happened.
 const WORD: usize = 12;
 
@@ -45,10 +47,12 @@ impl Columns {
             }
             What::State { device, bit, state, mask, detail } => {
                 let word = palette.state(*state, &pad(state.word()));
-                let separator = if detail.is_empty() { "" } else { "   " };
-                (device, Some(bit), word, format!("{detail}{separator}mask {mask}"))
+                let missing = DETAIL.saturating_sub(text::width(&text::plain(detail)));
+                (device, Some(bit), word, format!("{detail}{:missing$}   mask {mask}", ""))
             }
-            What::Unregistered { device, reason } => (device, None, palette.warn(&pad("unregistered")), reason.clone()),
+            What::Unregistered { device, reason } => {
+                (&"usb".to_owned(), None, palette.warn(&pad("unregistered")), format!("{device}   {reason}"))
+            }
             What::Recording { file } => {
                 (&"episode".to_owned(), None, palette.good(&pad("recording")), file.display().to_string())
             }

@@ -124,10 +124,12 @@ impl Palette {
 mod tests {
     use super::*;
 
+    type Environment = &'static [(&'static str, &'static str)];
+
     #[test]
     fn choice_environment_and_terminal_decide_in_this_order() {
         use ColourChoice::{Always, Auto, Never};
-        let table: [(ColourChoice, Terminal, &[(&str, &str)], Palette); 9] = [
+        let table: [(ColourChoice, Terminal, Environment, Palette); 9] = [
             (Auto, Terminal::Yes, &[], Palette::Ansi),
             (Auto, Terminal::No, &[], Palette::Plain),
             (Auto, Terminal::Yes, &[("NO_COLOR", "1")], Palette::Plain),

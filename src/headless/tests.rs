@@ -1,1 +1,235 @@
+use std::sync::Mutex;
 
+use serde_json::Value;
+
+use super::*;
+use crate::sample::Epoch;
+use crate::status::literal::{WALL_NS, board, every_state, id, recording, three_streaming};
+use crate::status::{Level, SlotState, What};
+
+/// An output that keeps what it is given.
+#[derive(Clone, Default)]
+struct Kept(Arc<Mutex<Vec<u8>>>);
+
+impl Kept {
+    fn text(&self) -> String {
+        String::from_utf8(self.0.lock().unwrap().clone()).unwrap()
+    }
+}
+
+impl Write for Kept {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0.lock().unwrap().extend_from_slice(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+fn event(what: What) -> Event {
+    Event { stamp: Stamp(0), what }
+}
+
+fn state(device: &str, bit: u8, state: SlotState, detail: &str) -> What {
+    What::State { device: device.to_owned(), bit: id(bit), state, mask: "0x05".to_owned(), detail: detail.to_owned() }
+}
+
+fn episode(dropped: u64, error: Option<&str>) -> What {
+    What::Episode {
+        file: "out/a.mcap".into(),
+        seconds: 30.04,
+        messages: 1234,
+        bytes: 12_345_678,
+        dropped,
+        error: error.map(str::to_owned),
+    }
+}
+
+fn all_events() -> Vec<What> {
+    vec![
+        What::Attach {
+            device: "cam_wrist".to_owned(),
+            bit: id(0),
+            node: "/dev/video0".to_owned(),
+            port: "1-2.3".to_owned(),
+            serial: Some("CAM\x1b[2J00".to_owned()),
+        },
+        state("cam_wrist", 0, SlotState::Streaming, "/dev/video0 MJPG 640x480@30"),
+        What::Detach { device: "tof".to_owned(), bit: id(12), witness: "kernel".to_owned() },
+        state("tof", 12, SlotState::Absent, ""),
+        What::Unregistered { device: "046d:0825 \nX".to_owned(), reason: "no entry has this serial".to_owned() },
+        What::Recording { file: "out/a.mcap".into() },
+        episode(0, None),
+        episode(3, Some("disk full")),
+        What::Log { level: Level::Warn, text: "something".to_owned() },
+    ]
+}
+
+#[test]
+fn lines_for_people_have_their_columns() {
+    let columns = line::Columns { name: 9, palette: Palette::Plain };
+    let lines: Vec<_> = all_events().into_iter().map(|what| columns.line(&event(what), WALL_NS)).collect();
+    insta::assert_snapshot!(lines.join("\n"), @r#"
+    22:13:20.000Z  cam_wrist  bit 0   attached      /dev/video0 port 1-2.3 serial CAM [2J00
+    22:13:20.000Z  cam_wrist  bit 0   streaming     /dev/video0 MJPG 640x480@30    mask 0x05
+    22:13:20.000Z  tof        bit 12  detached      told by kernel
+    22:13:20.000Z  tof        bit 12  absent                                       mask 0x05
+    22:13:20.000Z  usb                unregistered  046d:0825  X   no entry has this serial
+    22:13:20.000Z  episode            recording     out/a.mcap
+    22:13:20.000Z  episode            finished      out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped
+    22:13:20.000Z  episode            not whole     out/a.mcap  30.0 s  1234 messages  12.3 MB  3 dropped  disk full
+    22:13:20.000Z  log                warn          something
+    "#);
+}
+
+#[test]
+fn colours_follow_the_state_and_nothing_else_is_an_escape() {
+    let columns = line::Columns { name: 9, palette: Palette::Ansi };
+    let line = columns.line(&event(state("tof", 2, SlotState::Failed, "a\x1b[31mb")), WALL_NS);
+    assert!(line.contains("\x1b[1;31mfailed      \x1b[0m"), "{line:?}");
+    assert!(line.contains("a [31mb"), "{line:?}");
+}
+
+#[test]
+fn json_is_the_event_with_its_wall_time() {
+    let object: Value =
+        serde_json::from_str(&line::json(&event(state("cam_wrist", 0, SlotState::Streaming, "x")), WALL_NS).unwrap())
+            .unwrap();
+    let expected = serde_json::json!({
+        "event": "state", "device": "cam_wrist", "bit": 0, "state": "streaming", "mask": "0x05", "detail": "x",
+        "stamp": 0, "time": "2023-11-14T22:13:20.000Z",
+    });
+    assert_eq!(object, expected);
+    for what in all_events() {
+        let text = line::json(&event(what), WALL_NS).unwrap();
+        assert!(!text.contains('\n') && !text.contains('\x1b'), "{text}");
+        assert!(serde_json::from_str::<Value>(&text).unwrap()["event"].is_string(), "{text}");
+    }
+}
+
+#[test]
+fn progress_names_what_counts_first() {
+    let mut snapshot = every_state();
+    snapshot.recording = Some(recording(2));
+    let line = progress::line(&snapshot, &Rates::default(), Duration::from_secs(12), Some(Duration::from_secs(30)));
+    insta::assert_snapshot!(line, @r#"00:12/00:30  mask 0x09  rec 01:23 312.4 MB 0.0 MB/s  2 dropped  cam_wrist 0.0 Hz  imu 0.0 Hz stalled"#);
+    let json = progress::json(&snapshot, &Rates::default(), Duration::from_secs(12), None, WALL_NS).unwrap();
+    let object: Value = serde_json::from_str(&json).unwrap();
+    assert_eq!(object["event"], "progress");
+    assert_eq!(object["recording"]["dropped"], 2);
+    assert_eq!(object["devices"][3]["state"], "stalled");
+    assert!(object.get("duration").is_none());
+}
+
+#[test]
+fn the_summary_counts_from_its_beginning_and_means_while_present() {
+    let start = three_streaming();
+    let mut tally = Tally::new(&start);
+    let at = |seconds: u64| Stamp(start.taken.0 + seconds * 1_000_000_000);
+    // Present from 0 to 4 s and from 9 s on: half of the run.
+    for (seconds, to) in
+        [(4, SlotState::Absent), (8, SlotState::Opening), (9, SlotState::Streaming), (9, SlotState::Stalled)]
+    {
+        tally.count(&Event { stamp: at(seconds), what: state("cam_wrist", 0, to, "") });
+    }
+    tally.count(&Event { stamp: at(9), what: episode(3, None) });
+    let mut end = start.clone();
+    end.taken = at(10);
+    for device in &mut end.devices {
+        device.samples += 150;
+        device.gaps += u64::from(device.id.bit());
+    }
+    let summary = tally.summary(&end);
+    let object = serde_json::to_value(&summary).unwrap();
+    assert_eq!(object["event"], "summary");
+    assert_eq!(object["devices"][0]["samples"], 150);
+    assert_eq!(object["devices"][0]["present"], 0.5);
+    assert_eq!(object["devices"][0]["hz"], 30.0);
+    assert_eq!(object["devices"][1]["hz"], 15.0);
+    assert_eq!(object["devices"][2]["gaps"], 2);
+    assert_eq!(object["episodes"][0]["file"], "out/a.mcap");
+    insta::assert_snapshot!(summary.text(9, Palette::Plain), @r#"
+    modality   bit    samples   mean Hz  present     gaps      bytes
+    cam_wrist    0        150      30.0    50.0%        0        0 B
+    cam_top      1        150      15.0   100.0%        1        0 B
+    tof          2        150      15.0   100.0%        2        0 B
+    episode out/a.mcap  30.0 s  1234 messages  12.3 MB  3 dropped
+    10.0 s in all
+    "#);
+}
+
+#[tokio::test]
+async fn what_is_announced_before_the_end_is_printed_and_summed_up() {
+    let board = Arc::new(board(&["cam_wrist", "tof"]));
+    let shutdown = CancellationToken::new();
+    let kept = Kept::default();
+    let options = HeadlessOptions { colour: ColourChoice::Never, ..HeadlessOptions::default() };
+    let output = run(Arc::clone(&board), shutdown.clone(), options, kept.clone());
+    // Announced after the call and before the first poll: not lost.
+    board.set_slot(id(0), SlotState::Streaming, Epoch(1), "");
+    board.announce(state("cam_wrist", 0, SlotState::Streaming, "/dev/video0"));
+    board.counters(id(0)).count(100, Stamp::now(), 0);
+    board.announce(episode(0, None));
+    shutdown.cancel();
+    output.await.unwrap();
+    let text = kept.text();
+    assert!(text.contains("cam_wrist  bit 0   streaming     /dev/video0                    mask 0x05\n"), "{text}");
+    assert!(text.contains("episode out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped\n"), "{text}");
+    assert!(text.contains("cam_wrist    0          1"), "{text}");
+}
+
+#[tokio::test]
+async fn every_json_line_is_an_object_and_what_was_missed_is_said() {
+    let board = Arc::new(board(&["cam_wrist"]));
+    let shutdown = CancellationToken::new();
+    let kept = Kept::default();
+    let options = HeadlessOptions { json: true, progress: true, ..HeadlessOptions::default() };
+    let output = run(Arc::clone(&board), shutdown.clone(), options, kept.clone());
+    // More than the board keeps for a slow reader.
+    for _ in 0..5000 {
+        board.announce(What::Log { level: Level::Info, text: "x".to_owned() });
+    }
+    shutdown.cancel();
+    output.await.unwrap();
+    let text = kept.text();
+    let objects: Vec<Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let missed = objects.iter().find(|object| object["event"] == "missed").unwrap();
+    let count = missed["count"].as_u64().unwrap();
+    let logged = objects.iter().filter(|object| object["event"] == "log").count() as u64;
+    assert_eq!(count + logged, 5000);
+    let summary = objects.last().unwrap();
+    assert_eq!(summary["event"], "summary");
+    assert_eq!(summary["missed_events"], count);
+}
+
+#[tokio::test]
+async fn a_closed_pipe_is_a_clean_end_without_a_shutdown() {
+    let board = Arc::new(board(&["cam_wrist"]));
+    let (reader, writer) = io::pipe().unwrap();
+    drop(reader);
+    let output = run(Arc::clone(&board), CancellationToken::new(), HeadlessOptions::default(), writer);
+    board.announce(What::Log { level: Level::Info, text: "x".to_owned() });
+    output.await.unwrap();
+}
+
+#[test]
+fn progress_in_place_is_erased_before_a_line() {
+    let snapshot = three_streaming();
+    let options = HeadlessOptions { progress: true, ..HeadlessOptions::default() };
+    let mut printer = Printer::new(&snapshot, &options, Progress::InPlace, Palette::Plain);
+    let piece = printer.look(&snapshot).unwrap().unwrap();
+    assert!(piece.starts_with(ERASE_LINE) && !piece.contains('\n'), "{piece:?}");
+    let line = printer.event(&event(episode(0, None))).unwrap();
+    assert!(line.starts_with(ERASE_LINE) && line.ends_with('\n'), "{line:?}");
+    let line = printer.event(&event(episode(0, None))).unwrap();
+    assert!(!line.contains(ERASE_LINE), "{line:?}");
+
+    let mut printer = Printer::new(&snapshot, &options, Progress::Lines, Palette::Plain);
+    assert_eq!(printer.look(&snapshot).unwrap(), None);
+    let mut later = snapshot.clone();
+    later.taken = later.taken.after(PROGRESS_LINE);
+    let piece = printer.look(&later).unwrap().unwrap();
+    assert!(piece.starts_with("00:10  mask 0x07") && piece.ends_with('\n'), "{piece:?}");
+}

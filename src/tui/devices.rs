@@ -10,7 +10,7 @@ use ratatui::text::{Line, Span};
 use super::model::Model;
 use super::theme::Theme;
 use super::view;
-use crate::status::{DeviceStatus, SlotState, Snapshot};
+use crate::status::{DeviceStatus, Level, SlotState, Snapshot};
 use crate::text;
 
 /// Columns of state, rate, age, gaps and total, each with the space before it.
@@ -93,7 +93,7 @@ fn row(device: &DeviceStatus, name: usize, width: u16, model: &Model, theme: The
     let rate = if running { text::hertz(reading.hz) } else { none.clone() };
     let age = reading.age.filter(|_| running).map_or(none, text::age);
     let is_old = device.state == SlotState::Stalled || reading.age.is_some_and(|age| age >= Duration::from_secs(1));
-    let gaps = if device.gaps > 0 { theme.warning() } else { theme.faint() };
+    let gaps = if device.gaps > 0 { theme.level(Level::Warn) } else { theme.faint() };
     let word = format!("{} {}", theme.state_symbol(device.state), device.state.word());
     let used = BIT + name + STATE + RATE + AGE + GAPS + TOTAL + 2;
     let detail = usize::from(width).saturating_sub(used);

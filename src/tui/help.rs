@@ -2,6 +2,7 @@
 
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Flex, Layout, Rect};
+use ratatui::style::Modifier;
 use ratatui::text::{Line, Span};
 use ratatui::widgets::{Block, Clear, Padding, Paragraph};
 
@@ -11,7 +12,7 @@ use crate::status::SlotState;
 const KEYS: [(&str, &str); 8] = [
     ("space", "start an episode, end the one in progress"),
     ("up, down", "select a device"),
-    ("r", "start the selected device again, if it failed"),
+    ("r", "restart the selected device, if it failed"),
     ("p", "pause the view; everything else goes on"),
     ("pgup, pgdn", "scroll the log; esc goes to its end"),
     ("?", "this help"),
@@ -48,7 +49,7 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, theme: Theme) {
     let block = Block::bordered()
         .border_set(theme.border())
         .border_style(theme.faint())
-        .title(Span::styled(" Keys and states ", theme.title()))
+        .title(Span::styled(" Keys and states ", theme.title().remove_modifier(Modifier::DIM)))
         .padding(Padding::horizontal(1));
     frame.render_widget(Clear, middle);
     frame.render_widget(Paragraph::new(lines).block(block), middle);

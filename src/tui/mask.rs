@@ -32,13 +32,32 @@ enum Density {
 }
 
 impl Density {
-    /// Columns of a cell, and of the space behind it.
-    fn cell(self) -> (usize, usize) {
+    /// Columns of a cell with the space behind it.
+    fn cell(self) -> usize {
         match self {
-            // Space, symbol, space, bit, space, name, space.
-            Self::Named(name) => (name + 7, 1),
-            Self::Numbered => (4, 1),
-            Self::Dots => (1, 0),
+            // Space, symbol, space, two digits, space, name, space.
+            Self::Named(name) => name + 8,
+            Self::Numbered => 4,
+            Self::Dots => 1,
+        }
+    }
+
+    /// The most cells in a row of `width` columns. A mask is read in bytes: without names, as many
+    /// whole groups of eight as fit.
+    fn per_row(self, width: usize) -> usize {
+        let whole = match self {
+            Self::Named(_) => return (width + 1) / self.cell(),
+            Self::Numbered => (width + 1) / (8 * self.cell()) * 8,
+            Self::Dots => (width + 1) / 9 * 8,
+        };
+        if whole > 0 { whole } else { width / self.cell() }
+    }
+
+    /// Space between the cell at `column` of a row and the next.
+    fn gap(self, column: usize) -> &'static str {
+        match self {
+            Self::Dots if column % 8 != 7 => "",
+            _ => " ",
         }
     }
 }
@@ -50,19 +69,25 @@ impl Plan {
         let width = usize::from(width.saturating_sub(2));
         let rows = usize::from(rows.clamp(1, 6));
         let name = devices.iter().map(|device| text::width(&device.name)).max().unwrap_or(0).clamp(1, NAME);
-        let mut plan = None;
-        for density in [Density::Named(name), Density::Numbered, Density::Dots] {
-            let (cell, gap) = density.cell();
-            let per_row = round((width + gap) / (cell + gap), density);
-            let needed = devices.len().div_ceil(per_row).max(1);
-            plan = Some(Self { density, per_row, rows: u16::try_from(needed.min(rows)).unwrap_or(1) });
-            // Names are worth two rows, or three on a high terminal; more of them are a wall of text.
-            let worth = if matches!(density, Density::Named(_)) { rows.min(3) } else { rows };
-            if needed <= worth {
-                break;
-            }
+        // Names are worth three rows at most; more of them are a wall of text.
+        let names = Self::of(Density::Named(name), devices.len(), width);
+        if usize::from(names.rows) <= rows.min(3) {
+            return names;
         }
-        plan.unwrap_or(Self { density: Density::Dots, per_row: 1, rows: 1 })
+        let numbers = Self::of(Density::Numbered, devices.len(), width);
+        if usize::from(numbers.rows) <= rows {
+            return numbers;
+        }
+        Self::of(Density::Dots, devices.len(), width)
+    }
+
+    fn of(density: Density, devices: usize, width: usize) -> Self {
+        let most = density.per_row(width).max(1);
+        let rows = devices.div_ceil(most).max(1);
+        // Rows of equal length, in whole groups of eight.
+        let even = devices.div_ceil(rows).next_multiple_of(8).min(most).max(1);
+        let per_row = if matches!(density, Density::Named(_)) { most } else { even };
+        Self { density, per_row, rows: u16::try_from(rows).unwrap_or(u16::MAX) }
     }
 
     pub(super) fn rows(self) -> u16 {
@@ -70,23 +95,15 @@ impl Plan {
     }
 }
 
-/// Rows of a mask are read in bytes: as many whole groups of eight as fit.
-fn round(per_row: usize, density: Density) -> usize {
-    match density {
-        Density::Numbered | Density::Dots if per_row >= 8 => per_row / 8 * 8,
-        _ => per_row.max(1),
-    }
-}
-
 pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, plan: &Plan, model: &Model, theme: Theme) {
     let snapshot = model.shown();
     let online = format!("{} of {} present", snapshot.mask.online_count(), snapshot.devices.len());
     let inner = view::panel(frame, area, "Mask", Span::styled(online, theme.faint()).into(), theme);
-    for (row, devices) in inner.rows().take(usize::from(plan.rows)).zip(snapshot.devices.chunks(plan.per_row)) {
+    for (row, devices) in inner.rows().zip(snapshot.devices.chunks(plan.per_row)) {
         let mut spans = Vec::with_capacity(devices.len() * 2);
-        for device in devices {
+        for (column, device) in devices.iter().enumerate() {
             spans.push(cell(device, plan.density, model, theme));
-            spans.push(Span::raw(" ".repeat(plan.density.cell().1)));
+            spans.push(Span::raw(plan.density.gap(column)));
         }
         frame.render_widget(Line::from(spans), row);
     }
@@ -104,7 +121,7 @@ fn cell(device: &DeviceStatus, density: Density, model: &Model, theme: Theme) ->
     let bit = device.id.bit();
     let content = match density {
         Density::Named(name) => format!(" {symbol} {bit:>2} {} ", theme.column(&device.name, name)),
-        Density::Numbered => format!("{symbol}{bit:>2} "),
+        Density::Numbered => format!("{symbol}{bit:>2}"),
         Density::Dots => symbol.to_owned(),
     };
     Span::styled(content, theme.mask_cell(present, edge))

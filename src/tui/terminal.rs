@@ -7,7 +7,7 @@
 use std::io::{self, IsTerminal, Write};
 use std::panic::PanicHookInfo;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
 use std::time::Duration;
 
 use crossterm::cursor::{Hide, Show};
@@ -103,11 +103,20 @@ fn give_back() {
     if !UP.swap(false, Ordering::SeqCst) {
         return;
     }
-    let mut out = io::stdout();
-    let _ = crossterm::execute!(out, EnableLineWrap, LeaveAlternateScreen, Show);
+    let (done, is_done) = mpsc::channel();
+    let leave = move || {
+        let _ = crossterm::execute!(io::stdout(), EnableLineWrap, LeaveAlternateScreen, Show);
+        let _ = done.send(());
+    };
+    // A terminal that is stopped takes nothing: the program ends all the same.
+    let left = std::thread::Builder::new().name("screen".to_owned()).spawn(leave).is_ok()
+        && is_done.recv_timeout(LAST_FRAME).is_ok();
     let _ = disable_raw_mode();
-    for message in lock(&HELD_BACK).drain(..) {
-        let _ = writeln!(io::stderr(), "{message}");
+    let messages = std::mem::take(&mut *lock(&HELD_BACK));
+    if left {
+        for message in messages {
+            let _ = writeln!(io::stderr(), "{message}");
+        }
     }
 }
 

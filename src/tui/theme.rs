@@ -204,13 +204,15 @@ pub enum Edge {
 mod tests {
     use super::*;
 
+    type Environment = &'static [(&'static str, &'static str)];
+
     #[test]
     fn the_environment_decides() {
         use {
             Charset::{Ascii, Unicode},
             Colours::{None, Sixteen},
         };
-        let table: [(&[(&str, &str)], Colours, Charset); 7] = [
+        let table: [(Environment, Colours, Charset); 7] = [
             (&[], Sixteen, Ascii),
             (&[("LANG", "en_US.UTF-8"), ("TERM", "xterm")], Sixteen, Unicode),
             (&[("LANG", "C.utf8")], Sixteen, Unicode),

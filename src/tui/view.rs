@@ -16,7 +16,7 @@ use super::{devices, footer, header, help, log, mask, recording};
 pub const MINIMUM: (u16, u16) = (60, 12);
 /// From this height on, panels have an empty line between them.
 const ROOMY: u16 = 32;
-/// From this height on, the selected device has a line of its own.
+/// From this height on, the selected device and the name of the episode have lines of their own.
 const WITH_SELECTION: u16 = 20;
 /// Least and most lines of log next to a full table.
 const LOG_LINES: (u16, u16) = (1, 5);
@@ -30,7 +30,7 @@ pub fn draw(frame: &mut Frame<'_>, model: &Model, theme: Theme) {
     let gap = u16::from(area.height >= ROOMY);
     let plan = mask::Plan::new(model, area.width, area.height / 4);
     let selection = u16::from(area.height >= WITH_SELECTION);
-    let recording_lines = if area.height >= ROOMY { 2 } else { 1 };
+    let recording_lines = if area.height >= WITH_SELECTION { 2 } else { 1 };
     // A rule above each of the four panels, the head of the table, header and footer.
     let fixed = 4 + 1 + 2 + 4 * gap + plan.rows() + selection + recording_lines;
     let rest = area.height.saturating_sub(fixed);
