@@ -169,9 +169,12 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     let rig_stop = CancellationToken::new();
     let (rig_commands, rig_asked) = mpsc::channel(16);
     let mut rig = Rig::new(&registry, &bus, presence, Arc::clone(&board));
+    let rig_ended = CancellationToken::new();
     let rig = tokio::spawn({
-        let stop = rig_stop.clone();
+        let (stop, ended) = (rig_stop.clone(), rig_ended.clone().drop_guard());
         async move {
+            // Dropped by a panic too.
+            let _ended = ended;
             let outcome = rig.run(hotplug, rig_asked, stop).await;
             (rig, outcome)
         }
@@ -187,7 +190,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
         duration: options.duration,
         recording: false,
     };
-    let mut running = Running { rig, rig_stop, screen, screen_stop, signals, asked };
+    let mut running = Running { rig, rig_ended, rig_stop, screen, screen_stop, signals, asked };
     let outcome = conductor.conduct(&mut running).await;
     finish(running, conductor, outcome).await
 }
@@ -222,6 +225,7 @@ fn start_screen(
 /// The tasks of a run, and what can be asked of it from outside.
 struct Running {
     rig: JoinHandle<(Rig, Result<(), RigError>)>,
+    rig_ended: CancellationToken,
     rig_stop: CancellationToken,
     screen: ScreenTask,
     screen_stop: CancellationToken,
@@ -257,10 +261,8 @@ impl Conductor {
             tokio::select! {
                 biased;
                 () = running.signals.next() => return Ok(()),
-                _ = &mut running.rig, if !running.rig_stop.is_cancelled() => {
-                    // Its outcome is taken when everything is taken down.
-                    return Ok(());
-                }
+                // Its outcome is taken when everything is taken down.
+                () = running.rig_ended.cancelled() => return Ok(()),
                 outcome = &mut running.screen, if !screen_ended => {
                     outcome.unwrap_or(Err(AppError::Panicked("the screen")))?;
                     // Nobody reads the output any more. An episode is worth more than its log lines.

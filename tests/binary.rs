@@ -14,7 +14,8 @@ fn text(bytes: &[u8]) -> String {
 #[test]
 fn a_recording_of_a_given_duration_ends_by_itself_with_one_whole_file() {
     let place = Place::new();
-    let output = place.run(&[&RECORD[..], &["--duration", "2s", "--task", "Place block!", "--tag", "finger=soft"]].concat());
+    let output =
+        place.run(&[&RECORD[..], &["--duration", "2s", "--task", "Place block!", "--tag", "finger=soft"]].concat());
     assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
     let files = place.files("out");
     assert_eq!(files.len(), 1, "{files:?}");
@@ -23,7 +24,8 @@ fn a_recording_of_a_given_duration_ends_by_itself_with_one_whole_file() {
     let ended = events.iter().find(|event| event["event"] == "episode").expect("an episode event");
     assert_eq!((&ended["dropped"], &ended["error"]), (&0.into(), &serde_json::Value::Null));
     let episode = Episode::read(&place.path("out").join(&files[0]));
-    for topic in ["/rapid/camera/wrist", "/rapid/camera/tactile", "/rapid/serial/motor", "/rapid/mask", "/rapid/frame"] {
+    for topic in ["/rapid/camera/wrist", "/rapid/camera/tactile", "/rapid/serial/motor", "/rapid/mask", "/rapid/frame"]
+    {
         assert!(episode.topic(topic).count() > 0, "no message of {topic}");
     }
     assert!(episode.topic("/rapid/frame").count() >= 59, "30 Hz for 2 s");
