@@ -116,6 +116,17 @@ fn a_composite_device_may_have_an_entry_for_each_node() {
     assert_eq!((serial.framing, serial.parse, serial.channels), (Framing::Fixed(12), Parse::F32le, 3));
 }
 
+#[test]
+fn editors_of_other_systems_are_understood() {
+    let text = "\u{feff}[device.cam]\r\nvid = \"046d\"\r\npid = \"0825\"\r\nnode = \"camera\"\r\n";
+    assert_eq!(Registry::parse(text, None).unwrap().registry.devices[0].name, "cam");
+    let errors = Registry::parse(&format!("{text}tpoic = \"/ü\" # ü\r\n"), None).unwrap_err();
+    assert_eq!(
+        errors.to_string(),
+        "devices.toml:5:1: [device.cam] unknown key \"tpoic\"\n    fix: did you mean \"topic\"?"
+    );
+}
+
 /// A valid or nearly valid file with some bytes replaced, removed, doubled.
 fn mutated() -> impl Strategy<Value = String> {
     let sources: Vec<String> = files("valid")
