@@ -107,11 +107,8 @@ pub(super) fn read<'a>(name: &str, section: Section<'a>, problems: &mut Problems
     let bit = section
         .integer(problems, "bit", 0..=HIGHEST_BIT)
         .and_then(|bit| Some(At { at: bit.at, value: u8::try_from(bit.value).ok()? }));
-    let slots = [("front", Mount::Front), ("tip", Mount::Tip), ("top", Mount::Top), ("bottom", Mount::Bottom)];
-    let mount = section.choice(problems, "slot", &slots);
-    let when_stale = section
-        .choice(problems, "when_stale", &[("hold", WhenStale::Hold), ("zero", WhenStale::Zero)])
-        .unwrap_or_default();
+    let mount = section.choice(problems, "slot", &Mount::WORDS);
+    let when_stale = section.choice(problems, "when_stale", &WhenStale::WORDS).unwrap_or_default();
     let stall = Duration::from_millis(10)..=Duration::from_hours(1);
     let stall_after =
         section.duration(problems, "stall_after", stall).unwrap_or_else(|| node::default_stall(settings.as_ref()));

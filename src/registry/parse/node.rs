@@ -21,8 +21,7 @@ pub(super) fn camera(section: &Section<'_>, problems: &mut Problems<'_>) -> Came
     camera.width = integer("width", 8192, camera.width);
     camera.height = integer("height", 8192, camera.height);
     camera.fps = integer("fps", 1000, camera.fps);
-    let formats = [("MJPG", PixelFormat::Mjpg), ("YUYV", PixelFormat::Yuyv), ("GREY", PixelFormat::Grey)];
-    camera.format = table.choice(problems, "format", &formats).unwrap_or(camera.format);
+    camera.format = table.choice(problems, "format", &PixelFormat::WORDS).unwrap_or(camera.format);
     if let Some(controls) = table.table(problems, "controls") {
         for (_, name, _) in controls.fields() {
             if let Some(value) = controls.integer(problems, name, i64::MIN..=i64::MAX) {
@@ -48,8 +47,7 @@ pub(super) fn serial(section: &Section<'_>, problems: &mut Problems<'_>) -> Opti
     let baud =
         table.integer(problems, "baud", 50..=12_000_000).map_or(Some(115_200), |baud| baud.value.try_into().ok());
     let framing = framing(&table, problems).unwrap_or(Framing::Line);
-    let parses = [("csv", Parse::Csv), ("json", Parse::Json), ("f32le", Parse::F32le), ("raw", Parse::Raw)];
-    let parse = table.choice(problems, "parse", &parses).unwrap_or(Parse::Csv);
+    let parse = table.choice(problems, "parse", &Parse::WORDS).unwrap_or(Parse::Csv);
     let channels = table.integer(problems, "channels", 1..=1024).and_then(|count| usize::try_from(count.value).ok());
     if parse == Parse::Raw {
         if table.has("channels") {
