@@ -149,6 +149,12 @@ fn twins_with_one_serial_number_do_not_collapse_and_are_told_apart_by_port() {
     assigner.detach(Path::new("/sys/devices/usb1"));
     assert_eq!(assigner.attach(&video(0, unit(2, Some("0001"), "1-4"))), entry(3));
     assert_eq!(assigner.attach(&video(1, unit(2, Some("0001"), "1-5"))), entry(2));
+    assigner.detach(Path::new("/sys/devices/usb1"));
+    assert_eq!(assigner.attach(&video(0, unit(2, Some("0001"), "1-5"))), entry(2));
+    assert_eq!(assigner.attach(&video(1, unit(2, Some("0001"), "1-4"))), entry(3));
+    // In the other order what was plugged last is not what comes back first.
+    assigner.detach(Path::new("/sys/devices/usb1"));
+    assert_eq!(assigner.attach(&video(0, unit(2, Some("0001"), "1-5"))), entry(2));
 }
 
 #[test]
