@@ -13,6 +13,7 @@ use std::process::Command;
 use rustix::fs::{AtFlags, Mode, OFlags};
 use rustix::io::Errno;
 
+use super::Format;
 use crate::registry::Registry;
 use crate::registry::artifacts::{Artifact, ArtifactKind, DESCRIPTORS, HEADER, SYSTEM_REGISTRY, artifacts};
 use crate::time::realtime_ns;
@@ -54,8 +55,14 @@ pub enum ArtifactsError {
 ///
 /// # Errors
 /// When `out` cannot be written to.
-pub fn list(registry: &Registry, out: &mut dyn Write) -> io::Result<()> {
+pub fn list(registry: &Registry, format: Format, out: &mut dyn Write) -> io::Result<()> {
     for artifact in artifacts(registry) {
+        if format == Format::Json {
+            let path = artifact.path.to_string_lossy();
+            let line = serde_json::json!({ "kind": "artifact", "path": path, "contents": artifact.contents });
+            writeln!(out, "{line}")?;
+            continue;
+        }
         writeln!(out, "--- {}", artifact.path.display())?;
         out.write_all(artifact.contents.as_bytes())?;
     }
@@ -204,7 +211,10 @@ fn remove_stale(folder: &Path, all: &[Artifact], links: Links, out: &mut dyn Wri
         let entry = entry.map_err(explain)?;
         let name = entry.file_name().to_string_lossy().into_owned();
         let current = all.iter().any(|artifact| artifact.path.file_name().is_some_and(|file| *file == *name));
-        if current || !name.ends_with(".yaml") || !is_ours(&opened, &name) {
+        if current
+            || Path::new(&name).extension().is_none_or(|extension| extension != "yaml")
+            || !is_ours(&opened, &name)
+        {
             continue;
         }
         rustix::fs::unlinkat(&opened, &name, AtFlags::empty()).map_err(explain)?;

@@ -6,9 +6,7 @@ use std::path::Path;
 use serde::Serialize;
 
 use super::{Format, Outcome};
-use crate::registry::{
-    DeviceSpec, Diagnostic, Framing, IdentitySpec, Loaded, Mount, NodeSpec, Parse, PixelFormat, Registry,
-};
+use crate::registry::{DeviceSpec, Diagnostic, IdentitySpec, Loaded, Mount, Registry};
 
 /// Reads the registry at `path` and writes its entries, or every problem, to `out`.
 ///
@@ -71,38 +69,14 @@ struct Row<'a> {
 }
 
 fn row(device: &DeviceSpec) -> Row<'_> {
-    let (node, format) = match &device.node {
-        NodeSpec::Camera(camera) => {
-            let format = match camera.format {
-                PixelFormat::Mjpg => "MJPG",
-                PixelFormat::Yuyv => "YUYV",
-                PixelFormat::Grey => "GREY",
-            };
-            ("camera", format!("{}x{}@{} {format}", camera.width, camera.height, camera.fps))
-        }
-        NodeSpec::Serial(serial) => {
-            let framing = match serial.framing {
-                Framing::Line => "line".to_owned(),
-                Framing::Cobs => "cobs".to_owned(),
-                Framing::Fixed(bytes) => format!("fixed {bytes}"),
-            };
-            let content = match serial.parse {
-                Parse::Csv => format!("csv x{}", serial.channels),
-                Parse::Json => format!("json x{}", serial.channels),
-                Parse::F32le => format!("f32le x{}", serial.channels),
-                Parse::Raw => "raw".to_owned(),
-            };
-            ("serial", format!("{} baud {framing} {content}", serial.baud))
-        }
-    };
     Row {
         bit: device.id.bit(),
         name: &device.name,
-        node,
+        node: device.node.kind(),
         identity: &device.identity,
         slot: device.mount,
         topic: &device.topic,
-        format,
+        format: device.node.format(),
         max_bytes: device.max_bytes,
         depth: device.depth,
     }

@@ -54,8 +54,8 @@ pub fn artifacts(registry: &Registry) -> Vec<Artifact> {
     ];
     for device in &registry.devices {
         let path = PathBuf::from(DESCRIPTORS).join(format!("{}.yaml", device.name));
-        let stable = rules::identify(registry, device).is_ok();
-        all.push(artifact(path, descriptor::descriptor(device, stable), ArtifactKind::Descriptor));
+        let stable_path = rules::identify(registry, device).ok().map(|_| format!("/dev/rapid/{}", device.name));
+        all.push(artifact(path, descriptor::descriptor(device, stable_path.as_deref()), ArtifactKind::Descriptor));
     }
     all
 }

@@ -14,6 +14,7 @@ mod scenario_file;
 mod section;
 mod spec;
 mod units;
+mod words;
 
 pub use attachment::{Attachment, DeviceNode, UsbIdentity};
 pub use diagnostic::{Diagnostic, RegistryErrors};

@@ -9,6 +9,7 @@
 mod budget;
 mod device;
 mod file;
+mod node;
 
 use std::path::Path;
 use std::time::Duration;
@@ -70,8 +71,9 @@ impl Registry {
         }
         check_identities(&drafts, &mut problems);
         check_topics(&drafts, &mut problems);
-        let warnings = assign_bits(&mut drafts, &mut problems);
-        budget::fit(&mut drafts, rig.memory_budget, root.at_of("rig"), &mut problems);
+        let mut warnings = assign_bits(&mut drafts, &mut problems);
+        warnings.extend(unused_ports(&drafts, &problems));
+        warnings.extend(budget::fit(&mut drafts, rig.memory_budget, root.at_of("rig"), &mut problems));
         problems.check()?;
         let mut devices: Vec<_> = drafts.into_iter().filter_map(Draft::finish).collect();
         devices.sort_by_key(|device| device.id);
@@ -80,6 +82,9 @@ impl Registry {
     }
 
     /// The registry of the simulated demonstration rig, `devices.toml` of the repository.
+    ///
+    /// # Panics
+    /// Never: the text is part of the program, and a test parses it.
     #[must_use]
     #[expect(clippy::expect_used, reason = "a text fixed at build time, parsed by a test")]
     pub fn builtin() -> Self {
@@ -120,7 +125,7 @@ fn rig(root: &Section<'_>, problems: &mut Problems<'_>) -> RigSpec {
     }
     let window = Duration::from_millis(1)..=Duration::from_secs(10);
     rig.sync_window = section.duration(problems, "sync_window", window).unwrap_or(rig.sync_window);
-    let cooldown = Duration::ZERO..=Duration::from_secs(60);
+    let cooldown = Duration::ZERO..=Duration::from_mins(1);
     rig.cooldown = section.duration(problems, "cooldown", cooldown).unwrap_or(rig.cooldown);
     let budget = 1 << 20..=64 << 30;
     rig.memory_budget = section.size(problems, "memory_budget", budget).unwrap_or(rig.memory_budget);
@@ -185,6 +190,18 @@ fn check_identities(drafts: &[Draft<'_>], problems: &mut Problems<'_>) {
     }
 }
 
+fn unused_ports(drafts: &[Draft<'_>], problems: &Problems<'_>) -> Vec<Diagnostic> {
+    let both = drafts.iter().filter(|draft| {
+        draft.identity.as_ref().is_some_and(|identity| identity.serial.is_some() && identity.port.is_some())
+    });
+    let warn = |draft: &Draft<'_>| {
+        let message = "port has no effect beside a serial number: the unit is recognised in every port".to_owned();
+        let fix = "remove port, or remove the serial number to accept any unit in that port".to_owned();
+        problems.diagnostic(draft.section.at_of("port"), &draft.section.entry, message, fix)
+    };
+    both.map(warn).collect()
+}
+
 fn check_topics(drafts: &[Draft<'_>], problems: &mut Problems<'_>) {
     for (index, draft) in drafts.iter().enumerate() {
         if OWN_TOPICS.contains(&draft.topic.as_str()) {
@@ -217,7 +234,8 @@ fn assign_bits(drafts: &mut [Draft<'_>], problems: &mut Problems<'_>) -> Vec<Dia
         if let Some(bit) = draft.bit {
             if let Some(earlier) = taken.iter().find(|earlier| earlier.value == bit.value) {
                 let message = format!("bit {} is already taken on line {}", bit.value, problems.line(earlier.at));
-                let fix = free.clone().next().map_or_else(String::new, |free| format!("bit = {free} is free"));
+                let fix =
+                    free.clone().next().map_or("choose another".to_owned(), |free| format!("bit = {free} is free"));
                 problems.report(bit.at, &draft.section.entry, message, fix);
             }
             taken.push(bit);

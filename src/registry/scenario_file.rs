@@ -46,7 +46,7 @@ const ACTIONS: [&str; 4] = ["plug", "unplug", "silence", "resume"];
 const EVENT_KEYS: [&str; 6] = ["at", "plug", "unplug", "silence", "resume", "port"];
 /// Rate of a simulated serial line, Hz: that of a usual motor controller's state.
 const SERIAL_HZ: u32 = 100;
-const LONGEST: Duration = Duration::from_secs(7 * 24 * 3600);
+const LONGEST: Duration = Duration::from_hours(7 * 24);
 
 impl Scenario {
     /// Reads a scenario file for the devices of `registry`.
@@ -128,7 +128,7 @@ fn standing_for(spec: &DeviceSpec, name: &str) -> ScenarioDevice {
 fn invent_ports(devices: &mut [ScenarioDevice]) {
     let mut taken: Vec<String> = devices.iter().map(|device| device.usb.port.clone()).collect();
     for device in devices.iter_mut().filter(|device| device.usb.port.is_empty()) {
-        let port = (1..).map(|number| format!("9-{number}")).find(|port| !taken.contains(port));
+        let port = (1..=taken.len() + 1).map(|number| format!("9-{number}")).find(|port| !taken.contains(port));
         device.usb.port = port.unwrap_or_default();
         taken.push(device.usb.port.clone());
     }

@@ -78,7 +78,7 @@ impl<'a> Problems<'a> {
 pub(super) fn file_label(path: Option<&Path>, otherwise: &str) -> String {
     // A path may hold any byte: what would not print is escaped.
     let shown = path.map_or_else(|| otherwise.to_owned(), |path| path.display().to_string());
-    shown.chars().flat_map(|c| if c.is_control() { c.escape_default().collect() } else { vec![c] }).collect()
+    printable(&shown)
 }
 
 /// Reads a TOML text. Syntax errors are noted; with any of them the table is not to be used.
@@ -86,34 +86,57 @@ pub(super) fn read<'a>(text: &'a str, problems: &mut Problems<'a>) -> Spanned<De
     /// More than this many follow from one another.
     const SHOWN: usize = 10;
     let (table, errors) = DeTable::parse_recoverable(text);
+    let source: Vec<&str> = if errors.is_empty() { Vec::new() } else { text.lines().map(str::trim).collect() };
+    let line_at = |line: usize| source.get(line.saturating_sub(1)).copied().unwrap_or_default();
     let mut lines = Vec::new();
+    // Until this line a table that stands twice makes each of its keys a duplicate.
+    let mut repeated_until = 0;
     for error in errors {
         if lines.len() == SHOWN {
             break;
         }
         let at = error.span().map_or(0, |span| span.start);
         let line = problems.line(at);
+        let duplicate = error.message() == "duplicate key";
         // The rest of a line that is wrong is wrong in consequence.
-        if lines.contains(&line) {
+        if lines.contains(&line) || (duplicate && line < repeated_until) {
             continue;
         }
         lines.push(line);
-        let source = text.lines().nth(line - 1).unwrap_or_default().trim();
-        let message: String = error.message().chars().flat_map(char::escape_debug).collect();
-        problems.report(at, "", format!("not TOML: {message}"), syntax_fix(error.message(), source));
+        if duplicate && line_at(line).starts_with('[') {
+            let next = source.iter().skip(line).position(|line| line.starts_with('['));
+            repeated_until = next.map_or(usize::MAX, |next| line + 1 + next);
+        }
+        let earlier = source.iter().take(line - 1).position(|earlier| *earlier == line_at(line));
+        let message = match earlier.filter(|_| duplicate) {
+            Some(earlier) => format!("not TOML: the same stands already on line {}", earlier + 1),
+            None => format!("not TOML: {}", printable(error.message().trim_end_matches(", expected nothing"))),
+        };
+        problems.report(at, "", message, syntax_fix(error.message(), line_at(line)));
     }
     table
 }
 
-fn syntax_fix(message: &str, source: &str) -> &'static str {
-    if source.starts_with('[') && source.contains("serial") {
+fn syntax_fix(message: &str, source: &str) -> String {
+    let (key, value) = source.split_once('=').unwrap_or((source, ""));
+    let digits = value.split_whitespace().next().unwrap_or_default();
+    if message == "duplicate key" && source.starts_with('[') && source.contains("serial") {
         "`serial` can stand only once in an entry: beside a [device.NAME.serial] table write the device's serial \
          number as `serial_number = \"...\"`"
-    } else if message.contains("duplicate") {
-        "a name can stand only once: rename or remove one of the two"
+            .to_owned()
+    } else if message == "duplicate key" {
+        "a name can stand only once: rename or remove one of the two".to_owned()
+    } else if matches!(key.trim(), "vid" | "pid") && digits.bytes().all(|b| b.is_ascii_hexdigit()) && !digits.is_empty()
+    {
+        format!("write USB ids as text: {} = \"{digits}\"", key.trim())
     } else {
-        "write one `key = value` a line, text in double quotes, tables as [device.NAME]"
+        "write one `key = value` a line, text in double quotes, tables as [device.NAME]".to_owned()
     }
+}
+
+/// Without control characters.
+fn printable(text: &str) -> String {
+    text.chars().flat_map(|c| if c.is_control() { c.escape_default().collect() } else { vec![c] }).collect()
 }
 
 /// A value and where it stands.

@@ -79,7 +79,7 @@ mod tests {
         for (text, expected) in [
             ("25ms", Some(Duration::from_millis(25))),
             ("1.5s", Some(Duration::from_millis(1500))),
-            ("2 min", Some(Duration::from_secs(120))),
+            ("2 min", Some(Duration::from_mins(2))),
             ("0s", Some(Duration::ZERO)),
             ("250us", Some(Duration::from_micros(250))),
             ("25", None),

@@ -32,6 +32,20 @@ fn everything_is_written_whole_and_what_is_stale_is_removed() {
 }
 
 #[test]
+fn the_listing_holds_every_file() {
+    let mut text = Vec::new();
+    list(&Registry::builtin(), Format::Text, &mut text).unwrap();
+    let text = String::from_utf8(text).unwrap();
+    assert_eq!(text.lines().filter(|line| line.starts_with("--- ")).count(), 5);
+    let mut json = Vec::new();
+    list(&Registry::builtin(), Format::Json, &mut json).unwrap();
+    for (line, artifact) in String::from_utf8(json).unwrap().lines().zip(artifacts(&Registry::builtin())) {
+        let value: serde_json::Value = serde_json::from_str(line).unwrap();
+        assert_eq!(value["contents"], artifact.contents);
+    }
+}
+
+#[test]
 fn a_planted_link_is_replaced_and_never_written_through() {
     let dir = tempfile::tempdir().unwrap();
     let victim = dir.path().join("victim");

@@ -4,19 +4,13 @@
 use std::fmt::Write as _;
 
 use super::HEADER;
-use crate::registry::spec::{DeviceSpec, Framing, NodeSpec, Parse, PixelFormat};
+use crate::registry::spec::{DeviceSpec, NodeSpec};
 
-/// The descriptor of one entry; `stable` when the rules give it a name under /dev/rapid.
-pub(super) fn descriptor(device: &DeviceSpec, stable: bool) -> String {
+/// The descriptor of one entry; `stable_path` is the name the rules give it, if they can.
+pub(super) fn descriptor(device: &DeviceSpec, stable_path: Option<&str>) -> String {
     let usb = &device.identity;
-    let slot = device.mount.map_or("null", |mount| match mount {
-        crate::registry::Mount::Front => "\"front\"",
-        crate::registry::Mount::Tip => "\"tip\"",
-        crate::registry::Mount::Top => "\"top\"",
-        crate::registry::Mount::Bottom => "\"bottom\"",
-    });
-    let path = if stable { quoted(&format!("/dev/rapid/{}", device.name)) } else { "null".to_owned() };
-    let optional = |text: Option<&String>| text.map_or_else(|| "null".to_owned(), |text| quoted(text));
+    let slot = device.mount.map_or_else(|| "null".to_owned(), |mount| quoted(&mount.to_string()));
+    let optional = |text: Option<&str>| text.map_or_else(|| "null".to_owned(), quoted);
     format!(
         "{HEADER}\n\
          module: {}\n\
@@ -28,50 +22,32 @@ pub(super) fn descriptor(device: &DeviceSpec, stable: bool) -> String {
            pid: \"{:04x}\"\n  \
            serial: {}\n  \
            port: {}\n\
-         path: {path}\n\
+         path: {}\n\
          topic: {}\n\
          bit: {}\n",
         quoted(&device.name),
         sensor(&device.node),
         usb.vid,
         usb.pid,
-        optional(usb.serial.as_ref()),
-        optional(usb.port.as_ref()),
+        optional(usb.serial.as_deref()),
+        optional(usb.port.as_deref()),
+        optional(stable_path),
         quoted(&device.topic),
         device.id,
     )
 }
 
 fn sensor(node: &NodeSpec) -> String {
+    let kind = node.kind();
     match node {
-        NodeSpec::Camera(camera) => {
-            let format = match camera.format {
-                PixelFormat::Mjpg => "MJPG",
-                PixelFormat::Yuyv => "YUYV",
-                PixelFormat::Grey => "GREY",
-            };
-            format!(
-                "  - kind: \"camera\"\n    width: {}\n    height: {}\n    fps: {}\n    format: \"{format}\"\n",
-                camera.width, camera.height, camera.fps
-            )
-        }
-        NodeSpec::Serial(serial) => {
-            let framing = match serial.framing {
-                Framing::Line => "line".to_owned(),
-                Framing::Cobs => "cobs".to_owned(),
-                Framing::Fixed(bytes) => format!("fixed {bytes}"),
-            };
-            let parse = match serial.parse {
-                Parse::Csv => "csv",
-                Parse::Json => "json",
-                Parse::F32le => "f32le",
-                Parse::Raw => "raw",
-            };
-            format!(
-                "  - kind: \"serial\"\n    baud: {}\n    framing: \"{framing}\"\n    parse: \"{parse}\"\n    channels: {}\n",
-                serial.baud, serial.channels
-            )
-        }
+        NodeSpec::Camera(camera) => format!(
+            "  - kind: \"{kind}\"\n    width: {}\n    height: {}\n    fps: {}\n    format: \"{}\"\n",
+            camera.width, camera.height, camera.fps, camera.format
+        ),
+        NodeSpec::Serial(serial) => format!(
+            "  - kind: \"{kind}\"\n    baud: {}\n    framing: \"{}\"\n    parse: \"{}\"\n    channels: {}\n",
+            serial.baud, serial.framing, serial.parse, serial.channels
+        ),
     }
 }
 

@@ -94,16 +94,13 @@ fn matches_exactly(pattern: &str, text: &str) -> bool {
     let mut rest = pattern;
     while let Some(c) = rest.chars().next() {
         let bracket = rest.strip_prefix('[').and_then(|after| Some((after.chars().next()?, after.get(1..2)?)));
-        match bracket {
-            Some((inner, "]")) => {
-                literal.push(inner);
-                rest = &rest[3..];
-            }
-            _ => {
-                assert!(!"*?[".contains(c), "an open glob in {pattern:?}");
-                literal.push(c);
-                rest = &rest[c.len_utf8()..];
-            }
+        if let Some((inner, "]")) = bracket {
+            literal.push(inner);
+            rest = &rest[3..];
+        } else {
+            assert!(!"*?[".contains(c), "an open glob in {pattern:?}");
+            literal.push(c);
+            rest = &rest[c.len_utf8()..];
         }
     }
     literal == text

@@ -149,6 +149,12 @@ fn twins_with_one_serial_number_do_not_collapse_and_are_told_apart_by_port() {
     assigner.detach(Path::new("/sys/devices/usb1"));
     assert_eq!(assigner.attach(&video(0, unit(2, Some("0001"), "1-4"))), entry(3));
     assert_eq!(assigner.attach(&video(1, unit(2, Some("0001"), "1-5"))), entry(2));
+    assigner.detach(Path::new("/sys/devices/usb1"));
+    assert_eq!(assigner.attach(&video(0, unit(2, Some("0001"), "1-5"))), entry(2));
+    assert_eq!(assigner.attach(&video(1, unit(2, Some("0001"), "1-4"))), entry(3));
+    // In the other order what was plugged last is not what comes back first.
+    assigner.detach(Path::new("/sys/devices/usb1"));
+    assert_eq!(assigner.attach(&video(0, unit(2, Some("0001"), "1-5"))), entry(2));
 }
 
 #[test]
@@ -288,18 +294,29 @@ proptest! {
     }
 
     #[test]
-    fn with_serial_numbers_the_order_of_plugging_does_not_matter(
-        plugged in prop::sample::subsequence(vec![0_usize, 1, 2], 0..=3).prop_shuffle(),
+    fn where_units_are_told_apart_only_what_is_plugged_counts(
+        noise in prop::collection::vec(0_usize..5, 0..12),
+        plugged in prop::sample::subsequence(vec![0_usize, 1, 2, 3, 4], 0..=5).prop_shuffle(),
     ) {
         let units = [
-            video(0, unit(1, Some("A"), "1-5")),
-            video(1, unit(3, Some("C"), "1-6")),
-            tty(unit(3, Some("C"), "1-6")),
+            (video(0, unit(1, Some("A"), "1-5")), Some(0)),
+            (video(1, unit(1, Some("B"), "1-9")), Some(1)),
+            (video(2, unit(3, Some("C"), "1-6")), Some(4)),
+            (tty(unit(3, Some("C"), "1-6")), Some(5)),
+            (video(3, unit(1, Some("stranger"), "1-4")), None),
         ];
-        let expected = [entry(0), entry(4), entry(5)];
         let mut assigner = Assigner::new(&registry());
-        for index in plugged {
-            prop_assert_eq!(&assigner.attach(&units[index]), &expected[index]);
+        for index in noise {
+            assigner.attach(&units[index].0);
+            assigner.detach(&units[index].0.syspath);
+        }
+        for index in &plugged {
+            assigner.attach(&units[*index].0);
+        }
+        for (index, (attachment, bit)) in units.iter().enumerate() {
+            let Some(bit) = bit else { continue };
+            let expected = plugged.contains(&index).then_some(attachment);
+            prop_assert_eq!(assigner.attached_as(id(*bit)), expected);
         }
     }
 }

@@ -1,6 +1,7 @@
 //! How many samples each topic keeps, within the rig's shared memory.
 
 use super::device::Draft;
+use crate::registry::diagnostic::Diagnostic;
 use crate::registry::section::Problems;
 use crate::registry::units::show_size;
 
@@ -9,7 +10,13 @@ const LEAST_CAMERA_DEPTH: u64 = 8;
 
 /// Lowers the default depths of cameras, all in proportion, until the topics fit into `budget`.
 /// Depths written in the file stay. Too much even so is a problem that names the largest topics.
-pub(super) fn fit(drafts: &mut [Draft<'_>], budget: u64, rig_at: usize, problems: &mut Problems<'_>) {
+/// Returns what was lowered, as warnings.
+pub(super) fn fit(
+    drafts: &mut [Draft<'_>],
+    budget: u64,
+    rig_at: usize,
+    problems: &mut Problems<'_>,
+) -> Vec<Diagnostic> {
     let scaled = |draft: &Draft<'_>, permille: u64| {
         if draft.depth_written || !draft.is_camera() {
             return draft.depth;
@@ -22,12 +29,24 @@ pub(super) fn fit(drafts: &mut [Draft<'_>], budget: u64, rig_at: usize, problems
     };
     if total(drafts, 0) > budget {
         report(drafts, total(drafts, 0), budget, rig_at, problems);
-        return;
+        return Vec::new();
     }
     let permille = (0..=1000).rev().find(|permille| total(drafts, *permille) <= budget).unwrap_or(0);
+    let mut warnings = Vec::new();
     for draft in drafts {
-        draft.depth = scaled(draft, permille);
+        let depth = scaled(draft, permille);
+        if depth < draft.depth {
+            let message = format!(
+                "depth lowered from {} to {depth} to keep all topics within memory_budget = {}",
+                draft.depth,
+                show_size(budget)
+            );
+            let fix = format!("write depth = {depth}, a smaller max_bytes, or a larger memory_budget in [rig]");
+            warnings.push(problems.diagnostic(draft.section.at, &draft.section.entry, message, fix));
+        }
+        draft.depth = depth;
     }
+    warnings
 }
 
 fn report(drafts: &[Draft<'_>], total: u64, budget: u64, rig_at: usize, problems: &mut Problems<'_>) {

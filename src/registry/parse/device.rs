@@ -2,12 +2,11 @@
 
 use std::time::Duration;
 
-use crate::modality::{MAX_MODALITIES, ModalityId};
+use super::node;
+use crate::modality::ModalityId;
 use crate::registry::diagnostic::{did_you_mean, nearest};
 use crate::registry::section::{At, Problems, Section};
-use crate::registry::spec::{
-    CameraSpec, DeviceSpec, Framing, IdentitySpec, Mount, NodeSpec, Parse, PixelFormat, SerialSpec, WhenStale,
-};
+use crate::registry::spec::{DeviceSpec, IdentitySpec, Mount, NodeSpec, WhenStale};
 
 /// Kinds of node this version has a driver for.
 const BUILT_IN: [(&str, Kind); 2] = [("camera", Kind::Camera), ("serial", Kind::Serial)];
@@ -31,6 +30,9 @@ const KEYS: [&str; 14] = [
     "when_stale",
     "camera",
 ];
+
+/// The mask is 64 bits wide.
+const HIGHEST_BIT: i64 = 63;
 
 /// How a device is read, without the settings.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -96,23 +98,21 @@ pub(super) fn read<'a>(name: &str, section: Section<'a>, problems: &mut Problems
     check_keys(&section, problems);
     let kind = kind(&section, problems);
     let identity = identity(&section, problems);
-    let node = match kind {
-        Some(Kind::Camera) => Some(NodeSpec::Camera(camera(&section, problems))),
-        Some(Kind::Serial) => serial(&section, problems).map(NodeSpec::Serial),
+    let settings = match kind {
+        Some(Kind::Camera) => Some(NodeSpec::Camera(node::camera(&section, problems))),
+        Some(Kind::Serial) => node::serial(&section, problems).map(NodeSpec::Serial),
         None => None,
     };
     let topic = topic(&section, problems).unwrap_or_else(|| default_topic(kind, name));
     let bit = section
-        .integer(problems, "bit", 0..=MAX_MODALITIES as i64 - 1)
+        .integer(problems, "bit", 0..=HIGHEST_BIT)
         .and_then(|bit| Some(At { at: bit.at, value: u8::try_from(bit.value).ok()? }));
-    let slots = [("front", Mount::Front), ("tip", Mount::Tip), ("top", Mount::Top), ("bottom", Mount::Bottom)];
-    let mount = section.choice(problems, "slot", &slots);
-    let when_stale = section
-        .choice(problems, "when_stale", &[("hold", WhenStale::Hold), ("zero", WhenStale::Zero)])
-        .unwrap_or_default();
-    let stall = Duration::from_millis(10)..=Duration::from_secs(3600);
-    let stall_after = section.duration(problems, "stall_after", stall).unwrap_or_else(|| default_stall(node.as_ref()));
-    let max_bytes = max_bytes(&section, node.as_ref(), problems);
+    let mount = section.choice(problems, "slot", &Mount::WORDS);
+    let when_stale = section.choice(problems, "when_stale", &WhenStale::WORDS).unwrap_or_default();
+    let stall = Duration::from_millis(10)..=Duration::from_hours(1);
+    let stall_after =
+        section.duration(problems, "stall_after", stall).unwrap_or_else(|| node::default_stall(settings.as_ref()));
+    let max_bytes = node::max_bytes(&section, settings.as_ref(), problems);
     let written = section.integer(problems, "depth", 2..=4096).and_then(|depth| u64::try_from(depth.value).ok());
     Draft {
         name: name.to_owned(),
@@ -124,10 +124,10 @@ pub(super) fn read<'a>(name: &str, section: Section<'a>, problems: &mut Problems
         mount,
         stall_after,
         max_bytes,
-        depth: written.unwrap_or_else(|| default_depth(node.as_ref())),
+        depth: written.unwrap_or_else(|| node::default_depth(settings.as_ref())),
         depth_written: written.is_some(),
         when_stale,
-        node,
+        node: settings,
         section,
     }
 }
@@ -174,7 +174,7 @@ fn kind(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<Kind> {
     }
     let fix = match nearest(text, BUILT_IN.map(|(name, _)| name)) {
         Some(name) if !PLANNED.contains(&text) => format!("did you mean \"{name}\"?"),
-        _ => "built in are \"camera\" and \"serial\"; remove the entry until then".to_owned(),
+        _ => "built in are \"camera\" and \"serial\"; leave the entry out until then".to_owned(),
     };
     let message = if PLANNED.contains(&text) {
         format!("node {text:?} is not supported by this version of rapid")
@@ -260,101 +260,6 @@ pub(crate) fn is_port(text: &str) -> bool {
     number(bus) && ports.split('.').count() <= 6 && ports.split('.').all(number)
 }
 
-fn camera(section: &Section<'_>, problems: &mut Problems<'_>) -> CameraSpec {
-    if section.is_table("serial") {
-        let fix = "remove the table, or write node = \"serial\"";
-        section.report(problems, "serial", "a camera has no [...serial] table".to_owned(), fix);
-    }
-    let mut camera = CameraSpec { width: 640, height: 480, fps: 30, format: PixelFormat::Mjpg, controls: Vec::new() };
-    let Some(table) = section.table(problems, "camera") else { return camera };
-    table.allow(problems, &["width", "height", "fps", "format", "controls"]);
-    let mut integer = |key, most, default| {
-        table.integer(problems, key, 1..=most).and_then(|found| u32::try_from(found.value).ok()).unwrap_or(default)
-    };
-    camera.width = integer("width", 8192, camera.width);
-    camera.height = integer("height", 8192, camera.height);
-    camera.fps = integer("fps", 1000, camera.fps);
-    let formats = [("MJPG", PixelFormat::Mjpg), ("YUYV", PixelFormat::Yuyv), ("GREY", PixelFormat::Grey)];
-    camera.format = table.choice(problems, "format", &formats).unwrap_or(camera.format);
-    if let Some(controls) = table.table(problems, "controls") {
-        for (_, name, _) in controls.fields() {
-            if let Some(value) = controls.integer(problems, name, i64::MIN..=i64::MAX) {
-                camera.controls.push((name.to_owned(), value.value));
-            }
-        }
-    }
-    camera
-}
-
-fn serial(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<SerialSpec> {
-    if section.has("camera") {
-        let fix = "remove the table, or write node = \"camera\"";
-        section.report(problems, "camera", "a serial line has no [...camera] table".to_owned(), fix);
-    }
-    if !section.is_table("serial") {
-        let fix = format!("write [{}] with channels = the count of numbers in a message", section.child("serial"));
-        section.missing(problems, "the table of the serial line", &fix);
-        return None;
-    }
-    let table = section.table(problems, "serial")?;
-    table.allow(problems, &["baud", "framing", "parse", "channels"]);
-    let baud =
-        table.integer(problems, "baud", 50..=12_000_000).map_or(Some(115_200), |baud| baud.value.try_into().ok());
-    let framing = framing(&table, problems).unwrap_or(Framing::Line);
-    let parses = [("csv", Parse::Csv), ("json", Parse::Json), ("f32le", Parse::F32le), ("raw", Parse::Raw)];
-    let parse = table.choice(problems, "parse", &parses).unwrap_or(Parse::Csv);
-    let channels = table.integer(problems, "channels", 1..=1024).and_then(|count| usize::try_from(count.value).ok());
-    if parse == Parse::Raw {
-        if table.has("channels") {
-            let fix = "remove channels, or write parse = \"csv\", \"json\" or \"f32le\"";
-            table.report(problems, "channels", "raw messages are not looked into and have no channels".to_owned(), fix);
-        }
-        return Some(SerialSpec { baud: baud?, framing, parse, channels: 0 });
-    }
-    if !table.has("channels") {
-        table.missing(problems, "channels", "write channels = the count of numbers in a message");
-    }
-    let channels = channels?;
-    if let (Parse::F32le, Framing::Fixed(bytes)) = (parse, framing)
-        && bytes != 4 * channels
-    {
-        let message = format!("{channels} channels of f32le take {} bytes, not {bytes}", 4 * channels);
-        table.report(problems, "framing", message, format!("write framing = \"fixed {}\"", 4 * channels));
-    }
-    if let (Parse::F32le, Framing::Line) = (parse, framing) {
-        let message = "f32le messages cannot be framed by lines: a number may contain a newline".to_owned();
-        table.report(problems, "framing", message, format!("write framing = \"fixed {}\" or \"cobs\"", 4 * channels));
-    }
-    Some(SerialSpec { baud: baud?, framing, parse, channels })
-}
-
-fn framing(table: &Section<'_>, problems: &mut Problems<'_>) -> Option<Framing> {
-    /// More than any message of the devices this is for; bounds the buffer.
-    const LONGEST: usize = 65_536;
-    let text = table.text(problems, "framing")?.value;
-    match text.split_once(' ') {
-        None if text == "line" => return Some(Framing::Line),
-        None if text == "cobs" => return Some(Framing::Cobs),
-        Some(("fixed", bytes)) => {
-            if let Some(bytes) = bytes.trim().parse().ok().filter(|bytes| (1..=LONGEST).contains(bytes)) {
-                return Some(Framing::Fixed(bytes));
-            }
-            let message = format!("{:?} is not a message length", bytes.trim());
-            table.report(problems, "framing", message, format!("write \"fixed N\" with N from 1 to {LONGEST} bytes"));
-            return None;
-        }
-        _ => {}
-    }
-    let word = text.split(' ').next().unwrap_or_default();
-    let fix = match nearest(word, ["line", "cobs", "fixed"]) {
-        Some("fixed") => "write \"fixed N\" with N bytes a message, for example \"fixed 12\"".to_owned(),
-        Some(name) => format!("did you mean \"{name}\"?"),
-        None => "write one of: line, cobs, fixed N".to_owned(),
-    };
-    table.report(problems, "framing", format!("unknown framing {text:?}"), fix);
-    None
-}
-
 fn default_topic(kind: Option<Kind>, name: &str) -> String {
     let kind = BUILT_IN.iter().find(|(_, built_in)| Some(*built_in) == kind).map_or("device", |(kind, _)| kind);
     format!("/rapid/{kind}/{name}")
@@ -378,44 +283,4 @@ fn topic(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<String> {
     };
     section.report(problems, "topic", message, fix);
     None
-}
-
-/// Half a second, or ten periods of a slow camera; a serial line's rate is not known.
-fn default_stall(node: Option<&NodeSpec>) -> Duration {
-    const LEAST: Duration = Duration::from_millis(500);
-    match node {
-        Some(NodeSpec::Camera(camera)) => (Duration::from_secs(10) / camera.fps.max(1)).max(LEAST),
-        _ => LEAST,
-    }
-}
-
-fn max_bytes(section: &Section<'_>, node: Option<&NodeSpec>, problems: &mut Problems<'_>) -> u64 {
-    /// A JPEG picture of a small, noisy scene with its tables can exceed two bytes a pixel.
-    const SMALLEST_JPEG: u64 = 64 << 10;
-    let (default, least) = match node {
-        Some(NodeSpec::Camera(camera)) => {
-            let pixels = u64::from(camera.width) * u64::from(camera.height);
-            match camera.format {
-                PixelFormat::Mjpg => ((2 * pixels).max(SMALLEST_JPEG), 1024),
-                PixelFormat::Yuyv => (2 * pixels, 2 * pixels),
-                PixelFormat::Grey => (pixels, pixels),
-            }
-        }
-        Some(NodeSpec::Serial(serial)) => match (serial.parse, serial.framing) {
-            (Parse::Raw, Framing::Fixed(bytes)) => (bytes as u64, bytes as u64),
-            (Parse::Raw, _) => (4096, 1),
-            // Numbers travel as 64-bit floats.
-            _ => (8 * serial.channels as u64, 8 * serial.channels as u64),
-        },
-        None => (1, 1),
-    };
-    section.size(problems, "max_bytes", least..=256 << 20).unwrap_or(default)
-}
-
-/// About two seconds of pictures; a serial line may send a thousand samples a second.
-fn default_depth(node: Option<&NodeSpec>) -> u64 {
-    match node {
-        Some(NodeSpec::Camera(camera)) => (2 * u64::from(camera.fps)).clamp(16, 1024),
-        _ => 2048,
-    }
 }

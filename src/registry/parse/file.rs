@@ -93,6 +93,9 @@ mod tests {
         assert!(message(&path).contains("larger than 1MiB"));
         std::fs::write(&path, "a = 1\n").unwrap();
         assert_eq!(read_file(&path, "").unwrap(), "a = 1\n");
+        std::fs::set_permissions(&path, std::os::unix::fs::PermissionsExt::from_mode(0o666)).unwrap();
+        let is_root = rustix::process::geteuid().is_root();
+        assert_eq!(read_file(&path, "").is_err(), is_root, "only root distrusts a file all may write");
         let pipe = dir.path().join("pipe");
         rustix::fs::mknodat(rustix::fs::CWD, &pipe, rustix::fs::FileType::Fifo, 0o600.into(), 0).unwrap();
         assert!(message(&pipe).contains("not a regular file"));

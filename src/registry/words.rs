@@ -1,0 +1,108 @@
+//! The words `devices.toml` uses for our types: read by the parser, written by everything that
+//! shows an entry.
+
+use std::fmt;
+
+use super::spec::{Framing, Mount, NodeSpec, Parse, PixelFormat, WhenStale};
+
+impl PixelFormat {
+    /// Every format and its V4L2 name.
+    pub const WORDS: [(&str, Self); 3] = [("MJPG", Self::Mjpg), ("YUYV", Self::Yuyv), ("GREY", Self::Grey)];
+}
+
+impl Parse {
+    /// Every kind of content and its name.
+    pub const WORDS: [(&str, Self); 4] =
+        [("csv", Self::Csv), ("json", Self::Json), ("f32le", Self::F32le), ("raw", Self::Raw)];
+}
+
+impl Mount {
+    /// Every slot and its name.
+    pub const WORDS: [(&str, Self); 4] =
+        [("front", Self::Front), ("tip", Self::Tip), ("top", Self::Top), ("bottom", Self::Bottom)];
+}
+
+impl WhenStale {
+    /// Every policy and its name.
+    pub const WORDS: [(&str, Self); 2] = [("hold", Self::Hold), ("zero", Self::Zero)];
+}
+
+fn word<T: PartialEq>(words: &[(&'static str, T)], value: &T) -> &'static str {
+    words.iter().find(|(_, named)| named == value).map_or("", |(word, _)| word)
+}
+
+impl fmt::Display for PixelFormat {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(word(&Self::WORDS, self))
+    }
+}
+
+impl fmt::Display for Parse {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(word(&Self::WORDS, self))
+    }
+}
+
+impl fmt::Display for Mount {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(word(&Self::WORDS, self))
+    }
+}
+
+impl fmt::Display for WhenStale {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(word(&Self::WORDS, self))
+    }
+}
+
+impl fmt::Display for Framing {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Line => f.write_str("line"),
+            Self::Cobs => f.write_str("cobs"),
+            Self::Fixed(bytes) => write!(f, "fixed {bytes}"),
+        }
+    }
+}
+
+impl NodeSpec {
+    /// The kind of node: `camera` or `serial`.
+    #[must_use]
+    pub const fn kind(&self) -> &'static str {
+        match self {
+            Self::Camera(_) => "camera",
+            Self::Serial(_) => "serial",
+        }
+    }
+
+    /// The format on one line: `640x480@30 MJPG`, `115200 baud line csv x3`.
+    #[must_use]
+    pub fn format(&self) -> String {
+        match self {
+            Self::Camera(camera) => format!("{}x{}@{} {}", camera.width, camera.height, camera.fps, camera.format),
+            Self::Serial(serial) if serial.parse == Parse::Raw => {
+                format!("{} baud {} raw", serial.baud, serial.framing)
+            }
+            Self::Serial(serial) => {
+                format!("{} baud {} {} x{}", serial.baud, serial.framing, serial.parse, serial.channels)
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_value_has_a_word() {
+        let formats = [PixelFormat::Mjpg, PixelFormat::Yuyv, PixelFormat::Grey].map(|format| format.to_string());
+        assert_eq!(formats, ["MJPG", "YUYV", "GREY"]);
+        let parses = [Parse::Csv, Parse::Json, Parse::F32le, Parse::Raw].map(|parse| parse.to_string());
+        assert_eq!(parses, ["csv", "json", "f32le", "raw"]);
+        let mounts = [Mount::Front, Mount::Tip, Mount::Top, Mount::Bottom].map(|mount| mount.to_string());
+        assert_eq!(mounts, ["front", "tip", "top", "bottom"]);
+        assert_eq!([WhenStale::Hold, WhenStale::Zero].map(|stale| stale.to_string()), ["hold", "zero"]);
+        assert_eq!(Framing::Fixed(12).to_string(), "fixed 12");
+    }
+}

@@ -1,0 +1,215 @@
+//! The registry against files: each in `registry/invalid` is refused with exactly the text beside
+//! it (`NAME.expected`), each in `registry/valid` is accepted; and no text at all makes it panic.
+
+#![expect(clippy::unwrap_used, reason = "helpers of tests")]
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use proptest::prelude::*;
+use rapid::registry::scenario::Scenario;
+use rapid::registry::{BUILTIN, Framing, Loaded, NodeSpec, Parse, Registry};
+
+fn files(folder: &str) -> Vec<PathBuf> {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/registry").join(folder);
+    let mut files: Vec<_> = std::fs::read_dir(folder)
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .filter(|path| path.extension().is_some_and(|extension| extension == "toml"))
+        .collect();
+    files.sort();
+    files
+}
+
+fn valid(name: &str) -> Loaded {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/registry/valid").join(format!("{name}.toml"));
+    Registry::parse(&std::fs::read_to_string(path).unwrap(), None).unwrap()
+}
+
+#[test]
+fn every_mistake_is_told_in_full() {
+    let files = files("invalid");
+    assert!(files.len() >= 30, "{} files", files.len());
+    for path in files {
+        let text = std::fs::read_to_string(&path).unwrap();
+        let errors = Registry::parse(&text, Some(Path::new("devices.toml"))).expect_err(&path.display().to_string());
+        let expected = std::fs::read_to_string(path.with_extension("expected")).unwrap_or_default();
+        assert_eq!(format!("{errors}\n"), expected, "{}", path.display());
+        for diagnostic in &errors.diagnostics {
+            assert!(diagnostic.fix.as_ref().is_some_and(|fix| !fix.is_empty()), "{diagnostic}");
+            assert!(!diagnostic.to_string().chars().any(|c| c.is_control() && c != '\n'), "{diagnostic:?}");
+        }
+    }
+}
+
+#[test]
+fn what_is_right_is_accepted() {
+    for path in files("valid") {
+        let text = std::fs::read_to_string(&path).unwrap();
+        let loaded = Registry::parse(&text, Some(&path)).unwrap_or_else(|errors| panic!("{errors}"));
+        let devices = &loaded.registry.devices;
+        assert!(devices.is_sorted_by_key(|device| device.id), "{}", path.display());
+        assert_eq!(devices.iter().map(|device| device.id).collect::<BTreeSet<_>>().len(), devices.len());
+        assert_eq!(loaded.registry.path.as_deref(), Some(path.as_path()));
+        assert_eq!(loaded.registry.text, text);
+    }
+}
+
+#[test]
+fn defaults_are_those_of_the_documentation() {
+    let Loaded { registry, warnings } = valid("minimal");
+    let device = &registry.devices[0];
+    assert_eq!((device.topic.as_str(), device.depth, device.max_bytes), ("/rapid/camera/cam", 60, 640 * 480 * 2));
+    assert_eq!(device.stall_after.as_millis(), 500);
+    assert_eq!((registry.rig.name.as_str(), registry.rig.observation_hz), ("rig", 30.0));
+    assert_eq!(registry.rig.sync_window.as_millis(), 25);
+    assert_eq!((registry.rig.cooldown.as_secs(), registry.rig.memory_budget), (2, 512 << 20));
+    assert_eq!(
+        warnings[0].to_string(),
+        "devices.toml:1:9: [device.cam] no bit given, it gets bit 0: another entry above it would move it\n    \
+         fix: pin it with bit = 0; a policy is trained on bit positions"
+    );
+}
+
+#[test]
+fn every_key_arrives() {
+    let Loaded { registry, warnings } = valid("every_key");
+    assert_eq!(warnings[0].message, "port has no effect beside a serial number: the unit is recognised in every port");
+    let [tof, cam] = registry.devices.as_slice() else { panic!("two devices") };
+    assert_eq!((cam.id.bit(), cam.topic.as_str(), cam.depth, cam.max_bytes), (63, "/a/b-c_d", 100, 1 << 20));
+    assert_eq!(cam.identity.serial.as_deref(), Some("with \"quotes\" and spaces"));
+    assert_eq!(cam.identity.port.as_deref(), Some("1-2.3"));
+    let NodeSpec::Camera(camera) = &cam.node else { panic!("a camera") };
+    assert_eq!((camera.width, camera.height, camera.fps), (1, 2, 1000));
+    assert_eq!(camera.controls, [("gain".to_owned(), -3)]);
+    let NodeSpec::Serial(serial) = &tof.node else { panic!("a serial line") };
+    assert_eq!((serial.baud, serial.framing, serial.parse, serial.channels), (9600, Framing::Cobs, Parse::Raw, 0));
+    assert_eq!((tof.max_bytes, tof.depth), (4096, 2048));
+    assert_eq!(registry.rig.sync_window.as_micros(), 12_500);
+}
+
+#[test]
+fn missing_bits_are_the_lowest_free_in_the_order_of_the_file() {
+    let Loaded { registry, warnings } = valid("bits_filled_in");
+    let bits: Vec<_> = registry.devices.iter().map(|device| (device.name.as_str(), device.id.bit())).collect();
+    assert_eq!(bits, [("pinned", 0), ("z_first", 1), ("a_last", 2)]);
+    let warned: Vec<_> = warnings.iter().map(|warning| warning.entry.as_deref().unwrap()).collect();
+    assert_eq!(warned, ["device.z_first", "device.a_last"]);
+}
+
+#[test]
+fn depths_shrink_to_the_budget_but_not_those_that_were_written() {
+    let Loaded { registry, warnings } = valid("depths_within_budget");
+    assert_eq!(warnings[0].message, "depth lowered from 60 to 33 to keep all topics within memory_budget = 64MiB");
+    assert_eq!(warnings.len(), 1);
+    let depths: Vec<_> = registry.devices.iter().map(|device| device.depth).collect();
+    let total: usize = registry.devices.iter().map(|device| device.depth * device.max_bytes).sum();
+    assert_eq!(depths, [33, 20]);
+    assert!(total <= 64 << 20, "{total}");
+}
+
+#[test]
+fn a_composite_device_may_have_an_entry_for_each_node() {
+    let registry = valid("composite_device").registry;
+    assert_eq!(registry.devices[0].identity, registry.devices[1].identity);
+    let NodeSpec::Serial(serial) = &registry.devices[1].node else { panic!("a serial line") };
+    assert_eq!((serial.framing, serial.parse, serial.channels), (Framing::Fixed(12), Parse::F32le, 3));
+}
+
+#[test]
+fn editors_of_other_systems_are_understood() {
+    let text = "\u{feff}[device.cam]\r\nvid = \"046d\"\r\npid = \"0825\"\r\nnode = \"camera\"\r\n";
+    assert_eq!(Registry::parse(text, None).unwrap().registry.devices[0].name, "cam");
+    let errors = Registry::parse(&format!("{text}tpoic = \"/ü\" # ü\r\n"), None).unwrap_err();
+    assert_eq!(
+        errors.to_string(),
+        "devices.toml:5:1: [device.cam] unknown key \"tpoic\"\n    fix: did you mean \"topic\"?"
+    );
+}
+
+/// A valid or nearly valid file with some bytes replaced, removed, doubled.
+fn mutated() -> impl Strategy<Value = String> {
+    let sources: Vec<String> = files("valid")
+        .iter()
+        .chain(&files("invalid"))
+        .map(|path| std::fs::read_to_string(path).unwrap())
+        .filter(|text| !text.is_empty())
+        .collect();
+    let edit = (any::<prop::sample::Index>(), 0_usize..12, "[ -~\\n\"\\[\\]=.]{0,6}|\\PC{0,2}|-?[0-9]{1,25}");
+    (prop::sample::select(sources), prop::collection::vec(edit, 1..6)).prop_map(|(mut text, edits)| {
+        for (place, length, new) in edits {
+            let mut chars: Vec<char> = text.chars().collect();
+            let at = place.index(chars.len() + 1);
+            let end = (at + length).min(chars.len());
+            chars.splice(at..end, new.chars());
+            text = chars.into_iter().collect();
+        }
+        text
+    })
+}
+
+/// Whatever is said about a text has a place in it and a fix; whatever is accepted is consistent.
+fn check_any(text: &str) {
+    match Registry::parse(text, None) {
+        Ok(loaded) => {
+            let devices = &loaded.registry.devices;
+            assert!((1..=64).contains(&devices.len()));
+            for set in [
+                devices.iter().map(|device| device.id.to_string()).collect::<BTreeSet<_>>(),
+                devices.iter().map(|device| device.topic.clone()).collect(),
+                devices.iter().map(|device| device.name.clone()).collect(),
+            ] {
+                assert_eq!(set.len(), devices.len());
+            }
+            let total: u64 = devices.iter().map(|device| device.max_bytes as u64 * device.depth as u64).sum();
+            assert!(total <= loaded.registry.rig.memory_budget);
+            let files = rapid::registry::artifacts::artifacts(&loaded.registry);
+            assert_eq!(files.len(), 2 + devices.len());
+            let demo = Scenario::demo(&loaded.registry);
+            assert_eq!(demo.devices.len(), devices.len());
+        }
+        Err(errors) => {
+            assert!(!errors.diagnostics.is_empty());
+            for diagnostic in &errors.diagnostics {
+                assert!(diagnostic.line <= text.split('\n').count(), "{diagnostic:?}");
+                assert!(diagnostic.fix.is_some(), "{diagnostic:?}");
+                assert!(!diagnostic.to_string().chars().any(|c| c.is_control() && c != '\n'), "{diagnostic:?}");
+            }
+        }
+    }
+}
+
+proptest! {
+    #[test]
+    fn no_text_makes_it_panic(text in any::<String>()) {
+        check_any(&text);
+        let _ = Scenario::parse(&text, None, &Registry::builtin());
+    }
+
+    #[test]
+    fn no_damaged_file_makes_it_panic(text in mutated()) {
+        check_any(&text);
+    }
+
+    #[test]
+    fn no_value_makes_it_panic(key in "[a-z_.]{1,12}", value in "[-0-9a-zA-Z_.\"'\\[\\]{}=, ]{0,30}") {
+        check_any(&format!("{BUILTIN}\n{key} = {value}\n[device.x]\n{key} = {value}\n"));
+        let text = format!("repeat = {value}\n[[device]]\n{key} = {value}\n[[event]]\n{key} = {value}\n");
+        let _ = Scenario::parse(&text, None, &Registry::builtin());
+    }
+}
+
+#[test]
+fn deep_and_wide_texts_are_survived() {
+    for text in [
+        "a.".repeat(400_000),
+        format!("[{}a]", "a.".repeat(400_000)),
+        format!("a = {}", "[".repeat(900_000)),
+        format!("a = {}", "{a=".repeat(300_000)),
+        "[device.x]\n".repeat(90_000),
+        (0..60_000).map(|number| format!("k{number} = 1")).collect::<Vec<_>>().join("\n"),
+        format!("[device.x]\nserial = \"{}\"", "x".repeat(1 << 20)),
+    ] {
+        check_any(&text);
+    }
+}
