@@ -156,7 +156,6 @@ impl Decoder {
         let (taken, cut) = self.framer.feed(bytes);
         let decoded = match cut {
             Cut::Open => Decoded::Nothing,
-            Cut::Malformed => Decoded::Malformed,
             Cut::Message if self.accepts() => {
                 self.slipping = false;
                 Decoded::Message
@@ -165,7 +164,7 @@ impl Decoder {
                 let first = !std::mem::replace(&mut self.slipping, true);
                 if first { Decoded::Malformed } else { Decoded::Nothing }
             }
-            Cut::Message => Decoded::Malformed,
+            Cut::Message | Cut::Malformed => Decoded::Malformed,
         };
         (taken, decoded)
     }
@@ -206,13 +205,13 @@ fn open_line(path: &Path, baud: u32) -> Result<SerialStream, DriverError> {
         return Err(DriverError::Fatal(format!("{}: the path is not UTF-8", path.display())));
     };
     let stream =
-        SerialStream::open(&tokio_serial::new(name, baud).exclusive(true)).map_err(|error| open_error(path, &error))?;
+        SerialStream::open(&tokio_serial::new(name, baud).exclusive(true)).map_err(|error| open_error(path, baud, &error))?;
     // Whatever waited in the kernel is older than this opening.
     let _ = stream.clear(ClearBuffer::Input);
     Ok(stream)
 }
 
-fn open_error(path: &Path, error: &tokio_serial::Error) -> DriverError {
+fn open_error(path: &Path, baud: u32, error: &tokio_serial::Error) -> DriverError {
     let shown = path.display();
     match error.kind() {
         // serialport tells EBUSY, from TIOCEXCL or from its lock, as `NoDevice`.
@@ -228,7 +227,7 @@ fn open_error(path: &Path, error: &tokio_serial::Error) -> DriverError {
         )),
         // ENODEV, ENXIO and EIO arrive without their number; a node that is gone tells them apart.
         _ if !path.exists() => DriverError::Gone,
-        _ => DriverError::Retry(format!("{shown} at {baud_hint}: {error}", baud_hint = "the wished settings")),
+        _ => DriverError::Retry(format!("{shown} at {baud} baud: {error}")),
     }
 }
 

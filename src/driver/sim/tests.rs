@@ -1,1 +1,103 @@
+use super::*;
 
+const CAMERA: SimSource = SimSource::Camera { width: 64, height: 48, fps: 30, seed: 7 };
+
+fn device(source: SimSource) -> Arc<SimDevice> {
+    Arc::new(SimDevice::new("sim", source, stamp_of(Instant::now())))
+}
+
+#[test]
+fn the_grid_does_not_drift_and_first_after_is_the_next_point() {
+    let grid = Grid { begun: Stamp(1_000), rate: 30 };
+    assert_eq!(grid.stamp(30_000_000), Stamp(1_000 + 1_000_000 * 1_000_000_000));
+    for point in [0, 1, 2, 3, 29, 30, 31, 1_000_003] {
+        let stamp = grid.stamp(point);
+        assert_eq!(grid.first_after(stamp), point + 1);
+        assert_eq!(grid.first_after(Stamp(stamp.0 - 1)), point);
+    }
+    assert_eq!(grid.first_after(Stamp(0)), 0);
+}
+
+#[test]
+fn a_picture_is_a_jpeg_that_names_seed_and_sequence() {
+    let picture = frame(&CAMERA, 12).unwrap();
+    assert_eq!(picture[..4], [0xff, 0xd8, 0xff, 0xfe]);
+    assert_eq!(&picture[6..22], b"rapid-sim 7 12\xff\xe0", "the segment ends where the next begins");
+    assert_eq!(u16::from_be_bytes([picture[4], picture[5]]), 2 + 14);
+    assert_eq!(picture[picture.len() - 2..], [0xff, 0xd9], "end of image");
+    assert_ne!(frame(&CAMERA, 13).unwrap()[22..], picture[22..], "something moves");
+    assert_eq!(frame(&CAMERA, 20).unwrap()[22..], picture[22..], "and comes back");
+    let other = SimSource::Camera { width: 64, height: 48, fps: 30, seed: 8 };
+    assert_ne!(frame(&other, 12).unwrap()[22..], picture[22..]);
+}
+
+#[test]
+fn values_begin_with_the_sequence_and_stay_within_one() {
+    let bytes = frame(&SimSource::Serial { channels: 3, hz: 100, seed: 1 }, 41).unwrap();
+    let values: Vec<f64> = bytes.as_chunks().0.iter().map(|eight| f64::from_le_bytes(*eight)).collect();
+    assert_eq!(values.len(), 3);
+    assert_eq!(values[0].to_bits(), 41.0_f64.to_bits());
+    assert!(values[1..].iter().all(|value| value.abs() <= 1.0));
+}
+
+#[tokio::test(start_paused = true)]
+async fn samples_lie_on_the_grid() {
+    let device = device(CAMERA);
+    let mut sim = Sim::open(Arc::clone(&device)).await.unwrap();
+    for sequence in 0..40 {
+        let reading = sim.read().await.unwrap();
+        assert_eq!(reading.bytes, frame(&CAMERA, sequence).unwrap());
+        assert_eq!((reading.width, reading.height, reading.lost), (64, 48, 0));
+        let offset = reading.captured.since(device.begun).as_nanos() * 30;
+        assert!(offset % 1_000_000_000 < 30 || offset % 1_000_000_000 > 999_999_970, "{offset}");
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_late_reader_is_told_what_it_lost() {
+    let mut sim = Sim::open(device(CAMERA)).await.unwrap();
+    sim.read().await.unwrap();
+    tokio::time::sleep(Duration::from_secs(2)).await;
+    let reading = sim.read().await.unwrap();
+    let lost = u32::try_from(reading.lost).unwrap();
+    assert!(lost >= 50, "{lost}");
+    assert_eq!(reading.bytes, frame(&CAMERA, 1 + lost).unwrap());
+    assert_eq!(sim.read().await.unwrap().lost, 0);
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_silent_device_sends_nothing_and_goes_on_where_it_was() {
+    let device = device(CAMERA);
+    let mut sim = Sim::open(Arc::clone(&device)).await.unwrap();
+    let before = sim.read().await.unwrap().captured;
+    device.set_silent(true);
+    assert!(tokio::time::timeout(Duration::from_secs(5), sim.read()).await.is_err());
+    device.set_silent(false);
+    let reading = sim.read().await.unwrap();
+    assert_eq!(reading.lost, 0);
+    assert!(reading.captured.since(before) >= Duration::from_secs(5));
+    assert_eq!(reading.bytes, frame(&CAMERA, 1).unwrap());
+}
+
+#[tokio::test(start_paused = true)]
+async fn the_sequence_goes_on_over_a_replug() {
+    let first = device(CAMERA);
+    let mut sim = Sim::open(Arc::clone(&first)).await.unwrap();
+    for _ in 0..3 {
+        sim.read().await.unwrap();
+    }
+    first.unplug();
+    assert!(matches!(sim.read().await, Err(DriverError::Gone)));
+    let second = Arc::new(SimDevice::new("sim", CAMERA, first.begun));
+    second.sequence.store(first.sequence.load(Ordering::Acquire), Ordering::Release);
+    let mut sim = Sim::open(second).await.unwrap();
+    assert_eq!(sim.read().await.unwrap().bytes, frame(&CAMERA, 3).unwrap());
+}
+
+#[test]
+fn impossible_pictures_are_refused() {
+    assert!(encode(0, 10, 1, 0).is_err());
+    assert!(encode(100_000, 10, 1, 0).is_err());
+    assert!(encode(1, 1, 1, 7).is_ok());
+    assert!(encode(2, 300, 1, 7).is_ok());
+}
