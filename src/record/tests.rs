@@ -215,6 +215,13 @@ impl Bench {
         finished
     }
 
+    /// Waits until a file has its final name.
+    pub(super) async fn until_file(&self, file: &Path) {
+        while !file.exists() {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    }
+
     async fn until_closed(&self, events: &mut tokio::sync::broadcast::Receiver<crate::status::Event>) -> What {
         loop {
             let event = events.recv().await.unwrap();
