@@ -147,7 +147,7 @@ impl Bench {
         let (encoding, payload) = match bit {
             CAM => (Encoding::Mjpeg, seq.to_le_bytes().repeat(100)),
             TOF => (Encoding::F64, [seq as f64, 0.5].iter().flat_map(|v| v.to_le_bytes()).collect()),
-            _ => (Encoding::Grey, vec![seq as u8; 8]),
+            _ => (Encoding::Grey, vec![seq.to_le_bytes()[0]; 8]),
         };
         let header = SampleHeader {
             seq,
@@ -180,7 +180,7 @@ impl Bench {
     /// the mask at first.
     pub(super) async fn one_second(&self) -> PathBuf {
         self.mask(0b11, 1, Stamp::now().0);
-        let finished = self.recorder.start(self.request(Some(Duration::from_millis(1000)))).await.unwrap();
+        let finished = self.recorder.start(self.request(Some(Duration::from_secs(1)))).await.unwrap();
         let attach = What::Attach {
             device: "raw".to_owned(),
             bit: id(RAW),
@@ -457,7 +457,7 @@ async fn orders_out_of_turn_are_refused_and_a_stop_reports() {
     // The handle's end is the episode's end.
     let Bench { recorder, folder, .. } = bench;
     drop(recorder);
-    assert_eq!(read(&second).metadata["rapid/summary"]["frames"].is_empty(), false);
+    assert!(read(&second).metadata["rapid/summary"]["frames"].parse::<u64>().is_ok());
     drop(folder);
 }
 

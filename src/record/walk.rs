@@ -71,8 +71,8 @@ pub(super) fn walk(file: &mut impl Read, size: u64, visit: &mut dyn FnMut(u8, &[
         let (Some(opcode), Some(length)) = (head.u8(), head.u64()) else { break FileEnd::Torn };
         let known = (1..=op::DATA_END).contains(&opcode) || opcode >= op::PRIVATE;
         let left = size.saturating_sub(walked.bytes).saturating_sub(9);
-        let held = matches!(opcode, op::CHUNK | op::CHANNEL | op::MESSAGE | op::METADATA | op::FOOTER);
-        if !known || (held && length.min(left) > MAX_RECORD) {
+        let in_memory = matches!(opcode, op::CHUNK | op::CHANNEL | op::MESSAGE | op::METADATA | op::FOOTER);
+        if !known || (in_memory && length.min(left) > MAX_RECORD) {
             break FileEnd::Damaged;
         }
         if length > left && opcode != op::CHUNK {
