@@ -84,7 +84,8 @@ impl EpisodePath {
         Err(at(out)(io::Error::new(io::ErrorKind::AlreadyExists, "no free number for this task")))
     }
 
-    /// Gives the finished file its name. The name is on the disk when this returns.
+    /// Gives the finished file its name, and waits for the name to be on the disk where the file
+    /// system can be asked for that.
     pub(super) fn publish(&self) -> io::Result<()> {
         match renameat_with(CWD, &self.partial, CWD, &self.finished, RenameFlags::NOREPLACE) {
             Ok(()) => {}
@@ -94,10 +95,12 @@ impl EpisodePath {
             }
             Err(error) => return Err(error.into()),
         }
-        match self.finished.parent() {
-            Some(folder) if folder != Path::new("") => File::open(folder)?.sync_all(),
-            _ => File::open(".")?.sync_all(),
+        let folder = self.finished.parent().filter(|folder| *folder != Path::new("")).unwrap_or(Path::new("."));
+        // The file has its name: what remains is what a loss of power right now would do to it.
+        if let Err(error) = File::open(folder).and_then(|folder| folder.sync_all()) {
+            tracing::warn!(folder = %folder.display(), %error, "folder not synced");
         }
+        Ok(())
     }
 }
 

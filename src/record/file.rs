@@ -191,13 +191,9 @@ impl EpisodeFile {
     }
 
     fn write(&mut self, channel_id: u16, sequence: u64, log_time: u64, published: Stamp) -> io::Result<()> {
-        let header = MessageHeader {
-            channel_id,
-            // MCAP has 32 bits for it: the lower ones.
-            sequence: (sequence & u64::from(u32::MAX)) as u32,
-            log_time,
-            publish_time: self.clock.wall_ns(published),
-        };
+        #[expect(clippy::cast_possible_truncation, reason = "MCAP has 32 bits for it: the lower ones")]
+        let sequence = sequence as u32;
+        let header = MessageHeader { channel_id, sequence, log_time, publish_time: self.clock.wall_ns(published) };
         self.writer.write_to_known_channel(&header, &self.message).map_err(io_error)?;
         self.messages += 1;
         Ok(())

@@ -12,6 +12,7 @@
 pub mod encode;
 mod episode;
 mod file;
+pub mod inspect;
 mod metadata;
 mod recorder;
 pub mod schema;
@@ -19,6 +20,8 @@ mod session;
 mod source;
 #[cfg(test)]
 mod tests;
+mod walk;
+mod wire;
 
 use std::path::PathBuf;
 

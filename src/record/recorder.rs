@@ -282,8 +282,11 @@ impl Writer {
             clock,
             begin,
         };
-        let session = Session::begin(beginning, &self.streams.masks)
-            .map_err(|source| RecordError::Io { path: partial, source })?;
+        let session = Session::begin(beginning, &self.streams.masks).map_err(|source| {
+            // Nothing was recorded into it, and it was made a moment ago.
+            let _ = std::fs::remove_file(&partial);
+            RecordError::Io { path: partial, source }
+        })?;
         self.config.board.set_recording(Some(session.status(begin)));
         self.config.board.announce(What::Recording { file: finished.clone() });
         self.session = Some(session);
@@ -313,7 +316,9 @@ impl Writer {
         let report = session.finish(now, &self.streams.masks, reason);
         let board = &self.config.board;
         board.set_recording(None);
-        board.set_last_episode(report.file.clone());
+        if report.error.is_none() {
+            board.set_last_episode(report.file.clone());
+        }
         let EpisodeReport { file, seconds, messages, bytes, dropped, error } = report.clone();
         if let Some(error) = &error {
             tracing::error!(file = %file.display(), %error, "episode not whole");

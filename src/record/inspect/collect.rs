@@ -1,0 +1,268 @@
+//! Gathering an [`Inspection`] from the records of a file, in the order they lie in it.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use super::super::file::{EVENT_TOPIC, FRAME_TOPIC, MASK_TOPIC};
+use super::super::walk::{Walked, op};
+use super::super::wire::{Fields, protobuf};
+use super::{EventReport, Inspection, Lateness, MaskEdge, ModalityReport, TopicReport};
+use crate::mask::PhysicalMask;
+use crate::modality::{MAX_MODALITIES, ModalityId};
+
+/// Events kept: a rig that flaps all day must not fill the memory.
+const MAX_EVENTS: usize = 10_000;
+
+/// See the module's comment.
+#[derive(Debug, Default)]
+pub(super) struct Collected {
+    channels: BTreeMap<u16, Channel>,
+    about: BTreeMap<String, String>,
+    summary: BTreeMap<String, String>,
+    messages: u64,
+    first: Option<u64>,
+    last: u64,
+    /// Time and value of the first mask and of every change.
+    masks: Vec<(u64, u64)>,
+    frames: u64,
+    /// Frames in which each bit is valid and stale.
+    slots: BTreeMap<u8, (u64, u64)>,
+    events: Vec<(u64, EventReport)>,
+}
+
+#[derive(Debug, Default)]
+struct Channel {
+    topic: String,
+    metadata: BTreeMap<String, String>,
+    messages: u64,
+    first: u64,
+    previous: u64,
+    latest: u64,
+    longest_gap: u64,
+    next: u32,
+    missing: u64,
+    /// Receipt minus capture, microseconds.
+    lateness: Vec<u32>,
+}
+
+impl Collected {
+    /// Takes a record; one that cannot be read is passed over.
+    pub(super) fn record(&mut self, opcode: u8, record: &[u8]) {
+        let fields = Fields(record);
+        // `None` is a record that is shorter than it says.
+        let _ = match opcode {
+            op::CHANNEL => self.channel(fields),
+            op::METADATA => self.metadata(fields),
+            op::MESSAGE => self.message(fields),
+            _ => None,
+        };
+    }
+
+    fn channel(&mut self, mut fields: Fields<'_>) -> Option<()> {
+        let (id, _schema) = (fields.u16()?, fields.u16()?);
+        let (topic, _encoding) = (fields.string()?, fields.string()?);
+        let metadata = fields.map()?;
+        // The summary repeats the channels.
+        self.channels.entry(id).or_insert_with(|| Channel { topic: topic.to_owned(), metadata, ..Channel::default() });
+        Some(())
+    }
+
+    fn metadata(&mut self, mut fields: Fields<'_>) -> Option<()> {
+        let name = fields.string()?;
+        let map = fields.map()?;
+        match name {
+            "rapid" => self.about = map,
+            "rapid/summary" => self.summary = map,
+            _ => {}
+        }
+        Some(())
+    }
+
+    fn message(&mut self, mut fields: Fields<'_>) -> Option<()> {
+        let (id, sequence) = (fields.u16()?, fields.u32()?);
+        let (captured, received) = (fields.u64()?, fields.u64()?);
+        let channel = self.channels.get_mut(&id)?;
+        channel.count(sequence, captured, received);
+        self.messages += 1;
+        self.first = Some(self.first.map_or(captured, |first| first.min(captured)));
+        self.last = self.last.max(captured);
+        match channel.topic.as_str() {
+            MASK_TOPIC => self.mask(captured, fields.0),
+            FRAME_TOPIC => self.frame(fields.0),
+            EVENT_TOPIC => self.event(captured, fields.0),
+            _ => {}
+        }
+        Some(())
+    }
+
+    fn mask(&mut self, at: u64, message: &[u8]) {
+        let mask = protobuf(message).filter(|(field, _)| *field == 2).last().map_or(0, |(_, value)| value.number());
+        if self.masks.last().is_none_or(|(_, last)| *last != mask) {
+            self.masks.push((at, mask));
+        }
+    }
+
+    fn frame(&mut self, message: &[u8]) {
+        self.frames += 1;
+        for (_, slot) in protobuf(message).filter(|(field, _)| *field == 4) {
+            let (mut bit, mut valid, mut stale) = (0, 0, 0);
+            for (field, value) in protobuf(slot.bytes()) {
+                match field {
+                    1 => bit = value.number(),
+                    2 => valid = u64::from(value.number() != 0),
+                    3 => stale = u64::from(value.number() != 0),
+                    _ => {}
+                }
+            }
+            if let Some(id) = u8::try_from(bit).ok().and_then(ModalityId::new) {
+                let slot = self.slots.entry(id.bit()).or_default();
+                *slot = (slot.0 + valid, slot.1 + stale);
+            }
+        }
+    }
+
+    fn event(&mut self, at: u64, message: &[u8]) {
+        if self.events.len() == MAX_EVENTS {
+            return;
+        }
+        let mut event = EventReport { at: 0.0, kind: String::new(), device: String::new(), text: String::new() };
+        for (field, value) in protobuf(message) {
+            match field {
+                2 => event.kind = value.text(),
+                3 => event.device = value.text(),
+                4 => event.text = value.text(),
+                _ => {}
+            }
+        }
+        self.events.push((at, event));
+    }
+
+    /// What was gathered, as a report on the file at `path`.
+    pub(super) fn report(mut self, path: &Path, size: u64, walked: Walked) -> Inspection {
+        let said = |map: &BTreeMap<String, String>, key: &str| map.get(key).cloned().unwrap_or_default();
+        let begin_ns = said(&self.about, "begin_wall_ns").parse().ok().or(self.first).unwrap_or(0);
+        let told = said(&self.summary, "duration_s").parse().ok().filter(|seconds: &f64| seconds.is_finite());
+        let seconds = told.unwrap_or_else(|| from(begin_ns, self.last)).max(0.0);
+        let mut events = std::mem::take(&mut self.events);
+        for (at, event) in &mut events {
+            event.at = from(begin_ns, *at);
+        }
+        let (modalities, topics) = self.topics(begin_ns, seconds);
+        let count = modalities.len();
+        let mask = self
+            .masks
+            .iter()
+            .map(|(at, mask)| MaskEdge { at: from(begin_ns, *at), mask: PhysicalMask(*mask).hex(count) });
+        Inspection {
+            file: path.to_owned(),
+            bytes: size,
+            end: walked.end,
+            unread_bytes: size.saturating_sub(walked.bytes),
+            damaged_chunks: walked.damaged_chunks,
+            software: said(&self.about, "software"),
+            rig: said(&self.about, "rig"),
+            task: said(&self.about, "task"),
+            tags: serde_json::from_str(&said(&self.about, "tags")).unwrap_or_default(),
+            begin_ns,
+            seconds,
+            messages: self.messages,
+            dropped: said(&self.summary, "dropped").parse().ok(),
+            frames: self.frames,
+            modalities,
+            topics,
+            mask: mask.collect(),
+            events: events.into_iter().map(|(_, event)| event).collect(),
+        }
+    }
+
+    fn topics(&mut self, begin_ns: u64, seconds: f64) -> (Vec<ModalityReport>, Vec<TopicReport>) {
+        let (mut modalities, mut topics) = (Vec::new(), Vec::new());
+        for mut channel in std::mem::take(&mut self.channels).into_values() {
+            let topic = channel.report();
+            let bit = channel.metadata.get("bit").and_then(|bit| bit.parse().ok()).and_then(ModalityId::new);
+            let Some(id) = bit else {
+                topics.push(topic);
+                continue;
+            };
+            let present = self.present(id, begin_ns, seconds);
+            let together: f64 = present.iter().map(|(begin, end)| end - begin).sum();
+            let (frames_valid, frames_stale) = self.slots.get(&id.bit()).copied().unwrap_or_default();
+            modalities.push(ModalityReport {
+                name: channel.metadata.get("modality").unwrap_or(&channel.topic).clone(),
+                bit: id.bit(),
+                topic,
+                presence: (!self.masks.is_empty() && seconds > 0.0).then(|| (together / seconds).clamp(0.0, 1.0)),
+                present,
+                frames_valid,
+                frames_stale,
+            });
+        }
+        modalities.sort_by_key(|modality| modality.bit);
+        debug_assert!(modalities.iter().all(|modality| usize::from(modality.bit) < MAX_MODALITIES));
+        (modalities, topics)
+    }
+
+    /// When the bit of `id` was set, within the episode.
+    fn present(&self, id: ModalityId, begin_ns: u64, seconds: f64) -> Vec<(f64, f64)> {
+        let mut spans = Vec::new();
+        let mut since = None;
+        for (at, mask) in &self.masks {
+            let at = from(begin_ns, *at).clamp(0.0, seconds);
+            match (PhysicalMask(*mask).contains(id), since) {
+                (true, None) => since = Some(at),
+                (false, Some(begin)) => {
+                    spans.push((begin, at));
+                    since = None;
+                }
+                _ => {}
+            }
+        }
+        spans.extend(since.map(|begin| (begin, seconds)));
+        spans.retain(|(begin, end)| begin < end);
+        spans
+    }
+}
+
+impl Channel {
+    fn count(&mut self, sequence: u32, captured: u64, received: u64) {
+        if self.messages == 0 {
+            (self.first, self.latest) = (captured, captured);
+        } else {
+            self.longest_gap = self.longest_gap.max(captured.saturating_sub(self.previous));
+            // Numbers wrap after 32 bits; a step of more than half of that goes backwards.
+            let step = sequence.wrapping_sub(self.next);
+            self.missing += u64::from(if step <= u32::MAX / 2 { step } else { 0 });
+        }
+        self.messages += 1;
+        self.next = sequence.wrapping_add(1);
+        self.previous = captured;
+        self.first = self.first.min(captured);
+        self.latest = self.latest.max(captured);
+        self.lateness.push(u32::try_from(received.saturating_sub(captured) / 1000).unwrap_or(u32::MAX));
+    }
+
+    fn report(&mut self) -> TopicReport {
+        let span = from(self.first, self.latest);
+        let hz = if self.messages > 1 && span > 0.0 { (self.messages - 1) as f64 / span } else { 0.0 };
+        self.lateness.sort_unstable();
+        let at = |percent: usize| {
+            let last = self.lateness.len().checked_sub(1)?;
+            self.lateness.get(last * percent / 100).map(|us| f64::from(*us) / 1e3)
+        };
+        let lateness = (|| Some(Lateness { p50: at(50)?, p99: at(99)?, max: at(100)? }))();
+        TopicReport {
+            topic: self.topic.clone(),
+            messages: self.messages,
+            hz,
+            missing: self.missing,
+            longest_gap: self.longest_gap as f64 / 1e9,
+            lateness,
+        }
+    }
+}
+
+/// Seconds from one wall time to another, negative if it lies before.
+fn from(begin_ns: u64, at_ns: u64) -> f64 {
+    let distance = begin_ns.abs_diff(at_ns) as f64 / 1e9;
+    if at_ns < begin_ns { -distance } else { distance }
+}

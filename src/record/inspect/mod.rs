@@ -1,0 +1,170 @@
+//! What a recorded file holds: counts, rates, gaps, lateness and presence of every modality.
+//!
+//! Reads any file the recorder wrote, finished or not, from its beginning to where it ends.
+//!
+//! Invariant: no file makes this panic, and memory does not grow with a file's payloads.
+
+mod collect;
+mod render;
+#[cfg(test)]
+mod tests;
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{self, BufReader, Read};
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+
+use super::walk::walk;
+use collect::Collected;
+
+pub use super::walk::FileEnd;
+pub use render::{Paint, render};
+
+/// Why a file cannot be inspected.
+#[derive(Debug, thiserror::Error)]
+pub enum InspectError {
+    /// It cannot be read.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// It does not begin as an MCAP file does.
+    #[error("{}: not an MCAP file", .0.display())]
+    NotMcap(PathBuf),
+}
+
+/// What a file holds.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Inspection {
+    /// The file.
+    pub file: PathBuf,
+    /// Its size in bytes.
+    pub bytes: u64,
+    /// How it ends.
+    pub end: FileEnd,
+    /// Bytes at its end that could not be understood.
+    pub unread_bytes: u64,
+    /// Chunks whose content is not what was written.
+    pub damaged_chunks: u64,
+    /// The program that wrote it, with its version.
+    pub software: String,
+    /// Name of the rig.
+    pub rig: String,
+    /// The task in the user's words.
+    pub task: String,
+    /// Tags of the user.
+    pub tags: BTreeMap<String, String>,
+    /// Beginning, ns since 1970.
+    pub begin_ns: u64,
+    /// Length in seconds: what the recorder says, else up to the last message.
+    pub seconds: f64,
+    /// Messages on all topics.
+    pub messages: u64,
+    /// Samples the recorder says were lost on the way to the file; unknown in an unfinished file.
+    pub dropped: Option<u64>,
+    /// Ticks of the frame index.
+    pub frames: u64,
+    /// The modalities, ascending by bit.
+    pub modalities: Vec<ModalityReport>,
+    /// The other topics.
+    pub topics: Vec<TopicReport>,
+    /// Values of the mask over time: the first one and every change.
+    pub mask: Vec<MaskEdge>,
+    /// Events, the first ten thousand.
+    pub events: Vec<EventReport>,
+}
+
+/// One modality.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ModalityReport {
+    /// Name.
+    pub name: String,
+    /// Bit in the mask.
+    pub bit: u8,
+    /// What was recorded of it.
+    #[serde(flatten)]
+    pub topic: TopicReport,
+    /// Share of the episode in which it was present, 0 to 1; unknown in a file without the mask.
+    pub presence: Option<f64>,
+    /// When it was present: begin and end in seconds from the beginning.
+    pub present: Vec<(f64, f64)>,
+    /// Frames in which a sample of it lies within the window.
+    pub frames_valid: u64,
+    /// Frames in which it is present without such a sample.
+    pub frames_stale: u64,
+}
+
+/// One topic.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct TopicReport {
+    /// Topic.
+    pub topic: String,
+    /// Messages.
+    pub messages: u64,
+    /// Messages a second between the first and the last.
+    pub hz: f64,
+    /// Sequence numbers missing between messages.
+    pub missing: u64,
+    /// Longest time between two messages, seconds.
+    pub longest_gap: f64,
+    /// Times from capture to receipt; absent without messages.
+    pub lateness: Option<Lateness>,
+}
+
+/// Times from capture to receipt, ms.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Lateness {
+    /// Median.
+    pub p50: f64,
+    /// 99th percentile.
+    pub p99: f64,
+    /// Longest.
+    pub max: f64,
+}
+
+/// A value of the mask and when it began.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct MaskEdge {
+    /// Seconds from the beginning.
+    pub at: f64,
+    /// The mask from then on, `0x05`.
+    pub mask: String,
+}
+
+/// An event.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct EventReport {
+    /// Seconds from the beginning.
+    pub at: f64,
+    /// What kind of event.
+    pub kind: String,
+    /// The modality, or empty.
+    pub device: String,
+    /// For people.
+    pub text: String,
+}
+
+/// Reads a file and says what it holds.
+///
+/// # Errors
+/// When it cannot be read or is no MCAP file. An unfinished or damaged one is no error.
+pub fn inspect(path: &Path) -> Result<Inspection, InspectError> {
+    let io = |source| InspectError::Io { path: path.to_owned(), source };
+    let file = File::open(path).map_err(io)?;
+    let size = file.metadata().map_err(io)?.len();
+    // One that grows meanwhile is read as it was.
+    let mut file = BufReader::with_capacity(1 << 16, file.take(size));
+    inspect_from(&mut file, size, path).map_err(io)?.ok_or_else(|| InspectError::NotMcap(path.to_owned()))
+}
+
+/// `None`: no MCAP file.
+fn inspect_from(file: &mut impl Read, size: u64, path: &Path) -> io::Result<Option<Inspection>> {
+    let mut collected = Collected::default();
+    let walked = walk(file, size, &mut |opcode, record| collected.record(opcode, record))?;
+    Ok(walked.map(|walked| collected.report(path, size, walked)))
+}

@@ -1,0 +1,166 @@
+//! An [`Inspection`] as text for a terminal.
+
+use std::fmt::Write;
+
+use super::{FileEnd, Inspection, Lateness, ModalityReport, TopicReport};
+
+/// Whether the terminal shows colours.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Paint {
+    /// Text only.
+    Plain,
+    /// ANSI escape sequences.
+    Ansi,
+}
+
+/// Events shown; the JSON form has all of them.
+const EVENTS: usize = 40;
+/// Narrowest timeline.
+const TIMELINE: usize = 10;
+
+/// The report in lines of at most `width` characters, as far as names allow.
+#[must_use]
+pub fn render(inspection: &Inspection, width: usize, paint: Paint) -> String {
+    let mut out = String::new();
+    // Writing to a string cannot fail.
+    let _ = write_all(&mut out, inspection, width, paint);
+    out
+}
+
+fn write_all(out: &mut String, inspection: &Inspection, width: usize, paint: Paint) -> std::fmt::Result {
+    let name = inspection.file.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    writeln!(out, "{}  {}", clean(&name), ending(inspection, paint))?;
+    if inspection.damaged_chunks > 0 {
+        let text = format!("{} damaged chunks: their messages may be missing or wrong", inspection.damaged_chunks);
+        writeln!(out, "{}", colour(paint, RED, &text))?;
+    }
+    let mut about = vec![format!("task {}", or_dash(&inspection.task)), format!("rig {}", or_dash(&inspection.rig))];
+    about.extend(inspection.tags.iter().map(|(key, value)| format!("{key}={value}")));
+    writeln!(out, "{}", clean(&about.join("   ")))?;
+    let dropped = inspection.dropped.map_or("?".to_owned(), |dropped| dropped.to_string());
+    writeln!(
+        out,
+        "{:.3} s   {}   {} messages   {} frames   {dropped} dropped",
+        inspection.seconds,
+        size(inspection.bytes),
+        inspection.messages,
+        inspection.frames
+    )?;
+
+    let names = inspection.modalities.iter().map(|modality| clean(&modality.name).chars().count());
+    let topics = inspection.topics.iter().map(|topic| clean(&topic.topic).chars().count());
+    let column = names.chain(topics).max().unwrap_or(0).max(8);
+    writeln!(
+        out,
+        "\n{:column$} {:>8} {:>7} {:>7} {:>7} {:>17} {:>6}",
+        "", "messages", "Hz", "missing", "gap ms", "late p50/99/max", "frames"
+    )?;
+    for modality in &inspection.modalities {
+        let frames = percent(modality.frames_valid as f64 / (inspection.frames.max(1)) as f64);
+        let frames = if inspection.frames == 0 { "-".to_owned() } else { frames };
+        write_topic(out, &modality.name, &modality.topic, &format!(" {frames:>6}"), column)?;
+    }
+    for topic in &inspection.topics {
+        write_topic(out, &topic.topic, topic, "", column)?;
+    }
+
+    writeln!(out, "\npresence")?;
+    let cells = width.saturating_sub(column + 8).max(TIMELINE);
+    for modality in &inspection.modalities {
+        let share = modality.presence.map_or("?".to_owned(), percent);
+        let line = timeline(modality, inspection.seconds, cells, paint);
+        writeln!(out, "{:column$} {line} {share:>6}", clean(&modality.name))?;
+    }
+
+    if !inspection.events.is_empty() {
+        writeln!(out, "\nevents")?;
+        for event in inspection.events.iter().take(EVENTS) {
+            let line = format!("{:>10.3} s  {:12} {}", event.at, clean(&event.kind), clean(&event.text));
+            writeln!(out, "{}", line.chars().take(width.max(TIMELINE)).collect::<String>())?;
+        }
+        if inspection.events.len() > EVENTS {
+            writeln!(out, "{:>10}    {} more", "", inspection.events.len() - EVENTS)?;
+        }
+    }
+    Ok(())
+}
+
+fn ending(inspection: &Inspection, paint: Paint) -> String {
+    let unread = size(inspection.unread_bytes);
+    match inspection.end {
+        FileEnd::Finished => colour(paint, GREEN, "complete"),
+        FileEnd::Unfinished => colour(paint, YELLOW, "INCOMPLETE: no footer, read to its end"),
+        FileEnd::Torn => {
+            colour(paint, YELLOW, &format!("INCOMPLETE: the last record is cut, {unread} of it not whole"))
+        }
+        FileEnd::Damaged => colour(paint, RED, &format!("DAMAGED: the last {unread} cannot be read")),
+    }
+}
+
+fn write_topic(out: &mut String, name: &str, topic: &TopicReport, frames: &str, column: usize) -> std::fmt::Result {
+    let late =
+        topic.lateness.map_or("-".to_owned(), |Lateness { p50, p99, max }| format!("{p50:.1}/{p99:.1}/{max:.1}"));
+    writeln!(
+        out,
+        "{:column$} {:>8} {:>7.2} {:>7} {:>7.0} {late:>17}{frames}",
+        clean(name),
+        topic.messages,
+        topic.hz,
+        topic.missing,
+        topic.longest_gap * 1e3,
+    )
+}
+
+/// One character a cell of time: present throughout, absent throughout, or both.
+fn timeline(modality: &ModalityReport, seconds: f64, cells: usize, paint: Paint) -> String {
+    let mut line = String::new();
+    for cell in 0..cells {
+        let begin = seconds * cell as f64 / cells as f64;
+        let end = seconds * (cell + 1) as f64 / cells as f64;
+        let together: f64 = modality.present.iter().map(|(from, to)| (to.min(end) - from.max(begin)).max(0.0)).sum();
+        let share = if end > begin { together / (end - begin) } else { 0.0 };
+        line.push_str(&match share {
+            // A rounding error is neither presence nor absence.
+            _ if modality.presence.is_none() => "·".to_owned(),
+            share if share > 0.999 => colour(paint, GREEN, "█"),
+            share if share < 0.001 => colour(paint, RED, "░"),
+            _ => colour(paint, YELLOW, "▓"),
+        });
+    }
+    line
+}
+
+const RED: u8 = 31;
+const GREEN: u8 = 32;
+const YELLOW: u8 = 33;
+
+fn colour(paint: Paint, code: u8, text: &str) -> String {
+    match paint {
+        Paint::Plain => text.to_owned(),
+        Paint::Ansi => format!("\x1b[{code}m{text}\x1b[0m"),
+    }
+}
+
+/// Text of a file, without what could move the cursor of a terminal.
+fn clean(text: &str) -> String {
+    text.replace(char::is_control, " ")
+}
+
+fn or_dash(text: &str) -> &str {
+    if text.is_empty() { "-" } else { text }
+}
+
+fn percent(share: f64) -> String {
+    // Only what is whole is 100 %.
+    let percent = if share < 1.0 { (share * 100.0).min(99.0) } else { 100.0 };
+    format!("{percent:.0} %")
+}
+
+fn size(bytes: u64) -> String {
+    match bytes {
+        0..10_000 => format!("{bytes} B"),
+        10_000..1_000_000 => format!("{:.1} kB", bytes as f64 / 1e3),
+        1_000_000..1_000_000_000 => format!("{:.1} MB", bytes as f64 / 1e6),
+        _ => format!("{:.1} GB", bytes as f64 / 1e9),
+    }
+}

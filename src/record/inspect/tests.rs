@@ -1,0 +1,202 @@
+//! Inspecting what the recorder wrote: whole, cut, flipped, and a literal report on the screen.
+
+use proptest::prelude::*;
+
+use super::*;
+use crate::record::tests::Bench;
+
+fn of(bytes: &[u8]) -> Option<Inspection> {
+    inspect_from(&mut &*bytes, bytes.len() as u64, Path::new("x.mcap")).unwrap()
+}
+
+async fn episode() -> (Bench, PathBuf) {
+    let bench = Bench::new();
+    let file = bench.one_second().await;
+    bench.until_file(&file).await;
+    (bench, file)
+}
+
+#[tokio::test]
+async fn a_finished_episode_is_told_as_it_was() {
+    let (_bench, file) = episode().await;
+    let said = inspect(&file).unwrap();
+    assert_eq!((said.end, said.unread_bytes, said.damaged_chunks), (FileEnd::Finished, 0, 0));
+    assert_eq!((said.rig.as_str(), said.task.as_str(), said.tags["finger"].as_str()), ("bench", "place block", "soft"));
+    assert_eq!((said.seconds, said.frames, said.dropped), (1.0, 30, Some(8)));
+    let names: Vec<_> = said.modalities.iter().map(|m| (m.bit, m.name.as_str())).collect();
+    assert_eq!(names, [(0, "cam_wrist"), (1, "tof"), (5, "never"), (7, "raw")]);
+    let [cam, tof, never, raw] = said.modalities.as_slice() else { unreachable!() };
+
+    // The camera is away from 300 to 600 ms of the script, which begins a little after the episode.
+    let [first, second] = cam.present.as_slice() else { panic!("{:?}", cam.present) };
+    assert!((second.0 - first.1 - 0.3).abs() < 1e-6 && first.0.abs() < 1e-9 && (second.1 - 1.0).abs() < 1e-9);
+    assert!((cam.presence.unwrap() - 0.7).abs() < 1e-6);
+    assert!((0.3..0.4).contains(&cam.topic.longest_gap), "{}", cam.topic.longest_gap);
+    assert_eq!(cam.topic.lateness, Some(Lateness { p50: 5.0, p99: 5.0, max: 5.0 }));
+    assert!(cam.frames_valid > 10 && cam.frames_valid + cam.frames_stale < 25);
+    assert_eq!((tof.topic.missing, tof.presence), (8, Some(1.0)));
+    assert!((80.0..101.0).contains(&tof.topic.hz), "{}", tof.topic.hz);
+    assert_eq!((never.topic.messages, never.presence, never.topic.lateness), (0, Some(0.0), None));
+    assert!(raw.frames_stale > 10 && raw.frames_valid > 0);
+    let masks: Vec<_> = said.mask.iter().map(|edge| edge.mask.as_str()).collect();
+    assert_eq!(masks, ["0x03", "0x83", "0x82", "0x83"]);
+    let kinds: Vec<_> = said.events.iter().take(3).map(|event| event.kind.as_str()).collect();
+    assert_eq!(kinds, ["recording", "attach", "log"]);
+    let together: u64 = said.topics.iter().chain(said.modalities.iter().map(|m| &m.topic)).map(|t| t.messages).sum();
+    assert_eq!(together, said.messages);
+    let json = serde_json::to_value(&said).unwrap();
+    assert_eq!((&json["end"], &json["modalities"][1]["missing"]), (&"finished".into(), &8.into()));
+}
+
+#[tokio::test]
+async fn a_cut_or_damaged_file_is_read_as_far_as_it_goes() {
+    let (_bench, file) = episode().await;
+    let bytes = std::fs::read(&file).unwrap();
+    let whole = of(&bytes).unwrap();
+    assert!(bytes.len() > 20_000);
+    let mut before = 0;
+    for cut in (0..bytes.len()).step_by(61) {
+        let Some(said) = of(&bytes[..cut]) else {
+            assert!(cut < mcap::MAGIC.len());
+            continue;
+        };
+        assert_ne!(said.end, FileEnd::Finished, "cut at {cut}");
+        assert!((before..=whole.messages).contains(&said.messages), "cut at {cut}");
+        before = said.messages;
+        assert!(!render(&said, 80, Paint::Ansi).is_empty());
+    }
+    assert_eq!(before, whole.messages);
+    let mut noticed = 0;
+    for at in (0..bytes.len()).step_by(37) {
+        let mut flipped = bytes.clone();
+        flipped[at] ^= 1 << (at % 8);
+        if let Some(said) = of(&flipped) {
+            noticed += usize::from(said.damaged_chunks > 0 || said.end != FileEnd::Finished);
+            assert!(!render(&said, 80, Paint::Plain).is_empty());
+        }
+    }
+    // Whatever lies in a chunk is under its CRC, and chunks are most of the file.
+    assert!(noticed * 37 > bytes.len() / 2, "{noticed}");
+}
+
+#[tokio::test]
+async fn several_flips_and_hostile_lengths_do_not_panic() {
+    let (_bench, file) = episode().await;
+    let bytes = std::fs::read(&file).unwrap();
+    let config = ProptestConfig { cases: 300, failure_persistence: None, ..ProptestConfig::default() };
+    let places = proptest::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..12);
+    proptest!(config, |(places in places, word in any::<prop::sample::Index>(), value in any::<u64>())| {
+        let mut bytes = bytes.clone();
+        for (place, value) in places {
+            let at = place.index(bytes.len());
+            bytes[at] = value;
+        }
+        if let Some(field) = bytes.get_mut(word.index(4000)..).and_then(|rest| rest.first_chunk_mut()) {
+            *field = value.to_le_bytes();
+        }
+        if let Some(said) = of(&bytes) {
+            assert!(!render(&said, 80, Paint::Plain).is_empty());
+        }
+    });
+}
+
+#[test]
+fn chunks_of_other_writers_are_opened_and_their_damage_survived() {
+    for compression in [Some(mcap::Compression::Zstd), Some(mcap::Compression::Lz4), None] {
+        let mut file = std::io::Cursor::new(Vec::new());
+        let options = mcap::WriteOptions::new().compression(compression);
+        let mut writer = mcap::Writer::with_options(&mut file, options).unwrap();
+        let channel = writer.add_channel(0, "/other", "json", &BTreeMap::new()).unwrap();
+        for n in 0..50_u32 {
+            let log_time = u64::from(n) * 10_000_000;
+            let header = mcap::records::MessageHeader {
+                channel_id: channel,
+                sequence: n,
+                log_time,
+                publish_time: log_time + 2_000_000,
+            };
+            writer.write_to_known_channel(&header, b"{}").unwrap();
+        }
+        writer.finish().unwrap();
+        drop(writer);
+        let bytes = file.into_inner();
+        let said = of(&bytes).unwrap();
+        assert_eq!((said.end, said.messages, said.topics.len()), (FileEnd::Finished, 50, 1), "{compression:?}");
+        assert!((said.topics[0].hz - 100.0).abs() < 1e-6 && (said.seconds - 0.49).abs() < 1e-9);
+        for at in 0..bytes.len() {
+            for bit in 0..8 {
+                let mut flipped = bytes.clone();
+                flipped[at] ^= 1 << bit;
+                of(&flipped);
+            }
+        }
+    }
+}
+
+#[test]
+fn what_is_no_mcap_file_is_said() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("x.mcap");
+    assert!(matches!(inspect(&path), Err(InspectError::Io { .. })));
+    std::fs::write(&path, "no").unwrap();
+    let error = inspect(&path).unwrap_err();
+    assert!(error.to_string().ends_with("x.mcap: not an MCAP file"));
+}
+
+#[test]
+fn the_report_on_a_screen() {
+    let topic = |topic: &str, messages, missing, lateness| TopicReport {
+        topic: topic.to_owned(),
+        messages,
+        hz: messages as f64 / 10.0,
+        missing,
+        longest_gap: 0.0667,
+        lateness,
+    };
+    let late = Some(Lateness { p50: 12.3, p99: 40.0, max: 41.5 });
+    let said = Inspection {
+        file: PathBuf::from("/data/20261121_place-block_001.mcap"),
+        bytes: 7_400_000,
+        end: FileEnd::Torn,
+        unread_bytes: 512,
+        damaged_chunks: 0,
+        software: "rapid 0.1.0".to_owned(),
+        rig: "bench".to_owned(),
+        task: "place \x1b[31mblock".to_owned(),
+        tags: BTreeMap::from([("finger".to_owned(), "soft".to_owned())]),
+        begin_ns: 0,
+        seconds: 10.0,
+        messages: 5300,
+        dropped: None,
+        frames: 300,
+        modalities: vec![
+            ModalityReport {
+                name: "cam_wrist".to_owned(),
+                bit: 0,
+                topic: topic("/rapid/cam", 200, 3, late),
+                presence: Some(0.7),
+                present: vec![(0.0, 3.2), (6.2, 10.0)],
+                frames_valid: 209,
+                frames_stale: 1,
+            },
+            ModalityReport {
+                name: "tof".to_owned(),
+                bit: 1,
+                topic: topic("/rapid/tof", 0, 0, None),
+                presence: Some(0.0),
+                present: Vec::new(),
+                frames_valid: 0,
+                frames_stale: 0,
+            },
+        ],
+        topics: vec![topic("/rapid/mask", 5000, 0, late)],
+        mask: Vec::new(),
+        events: vec![EventReport {
+            at: 3.2,
+            kind: "detach".to_owned(),
+            device: "cam_wrist".to_owned(),
+            text: "cam_wrist detached, told by stream".to_owned(),
+        }],
+    };
+    insta::assert_snapshot!(render(&said, 60, Paint::Plain));
+}
