@@ -2,6 +2,9 @@
 
 pub mod artifacts;
 pub mod check;
+pub mod completions;
+pub mod devices;
+pub mod mask;
 
 /// How a listing is written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

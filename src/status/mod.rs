@@ -6,6 +6,9 @@
 
 pub mod board;
 mod event;
+#[cfg(test)]
+pub(crate) mod literal;
+pub mod rates;
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -37,6 +40,21 @@ pub enum SlotState {
     Backoff,
     /// Attached; given up until it is replugged or restarted by hand.
     Failed,
+}
+
+impl SlotState {
+    /// The word for it, as in JSON.
+    #[must_use]
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::Absent => "absent",
+            Self::Opening => "opening",
+            Self::Streaming => "streaming",
+            Self::Stalled => "stalled",
+            Self::Backoff => "backoff",
+            Self::Failed => "failed",
+        }
+    }
 }
 
 /// One row of the device table.
@@ -102,6 +120,19 @@ pub enum Level {
     Warn,
     /// Something ended that should not have.
     Error,
+}
+
+impl Level {
+    /// The word for it, as in JSON.
+    #[must_use]
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::Debug => "debug",
+            Self::Info => "info",
+            Self::Warn => "warn",
+            Self::Error => "error",
+        }
+    }
 }
 
 /// Everything a screen may show, copied at one moment.

@@ -1,0 +1,151 @@
+//! The monitor on a board that nobody but this program writes: for looking at the screen.
+//!
+//! `cargo run --example monitor_preview [DEVICES]` shows up to 64 devices (default 6) that come, go,
+//! stall and fail; space starts and ends a pretended episode.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use rapid::mask::PhysicalMask;
+use rapid::modality::ModalityId;
+use rapid::registry::{CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, WhenStale};
+use rapid::sample::Epoch;
+use rapid::status::{Board, Command, Level, LogLine, RecordingStatus, SlotState};
+use rapid::time::{Stamp, realtime_ns};
+use rapid::tui;
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+
+const NAMES: [&str; 6] = ["cam_wrist", "cam_top", "tof", "gripper", "tactile_left", "tactile_right"];
+
+#[tokio::main]
+async fn main() -> Result<(), tui::TuiError> {
+    let count = std::env::args().nth(1).and_then(|count| count.parse().ok()).unwrap_or(6_u8).clamp(1, 64);
+    let board = Arc::new(Board::new(&registry(count)));
+    let (sender, commands) = mpsc::channel(8);
+    let shutdown = CancellationToken::new();
+    let rig = tokio::spawn(pretend(Arc::clone(&board), count, commands, shutdown.clone()));
+    let outcome = tui::run(board, sender, shutdown.clone()).await;
+    shutdown.cancel();
+    // It ends by the token.
+    let _ = rig.await;
+    outcome
+}
+
+fn registry(count: u8) -> Registry {
+    let device = |bit: u8| {
+        let name = NAMES.get(usize::from(bit)).map_or_else(|| format!("sensor_{bit}"), |name| (*name).to_owned());
+        Some(DeviceSpec {
+            topic: format!("/rapid/{name}"),
+            name,
+            id: ModalityId::new(bit)?,
+            identity: IdentitySpec { vid: 0x046d, pid: 0x0825, serial: None, port: None },
+            node: NodeSpec::Camera(CameraSpec {
+                width: 640,
+                height: 480,
+                fps: 30,
+                format: PixelFormat::Mjpg,
+                controls: Vec::new(),
+            }),
+            mount: None,
+            stall_after: Duration::from_millis(500),
+            max_bytes: 1 << 20,
+            depth: 8,
+            when_stale: WhenStale::Hold,
+        })
+    };
+    Registry {
+        rig: RigSpec {
+            name: "bench-1".to_owned(),
+            observation_hz: 30.0,
+            sync_window: Duration::from_millis(25),
+            cooldown: Duration::from_secs(2),
+            memory_budget: 1 << 29,
+        },
+        devices: (0..count).filter_map(device).collect(),
+        path: None,
+        text: String::new(),
+    }
+}
+
+async fn pretend(board: Arc<Board>, count: u8, mut commands: mpsc::Receiver<Command>, shutdown: CancellationToken) {
+    let begun = Stamp::now();
+    let mut states = vec![SlotState::Absent; usize::from(count)];
+    let mut sequence = 0;
+    let mut episode: Option<(Stamp, PathBuf, u64)> = None;
+    let mut beat = tokio::time::interval(Duration::from_millis(10));
+    loop {
+        tokio::select! {
+            () = shutdown.cancelled() => return,
+            Some(command) = commands.recv() => match command {
+                Command::Quit => shutdown.cancel(),
+                Command::ToggleRecording => match episode.take() {
+                    Some((_, file, _)) => {
+                        say(&board, Level::Info, format!("episode {} finished", file.display()));
+                        board.set_last_episode(file);
+                    }
+                    None => episode = Some((Stamp::now(), "episodes/2026-01-01_place-block_001.mcap".into(), 0)),
+                },
+                Command::Restart(id) => states[id.index()] = SlotState::Absent,
+            },
+            _ = beat.tick() => {}
+        }
+        let now = Stamp::now();
+        let elapsed = now.since(begun).as_millis();
+        sequence += 5;
+        let mut mask = PhysicalMask::EMPTY;
+        for (index, before) in states.iter_mut().enumerate() {
+            let bit = u8::try_from(index).unwrap_or(0);
+            let Some(id) = ModalityId::new(bit) else { continue };
+            let state = script(u64::try_from(elapsed).unwrap_or(0), u64::from(bit));
+            if state != *before {
+                *before = state;
+                board.set_slot(id, state, Epoch(1), detail(state));
+                let level = if state == SlotState::Failed { Level::Error } else { Level::Info };
+                say(&board, level, format!("bit {bit} is {state:?}, {}", detail(state)));
+            }
+            if state == SlotState::Streaming && sequence % (5 * (1 + u64::from(bit) % 4)) == 0 {
+                board.counters(id).count(30_000, now, u64::from(sequence % 5000 == 0));
+                if let Some((_, _, messages)) = &mut episode {
+                    *messages += 1;
+                }
+            }
+            mask = mask.with(id, matches!(state, SlotState::Streaming | SlotState::Stalled));
+        }
+        board.set_mask(mask, sequence);
+        board.set_recording(episode.as_ref().map(|(start, file, messages)| RecordingStatus {
+            file: file.clone(),
+            elapsed: now.since(*start),
+            messages: *messages,
+            bytes: messages * 30_000,
+            dropped: messages / 2000,
+        }));
+    }
+}
+
+/// Each device goes through a life of its own, 40 s long.
+fn script(elapsed_ms: u64, bit: u64) -> SlotState {
+    match (elapsed_ms + bit * 6500) % 40_000 {
+        0..2_000 => SlotState::Opening,
+        2_000..28_000 => SlotState::Streaming,
+        28_000..30_000 => SlotState::Stalled,
+        30_000..33_000 => SlotState::Absent,
+        33_000..36_000 => SlotState::Backoff,
+        _ => SlotState::Failed,
+    }
+}
+
+fn detail(state: SlotState) -> &'static str {
+    match state {
+        SlotState::Streaming | SlotState::Opening => "/dev/video0 MJPG 640x480@30",
+        SlotState::Stalled => "no sample for 500 ms",
+        SlotState::Backoff => "again in 2 s: device busy",
+        SlotState::Failed => "/dev/video0: permission denied, is the user in group video?",
+        SlotState::Absent => "",
+    }
+}
+
+fn say(board: &Board, level: Level, text: String) {
+    board.log(LogLine { wall_ns: realtime_ns(), level, text });
+}

@@ -1,0 +1,80 @@
+//! How an event is written: a line for people, or a JSON object.
+
+use serde::Serialize;
+
+use super::style::Palette;
+use crate::status::{Event, What};
+use crate::text;
+
+/// An event with its time on the wall clock.
+#[derive(Serialize)]
+struct Timed<'a> {
+    #[serde(flatten)]
+    event: &'a Event,
+    time: String,
+}
+
+/// An event as one JSON object, with `time` as RFC 3339 in UTC; without a line end.
+pub(super) fn json(event: &Event, wall_ns: u64) -> serde_json::Result<String> {
+    serde_json::to_string(&Timed { event, time: text::rfc3339(wall_ns) })
+}
+
+/// Columns of the lines for people.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Columns {
+    /// Of the longest device name.
+    pub(super) name: usize,
+    /// Colours.
+    pub(super) palette: Palette,
+}
+
+/// Columns of the word that says what happened.
+const WORD: usize = 12;
+
+impl Columns {
+    /// An event as a line; without a line end.
+    pub(super) fn line(self, event: &Event, wall_ns: u64) -> String {
+        let palette = self.palette;
+        let (subject, bit, word, rest) = match &event.what {
+            What::Attach { device, bit, node, port, serial } => {
+                let serial = serial.as_deref().map(|serial| format!(" serial {serial}")).unwrap_or_default();
+                (device, Some(bit), pad("attached"), format!("{node} port {port}{serial}"))
+            }
+            What::Detach { device, bit, witness } => {
+                (device, Some(bit), palette.warn(&pad("detached")), format!("told by {witness}"))
+            }
+            What::State { device, bit, state, mask, detail } => {
+                let word = palette.state(*state, &pad(state.word()));
+                let separator = if detail.is_empty() { "" } else { "   " };
+                (device, Some(bit), word, format!("{detail}{separator}mask {mask}"))
+            }
+            What::Unregistered { device, reason } => (device, None, palette.warn(&pad("unregistered")), reason.clone()),
+            What::Recording { file } => {
+                (&"episode".to_owned(), None, palette.good(&pad("recording")), file.display().to_string())
+            }
+            What::Episode { file, seconds, messages, bytes, dropped, error } => {
+                let size = text::size(*bytes);
+                let file = file.display();
+                let figures = format!("{file}  {seconds:.1} s  {messages} messages  {size}  {dropped} dropped");
+                let (word, rest) = match error {
+                    Some(error) => (palette.bad(&pad("not whole")), format!("{figures}  {error}")),
+                    None if *dropped > 0 => (palette.warn(&pad("finished")), figures),
+                    None => (palette.good(&pad("finished")), figures),
+                };
+                (&"episode".to_owned(), None, word, rest)
+            }
+            What::Log { level, text } => {
+                let word = palette.level(*level, &pad(level.word()));
+                (&"log".to_owned(), None, word, text.clone())
+            }
+        };
+        let time = palette.faint(&text::time_of_day(wall_ns));
+        let subject = text::left(&text::plain(subject), self.name, "…");
+        let bit = bit.map_or_else(|| " ".repeat(6), |bit| format!("bit {:<2}", bit.bit()));
+        format!("{time}  {subject}  {}  {word}  {}", palette.faint(&bit), text::plain(&rest))
+    }
+}
+
+fn pad(word: &str) -> String {
+    format!("{word:WORD$}")
+}

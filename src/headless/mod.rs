@@ -1,0 +1,243 @@
+//! Headless output: state changes as lines or JSON objects, progress, and a summary at the end.
+//!
+//! Invariant: it only reads the board; a reader at the other end that is slow or gone holds up
+//! nothing but this output, and what it missed is said.
+
+mod line;
+mod progress;
+pub mod style;
+mod tally;
+
+use std::io::{self, Write};
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::broadcast;
+use tokio::sync::broadcast::error::{RecvError, TryRecvError};
+use tokio::time::MissedTickBehavior;
+use tokio_util::sync::CancellationToken;
+
+use crate::outlet::Outlet;
+use crate::status::rates::Rates;
+use crate::status::{Board, Event, Snapshot};
+use crate::text;
+use crate::time::{Stamp, WallClock};
+use style::{ColourChoice, Palette, Terminal};
+use tally::Tally;
+
+/// Pieces of output a reader may be behind before events wait for it, and are missed in the end.
+const DEPTH: usize = 1024;
+/// How often progress is looked at, and rewritten on a terminal.
+const LOOK: Duration = Duration::from_millis(250);
+/// How often progress is a line of its own where it cannot be rewritten.
+const PROGRESS_LINE: Duration = Duration::from_secs(10);
+/// How long a reader may take for the rest at the end.
+const LAST: Duration = Duration::from_secs(5);
+/// Back to the beginning of the line, which is erased.
+pub const ERASE_LINE: &str = "\r\x1b[K";
+
+/// What to print, and how.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct HeadlessOptions {
+    /// One JSON object a line instead of text.
+    pub json: bool,
+    /// Colours, in text.
+    pub colour: ColourChoice,
+    /// Progress between the events: rewritten in place on a terminal, otherwise every ten seconds.
+    pub progress: bool,
+    /// How long the run is to last; only shown. Who ends the run is not this module.
+    pub duration: Option<Duration>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Progress {
+    Off,
+    Lines,
+    InPlace,
+}
+
+/// Prints events to `out`, the process's standard output, until `shutdown`; then what is announced
+/// already, and the summary.
+///
+/// Events count from this call, not from the first poll. Cancel `shutdown` when everything else has
+/// ended, so that the last episode is in the summary. The future ends early, with `Ok`, when nobody
+/// reads the output any more (a closed pipe).
+///
+/// # Errors
+/// When the output cannot be written.
+pub fn run(
+    board: Arc<Board>,
+    shutdown: CancellationToken,
+    options: HeadlessOptions,
+    out: impl Write + Send + 'static,
+) -> impl Future<Output = io::Result<()>> + Send {
+    let terminal = Terminal::of(&io::stdout());
+    let palette =
+        if options.json { Palette::Plain } else { options.colour.resolve(terminal, |name| std::env::var(name).ok()) };
+    let progress = match (options.progress, terminal, options.json) {
+        (false, ..) => Progress::Off,
+        (true, Terminal::Yes, false) => Progress::InPlace,
+        (true, ..) => Progress::Lines,
+    };
+    let events = board.events();
+    let printer = Printer::new(&board.snapshot(), &options, progress, palette);
+    async move {
+        let outlet = Outlet::new("output", DEPTH, out)?;
+        match printer.run(&board, events, &shutdown, outlet).await {
+            Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
+            outcome => outcome,
+        }
+    }
+}
+
+/// Turns events and snapshots into pieces of output.
+struct Printer {
+    json: bool,
+    progress: Progress,
+    duration: Option<Duration>,
+    columns: line::Columns,
+    wall: WallClock,
+    began: Stamp,
+    rates: Rates,
+    tally: Tally,
+    /// A progress line stands on the terminal, without a line end.
+    pending: bool,
+    last_line: Stamp,
+}
+
+impl Printer {
+    fn new(snapshot: &Snapshot, options: &HeadlessOptions, progress: Progress, palette: Palette) -> Self {
+        let name = snapshot.devices.iter().map(|device| text::width(&device.name)).max().unwrap_or(0);
+        Self {
+            json: options.json,
+            progress,
+            duration: options.duration,
+            columns: line::Columns { name: name.clamp(8, 28), palette },
+            wall: WallClock::now(),
+            began: snapshot.taken,
+            rates: Rates::default(),
+            tally: Tally::new(snapshot),
+            pending: false,
+            last_line: snapshot.taken,
+        }
+    }
+
+    async fn run(
+        mut self,
+        board: &Board,
+        mut events: broadcast::Receiver<Event>,
+        shutdown: &CancellationToken,
+        outlet: Outlet,
+    ) -> io::Result<()> {
+        let mut looks = tokio::time::interval(LOOK);
+        let mut rest = String::new();
+        looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        loop {
+            let piece = tokio::select! {
+                biased;
+                () = shutdown.cancelled() => break,
+                () = outlet.closed() => return outlet.finish(LAST).await,
+                event = events.recv() => match event {
+                    Ok(event) => Some(self.event(&event)?),
+                    Err(RecvError::Lagged(missed)) => Some(self.missed(missed, &board.snapshot())),
+                    // The board, which we hold, keeps the channel open.
+                    Err(RecvError::Closed) => break,
+                },
+                _ = looks.tick() => self.look(&board.snapshot())?.filter(|_| outlet.is_idle()),
+            };
+            let Some(piece) = piece else { continue };
+            tokio::select! {
+                biased;
+                () = shutdown.cancelled() => {
+                    // Into the rest, where it waits for room.
+                    rest = piece;
+                    break;
+                }
+                _ = outlet.send(piece.clone().into_bytes()) => {}
+            }
+        }
+        loop {
+            match events.try_recv() {
+                Ok(event) => rest.push_str(&self.event(&event)?),
+                Err(TryRecvError::Lagged(missed)) => rest.push_str(&self.missed(missed, &board.snapshot())),
+                Err(TryRecvError::Empty | TryRecvError::Closed) => break,
+            }
+        }
+        rest.push_str(&self.summary(&board.snapshot())?);
+        let _ = tokio::time::timeout(LAST, outlet.send(rest.into_bytes())).await;
+        outlet.finish(LAST).await
+    }
+
+    fn event(&mut self, event: &Event) -> io::Result<String> {
+        self.tally.count(event);
+        let wall_ns = self.wall.wall_ns(event.stamp);
+        let line = if self.json { line::json(event, wall_ns)? } else { self.columns.line(event, wall_ns) };
+        Ok(self.whole_line(&line))
+    }
+
+    fn missed(&mut self, missed: u64, now: &Snapshot) -> String {
+        self.tally.miss(missed);
+        self.tally.agree(now);
+        let line = if self.json {
+            let time = text::rfc3339(self.wall.wall_ns(now.taken));
+            serde_json::json!({ "event": "missed", "count": missed, "time": time }).to_string()
+        } else {
+            let time = text::time_of_day(self.wall.wall_ns(now.taken));
+            let palette = self.columns.palette;
+            format!("{}  {}", palette.faint(&time), palette.warn(&format!("{missed} events missed: output was behind")))
+        };
+        self.whole_line(&line)
+    }
+
+    fn look(&mut self, snapshot: &Snapshot) -> io::Result<Option<String>> {
+        self.rates.update(snapshot);
+        let elapsed = snapshot.taken.since(self.began);
+        match self.progress {
+            Progress::Off => return Ok(None),
+            Progress::InPlace => {}
+            Progress::Lines if snapshot.taken.since(self.last_line) < PROGRESS_LINE => return Ok(None),
+            Progress::Lines => self.last_line = snapshot.taken,
+        }
+        if self.json {
+            let wall_ns = self.wall.wall_ns(snapshot.taken);
+            let line = progress::json(snapshot, &self.rates, elapsed, self.duration, wall_ns)?;
+            return Ok(Some(self.whole_line(&line)));
+        }
+        let line = progress::line(snapshot, &self.rates, elapsed, self.duration);
+        if self.progress == Progress::Lines {
+            return Ok(Some(self.whole_line(&line)));
+        }
+        self.pending = true;
+        // The last column stays empty: a full line would wrap, and then could not be rewritten.
+        let line = text::cut(&line, terminal_columns().saturating_sub(1), "~").into_owned();
+        Ok(Some(format!("{ERASE_LINE}{}", self.columns.palette.faint(&line))))
+    }
+
+    fn summary(&mut self, end: &Snapshot) -> io::Result<String> {
+        let tally = std::mem::replace(&mut self.tally, Tally::new(end));
+        let summary = tally.summary(end);
+        let text = if self.json {
+            serde_json::to_string(&summary)?
+        } else {
+            summary.text(self.columns.name, self.columns.palette)
+        };
+        Ok(self.whole_line(&text))
+    }
+
+    /// `line` with its end, in place of the progress line if one stands there.
+    fn whole_line(&mut self, line: &str) -> String {
+        let erase = if std::mem::take(&mut self.pending) { ERASE_LINE } else { "" };
+        format!("{erase}{line}\n")
+    }
+}
+
+/// Width of the terminal at standard output, 80 if it does not say.
+fn terminal_columns() -> usize {
+    match rustix::termios::tcgetwinsize(io::stdout()) {
+        Ok(size) if size.ws_col > 0 => usize::from(size.ws_col),
+        _ => 80,
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,98 @@
+//! The progress line: how far the run is, at a glance.
+
+use std::time::Duration;
+
+use serde::Serialize;
+
+use crate::status::rates::Rates;
+use crate::status::{SlotState, Snapshot};
+use crate::text;
+
+/// Progress as one line, without a line end: time, mask, rates of what streams, the episode.
+pub(super) fn line(snapshot: &Snapshot, rates: &Rates, elapsed: Duration, duration: Option<Duration>) -> String {
+    let of = duration.map(|duration| format!("/{}", text::clock(duration))).unwrap_or_default();
+    let mut parts = vec![format!("{}{of}", text::clock(elapsed))];
+    parts.push(format!("mask {}", snapshot.mask.hex(snapshot.devices.len())));
+    // The episode comes before the rates: with many devices it is the end that is cut off.
+    if let Some(recording) = &snapshot.recording {
+        parts.push(format!(
+            "rec {} {} {:.1} MB/s",
+            text::clock(recording.elapsed),
+            text::size(recording.bytes),
+            rates.recorded() / 1e6
+        ));
+        parts.push(format!("{} dropped", recording.dropped));
+    }
+    let running = snapshot.devices.iter().filter(|device| snapshot.mask.contains(device.id));
+    parts.extend(running.map(|device| {
+        let stalled = if device.state == SlotState::Stalled { " stalled" } else { "" };
+        format!("{} {} Hz{stalled}", text::plain(&device.name), text::hertz(rates.samples(device.id)))
+    }));
+    parts.join("  ")
+}
+
+/// Progress as JSON: `{"event":"progress",...}`.
+#[derive(Debug, Serialize)]
+#[serde(tag = "event", rename = "progress")]
+struct Progress<'a> {
+    time: String,
+    elapsed: f64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    duration: Option<f64>,
+    mask: String,
+    devices: Vec<DeviceProgress<'a>>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    recording: Option<RecordingProgress>,
+}
+
+#[derive(Debug, Serialize)]
+struct DeviceProgress<'a> {
+    device: &'a str,
+    bit: u8,
+    state: SlotState,
+    samples: u64,
+    gaps: u64,
+    hz: f64,
+}
+
+#[derive(Debug, Serialize)]
+struct RecordingProgress {
+    seconds: f64,
+    messages: u64,
+    bytes: u64,
+    dropped: u64,
+}
+
+/// Progress as one JSON object, without a line end.
+pub(super) fn json(
+    snapshot: &Snapshot,
+    rates: &Rates,
+    elapsed: Duration,
+    duration: Option<Duration>,
+    wall_ns: u64,
+) -> serde_json::Result<String> {
+    serde_json::to_string(&Progress {
+        time: text::rfc3339(wall_ns),
+        elapsed: elapsed.as_secs_f64(),
+        duration: duration.map(|duration| duration.as_secs_f64()),
+        mask: snapshot.mask.hex(snapshot.devices.len()),
+        devices: snapshot
+            .devices
+            .iter()
+            .map(|device| DeviceProgress {
+                device: &device.name,
+                bit: device.id.bit(),
+                state: device.state,
+                samples: device.samples,
+                gaps: device.gaps,
+                hz: (rates.samples(device.id) * 1000.0).round() / 1000.0,
+            })
+            .collect(),
+        recording: snapshot.recording.as_ref().map(|recording| RecordingProgress {
+            seconds: recording.elapsed.as_secs_f64(),
+            messages: recording.messages,
+            bytes: recording.bytes,
+            dropped: recording.dropped,
+        }),
+    })
+}

@@ -1,0 +1,211 @@
+//! The tally: what a run comes to, for the summary at its end.
+//!
+//! Invariant: pure; built from events and snapshots.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use serde::Serialize;
+
+use super::style::Palette;
+use crate::modality::MAX_MODALITIES;
+use crate::status::{DeviceStatus, Event, SlotState, Snapshot, What};
+use crate::text;
+use crate::time::Stamp;
+
+/// How long each device was present, and which episodes were closed.
+#[derive(Debug)]
+pub(super) struct Tally {
+    began: Stamp,
+    present: [Presence; MAX_MODALITIES],
+    /// Samples that were already counted when the tally began.
+    before: Vec<DeviceStatus>,
+    episodes: Vec<Episode>,
+    missed: u64,
+}
+
+#[derive(Debug, Clone, Copy, Default)]
+struct Presence {
+    since: Option<Stamp>,
+    total: Duration,
+}
+
+impl Presence {
+    fn set(&mut self, state: SlotState, at: Stamp) {
+        // A stalled device is attached and running: its bit in the mask stays.
+        let running = matches!(state, SlotState::Streaming | SlotState::Stalled);
+        match (self.since, running) {
+            (None, true) => self.since = Some(at),
+            (Some(since), false) => {
+                self.total += at.since(since);
+                self.since = None;
+            }
+            _ => {}
+        }
+    }
+
+    fn until(self, end: Stamp) -> Duration {
+        self.total + self.since.map_or(Duration::ZERO, |since| end.since(since))
+    }
+}
+
+/// An episode that was closed.
+#[derive(Debug, Clone, Serialize)]
+struct Episode {
+    file: PathBuf,
+    seconds: f64,
+    messages: u64,
+    bytes: u64,
+    dropped: u64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    error: Option<String>,
+}
+
+/// The summary, as JSON one object: `{"event":"summary",...}`.
+#[derive(Debug, Serialize)]
+#[serde(tag = "event", rename = "summary")]
+pub(super) struct Summary {
+    seconds: f64,
+    devices: Vec<Row>,
+    episodes: Vec<Episode>,
+    /// Events this output did not see because it was behind.
+    missed_events: u64,
+}
+
+/// What one modality came to.
+#[derive(Debug, Serialize)]
+struct Row {
+    device: String,
+    bit: u8,
+    samples: u64,
+    /// Mean rate while present.
+    hz: f64,
+    /// Part of the run in which the device was present, 0 to 1.
+    present: f64,
+    gaps: u64,
+    bytes: u64,
+}
+
+impl Tally {
+    pub(super) fn new(snapshot: &Snapshot) -> Self {
+        let mut tally = Self {
+            began: snapshot.taken,
+            present: [Presence::default(); MAX_MODALITIES],
+            before: snapshot.devices.clone(),
+            episodes: Vec::new(),
+            missed: 0,
+        };
+        tally.agree(snapshot);
+        tally
+    }
+
+    /// Takes over the states as they are, where events may be missing.
+    pub(super) fn agree(&mut self, snapshot: &Snapshot) {
+        for device in &snapshot.devices {
+            if let Some(presence) = self.present.get_mut(device.id.index()) {
+                presence.set(device.state, snapshot.taken);
+            }
+        }
+    }
+
+    pub(super) fn miss(&mut self, events: u64) {
+        self.missed += events;
+    }
+
+    pub(super) fn count(&mut self, event: &Event) {
+        match &event.what {
+            What::State { bit, state, .. } => {
+                if let Some(presence) = self.present.get_mut(bit.index()) {
+                    presence.set(*state, event.stamp);
+                }
+            }
+            What::Episode { file, seconds, messages, bytes, dropped, error } => self.episodes.push(Episode {
+                file: file.clone(),
+                seconds: *seconds,
+                messages: *messages,
+                bytes: *bytes,
+                dropped: *dropped,
+                error: error.clone(),
+            }),
+            _ => {}
+        }
+    }
+
+    pub(super) fn summary(self, end: &Snapshot) -> Summary {
+        let seconds = end.taken.since(self.began).as_secs_f64();
+        let row = |device: &DeviceStatus| {
+            let before = self.before.iter().find(|before| before.id == device.id);
+            let samples = device.samples - before.map_or(0, |before| before.samples).min(device.samples);
+            let present = self.present.get(device.id.index()).copied().unwrap_or_default().until(end.taken);
+            let present = present.as_secs_f64();
+            Row {
+                device: device.name.clone(),
+                bit: device.id.bit(),
+                samples,
+                hz: round(if present > 0.0 { samples as f64 / present } else { 0.0 }),
+                present: round(if seconds > 0.0 { (present / seconds).min(1.0) } else { 0.0 }),
+                gaps: device.gaps - before.map_or(0, |before| before.gaps).min(device.gaps),
+                bytes: device.bytes - before.map_or(0, |before| before.bytes).min(device.bytes),
+            }
+        };
+        Summary {
+            seconds: round(seconds),
+            devices: end.devices.iter().map(row).collect(),
+            episodes: self.episodes,
+            missed_events: self.missed,
+        }
+    }
+}
+
+/// To three decimals, which is all a mean over seconds can say.
+fn round(value: f64) -> f64 {
+    (value * 1000.0).round() / 1000.0
+}
+
+impl Summary {
+    /// The summary for people: a table of the modalities, then the episodes.
+    pub(super) fn text(&self, name: usize, palette: Palette) -> String {
+        let width = name.max(8);
+        let head = format!(
+            "{:width$}  bit  {:>9}  {:>8}  {:>7}  {:>7}  {:>9}",
+            "modality", "samples", "mean Hz", "present", "gaps", "bytes"
+        );
+        let mut lines = vec![String::new(), palette.faint(&head)];
+        for row in &self.devices {
+            let name = text::left(&text::plain(&row.device), width, "…");
+            let gaps = format!("{:>7}", row.gaps);
+            let gaps = if row.gaps > 0 { palette.warn(&gaps) } else { gaps };
+            lines.push(format!(
+                "{name}  {:>3}  {:>9}  {:>8}  {:>6.1}%  {gaps}  {:>9}",
+                row.bit,
+                row.samples,
+                text::hertz(row.hz),
+                row.present * 100.0,
+                text::size(row.bytes)
+            ));
+        }
+        for episode in &self.episodes {
+            let file = text::plain(&episode.file.display().to_string()).into_owned();
+            let dropped = format!("{} dropped", episode.dropped);
+            let dropped = if episode.dropped > 0 { palette.warn(&dropped) } else { dropped };
+            let mut line = format!(
+                "episode {}  {:.1} s  {} messages  {}  {dropped}",
+                palette.bold(&file),
+                episode.seconds,
+                episode.messages,
+                text::size(episode.bytes)
+            );
+            if let Some(error) = &episode.error {
+                line.push_str("  ");
+                line.push_str(&palette.bad(&format!("not whole: {}", text::plain(error))));
+            }
+            lines.push(line);
+        }
+        if self.missed_events > 0 {
+            let text = format!("{} events are missing above: this output was behind", self.missed_events);
+            lines.push(palette.warn(&text));
+        }
+        lines.push(format!("{} s in all", text::hertz(self.seconds)));
+        lines.join("\n")
+    }
+}

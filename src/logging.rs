@@ -1,0 +1,283 @@
+//! Logging: where the program's own log lines go.
+//!
+//! Every line goes to the board, for the screen. Without a full-screen monitor, lines also go to
+//! standard error; with one, nothing but the monitor writes to the terminal.
+//!
+//! `RAPID_LOG` chooses what is logged, in the syntax of `tracing_subscriber::EnvFilter`, for example
+//! `RAPID_LOG=debug` or `RAPID_LOG=rapid::rig=trace,warn`. Without it the board gets what [`DEFAULT`]
+//! says, and standard error only warnings and errors: state changes are printed as events already.
+//!
+//! Invariant: a line has no control characters and no line breaks, and at most [`LONGEST`] characters.
+
+use std::fmt::{Debug, Write as _};
+use std::io::{self, IsTerminal, Write};
+use std::sync::Arc;
+
+use tracing::field::{Field, Visit};
+use tracing::span::{Attributes, Id, Record};
+use tracing::{Event, Subscriber};
+use tracing_subscriber::filter::{EnvFilter, LevelFilter};
+use tracing_subscriber::layer::{Context, SubscriberExt};
+use tracing_subscriber::registry::LookupSpan;
+use tracing_subscriber::util::SubscriberInitExt;
+use tracing_subscriber::{Layer, Registry};
+
+use crate::headless::ERASE_LINE;
+use crate::headless::style::{ColourChoice, Terminal};
+use crate::status::{Board, Level, LogLine};
+use crate::text;
+use crate::time::realtime_ns;
+
+/// What is logged without `RAPID_LOG`. iceoryx2 warns of what it then handles itself.
+pub const DEFAULT: &str = "warn,rapid=info,iceoryx2=error";
+/// Characters of a line; what is longer is cut.
+pub const LONGEST: usize = 2000;
+
+/// What standard error gets.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Stderr {
+    /// Nothing: a full-screen monitor has the terminal.
+    Nothing,
+    /// Lines for people.
+    Text,
+    /// One JSON object a line: `{"event":"log","level":...,"text":...,"time":...}`.
+    Json,
+}
+
+/// Why there is no log.
+#[derive(Debug, thiserror::Error)]
+pub enum LoggingError {
+    /// `RAPID_LOG` is not a filter.
+    #[error("RAPID_LOG: {0}; for example RAPID_LOG=debug or RAPID_LOG=rapid::rig=trace,warn")]
+    Filter(#[from] tracing_subscriber::filter::ParseError),
+    /// There is a log already.
+    #[error("logging was started twice")]
+    Twice(#[from] tracing_subscriber::util::TryInitError),
+}
+
+/// Sends the program's log to `board` and to standard error. `filter` is the value of `RAPID_LOG`.
+///
+/// # Errors
+/// When the filter is wrong, or when called twice in a process.
+pub fn init(board: Arc<Board>, filter: Option<&str>, stderr: Stderr) -> Result<(), LoggingError> {
+    let chosen = filter.filter(|filter| !filter.is_empty());
+    let filter = EnvFilter::try_new(chosen.unwrap_or(DEFAULT))?;
+    let least = if chosen.is_some() { LevelFilter::TRACE } else { LevelFilter::WARN };
+    let printed = match stderr {
+        Stderr::Nothing => None,
+        Stderr::Text | Stderr::Json => Some(Lines { sink: StderrSink::new(stderr) }.with_filter(least)),
+    };
+    Registry::default().with(filter).with(Lines { sink: board }).with(printed).try_init()?;
+    Ok(())
+}
+
+/// Where formatted lines go.
+trait Sink: 'static {
+    fn take(&self, line: LogLine);
+}
+
+impl Sink for Arc<Board> {
+    fn take(&self, line: LogLine) {
+        self.log(line);
+    }
+}
+
+#[derive(Debug)]
+struct StderrSink {
+    form: Stderr,
+    palette: crate::headless::style::Palette,
+    /// Erases a progress line that stands on the same terminal.
+    before: &'static str,
+}
+
+impl StderrSink {
+    fn new(form: Stderr) -> Self {
+        let terminal = Terminal::of(&io::stderr());
+        let palette = ColourChoice::Auto.resolve(terminal, |name| std::env::var(name).ok());
+        let shared = form == Stderr::Text && terminal == Terminal::Yes && io::stdout().is_terminal();
+        Self { form, palette, before: if shared { ERASE_LINE } else { "" } }
+    }
+
+    fn render(&self, line: &LogLine) -> String {
+        if self.form == Stderr::Json {
+            let time = text::rfc3339(line.wall_ns);
+            let object = serde_json::json!({ "event": "log", "level": line.level, "text": line.text, "time": time });
+            return format!("{object}\n");
+        }
+        let time = self.palette.faint(&text::time_of_day(line.wall_ns));
+        let level = format!("{:5}", line.level.word());
+        format!("{}{time}  {}  {}\n", self.before, self.palette.level(line.level, &level), line.text)
+    }
+}
+
+impl Sink for StderrSink {
+    fn take(&self, line: LogLine) {
+        // In one piece, so that lines of several threads do not mix. There is nowhere left to report
+        // that standard error is gone.
+        let _ = io::stderr().write_all(self.render(&line).as_bytes());
+    }
+}
+
+/// The layer that makes one line of an event, its fields, and the fields of the spans around it.
+struct Lines<S> {
+    sink: S,
+}
+
+/// Fields of a span, as they stand at the end of a line.
+struct SpanFields(String);
+
+impl<S, K> Layer<S> for Lines<K>
+where
+    S: Subscriber + for<'a> LookupSpan<'a>,
+    K: Sink,
+{
+    fn on_new_span(&self, attributes: &Attributes<'_>, id: &Id, context: Context<'_, S>) {
+        let Some(span) = context.span(id) else { return };
+        let mut fields = Fields::default();
+        attributes.record(&mut fields);
+        // A second layer of this kind sees the same span: the fields are the same.
+        span.extensions_mut().replace(SpanFields(fields.rest));
+    }
+
+    fn on_record(&self, id: &Id, values: &Record<'_>, context: Context<'_, S>) {
+        let Some(span) = context.span(id) else { return };
+        let mut fields = Fields::default();
+        values.record(&mut fields);
+        if let Some(known) = span.extensions_mut().get_mut::<SpanFields>()
+            && !known.0.ends_with(&fields.rest)
+        {
+            known.0.push_str(&fields.rest);
+        }
+    }
+
+    fn on_event(&self, event: &Event<'_>, context: Context<'_, S>) {
+        let mut fields = Fields::default();
+        event.record(&mut fields);
+        let mut line = fields.message;
+        line.push_str(&fields.rest);
+        for span in context.event_scope(event).into_iter().flatten() {
+            if let Some(known) = span.extensions().get::<SpanFields>()
+                && !line.contains(known.0.as_str())
+            {
+                line.push_str(&known.0);
+            }
+        }
+        let line: String = text::plain(line.trim()).chars().take(LONGEST).collect();
+        self.sink.take(LogLine { wall_ns: realtime_ns(), level: level(*event.metadata().level()), text: line });
+    }
+}
+
+fn level(level: tracing::Level) -> Level {
+    match level {
+        tracing::Level::ERROR => Level::Error,
+        tracing::Level::WARN => Level::Warn,
+        tracing::Level::INFO => Level::Info,
+        tracing::Level::DEBUG | tracing::Level::TRACE => Level::Debug,
+    }
+}
+
+/// Collects the message, and the other fields as ` name=value`.
+#[derive(Default)]
+struct Fields {
+    message: String,
+    rest: String,
+}
+
+impl Fields {
+    fn add(&mut self, field: &Field, value: std::fmt::Arguments<'_>) {
+        let written = match field.name() {
+            "message" => write!(self.message, "{value}"),
+            // iceoryx2 puts a dump of whole objects here.
+            "origin" => Ok(()),
+            name => write!(self.rest, " {name}={value}"),
+        };
+        // Only a value whose own formatting reports an error can get here; the rest is still a line.
+        if written.is_err() {
+            self.rest.push_str(" (unprintable)");
+        }
+    }
+}
+
+impl Visit for Fields {
+    fn record_debug(&mut self, field: &Field, value: &dyn Debug) {
+        self.add(field, format_args!("{value:?}"));
+    }
+
+    fn record_str(&mut self, field: &Field, value: &str) {
+        self.add(field, format_args!("{value}"));
+    }
+
+    fn record_error(&mut self, field: &Field, value: &(dyn std::error::Error + 'static)) {
+        self.add(field, format_args!("{value}"));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Mutex;
+
+    use super::*;
+
+    #[derive(Default, Clone)]
+    struct Kept(Arc<Mutex<Vec<LogLine>>>);
+
+    impl Sink for Kept {
+        fn take(&self, line: LogLine) {
+            self.0.lock().unwrap().push(line);
+        }
+    }
+
+    fn lines(filter: &str, log: impl FnOnce()) -> Vec<(Level, String)> {
+        let kept = Kept::default();
+        let subscriber =
+            Registry::default().with(EnvFilter::try_new(filter).unwrap()).with(Lines { sink: kept.clone() });
+        tracing::subscriber::with_default(subscriber, log);
+        let lines = kept.0.lock().unwrap();
+        lines.iter().map(|line| (line.level, line.text.clone())).collect()
+    }
+
+    #[test]
+    fn a_line_has_message_fields_and_span_and_no_control_characters() {
+        let got = lines("trace", || {
+            let span = tracing::info_span!("slot", device = "cam_wrist");
+            let _entered = span.enter();
+            tracing::warn!(epoch = 3, reason = %"a\x1b[2J\nb", "no sample");
+            tracing::error!(device = "cam_wrist", "gone");
+        });
+        assert_eq!(
+            got,
+            [
+                (Level::Warn, "no sample epoch=3 reason=a [2J b device=cam_wrist".to_owned()),
+                (Level::Error, "gone device=cam_wrist".to_owned()),
+            ]
+        );
+    }
+
+    #[test]
+    fn by_default_others_are_only_heard_when_they_warn_and_iceoryx2_when_it_fails() {
+        let got = lines(DEFAULT, || {
+            tracing::info!(target: "rapid::rig", "one");
+            tracing::debug!(target: "rapid::rig", "no");
+            tracing::info!(target: "v4l", "no");
+            tracing::warn!(target: "v4l", "two");
+            tracing::warn!(target: "iceoryx2_bb_loggers::tracing", origin = "Node {..}", "no");
+            tracing::error!(target: "iceoryx2_bb_loggers::tracing", origin = "Node {..}", "three");
+        });
+        let texts: Vec<_> = got.into_iter().map(|(_, text)| text).collect();
+        assert_eq!(texts, ["one", "two", "three"]);
+    }
+
+    #[test]
+    fn json_lines_are_objects_and_long_lines_are_cut() {
+        let sink = StderrSink { form: Stderr::Json, palette: crate::headless::style::Palette::Plain, before: "" };
+        let line = LogLine { wall_ns: 1_700_000_000_123_000_000, level: Level::Warn, text: "a \"b\"".to_owned() };
+        let object: serde_json::Value = serde_json::from_str(&sink.render(&line)).unwrap();
+        assert_eq!(object["event"], "log");
+        assert_eq!(object["level"], "warn");
+        assert_eq!(object["text"], "a \"b\"");
+        assert_eq!(object["time"], "2023-11-14T22:13:20.123Z");
+
+        let got = lines("trace", || tracing::info!("{}", "ü".repeat(5000)));
+        assert_eq!(got[0].1.chars().count(), LONGEST);
+    }
+}

@@ -1,0 +1,129 @@
+//! Outlet: a terminal or a pipe that may be slow, behind a thread of its own.
+//!
+//! Invariant: who writes never waits for the reader at the other end longer than it chooses to.
+
+use std::io::{self, Write};
+use std::time::{Duration, Instant};
+
+use tokio::sync::{mpsc, oneshot};
+
+/// A thread that writes, in order, what it is sent.
+#[derive(Debug)]
+pub struct Outlet {
+    sender: mpsc::Sender<Vec<u8>>,
+    ended: oneshot::Receiver<io::Result<()>>,
+}
+
+impl Outlet {
+    /// Starts the thread `name`, which takes up to `depth` pieces ahead of what `out` has taken.
+    ///
+    /// # Errors
+    /// When the system allows no further thread.
+    pub fn new(name: &str, depth: usize, mut out: impl Write + Send + 'static) -> io::Result<Self> {
+        let (sender, mut pieces) = mpsc::channel::<Vec<u8>>(depth);
+        let (tell, ended) = oneshot::channel();
+        std::thread::Builder::new().name(name.to_owned()).spawn(move || {
+            let mut outcome = Ok(());
+            while let Some(piece) = pieces.blocking_recv() {
+                outcome = out.write_all(&piece).and_then(|()| out.flush());
+                if outcome.is_err() {
+                    break;
+                }
+            }
+            // Nobody may be left who wants to know.
+            let _ = tell.send(outcome);
+        })?;
+        Ok(Self { sender, ended })
+    }
+
+    /// Has everything sent so far been handed to the writer?
+    #[must_use]
+    pub fn is_idle(&self) -> bool {
+        self.sender.capacity() == self.sender.max_capacity()
+    }
+
+    /// Is the other end gone?
+    #[must_use]
+    pub fn is_closed(&self) -> bool {
+        self.sender.is_closed()
+    }
+
+    /// Sends a piece if there is room; true if there was.
+    #[must_use = "what there is no room for is lost"]
+    pub fn try_send(&self, piece: Vec<u8>) -> bool {
+        self.sender.try_send(piece).is_ok()
+    }
+
+    /// Sends a piece as soon as there is room; false when the other end is gone.
+    pub async fn send(&self, piece: Vec<u8>) -> bool {
+        self.sender.send(piece).await.is_ok()
+    }
+
+    /// Waits until the other end is gone.
+    pub async fn closed(&self) {
+        self.sender.closed().await;
+    }
+
+    /// Waits until everything is written, at most `within`.
+    ///
+    /// # Errors
+    /// What the writer said when it ended early; `TimedOut` when the reader takes too long.
+    pub async fn finish(self, within: Duration) -> io::Result<()> {
+        drop(self.sender);
+        match tokio::time::timeout(within, self.ended).await {
+            Ok(Ok(outcome)) => outcome,
+            Ok(Err(_)) => Err(io::Error::other("the writer ended without an outcome")),
+            Err(_) => Err(io::ErrorKind::TimedOut.into()),
+        }
+    }
+
+    /// The same for a place where one cannot await: blocks, at most `within`.
+    pub fn finish_blocking(self, within: Duration) {
+        let Self { sender, mut ended } = self;
+        drop(sender);
+        let deadline = Instant::now() + within;
+        while Instant::now() < deadline && matches!(ended.try_recv(), Err(oneshot::error::TryRecvError::Empty)) {
+            std::thread::sleep(Duration::from_millis(2));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    struct Broken;
+
+    impl Write for Broken {
+        fn write(&mut self, _: &[u8]) -> io::Result<usize> {
+            Err(io::ErrorKind::BrokenPipe.into())
+        }
+
+        fn flush(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    #[tokio::test]
+    async fn a_broken_pipe_is_told_and_nobody_waits_for_it() {
+        let outlet = Outlet::new("test", 1, Broken).unwrap();
+        assert!(outlet.send(b"x".to_vec()).await);
+        outlet.closed().await;
+        assert!(!outlet.send(b"y".to_vec()).await);
+        let error = outlet.finish(Duration::from_secs(5)).await.unwrap_err();
+        assert_eq!(error.kind(), io::ErrorKind::BrokenPipe);
+    }
+
+    #[tokio::test]
+    async fn pieces_arrive_in_order() {
+        let (mut reader, writer) = io::pipe().unwrap();
+        let outlet = Outlet::new("test", 2, writer).unwrap();
+        for piece in ["one ", "two ", "three"] {
+            assert!(outlet.send(piece.as_bytes().to_vec()).await);
+        }
+        outlet.finish(Duration::from_secs(5)).await.unwrap();
+        let mut text = String::new();
+        io::Read::read_to_string(&mut reader, &mut text).unwrap();
+        assert_eq!(text, "one two three");
+    }
+}

@@ -1,0 +1,139 @@
+//! Snapshots and boards written down, for tests of screens.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use super::{Board, DeviceStatus, Level, LogLine, RecordingStatus, SlotState, Snapshot};
+use crate::mask::PhysicalMask;
+use crate::modality::ModalityId;
+use crate::registry::{CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, WhenStale};
+use crate::sample::Epoch;
+use crate::time::Stamp;
+
+/// Moment of the snapshots: 754 s after the boot.
+pub(crate) const TAKEN: Stamp = Stamp(754_000_000_000);
+/// Wall time of the first log line, ns: 2023-11-14 22:13:20 UTC.
+pub(crate) const WALL_NS: u64 = 1_700_000_000_000_000_000;
+
+pub(crate) fn id(bit: u8) -> ModalityId {
+    ModalityId::new(bit).unwrap()
+}
+
+pub(crate) fn device(bit: u8, name: &str, state: SlotState, detail: &str) -> DeviceStatus {
+    let running = matches!(state, SlotState::Streaming | SlotState::Stalled);
+    let age = if state == SlotState::Stalled { 2345 } else { 12 + u64::from(bit) };
+    DeviceStatus {
+        name: name.to_owned(),
+        id: id(bit),
+        topic: format!("/rapid/{name}"),
+        state,
+        epoch: Epoch(1),
+        detail: detail.to_owned(),
+        samples: if running { 18_000 + u64::from(bit) } else { 0 },
+        gaps: 0,
+        bytes: if running { 540_000_000 } else { 0 },
+        newest: running.then(|| TAKEN.before(Duration::from_millis(age))),
+    }
+}
+
+/// A snapshot of these devices, the mask as their states want it.
+pub(crate) fn snapshot(devices: Vec<DeviceStatus>) -> Snapshot {
+    let mask = devices.iter().fold(PhysicalMask::EMPTY, |mask, device| {
+        mask.with(device.id, matches!(device.state, SlotState::Streaming | SlotState::Stalled))
+    });
+    Snapshot {
+        rig: "bench-1".to_owned(),
+        taken: TAKEN,
+        uptime: Duration::from_secs(754),
+        mask,
+        mask_sequence: 377_000,
+        devices,
+        recording: None,
+        last_episode: None,
+        log: Vec::new(),
+    }
+}
+
+pub(crate) fn three_streaming() -> Snapshot {
+    snapshot(vec![
+        device(0, "cam_wrist", SlotState::Streaming, "/dev/video0 MJPG 640x480@30"),
+        device(1, "cam_top", SlotState::Streaming, "/dev/video2 MJPG 640x480@30"),
+        device(2, "tof", SlotState::Streaming, "/dev/ttyACM0 115200 csv 8"),
+    ])
+}
+
+pub(crate) fn every_state() -> Snapshot {
+    let mut snapshot = snapshot(vec![
+        device(0, "cam_wrist", SlotState::Streaming, "/dev/video0 MJPG 640x480@30"),
+        device(1, "cam_top", SlotState::Absent, ""),
+        device(2, "tof", SlotState::Opening, "/dev/ttyACM0"),
+        device(3, "imu", SlotState::Stalled, "no sample for 500 ms"),
+        device(4, "gripper", SlotState::Failed, "/dev/ttyACM1: permission denied, is the user in group dialout?"),
+        device(5, "tactile", SlotState::Backoff, "again in 2 s: device busy"),
+    ]);
+    snapshot.devices[3].gaps = 3;
+    snapshot.log = vec![
+        line(0, Level::Info, "cam_wrist is streaming"),
+        line(1, Level::Warn, "imu: no sample for 500 ms"),
+        line(2, Level::Error, "gripper: permission denied"),
+        line(3, Level::Debug, "details"),
+    ];
+    snapshot
+}
+
+pub(crate) fn recording(dropped: u64) -> RecordingStatus {
+    RecordingStatus {
+        file: PathBuf::from("episodes/2023-11-14_place-block_007.mcap"),
+        elapsed: Duration::from_secs(83),
+        messages: 48_211,
+        bytes: 312_400_000,
+        dropped,
+    }
+}
+
+pub(crate) fn sixty_four() -> Snapshot {
+    let state = |bit: u8| match bit % 8 {
+        3 => SlotState::Absent,
+        5 => SlotState::Opening,
+        _ => SlotState::Streaming,
+    };
+    snapshot((0..64).map(|bit| device(bit, &format!("sensor_{bit}"), state(bit), "/dev/ttyACM0")).collect())
+}
+
+pub(crate) fn line(second: u64, level: Level, text: &str) -> LogLine {
+    LogLine { wall_ns: WALL_NS + second * 1_000_000_000, level, text: text.to_owned() }
+}
+
+/// A board for devices of these names, at bits 0, 1, ...
+pub(crate) fn board(names: &[&str]) -> Board {
+    let device = |(bit, name): (usize, &&str)| DeviceSpec {
+        name: (*name).to_owned(),
+        id: id(u8::try_from(bit).unwrap()),
+        identity: IdentitySpec { vid: 0x046d, pid: 0x0825, serial: None, port: None },
+        node: NodeSpec::Camera(CameraSpec {
+            width: 640,
+            height: 480,
+            fps: 30,
+            format: PixelFormat::Mjpg,
+            controls: Vec::new(),
+        }),
+        topic: format!("/rapid/{name}"),
+        mount: None,
+        stall_after: Duration::from_millis(500),
+        max_bytes: 1 << 20,
+        depth: 8,
+        when_stale: WhenStale::Hold,
+    };
+    Board::new(&Registry {
+        rig: RigSpec {
+            name: "bench-1".to_owned(),
+            observation_hz: 30.0,
+            sync_window: Duration::from_millis(25),
+            cooldown: Duration::from_secs(2),
+            memory_budget: 1 << 29,
+        },
+        devices: names.iter().enumerate().map(device).collect(),
+        path: None,
+        text: String::new(),
+    })
+}

@@ -1,0 +1,212 @@
+//! Text for people: what fits in a column, and how durations, sizes, rates and times are written.
+//!
+//! Owns the one place where text of a device becomes harmless to a terminal. Widths are columns of a
+//! terminal, not bytes or characters.
+//!
+//! Invariant: no text is cut within a character, and nothing that moves a cursor or turns the
+//! direction of writing leaves [`plain`].
+
+use std::borrow::Cow;
+use std::time::Duration;
+
+use unicode_segmentation::UnicodeSegmentation;
+use unicode_width::UnicodeWidthStr;
+
+/// Columns `text` takes.
+#[must_use]
+pub fn width(text: &str) -> usize {
+    UnicodeWidthStr::width(text)
+}
+
+/// `text` without control characters and without the invisible characters that reorder a line
+/// (Unicode bidirectional controls, zero-width characters, line and paragraph separators): each
+/// becomes a space.
+#[must_use]
+pub fn plain(text: &str) -> Cow<'_, str> {
+    if text.contains(is_unsafe) { Cow::Owned(text.replace(is_unsafe, " ")) } else { Cow::Borrowed(text) }
+}
+
+fn is_unsafe(c: char) -> bool {
+    c.is_control()
+        || matches!(c, '\u{200b}' | '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2060}'..='\u{206f}' | '\u{feff}' | '\u{61c}')
+}
+
+/// `text` with every character outside ASCII as `?`, for terminals that cannot show it.
+#[must_use]
+pub fn ascii(text: &str) -> String {
+    text.chars().map(|c| if c.is_ascii() { c } else { '?' }).collect()
+}
+
+/// `text` in at most `columns` columns; when it is longer, its beginning and `ellipsis`.
+#[must_use]
+pub fn cut<'a>(text: &'a str, columns: usize, ellipsis: &str) -> Cow<'a, str> {
+    if width(text) <= columns {
+        return Cow::Borrowed(text);
+    }
+    let Some(room) = columns.checked_sub(width(ellipsis)) else { return Cow::Borrowed("") };
+    let mut used = 0;
+    let mut kept = String::new();
+    for grapheme in text.graphemes(true) {
+        used += width(grapheme);
+        if used > room {
+            break;
+        }
+        kept.push_str(grapheme);
+    }
+    kept.push_str(ellipsis);
+    Cow::Owned(kept)
+}
+
+/// `text` in exactly `columns` columns, at the left.
+#[must_use]
+pub fn left(text: &str, columns: usize, ellipsis: &str) -> String {
+    let text = cut(text, columns, ellipsis);
+    let missing = columns.saturating_sub(width(&text));
+    format!("{text}{:missing$}", "")
+}
+
+/// `text` in exactly `columns` columns, at the right.
+#[must_use]
+pub fn right(text: &str, columns: usize, ellipsis: &str) -> String {
+    let text = cut(text, columns, ellipsis);
+    let missing = columns.saturating_sub(width(&text));
+    format!("{:missing$}{text}", "")
+}
+
+/// Hours, minutes and seconds: `1:02:03`, below an hour `02:03`.
+#[must_use]
+pub fn clock(duration: Duration) -> String {
+    let seconds = duration.as_secs();
+    let (hours, minutes, seconds) = (seconds / 3600, seconds / 60 % 60, seconds % 60);
+    if hours > 0 { format!("{hours}:{minutes:02}:{seconds:02}") } else { format!("{minutes:02}:{seconds:02}") }
+}
+
+/// An age to be read at a glance: `12 ms`, from one second `1.2 s`, from 100 seconds as a clock.
+#[must_use]
+pub fn age(duration: Duration) -> String {
+    match duration.as_millis() {
+        ms @ 0..1_000 => format!("{ms} ms"),
+        1_000..100_000 => format!("{:.1} s", duration.as_secs_f64()),
+        _ => clock(duration),
+    }
+}
+
+/// A number of bytes in decimal units: `512 B`, `1.5 kB`, `12.3 MB`.
+#[must_use]
+pub fn size(bytes: u64) -> String {
+    const UNITS: [&str; 5] = ["kB", "MB", "GB", "TB", "PB"];
+    if bytes < 1000 {
+        return format!("{bytes} B");
+    }
+    let mut value = bytes as f64 / 1000.0;
+    for unit in UNITS {
+        // What would be written as 1000.0 belongs to the next unit.
+        if value < 999.95 {
+            return format!("{value:.1} {unit}");
+        }
+        value /= 1000.0;
+    }
+    format!("{value:.1} EB")
+}
+
+/// Samples per second, with one decimal below 1000.
+#[must_use]
+pub fn hertz(hz: f64) -> String {
+    if hz < 999.95 { format!("{hz:.1}") } else { format!("{hz:.0}") }
+}
+
+/// A wall time as RFC 3339 in UTC with milliseconds: `2023-11-14T22:13:20.123Z`.
+#[must_use]
+pub fn rfc3339(wall_ns: u64) -> String {
+    let (year, month, day) = civil(wall_ns / NS_PER_DAY);
+    format!("{year:04}-{month:02}-{day:02}T{}", time_of_day(wall_ns))
+}
+
+/// The time of day of a wall time in UTC: `22:13:20.123Z`.
+#[must_use]
+pub fn time_of_day(wall_ns: u64) -> String {
+    let ms = wall_ns % NS_PER_DAY / 1_000_000;
+    format!("{:02}:{:02}:{:02}.{:03}Z", ms / 3_600_000, ms / 60_000 % 60, ms / 1000 % 60, ms % 1000)
+}
+
+const NS_PER_DAY: u64 = 86_400_000_000_000;
+
+/// Year, month and day of the proleptic Gregorian calendar, from days since 1970-01-01; the method of
+/// <https://howardhinnant.github.io/date_algorithms.html#civil_from_days> for dates from 1970 on.
+const fn civil(days: u64) -> (u64, u64, u64) {
+    let days = days + 719_468;
+    let era = days / 146_097;
+    let day_of_era = days % 146_097;
+    let year_of_era = (day_of_era - day_of_era / 1460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
+    let day_of_year = day_of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
+    let shifted_month = (5 * day_of_year + 2) / 153;
+    let day = day_of_year - (153 * shifted_month + 2) / 5 + 1;
+    let month = if shifted_month < 10 { shifted_month + 3 } else { shifted_month - 9 };
+    let year = year_of_era + era * 400 + if month <= 2 { 1 } else { 0 };
+    (year, month, day)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    #[test]
+    fn dates_agree_with_date_minus_u() {
+        for (seconds, expected) in [
+            (0, "1970-01-01T00:00:00.000Z"),
+            (951_782_399, "2000-02-28T23:59:59.000Z"),
+            (951_782_400, "2000-02-29T00:00:00.000Z"),
+            (1_700_000_000, "2023-11-14T22:13:20.000Z"),
+            (1_709_164_800, "2024-02-29T00:00:00.000Z"),
+            (4_107_542_400, "2100-03-01T00:00:00.000Z"),
+        ] {
+            assert_eq!(rfc3339(seconds * 1_000_000_000), expected);
+        }
+        assert_eq!(time_of_day(1_700_000_000_123_456_789), "22:13:20.123Z");
+    }
+
+    #[test]
+    fn text_is_cut_at_columns_not_bytes() {
+        assert_eq!(cut("camera", 6, "…"), "camera");
+        assert_eq!(cut("camera", 5, "…"), "came…");
+        assert_eq!(cut("相机手腕", 5, "…"), "相机…");
+        assert_eq!(cut("naïve-ü", 4, "..."), "n...");
+        assert_eq!(cut("camera", 0, "…"), "");
+        assert_eq!(left("相机", 6, "…"), "相机  ");
+        assert_eq!(right("12", 4, "…"), "  12");
+    }
+
+    #[test]
+    fn nothing_a_device_says_moves_the_cursor() {
+        assert_eq!(plain("a\x1b[2Jb\r\nc\u{202e}d\u{9b}e"), "a [2Jb  c d e");
+        assert!(matches!(plain("streaming ü 相机"), Cow::Borrowed(_)));
+        assert_eq!(ascii("µm 相"), "?m ?");
+    }
+
+    #[test]
+    fn quantities_are_short() {
+        assert_eq!(clock(Duration::from_secs(123)), "02:03");
+        assert_eq!(clock(Duration::from_secs(3723)), "1:02:03");
+        assert_eq!(age(Duration::from_millis(999)), "999 ms");
+        assert_eq!(age(Duration::from_millis(1250)), "1.2 s");
+        assert_eq!(age(Duration::from_secs(123)), "02:03");
+        assert_eq!(size(999), "999 B");
+        assert_eq!(size(999_999), "1.0 MB");
+        assert_eq!(size(12_345_678), "12.3 MB");
+        assert_eq!(size(u64::MAX), "18.4 EB");
+        assert_eq!(hertz(29.97), "30.0");
+        assert_eq!(hertz(1000.2), "1000");
+    }
+
+    proptest! {
+        #[test]
+        fn a_column_is_exactly_as_wide_as_asked(text in ".*", columns in 0_usize..40) {
+            let text = plain(&text).into_owned();
+            prop_assert_eq!(width(&left(&text, columns, "~")), columns.max(width(&cut(&text, columns, "~"))));
+            prop_assert!(width(&cut(&text, columns, "…")) <= columns);
+            prop_assert!(!plain(&text).contains(char::is_control));
+        }
+    }
+}

@@ -1,0 +1,84 @@
+//! The first line: which rig, since when, the mask as a number, and whether an episode is recorded.
+
+use ratatui::Frame;
+use ratatui::layout::Rect;
+use ratatui::style::Stylize;
+use ratatui::text::{Line, Span};
+
+use super::model::Model;
+use super::theme::Theme;
+use crate::text;
+
+pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
+    let width = usize::from(area.width);
+    let right = right(model, theme);
+    let mut left = identity(model, theme);
+    // In this order as long as they fit; the binary form is the longest and stands back first.
+    let hex = mask_hex(model, theme);
+    let publication = publication(model, theme);
+    let binary = mask_binary(model);
+    let room = width.saturating_sub(left.width() + right.width() + 2);
+    let with_publication = hex.width() + publication.width() <= room;
+    let with_binary = hex.width() + publication.width() + binary.width() <= room;
+    if hex.width() <= room {
+        left.spans.extend(hex.spans);
+    }
+    if with_binary {
+        left.spans.extend(binary.spans);
+    }
+    if with_publication {
+        left.spans.extend(publication.spans);
+    }
+    let space = width.saturating_sub(left.width() + right.width());
+    left.spans.push(Span::raw(" ".repeat(space)));
+    left.spans.extend(right.spans);
+    frame.render_widget(left, area);
+}
+
+fn identity(model: &Model, theme: Theme) -> Line<'static> {
+    let snapshot = model.shown();
+    let rig = text::cut(&theme.safe(&snapshot.rig), 20, theme.ellipsis()).into_owned();
+    Line::from(vec![
+        Span::styled(" rapid ", theme.title()),
+        Span::raw(rig).bold(),
+        Span::styled("   up ", theme.faint()),
+        Span::raw(text::clock(snapshot.uptime)),
+    ])
+}
+
+fn mask_hex(model: &Model, theme: Theme) -> Line<'static> {
+    let snapshot = model.shown();
+    Line::from(vec![
+        Span::styled("   mask ", theme.faint()),
+        Span::raw(snapshot.mask.hex(snapshot.devices.len())).bold(),
+    ])
+}
+
+fn mask_binary(model: &Model) -> Line<'static> {
+    let snapshot = model.shown();
+    let binary = snapshot.mask.binary(snapshot.devices.len());
+    let bytes: Vec<_> = binary.as_bytes().chunks(8).map(String::from_utf8_lossy).collect();
+    Line::from(vec![Span::raw("  "), Span::raw(bytes.join(" "))])
+}
+
+fn publication(model: &Model, theme: Theme) -> Line<'static> {
+    Line::from(vec![
+        Span::styled("   published ", theme.faint()),
+        Span::raw(format!("{:>3.0} Hz", model.totals().publications)),
+    ])
+}
+
+fn right(model: &Model, theme: Theme) -> Line<'static> {
+    let mut spans = Vec::new();
+    if model.is_paused() {
+        spans.push(Span::styled("view paused", theme.warning()));
+        spans.push(Span::raw("  "));
+    }
+    if model.is_recording() {
+        let elapsed = model.shown().recording.as_ref().map(|recording| format!(" {}", text::clock(recording.elapsed)));
+        let mark = format!("{} REC{}", theme.symbol("●", "*"), elapsed.unwrap_or_default());
+        spans.push(Span::styled(mark, theme.recording()));
+        spans.push(Span::raw(" "));
+    }
+    Line::from(spans)
+}

@@ -1,0 +1,55 @@
+//! The help: all keys, and what the states mean.
+
+use ratatui::Frame;
+use ratatui::layout::{Constraint, Flex, Layout, Rect};
+use ratatui::text::{Line, Span};
+use ratatui::widgets::{Block, Clear, Padding, Paragraph};
+
+use super::theme::Theme;
+use crate::status::SlotState;
+
+const KEYS: [(&str, &str); 8] = [
+    ("space", "start an episode, end the one in progress"),
+    ("up, down", "select a device"),
+    ("r", "start the selected device again, if it failed"),
+    ("p", "pause the view; everything else goes on"),
+    ("pgup, pgdn", "scroll the log; esc goes to its end"),
+    ("?", "this help"),
+    ("q, ctrl-c", "quit"),
+    ("", ""),
+];
+
+const STATES: [(SlotState, &str); 6] = [
+    (SlotState::Streaming, "samples arrive; bit set"),
+    (SlotState::Stalled, "attached, samples have stopped; bit set"),
+    (SlotState::Opening, "attached, first sample not here yet"),
+    (SlotState::Backoff, "attached, waits before it is started"),
+    (SlotState::Failed, "attached, given up: replug it or press r"),
+    (SlotState::Absent, "not attached"),
+];
+
+pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, theme: Theme) {
+    let keys = KEYS
+        .iter()
+        .map(|(key, meaning)| Line::from(vec![Span::styled(format!("{key:<12}"), theme.title()), Span::raw(*meaning)]));
+    let states = STATES.iter().map(|(state, meaning)| {
+        let word = format!("{} {:<10}", theme.state_symbol(*state), state.word());
+        Line::from(vec![Span::styled(word, theme.state(*state)), Span::raw(*meaning)])
+    });
+    let mut lines: Vec<_> = keys.chain(states).collect();
+    let room = usize::from(area.height.saturating_sub(2));
+    if lines.len() > room {
+        // On a low screen the keys alone.
+        lines.truncate(KEYS.len() - 1);
+    }
+    let height = u16::try_from(lines.len()).unwrap_or(u16::MAX).saturating_add(2).min(area.height);
+    let [middle] = Layout::vertical([Constraint::Length(height)]).flex(Flex::Center).areas(area);
+    let [middle] = Layout::horizontal([Constraint::Length(58)]).flex(Flex::Center).areas(middle);
+    let block = Block::bordered()
+        .border_set(theme.border())
+        .border_style(theme.faint())
+        .title(Span::styled(" Keys and states ", theme.title()))
+        .padding(Padding::horizontal(1));
+    frame.render_widget(Clear, middle);
+    frame.render_widget(Paragraph::new(lines).block(block), middle);
+}

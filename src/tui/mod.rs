@@ -1,0 +1,109 @@
+//! The monitor: a full-screen view of the rig while data is collected.
+//!
+//! A snapshot of the board fifteen times a second and the user's keys change the [`model`]; the
+//! `view` draws it; what the user wants goes out as [`Command`]s.
+//!
+//! Invariant: the terminal is given back as it was found, however the screen ends.
+//! Invariant: a terminal that takes no output delays nothing: frames are written by a thread of
+//! their own and left out while it is behind.
+
+mod devices;
+mod footer;
+mod header;
+mod help;
+mod log;
+mod mask;
+pub mod model;
+mod recording;
+mod terminal;
+pub mod theme;
+pub mod view;
+
+use std::io;
+use std::sync::Arc;
+use std::time::Duration;
+
+use crossterm::event::{Event, EventStream};
+use futures::{Stream, StreamExt};
+use tokio::sync::mpsc;
+use tokio::sync::mpsc::error::TrySendError;
+use tokio::time::MissedTickBehavior;
+use tokio_util::sync::CancellationToken;
+
+use crate::status::{Board, Command};
+use model::{Effect, Model, Msg};
+use terminal::Screen;
+use theme::Theme;
+
+/// Time between two frames when no key comes.
+const FRAME: Duration = Duration::from_millis(67);
+
+/// Why there is no screen.
+#[derive(Debug, thiserror::Error)]
+pub enum TuiError {
+    /// Neither input nor output is a terminal, or it cannot be put into raw mode.
+    #[error("no terminal for the monitor: {0}; --headless runs without one")]
+    NoTerminal(#[source] io::Error),
+    /// The terminal went away.
+    #[error("the terminal is gone: {0}")]
+    Gone(#[source] io::Error),
+}
+
+/// Shows the monitor until `shutdown`.
+///
+/// Asking to quit only sends [`Command::Quit`]; the screen stays until whoever takes the commands
+/// cancels `shutdown` or drops the receiver.
+///
+/// # Errors
+/// When there is no terminal, or it goes away.
+pub async fn run(
+    board: Arc<Board>,
+    commands: mpsc::Sender<Command>,
+    shutdown: CancellationToken,
+) -> Result<(), TuiError> {
+    let theme = Theme::detect(|name| std::env::var(name).ok());
+    let mut screen = Screen::open().map_err(TuiError::NoTerminal)?;
+    let outcome = drive(&board, &commands, &shutdown, EventStream::new(), |model| screen.draw(model, theme)).await;
+    screen.close().await;
+    outcome
+}
+
+/// The loop itself, with any source of terminal events and any way to draw.
+async fn drive(
+    board: &Board,
+    commands: &mpsc::Sender<Command>,
+    shutdown: &CancellationToken,
+    events: impl Stream<Item = io::Result<Event>>,
+    mut draw: impl FnMut(&Model) -> io::Result<()>,
+) -> Result<(), TuiError> {
+    let mut events = std::pin::pin!(events);
+    let mut model = Model::new(board.snapshot());
+    let mut frames = tokio::time::interval(FRAME);
+    frames.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    loop {
+        let effect = tokio::select! {
+            biased;
+            () = shutdown.cancelled() => return Ok(()),
+            event = events.next() => match event {
+                Some(Ok(Event::Key(key))) => model.update(Msg::Key(key)),
+                Some(Ok(_)) => Effect::None,
+                Some(Err(error)) => return Err(TuiError::Gone(error)),
+                None => return Err(TuiError::Gone(io::ErrorKind::UnexpectedEof.into())),
+            },
+            _ = frames.tick() => model.update(Msg::Snapshot(Box::new(board.snapshot()))),
+        };
+        if let Effect::Send(command) = effect {
+            match commands.try_send(command) {
+                Ok(()) => {}
+                Err(TrySendError::Full(_)) => {
+                    model.update(Msg::Refused);
+                }
+                Err(TrySendError::Closed(_)) => return Ok(()),
+            }
+        }
+        draw(&model).map_err(TuiError::Gone)?;
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,160 @@
+use super::*;
+use crate::mask::PhysicalMask;
+use crate::status::Level;
+use crate::status::literal::{TAKEN, every_state, id, line, recording, three_streaming};
+
+fn press(code: KeyCode) -> Msg {
+    Msg::Key(KeyEvent::new(code, KeyModifiers::NONE))
+}
+
+fn control(letter: char) -> Msg {
+    Msg::Key(KeyEvent::new(KeyCode::Char(letter), KeyModifiers::CONTROL))
+}
+
+fn repeated(code: KeyCode) -> Msg {
+    Msg::Key(KeyEvent::new_with_kind(code, KeyModifiers::NONE, KeyEventKind::Repeat))
+}
+
+fn released(code: KeyCode) -> Msg {
+    Msg::Key(KeyEvent::new_with_kind(code, KeyModifiers::NONE, KeyEventKind::Release))
+}
+
+fn after(snapshot: &Snapshot, ms: u64) -> Msg {
+    let mut later = snapshot.clone();
+    later.taken = Stamp(TAKEN.0 + ms * 1_000_000);
+    Msg::Snapshot(Box::new(later))
+}
+
+#[test]
+fn keys_become_commands() {
+    let quit = Effect::Send(Command::Quit);
+    let toggle = Effect::Send(Command::ToggleRecording);
+    let restart = Effect::Send(Command::Restart(id(4)));
+    let table: Vec<(&str, bool, Vec<Msg>, Effect)> = vec![
+        ("space", false, vec![press(KeyCode::Char(' '))], toggle.clone()),
+        ("space held down", false, vec![repeated(KeyCode::Char(' '))], Effect::None),
+        ("a key let go", false, vec![released(KeyCode::Char('q'))], Effect::None),
+        ("quit when idle", false, vec![press(KeyCode::Char('q'))], quit.clone()),
+        ("ctrl-c when idle", false, vec![control('c')], quit.clone()),
+        ("ctrl-q is no q", false, vec![control('q')], Effect::None),
+        ("quit while recording asks", true, vec![press(KeyCode::Char('q'))], Effect::None),
+        ("quit twice", true, vec![press(KeyCode::Char('q')), press(KeyCode::Char('q'))], quit.clone()),
+        ("ctrl-c twice", true, vec![control('c'), control('c')], quit.clone()),
+        (
+            "quit, another key, quit asks again",
+            true,
+            vec![press(KeyCode::Char('q')), press(KeyCode::Down), press(KeyCode::Char('q'))],
+            Effect::None,
+        ),
+        ("restart of what streams", false, vec![press(KeyCode::Char('r'))], Effect::None),
+        (
+            "restart of what failed",
+            false,
+            vec![
+                press(KeyCode::Down),
+                press(KeyCode::Down),
+                press(KeyCode::Down),
+                press(KeyCode::Char('j')),
+                press(KeyCode::Char('r')),
+            ],
+            restart,
+        ),
+        ("a key that closes the help", false, vec![press(KeyCode::Char('?')), press(KeyCode::Char(' '))], Effect::None),
+        ("quit from the help", false, vec![press(KeyCode::Char('?')), press(KeyCode::Char('q'))], quit),
+        (
+            "space after the help",
+            false,
+            vec![press(KeyCode::Char('?')), press(KeyCode::Esc), press(KeyCode::Char(' '))],
+            toggle,
+        ),
+    ];
+    for (what, is_recording, msgs, expected) in table {
+        let mut snapshot = every_state();
+        snapshot.recording = is_recording.then(|| recording(0));
+        let mut model = Model::new(snapshot);
+        let effects: Vec<_> = msgs.into_iter().map(|msg| model.update(msg)).collect();
+        assert_eq!(effects.last(), Some(&expected), "{what}");
+        let others = effects.iter().rev().skip(1);
+        assert!(others.into_iter().all(|effect| *effect == Effect::None), "{what}");
+    }
+}
+
+#[test]
+fn the_question_is_withdrawn_when_the_episode_ends_by_itself() {
+    let mut snapshot = three_streaming();
+    snapshot.recording = Some(recording(0));
+    let mut model = Model::new(snapshot);
+    model.update(press(KeyCode::Char('q')));
+    assert_eq!(model.quit(), Quit::Asked);
+    model.update(after(&three_streaming(), 100));
+    assert_eq!(model.quit(), Quit::No);
+}
+
+#[test]
+fn the_selection_stays_within_the_devices() {
+    let mut model = Model::new(three_streaming());
+    model.update(press(KeyCode::Up));
+    assert_eq!(model.selected(), 0);
+    model.update(press(KeyCode::End));
+    assert_eq!(model.selected(), 2);
+    model.update(press(KeyCode::Down));
+    assert_eq!(model.selected(), 2);
+    let mut empty = three_streaming();
+    empty.devices.clear();
+    let mut model = Model::new(empty);
+    model.update(press(KeyCode::Down));
+    assert_eq!(model.selected_device(), None);
+    assert_eq!(model.update(press(KeyCode::Char('r'))), Effect::None);
+}
+
+#[test]
+fn a_paused_view_stands_still_but_commands_know_what_is() {
+    let mut model = Model::new(every_state());
+    model.update(press(KeyCode::Char('p')));
+    let mut later = every_state();
+    later.mask = PhysicalMask(0);
+    later.recording = Some(recording(0));
+    model.update(after(&later, 100));
+    assert_eq!(model.shown().mask, every_state().mask);
+    assert_eq!(model.edge(id(0)), Edge::None);
+    // The episode that began meanwhile is known to the question.
+    assert!(model.is_recording());
+    assert_eq!(model.update(press(KeyCode::Char('q'))), Effect::None);
+    model.update(press(KeyCode::Char('p')));
+    assert!(!model.is_paused());
+    assert_eq!(model.shown().mask, PhysicalMask(0));
+    assert_eq!(model.edge(id(0)), Edge::Recent);
+}
+
+#[test]
+fn a_log_scrolled_back_stays_where_it_is_when_lines_come() {
+    let mut snapshot = three_streaming();
+    snapshot.log = (0..50).map(|second| line(second, Level::Info, "tick")).collect();
+    let mut model = Model::new(snapshot.clone());
+    model.update(press(KeyCode::PageUp));
+    assert_eq!(model.scroll(), SCROLL_STEP);
+    // Two lines come, the two oldest go.
+    snapshot.log.drain(..2);
+    snapshot.log.extend((50..52).map(|second| line(second, Level::Info, "tick")));
+    model.update(after(&snapshot, 100));
+    assert_eq!(model.scroll(), SCROLL_STEP + 2);
+    model.update(press(KeyCode::Esc));
+    assert_eq!(model.scroll(), 0);
+    model.update(after(&snapshot, 200));
+    assert_eq!(model.scroll(), 0);
+    for _ in 0..30 {
+        model.update(press(KeyCode::PageUp));
+    }
+    assert_eq!(model.scroll(), 49);
+}
+
+#[test]
+fn an_answer_fades() {
+    let mut model = Model::new(three_streaming());
+    model.update(press(KeyCode::Char('r')));
+    assert_eq!(model.notice(), Some("cam_wrist has not failed: nothing to restart"));
+    model.update(after(&three_streaming(), 3_900));
+    assert!(model.notice().is_some());
+    model.update(after(&three_streaming(), 4_100));
+    assert_eq!(model.notice(), None);
+}

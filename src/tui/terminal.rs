@@ -1,0 +1,159 @@
+//! The terminal: taken for the screen, given back as it was found.
+//!
+//! A panic anywhere while the screen is up would write its message into the picture, and a panic that
+//! a supervisor survives must not end the picture. So messages of panics are held back, told to the
+//! log, and printed once the terminal is given back.
+
+use std::io::{self, IsTerminal, Write};
+use std::panic::PanicHookInfo;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use crossterm::cursor::{Hide, Show};
+use crossterm::terminal::{
+    DisableLineWrap, EnableLineWrap, EnterAlternateScreen, LeaveAlternateScreen, disable_raw_mode, enable_raw_mode,
+};
+use ratatui::Terminal;
+use ratatui::backend::CrosstermBackend;
+
+use super::model::Model;
+use super::theme::Theme;
+use super::view;
+use crate::outlet::Outlet;
+
+/// How long a terminal that is behind may take for the last frame before it is left.
+const LAST_FRAME: Duration = Duration::from_millis(500);
+
+/// The screen is up.
+static UP: AtomicBool = AtomicBool::new(false);
+/// The panic hook is in place: it stays for the life of the process, as a hook cannot be taken out
+/// from between others.
+static HOOKED: AtomicBool = AtomicBool::new(false);
+/// Messages of panics while the screen was up.
+static HELD_BACK: Mutex<Vec<String>> = Mutex::new(Vec::new());
+
+/// The terminal while it shows the monitor.
+pub(super) struct Screen {
+    terminal: Terminal<CrosstermBackend<Frame>>,
+    frame: Frame,
+    outlet: Option<Outlet>,
+}
+
+impl Screen {
+    /// Takes the terminal.
+    pub(super) fn open() -> io::Result<Self> {
+        if !io::stdout().is_terminal() {
+            return Err(io::Error::other("standard output is not a terminal"));
+        }
+        let outlet = Outlet::new("screen", 1, io::stdout())?;
+        hook();
+        enable_raw_mode()?;
+        UP.store(true, Ordering::SeqCst);
+        let frame = Frame::default();
+        let outlet = Some(outlet);
+        let mut screen = match Terminal::new(CrosstermBackend::new(frame.clone())) {
+            Ok(terminal) => Self { terminal, frame, outlet },
+            Err(error) => {
+                give_back();
+                return Err(error);
+            }
+        };
+        crossterm::queue!(screen.frame, EnterAlternateScreen, DisableLineWrap, Hide)?;
+        Ok(screen)
+    }
+
+    /// Draws the model, unless the terminal has not yet taken the frame before.
+    pub(super) fn draw(&mut self, model: &Model, theme: Theme) -> io::Result<()> {
+        let Some(outlet) = &self.outlet else { return Ok(()) };
+        if !outlet.is_idle() {
+            return Ok(());
+        }
+        self.terminal.draw(|frame| view::draw(frame, model, theme))?;
+        let bytes = self.frame.take();
+        if outlet.is_closed() {
+            return Err(io::ErrorKind::BrokenPipe.into());
+        }
+        // There is room: nobody else sends.
+        let _ = outlet.try_send(bytes);
+        Ok(())
+    }
+
+    /// Gives the terminal back after the last frame.
+    pub(super) async fn close(mut self) {
+        if let Some(outlet) = self.outlet.take() {
+            // What comes next is to happen however this ended.
+            let _ = outlet.finish(LAST_FRAME).await;
+        }
+    }
+}
+
+impl Drop for Screen {
+    fn drop(&mut self) {
+        if let Some(outlet) = self.outlet.take() {
+            outlet.finish_blocking(LAST_FRAME);
+        }
+        give_back();
+    }
+}
+
+/// Restores the terminal and prints what was held back. Errors are passed over: there is no terminal
+/// left to tell them to.
+fn give_back() {
+    if !UP.swap(false, Ordering::SeqCst) {
+        return;
+    }
+    let mut out = io::stdout();
+    let _ = crossterm::execute!(out, EnableLineWrap, LeaveAlternateScreen, Show);
+    let _ = disable_raw_mode();
+    for message in lock(&HELD_BACK).drain(..) {
+        let _ = writeln!(io::stderr(), "{message}");
+    }
+}
+
+fn hook() {
+    if HOOKED.swap(true, Ordering::SeqCst) {
+        return;
+    }
+    let previous = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |info: &PanicHookInfo<'_>| {
+        if !UP.load(Ordering::SeqCst) {
+            return previous(info);
+        }
+        if cfg!(panic = "abort") {
+            // Nothing is dropped any more.
+            give_back();
+            return previous(info);
+        }
+        let thread = std::thread::current();
+        let message = format!("thread '{}' {info}", thread.name().unwrap_or("unnamed"));
+        tracing::error!("{message}");
+        lock(&HELD_BACK).push(message);
+    }));
+}
+
+/// The bytes of the frame being drawn.
+#[derive(Debug, Clone, Default)]
+struct Frame(Arc<Mutex<Vec<u8>>>);
+
+impl Frame {
+    fn take(&self) -> Vec<u8> {
+        std::mem::take(&mut lock(&self.0))
+    }
+}
+
+impl Write for Frame {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        lock(&self.0).extend_from_slice(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// A poisoned lock here guards whole values: go on with them.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

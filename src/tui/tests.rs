@@ -1,0 +1,265 @@
+use std::time::Duration;
+
+use crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
+use insta::assert_snapshot;
+use ratatui::Terminal;
+use ratatui::backend::TestBackend;
+use ratatui::buffer::Buffer;
+use ratatui::style::{Color, Modifier, Style};
+
+use super::*;
+use crate::status::literal::{
+    TAKEN, board, device, every_state, line, recording, sixty_four, snapshot, three_streaming,
+};
+use crate::status::{Level, SlotState, Snapshot};
+use crate::time::Stamp;
+use theme::{Charset, Colours};
+
+const THEME: Theme = Theme { colours: Colours::Sixteen, charset: Charset::Unicode };
+const ASCII: Theme = Theme { colours: Colours::None, charset: Charset::Ascii };
+
+fn press(code: KeyCode) -> Msg {
+    Msg::Key(KeyEvent::new(code, KeyModifiers::NONE))
+}
+
+/// The model after two seconds in which every running device sent 30 samples a second.
+fn measured(end: &Snapshot) -> Model {
+    let at = |ms: u64| {
+        let before = Duration::from_millis(2000 - ms);
+        let mut then = end.clone();
+        then.taken = end.taken.before(before);
+        then.mask_sequence = end.mask_sequence - (2000 - ms) / 2;
+        for device in &mut then.devices {
+            device.samples = device.samples.saturating_sub((2000 - ms) * 30 / 1000);
+            device.newest = device.newest.map(|newest| newest.before(before));
+        }
+        if let Some(recording) = &mut then.recording {
+            recording.bytes -= (2000 - ms) * 6_000;
+        }
+        then
+    };
+    let mut model = Model::new(at(0));
+    for ms in [500, 1000, 1500, 2000] {
+        model.update(Msg::Snapshot(Box::new(at(ms))));
+    }
+    model
+}
+
+fn draw(model: &Model, (width, height): (u16, u16), theme: Theme) -> TestBackend {
+    let mut terminal = Terminal::new(TestBackend::new(width, height)).unwrap();
+    terminal.draw(|frame| view::draw(frame, model, theme)).unwrap();
+    terminal.backend().clone()
+}
+
+/// The style of the first place where `text` stands.
+fn style_of(buffer: &Buffer, text: &str) -> Style {
+    let wanted: Vec<String> = text.chars().map(String::from).collect();
+    let columns = usize::from(buffer.area.width);
+    let at = buffer.content.chunks(columns).find_map(|row| {
+        let symbols: Vec<&str> = row.iter().map(ratatui::buffer::Cell::symbol).collect();
+        let start = symbols.windows(wanted.len()).position(|window| window == wanted)?;
+        row.get(start).map(ratatui::buffer::Cell::style)
+    });
+    at.unwrap_or_else(|| panic!("{text:?} is not on the screen"))
+}
+
+#[test]
+fn an_empty_rig() {
+    assert_snapshot!(draw(&Model::new(snapshot(Vec::new())), (80, 24), THEME));
+}
+
+#[test]
+fn three_devices_stream() {
+    let mut end = three_streaming();
+    end.last_episode = Some("episodes/2023-11-14_place-block_006.mcap".into());
+    end.log = vec![line(0, Level::Info, "cam_wrist is streaming"), line(1, Level::Info, "tof is streaming")];
+    assert_snapshot!("three_80x24", draw(&measured(&end), (80, 24), THEME));
+    assert_snapshot!("three_120x40", draw(&measured(&end), (120, 40), THEME));
+}
+
+#[test]
+fn every_state_has_its_word_symbol_and_colour() {
+    let model = measured(&every_state());
+    let screen = draw(&model, (80, 24), THEME);
+    assert_snapshot!("states_80x24", screen);
+    assert_snapshot!("states_120x40", draw(&model, (120, 40), THEME));
+    let buffer = screen.buffer();
+    for (cell, colour, bold) in [
+        ("● streaming", Color::Green, false),
+        ("○ absent", Color::Red, false),
+        ("◐ opening", Color::Yellow, false),
+        ("◌ backoff", Color::Yellow, false),
+        ("◆ stalled", Color::Magenta, false),
+        ("✕ failed", Color::Red, true),
+    ] {
+        let style = style_of(buffer, cell);
+        assert_eq!(style.fg, Some(colour), "{cell}");
+        // The first row is selected, and therefore bold whatever its state.
+        if cell != "● streaming" {
+            assert_eq!(style.add_modifier.contains(Modifier::BOLD), bold, "{cell}");
+        }
+    }
+    assert_eq!(style_of(buffer, "■  0").bg, Some(Color::Green));
+    assert_eq!(style_of(buffer, "□  1").bg, Some(Color::Reset));
+    assert_eq!(style_of(buffer, "warn ").fg, Some(Color::Yellow));
+    assert_eq!(style_of(buffer, "error").fg, Some(Color::Red));
+}
+
+#[test]
+fn without_colours_and_unicode_everything_can_still_be_told() {
+    let mut end = every_state();
+    end.devices[1].detail = "Kamera für Überblick 相机".to_owned();
+    end.recording = Some(recording(2));
+    let screen = draw(&measured(&end), (80, 24), ASCII);
+    assert_snapshot!(screen);
+    for cell in &screen.buffer().content {
+        assert!(cell.symbol().is_ascii(), "{:?}", cell.symbol());
+        assert!(cell.fg == Color::Reset && cell.bg == Color::Reset);
+    }
+    // Filled cells are still filled.
+    assert!(style_of(screen.buffer(), "#  0").add_modifier.contains(Modifier::REVERSED));
+}
+
+#[test]
+fn an_episode_that_loses_samples_says_so() {
+    let mut end = three_streaming();
+    end.recording = Some(recording(17));
+    let model = measured(&end);
+    let screen = draw(&model, (80, 24), THEME);
+    assert_snapshot!("recording_80x24", screen);
+    assert_snapshot!("recording_120x40", draw(&model, (120, 40), THEME));
+    assert_eq!(style_of(screen.buffer(), "▲ dropped 17").fg, Some(Color::Red));
+    assert_eq!(style_of(screen.buffer(), "● REC").fg, Some(Color::Red));
+}
+
+#[test]
+fn sixty_four_devices_fit_and_scroll() {
+    let mut model = measured(&sixty_four());
+    assert_snapshot!("sixty_four_80x24", draw(&model, (80, 24), THEME));
+    assert_snapshot!("sixty_four_60x12", draw(&model, (60, 12), THEME));
+    assert_snapshot!("sixty_four_120x40", draw(&model, (120, 40), THEME));
+    for _ in 0..40 {
+        model.update(press(KeyCode::Down));
+    }
+    let screen = draw(&model, (80, 24), THEME).to_string();
+    assert!(screen.contains("▸ 40 sensor_40"), "{screen}");
+    model.update(press(KeyCode::End));
+    let screen = draw(&model, (80, 24), THEME).to_string();
+    assert!(screen.contains("▸ 63 sensor_63"), "{screen}");
+}
+
+#[test]
+fn long_and_foreign_names_keep_the_columns() {
+    let mut end = snapshot(vec![
+        device(0, "a_name_of_sixty_four_characters_which_is_the_longest_that_is_ok", SlotState::Streaming, "x"),
+        device(1, "相机手腕左侧的相机", SlotState::Streaming, "/dev/video0 相机手腕左侧的相机手腕左侧的"),
+        device(2, "e\u{301}te\u{301}", SlotState::Absent, "\x1b[2J\x1b[Hhello\r\n\u{202e}reversed"),
+    ]);
+    end.rig = "a rig whose name is far too long for a header".to_owned();
+    end.log = vec![line(0, Level::Warn, &"wörter ".repeat(40)), line(1, Level::Info, "bell\x07 and\ttab")];
+    let screen = draw(&measured(&end), (80, 24), THEME);
+    assert_snapshot!(screen);
+    assert!(screen.buffer().content.iter().all(|cell| !cell.symbol().contains(char::is_control)));
+}
+
+#[test]
+fn a_small_terminal_says_what_it_needs() {
+    let model = measured(&three_streaming());
+    assert_snapshot!("too_small", draw(&model, (40, 8), THEME));
+    assert_snapshot!("smallest", draw(&model, (60, 12), THEME));
+    // Not even that fits: still no panic.
+    for size in [(1, 1), (10, 1), (1, 10), (59, 200), (300, 11), (300, 200)] {
+        draw(&model, size, THEME);
+    }
+}
+
+#[test]
+fn the_help_lists_every_key() {
+    let mut model = measured(&three_streaming());
+    model.update(press(KeyCode::Char('?')));
+    assert_snapshot!("help_80x24", draw(&model, (80, 24), THEME));
+    assert_snapshot!("help_60x12", draw(&model, (60, 12), THEME));
+}
+
+#[test]
+fn an_edge_is_highlighted_for_a_second() {
+    let mut model = measured(&three_streaming());
+    let mut later = three_streaming();
+    later.mask.0 = 0b110;
+    later.taken = Stamp(TAKEN.0 + 100_000_000);
+    model.update(Msg::Snapshot(Box::new(later.clone())));
+    let screen = draw(&model, (80, 24), THEME);
+    assert_eq!(style_of(screen.buffer(), "▼  0").bg, Some(Color::LightRed));
+    assert_eq!(style_of(screen.buffer(), "■  1").bg, Some(Color::Green));
+    later.taken = Stamp(TAKEN.0 + 1_200_000_000);
+    model.update(Msg::Snapshot(Box::new(later)));
+    let screen = draw(&model, (80, 24), THEME);
+    assert_eq!(style_of(screen.buffer(), "□  0").bg, Some(Color::Reset));
+}
+
+#[test]
+fn a_pause_shows_in_the_header_and_a_question_in_the_footer() {
+    let mut end = three_streaming();
+    end.recording = Some(recording(0));
+    let mut model = measured(&end);
+    model.update(press(KeyCode::Char('p')));
+    model.update(press(KeyCode::Char('q')));
+    let screen = draw(&model, (80, 24), THEME).to_string();
+    assert!(screen.contains("view paused"), "{screen}");
+    assert!(screen.contains("recording: q again to finish the episode and quit"), "{screen}");
+}
+
+/// Keys as a terminal sends them; then nothing more.
+fn typed(keys: &[KeyCode]) -> impl Stream<Item = io::Result<Event>> + use<> {
+    let events: Vec<_> = keys.iter().map(|code| Ok(Event::Key(KeyEvent::new(*code, KeyModifiers::NONE)))).collect();
+    futures::stream::iter(events).chain(futures::stream::pending())
+}
+
+#[tokio::test]
+async fn keys_become_commands_and_shutdown_ends_the_screen() {
+    let board = board(&["cam"]);
+    let (sender, mut commands) = mpsc::channel(4);
+    let shutdown = CancellationToken::new();
+    let end = shutdown.clone();
+    let keys = typed(&[KeyCode::Char(' '), KeyCode::Char('q')]);
+    let screen = drive(&board, &sender, &shutdown, keys, |_| Ok(()));
+    let app = async {
+        assert_eq!(commands.recv().await, Some(Command::ToggleRecording));
+        assert_eq!(commands.recv().await, Some(Command::Quit));
+        end.cancel();
+    };
+    let (outcome, ()) = tokio::join!(screen, app);
+    outcome.unwrap();
+}
+
+#[tokio::test]
+async fn a_busy_program_is_said_and_one_that_is_gone_ends_the_screen() {
+    let board = board(&["cam"]);
+    let (sender, commands) = mpsc::channel(1);
+    sender.try_send(Command::ToggleRecording).unwrap();
+    let shutdown = CancellationToken::new();
+    let end = shutdown.clone();
+    let mut notice = None;
+    drive(&board, &sender, &shutdown, typed(&[KeyCode::Char(' ')]), |model| {
+        if let Some(said) = model.notice() {
+            notice = Some(said.to_owned());
+            end.cancel();
+        }
+        Ok(())
+    })
+    .await
+    .unwrap();
+    assert_eq!(notice.as_deref(), Some("busy: not taken, try again"));
+
+    drop(commands);
+    drive(&board, &sender, &CancellationToken::new(), typed(&[KeyCode::Char('q')]), |_| Ok(())).await.unwrap();
+}
+
+#[tokio::test]
+async fn a_terminal_that_goes_away_is_an_error() {
+    let board = board(&["cam"]);
+    let (sender, _commands) = mpsc::channel(1);
+    let hung_up = futures::stream::iter([]);
+    let error = drive(&board, &sender, &CancellationToken::new(), hung_up, |_| Ok(())).await.unwrap_err();
+    assert!(matches!(error, TuiError::Gone(_)), "{error}");
+}

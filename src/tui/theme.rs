@@ -1,0 +1,229 @@
+//! Colours and symbols, by what the terminal can show.
+//!
+//! Only the 16 colours that the user's own terminal theme defines, so that dark and light terminals
+//! both read well. Every meaning that has a colour also has a symbol or a word.
+
+use ratatui::style::{Color, Modifier, Style};
+use ratatui::symbols::border;
+
+use crate::status::{Level, SlotState};
+use crate::text;
+
+/// Can the terminal show colours?
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Colours {
+    /// The 16 colours.
+    Sixteen,
+    /// None (`NO_COLOR`, or a terminal without).
+    None,
+}
+
+/// Can the terminal show characters outside ASCII?
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Charset {
+    /// All of Unicode.
+    Unicode,
+    /// ASCII only.
+    Ascii,
+}
+
+/// How things look.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Theme {
+    /// Colours.
+    pub colours: Colours,
+    /// Characters.
+    pub charset: Charset,
+}
+
+impl Theme {
+    /// What the environment says: `NO_COLOR` (<https://no-color.org>), `TERM`, and the locale in
+    /// `LC_ALL`, `LC_CTYPE` or `LANG`, of which the first that is set counts.
+    #[must_use]
+    pub fn detect(variable: impl Fn(&str) -> Option<String>) -> Self {
+        let set = |name: &str| variable(name).filter(|value| !value.is_empty());
+        let term = set("TERM").unwrap_or_default();
+        let colours = if set("NO_COLOR").is_some() || term == "dumb" { Colours::None } else { Colours::Sixteen };
+        let locale = ["LC_ALL", "LC_CTYPE", "LANG"].into_iter().find_map(set).unwrap_or_default().to_lowercase();
+        // The kernel's own console has a font of 256 or 512 glyphs, without most of our symbols.
+        let unicode = (locale.contains("utf-8") || locale.contains("utf8")) && term != "linux" && term != "dumb";
+        Self { colours, charset: if unicode { Charset::Unicode } else { Charset::Ascii } }
+    }
+
+    /// The same meaning in Unicode or ASCII.
+    #[must_use]
+    pub fn symbol(self, unicode: &'static str, ascii: &'static str) -> &'static str {
+        match self.charset {
+            Charset::Unicode => unicode,
+            Charset::Ascii => ascii,
+        }
+    }
+
+    /// What stands at the end of a text that was cut.
+    #[must_use]
+    pub fn ellipsis(self) -> &'static str {
+        self.symbol("…", "~")
+    }
+
+    /// Foreign text as this terminal may show it.
+    #[must_use]
+    pub fn safe(self, foreign: &str) -> String {
+        let plain = text::plain(foreign);
+        match self.charset {
+            Charset::Unicode => plain.into_owned(),
+            Charset::Ascii => text::ascii(&plain),
+        }
+    }
+
+    /// Foreign text in exactly `columns` columns.
+    #[must_use]
+    pub fn column(self, foreign: &str, columns: usize) -> String {
+        text::left(&self.safe(foreign), columns, self.ellipsis())
+    }
+
+    fn colour(self, colour: Color) -> Style {
+        match self.colours {
+            Colours::Sixteen => Style::new().fg(colour),
+            Colours::None => Style::new(),
+        }
+    }
+
+    /// Labels, rules, what is not the point.
+    #[must_use]
+    pub fn faint(self) -> Style {
+        Style::new().add_modifier(Modifier::DIM)
+    }
+
+    /// Names of panels and keys.
+    #[must_use]
+    pub fn title(self) -> Style {
+        self.colour(Color::Cyan).add_modifier(Modifier::BOLD)
+    }
+
+    /// Something that needs the user's eye.
+    #[must_use]
+    pub fn warning(self) -> Style {
+        self.colour(Color::Yellow).add_modifier(Modifier::BOLD)
+    }
+
+    /// Something is wrong.
+    #[must_use]
+    pub fn alarm(self) -> Style {
+        self.colour(Color::Red).add_modifier(Modifier::BOLD)
+    }
+
+    /// An episode is being written.
+    #[must_use]
+    pub fn recording(self) -> Style {
+        self.alarm()
+    }
+
+    /// A state of a slot.
+    #[must_use]
+    pub fn state(self, state: SlotState) -> Style {
+        match state {
+            SlotState::Streaming => self.colour(Color::Green),
+            SlotState::Opening | SlotState::Backoff => self.colour(Color::Yellow),
+            SlotState::Stalled => self.colour(Color::Magenta),
+            SlotState::Absent => self.colour(Color::Red),
+            SlotState::Failed => self.alarm(),
+        }
+    }
+
+    /// The symbol of a state, one column.
+    #[must_use]
+    pub fn state_symbol(self, state: SlotState) -> &'static str {
+        match state {
+            SlotState::Streaming => self.symbol("●", "*"),
+            SlotState::Opening => self.symbol("◐", "~"),
+            SlotState::Backoff => self.symbol("◌", ":"),
+            SlotState::Stalled => self.symbol("◆", "!"),
+            SlotState::Absent => self.symbol("○", "-"),
+            SlotState::Failed => self.symbol("✕", "X"),
+        }
+    }
+
+    /// A cell of the mask.
+    #[must_use]
+    pub fn mask_cell(self, present: bool, edge: Edge) -> Style {
+        let filled = match (present, edge) {
+            (_, Edge::Recent) => Some(if present { Color::LightYellow } else { Color::LightRed }),
+            (true, Edge::None) => Some(Color::Green),
+            (false, Edge::None) => None,
+        };
+        match (filled, self.colours) {
+            (None, _) => self.faint(),
+            (Some(colour), Colours::Sixteen) => Style::new().fg(Color::Black).bg(colour),
+            (Some(_), Colours::None) if edge == Edge::Recent && !present => {
+                Style::new().add_modifier(Modifier::UNDERLINED)
+            }
+            (Some(_), Colours::None) => Style::new().add_modifier(Modifier::REVERSED),
+        }
+    }
+
+    /// A line of the log.
+    #[must_use]
+    pub fn level(self, level: Level) -> Style {
+        match level {
+            Level::Debug => self.faint(),
+            Level::Info => Style::new(),
+            Level::Warn => self.colour(Color::Yellow),
+            Level::Error => self.alarm(),
+        }
+    }
+
+    /// Lines of a box.
+    #[must_use]
+    pub fn border(self) -> border::Set<'static> {
+        match self.charset {
+            Charset::Unicode => border::ROUNDED,
+            Charset::Ascii => border::Set {
+                top_left: "+",
+                top_right: "+",
+                bottom_left: "+",
+                bottom_right: "+",
+                vertical_left: "|",
+                vertical_right: "|",
+                horizontal_top: "-",
+                horizontal_bottom: "-",
+            },
+        }
+    }
+}
+
+/// Has a bit of the mask changed within the last second?
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Edge {
+    /// No.
+    None,
+    /// Yes.
+    Recent,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_environment_decides() {
+        use {
+            Charset::{Ascii, Unicode},
+            Colours::{None, Sixteen},
+        };
+        let table: [(&[(&str, &str)], Colours, Charset); 7] = [
+            (&[], Sixteen, Ascii),
+            (&[("LANG", "en_US.UTF-8"), ("TERM", "xterm")], Sixteen, Unicode),
+            (&[("LANG", "C.utf8")], Sixteen, Unicode),
+            (&[("LANG", "en_US.UTF-8"), ("LC_ALL", "C")], Sixteen, Ascii),
+            (&[("LANG", "en_US.UTF-8"), ("NO_COLOR", "1")], None, Unicode),
+            (&[("LANG", "en_US.UTF-8"), ("NO_COLOR", "")], Sixteen, Unicode),
+            (&[("LANG", "en_US.UTF-8"), ("TERM", "linux")], Sixteen, Ascii),
+        ];
+        for (environment, colours, charset) in table {
+            let theme = Theme::detect(|name| {
+                environment.iter().find(|(key, _)| *key == name).map(|(_, value)| (*value).to_owned())
+            });
+            assert_eq!(theme, Theme { colours, charset }, "{environment:?}");
+        }
+    }
+}

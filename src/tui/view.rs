@@ -1,0 +1,92 @@
+//! The view: where each panel goes on the screen.
+//!
+//! Invariant: drawing changes nothing but the frame.
+
+use ratatui::Frame;
+use ratatui::layout::{Constraint, Layout, Rect};
+use ratatui::style::Stylize;
+use ratatui::text::{Line, Span};
+use ratatui::widgets::Paragraph;
+
+use super::model::Model;
+use super::theme::Theme;
+use super::{devices, footer, header, help, log, mask, recording};
+
+/// Below this the screen only says how large it should be.
+pub const MINIMUM: (u16, u16) = (60, 12);
+/// From this height on, panels have an empty line between them.
+const ROOMY: u16 = 32;
+/// From this height on, the selected device has a line of its own.
+const WITH_SELECTION: u16 = 20;
+/// Least and most lines of log next to a full table.
+const LOG_LINES: (u16, u16) = (1, 5);
+
+/// Draws everything.
+pub fn draw(frame: &mut Frame<'_>, model: &Model, theme: Theme) {
+    let area = frame.area();
+    if area.width < MINIMUM.0 || area.height < MINIMUM.1 {
+        return draw_too_small(frame, area);
+    }
+    let gap = u16::from(area.height >= ROOMY);
+    let plan = mask::Plan::new(model, area.width, area.height / 4);
+    let selection = u16::from(area.height >= WITH_SELECTION);
+    let recording_lines = if area.height >= ROOMY { 2 } else { 1 };
+    // A rule above each of the four panels, the head of the table, header and footer.
+    let fixed = 4 + 1 + 2 + 4 * gap + plan.rows() + selection + recording_lines;
+    let rest = area.height.saturating_sub(fixed);
+    let log_least = (rest / 3).clamp(LOG_LINES.0, LOG_LINES.1);
+    let rows =
+        u16::try_from(model.shown().devices.len()).unwrap_or(u16::MAX).clamp(1, rest.saturating_sub(log_least).max(1));
+
+    let [header_area, mask_area, devices_area, recording_area, log_area, footer_area] = Layout::vertical([
+        Constraint::Length(1 + gap),
+        Constraint::Length(1 + plan.rows() + gap),
+        Constraint::Length(2 + rows + selection + gap),
+        Constraint::Length(1 + recording_lines + gap),
+        Constraint::Fill(1),
+        Constraint::Length(1),
+    ])
+    .areas(area);
+    header::draw(frame, header_area, model, theme);
+    mask::draw(frame, mask_area, &plan, model, theme);
+    devices::draw(frame, devices_area, (rows, selection), model, theme);
+    recording::draw(frame, recording_area, model, theme);
+    log::draw(frame, log_area, model, theme);
+    footer::draw(frame, footer_area, model, theme);
+    if model.is_help_open() {
+        help::draw(frame, area, theme);
+    }
+}
+
+fn draw_too_small(frame: &mut Frame<'_>, area: Rect) {
+    let lines = vec![
+        Line::from("The terminal is too small.").bold(),
+        Line::from(format!("needed {}x{}, is {}x{}", MINIMUM.0, MINIMUM.1, area.width, area.height)),
+    ];
+    let [middle] = Layout::vertical([Constraint::Length(2)]).flex(ratatui::layout::Flex::Center).areas(area);
+    frame.render_widget(Paragraph::new(lines).centered(), middle);
+}
+
+/// Draws the rule of a panel, with its title at the left and a remark at the right, and gives the rest.
+pub(super) fn panel(frame: &mut Frame<'_>, area: Rect, title: &str, remark: Line<'_>, theme: Theme) -> Rect {
+    let [rule, rest] = Layout::vertical([Constraint::Length(1), Constraint::Fill(1)]).areas(area);
+    let dash = theme.symbol("─", "-");
+    let left = title.chars().count() + 4;
+    let right = if remark.width() == 0 { 1 } else { remark.width() + 4 };
+    let fill = usize::from(area.width).saturating_sub(left + right);
+    let mut spans = vec![
+        Span::styled(format!(" {dash} "), theme.faint()),
+        Span::styled(title.to_owned(), theme.title()),
+        Span::raw(" "),
+        Span::styled(dash.repeat(fill), theme.faint()),
+    ];
+    if remark.width() > 0 {
+        spans.push(Span::raw(" "));
+        spans.extend(remark.spans);
+        spans.push(Span::styled(format!(" {dash} "), theme.faint()));
+    }
+    frame.render_widget(Line::from(spans), rule);
+    let [_, inner, _] =
+        Layout::horizontal([Constraint::Length(1), Constraint::Fill(1), Constraint::Length(1)]).areas(rest);
+    inner
+}
