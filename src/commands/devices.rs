@@ -52,23 +52,12 @@ pub fn list(registry: Option<&Registry>, attached: &[Attachment], formats: Forma
             },
             _ => (None, None),
         };
-        Plugged {
-            node: attachment.node.label(),
-            usb: attachment.usb.clone(),
-            entry,
-            reasons,
-            camera,
-            camera_error,
-        }
+        Plugged { node: attachment.node.label(), usb: attachment.usb.clone(), entry, reasons, camera, camera_error }
     };
     attached.iter().map(plugged).collect()
 }
 
-fn explain(
-    assigner: &mut Assigner,
-    registry: &Registry,
-    attachment: &Attachment,
-) -> (Option<String>, Vec<String>) {
+fn explain(assigner: &mut Assigner, registry: &Registry, attachment: &Attachment) -> (Option<String>, Vec<String>) {
     let why = assigner.explain(attachment).reasons;
     match assigner.attach(attachment) {
         Assignment::Entry(id) => (registry.device(id).map(|device| device.name.clone()), why),
@@ -115,9 +104,10 @@ pub fn print(plugged: &[Plugged], registry: Option<&Registry>, out: &mut dyn Wri
         }
     }
     let Some(registry) = registry else { return Ok(()) };
-    let missing = registry.devices.iter().filter(|entry| {
-        !plugged.iter().any(|device| device.entry.as_deref() == Some(entry.name.as_str()))
-    });
+    let missing = registry
+        .devices
+        .iter()
+        .filter(|entry| !plugged.iter().any(|device| device.entry.as_deref() == Some(entry.name.as_str())));
     for entry in missing {
         let identity = &entry.identity;
         writeln!(out, "[device.{}] {:04x}:{:04x} is not plugged in", entry.name, identity.vid, identity.pid)?;
