@@ -5,6 +5,7 @@
 
 // The binding is published as a wheel for this architecture alone.
 #![cfg(target_arch = "x86_64")]
+#![expect(clippy::expect_used, reason = "a test ends where what it needs is missing")]
 
 use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
@@ -38,7 +39,7 @@ fn python() -> PathBuf {
     python
 }
 
-/// The n-th Python example of the README.
+/// The Python example of the README with this text in it.
 fn readme_example(containing: &str) -> String {
     let readme = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("README.md")).expect("README.md");
     let mut examples = readme.split("```python\n").skip(1).filter_map(|rest| rest.split("```").next());
@@ -154,10 +155,12 @@ fn a_topic_that_is_not_there_is_said() {
 fn the_subscriber_of_the_readme_runs() {
     let camera = Camera::start("readme");
     let plain = "iox2.NodeBuilder.new()";
-    let code = readme_example(plain).replace(
-        plain,
-        &format!("(c := iox2.config.default(), setattr(c.global_cfg, 'prefix', iox2.FileName.new('iox2_{}_')), iox2.NodeBuilder.new().config(c))[2]", camera.instance),
+    let apart = format!(
+        "config = iox2.config.default()\nconfig.global_cfg.prefix = iox2.FileName.new('iox2_{}_')\n",
+        camera.instance
     );
+    let example = readme_example(plain).replace(plain, &format!("{plain}.config(config)"));
+    let code = example.replace("import iceoryx2 as iox2\n", &format!("import iceoryx2 as iox2\n{apart}"));
     let (_python, output) = Running::start(Command::new(python()).args(["-u", "-c", &code]));
     let line = output.lines().next().expect("a line").expect("of text");
     let fields: Vec<&str> = line.split_whitespace().collect();
