@@ -75,8 +75,11 @@
 //! * Bytes from devices and files never make the program panic. `unsafe` stands in [`driver`] and
 //!   [`bus`] alone.
 
+pub mod app;
 pub mod bus;
+pub mod cli;
 pub mod commands;
+pub mod dispatch;
 pub mod driver;
 pub mod headless;
 pub mod hotplug;

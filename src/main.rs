@@ -1,2 +1,18 @@
-//! Entry point.
-fn main() {}
+//! Entry point: parses the command line, runs the command, prints an error, sets the exit code.
+
+use std::process::ExitCode;
+
+use clap::Parser;
+
+fn main() -> ExitCode {
+    match rapid::cli::Cli::try_parse() {
+        Ok(cli) => rapid::dispatch::dispatch(cli),
+        Err(error) => {
+            // Help and version go to standard output and are no error.
+            let code = if error.use_stderr() { 2 } else { 0 };
+            // Nothing can be said when even this cannot be written.
+            let _ = error.print();
+            ExitCode::from(code)
+        }
+    }
+}

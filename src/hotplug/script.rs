@@ -105,6 +105,17 @@ impl Script {
     }
 }
 
+/// What is plugged in when a scenario begins.
+#[must_use]
+pub fn attached(scenario: Scenario) -> Vec<Attachment> {
+    let events = Script::new(scenario).queue;
+    let added = |event| match event {
+        HotplugEvent::Added(attachment) => Some(attachment),
+        HotplugEvent::Removed { .. } => None,
+    };
+    events.into_iter().filter_map(added).collect()
+}
+
 impl Stream for Script {
     type Item = Result<HotplugEvent, HotplugError>;
 

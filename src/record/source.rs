@@ -28,3 +28,20 @@ pub trait Source: Send {
     /// When the bus cannot be read; the text says why.
     fn drain(&mut self, take: &mut dyn FnMut(SourceTopic, &SampleHeader, &[u8])) -> Result<(), String>;
 }
+
+impl Source for crate::bus::Inbox {
+    fn wait(&mut self, timeout: Duration) -> Result<(), String> {
+        Self::wait(self, timeout).map_err(|error| error.to_string())
+    }
+
+    fn drain(&mut self, take: &mut dyn FnMut(SourceTopic, &SampleHeader, &[u8])) -> Result<(), String> {
+        Self::drain(self, &mut |topic, header, bytes| {
+            let topic = match topic {
+                crate::bus::TopicId::Modality(id) => SourceTopic::Modality(id),
+                crate::bus::TopicId::Mask => SourceTopic::Mask,
+            };
+            take(topic, header, bytes);
+        })
+        .map_err(|error| error.to_string())
+    }
+}

@@ -54,13 +54,30 @@ struct Shared {
     stop: AtomicBool,
 }
 
-impl Presence {
-    /// Takes the file at `path` and begins to publish an empty mask of `device_count` devices.
+/// The right to publish the mask of this rig, and with it to be its one `rapid`.
+#[derive(Debug)]
+pub struct Claim {
+    path: PathBuf,
+    file: MaskFile,
+}
+
+impl Claim {
+    /// Takes the file at `path`, for a mask of `device_count` devices.
     ///
     /// # Errors
     /// When another live process publishes there (its pid is named), or the file cannot be made.
-    pub fn start(path: &Path, device_count: u8, writer: Arc<Writer>, board: Arc<Board>) -> Result<Self, PresenceError> {
-        let file = MaskFile::create(path, device_count)?;
+    pub fn new(path: &Path, device_count: u8) -> Result<Self, PresenceError> {
+        Ok(Self { path: path.to_owned(), file: MaskFile::create(path, device_count)? })
+    }
+}
+
+impl Presence {
+    /// Begins to publish an empty mask.
+    ///
+    /// # Errors
+    /// When the thread cannot be started.
+    pub fn start(claim: Claim, writer: Arc<Writer>, board: Arc<Board>) -> Result<Self, PresenceError> {
+        let Claim { path, file } = claim;
         let shared = Arc::new(Shared::default());
         let beat = Beat { shared: Arc::clone(&shared), file, writer, board };
         let thread = std::thread::Builder::new()

@@ -1,0 +1,256 @@
+//! From what was typed to what is run, and from how that ended to the exit code.
+//!
+//! Invariant: every error is printed here, once.
+
+use std::io::{self, IsTerminal, Write};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use clap::CommandFactory;
+use tokio_util::sync::CancellationToken;
+
+use crate::app::{self, AppError, Devices, Options, Screen, mask_path};
+use crate::cli::{Cli, Command, Global, RunArgs};
+use crate::commands::{self, Format, Outcome, devices::Formats, mask::MaskOptions};
+use crate::driver::replay;
+use crate::headless::style::{ColourChoice, Palette, Terminal};
+use crate::hotplug::udev;
+use crate::record::{EpisodeRequest, RecordError};
+use crate::registry::scenario::Scenario;
+use crate::registry::{Registry, RegistryErrors};
+use crate::rig::presence::{PresenceError, json_path, read_mask};
+
+/// Why a command ended without having done what it was asked.
+#[derive(Debug, thiserror::Error)]
+enum Failure {
+    #[error(transparent)]
+    App(#[from] AppError),
+    /// The registry is wrong.
+    #[error("{0}")]
+    Registry(#[from] RegistryErrors),
+    /// There is none.
+    #[error(
+        "no devices.toml: looked for {}\n  fix: write one (`rapid devices` lists what is plugged in), name one with --config, \
+         or look around with `rapid --sim`", .0.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ")
+    )]
+    NoRegistry(Vec<PathBuf>),
+    #[error(transparent)]
+    Presence(#[from] PresenceError),
+    #[error(transparent)]
+    Hotplug(#[from] crate::hotplug::HotplugError),
+    #[error(transparent)]
+    Artifacts(#[from] commands::artifacts::ArtifactsError),
+    #[error(transparent)]
+    Mask(#[from] commands::mask::MaskError),
+    #[error("{}: {reason}", file.display())]
+    Replay { file: PathBuf, reason: String },
+    /// What was wrong has been printed.
+    #[error("")]
+    Told,
+    #[error("output: {0}")]
+    Output(#[from] io::Error),
+}
+
+impl Failure {
+    /// Exit codes: 1 failed while running, 2 bad configuration or arguments, 130 interrupted twice.
+    fn code(&self) -> u8 {
+        match self {
+            Self::App(AppError::InterruptedTwice) => 130,
+            Self::App(AppError::Record(RecordError::NoFolder(_)) | AppError::Logging(_))
+            | Self::Registry(_)
+            | Self::NoRegistry(_)
+            | Self::Told => 2,
+            _ => 1,
+        }
+    }
+}
+
+/// Runs what was typed.
+#[must_use]
+pub fn dispatch(cli: Cli) -> ExitCode {
+    let outcome = match cli.command {
+        None => run(&cli.global, &cli.run, None),
+        Some(Command::Replay { ref file, run: ref args }) => run(&cli.global, args, Some(file)),
+        Some(command) => print(&cli.global, &cli.run, command),
+    };
+    match outcome {
+        Ok(()) => ExitCode::SUCCESS,
+        // Whoever read the output has read enough of it.
+        Err(Failure::Output(error)) if error.kind() == io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
+        Err(failure) => {
+            let text = failure.to_string();
+            if !text.is_empty() {
+                let _ = writeln!(io::stderr(), "{} {text}", stderr_palette().bad("error:"));
+            }
+            ExitCode::from(failure.code())
+        }
+    }
+}
+
+/// Everything that prints and ends.
+fn print(global: &Global, run: &RunArgs, command: Command) -> Result<(), Failure> {
+    let out = &mut io::stdout().lock();
+    let format = if global.json { Format::Json } else { Format::Text };
+    match command {
+        Command::Check => {
+            let path = registry_path(global)?;
+            match commands::check::check(&path, format, out)? {
+                Outcome::Done => Ok(()),
+                Outcome::BadConfiguration => Err(Failure::Told),
+            }
+        }
+        Command::Devices { formats } => {
+            let registry = find_registry(global)?.map(|path| load(&path)).transpose()?;
+            let formats = if formats { Formats::Ask } else { Formats::Skip };
+            let plugged = commands::devices::list(registry.as_ref(), &attached(run, registry.as_ref())?, formats);
+            if format == Format::Json {
+                for device in &plugged {
+                    serde_json::to_writer(&mut *out, device).map_err(io::Error::from)?;
+                    writeln!(out)?;
+                }
+                return Ok(());
+            }
+            Ok(commands::devices::print(&plugged, registry.as_ref(), out)?)
+        }
+        Command::Artifacts { install, to } => {
+            let registry = load(&registry_path(global)?)?;
+            if install {
+                return Ok(commands::artifacts::install(&registry, out)?);
+            }
+            Ok(commands::artifacts::write(&registry, &to, out)?)
+        }
+        Command::Mask { watch } => mask(global, watch),
+        Command::Inspect { file } => {
+            let _ = file;
+            Ok(())
+        }
+        Command::Completions { shell } => Ok(commands::completions::completions(&mut Cli::command(), shell, out)?),
+        Command::Replay { .. } => Ok(()),
+    }
+}
+
+/// What is attached: to this machine, or at the beginning of a scenario.
+fn attached(run: &RunArgs, registry: Option<&Registry>) -> Result<Vec<crate::registry::Attachment>, Failure> {
+    match (&run.sim, registry) {
+        (Some(file), Some(registry)) => Ok(crate::hotplug::script::attached(scenario(file.as_deref(), registry)?)),
+        _ => Ok(udev::enumerate()?),
+    }
+}
+
+fn mask(global: &Global, watch: bool) -> Result<(), Failure> {
+    let path = mask_path(global.instance.as_deref());
+    let json = json_path(&path);
+    let names = || commands::mask::layout(&std::fs::read_to_string(&json).ok()?);
+    let read = || read_mask(&path).map_err(|error| error.to_string());
+    let options = MaskOptions { watch, json: global.json, palette: palette() };
+    let stop = CancellationToken::new();
+    runtime()?.block_on(async {
+        let interrupted = stop.clone();
+        tokio::spawn(async move {
+            if tokio::signal::ctrl_c().await.is_ok() {
+                interrupted.cancel();
+            }
+        });
+        Ok(commands::mask::run(read, names, crate::time::realtime_ns, options, stop, io::stdout()).await?)
+    })
+}
+
+/// The rig: on this machine, simulated, or played from an episode.
+fn run(global: &Global, args: &RunArgs, replayed: Option<&Path>) -> Result<(), Failure> {
+    let (mut registry, devices) = match (replayed, &args.sim) {
+        (Some(file), _) => {
+            let failed = |reason: String| Failure::Replay { file: file.to_owned(), reason };
+            let (text, scenario) = replay::scenario(file).map_err(|error| failed(error.to_string()))?;
+            let loaded = Registry::parse(&text, None).map_err(|errors| failed(errors.to_string()))?;
+            (loaded.registry, Devices::Simulated(scenario))
+        }
+        (None, Some(file)) => {
+            let registry = match find_registry(global)? {
+                Some(path) => load(&path)?,
+                None => Registry::builtin(),
+            };
+            let scenario = scenario(file.as_deref(), &registry)?;
+            (registry, Devices::Simulated(scenario))
+        }
+        (None, None) => (load(&registry_path(global)?)?, Devices::Machine),
+    };
+    if let Some(rate) = args.rate {
+        registry.rig.observation_hz = rate;
+    }
+    if let Some(window) = args.window {
+        registry.rig.sync_window = window;
+    }
+    let screen = match (args.headless || !io::stdout().is_terminal(), global.json) {
+        (_, true) => Screen::Json,
+        (true, false) => Screen::Lines,
+        (false, false) => Screen::Monitor,
+    };
+    let options = Options {
+        registry,
+        devices,
+        screen,
+        episode: EpisodeRequest {
+            out: args.out.clone(),
+            task: args.task.clone(),
+            tags: args.tag.clone(),
+            duration: args.duration,
+        },
+        record: args.record,
+        duration: args.duration,
+        instance: global.instance.clone(),
+    };
+    Ok(runtime()?.block_on(app::run(options))?)
+}
+
+fn scenario(file: Option<&Path>, registry: &Registry) -> Result<Scenario, Failure> {
+    match file {
+        Some(file) => Ok(Scenario::load(file, registry)?),
+        None => Ok(Scenario::demo(registry)),
+    }
+}
+
+/// Reads a registry; its warnings go to standard error.
+fn load(path: &Path) -> Result<Registry, Failure> {
+    let loaded = Registry::load(path)?;
+    for warning in &loaded.warnings {
+        let _ = writeln!(io::stderr(), "{} {warning}", stderr_palette().warn("warning:"));
+    }
+    Ok(loaded.registry)
+}
+
+fn registry_path(global: &Global) -> Result<PathBuf, Failure> {
+    find_registry(global)?.ok_or_else(|| Failure::NoRegistry(usual_places()))
+}
+
+/// The registry named, or the first of the usual places where there is one.
+fn find_registry(global: &Global) -> Result<Option<PathBuf>, Failure> {
+    if let Some(path) = &global.config {
+        return Ok(Some(path.clone()));
+    }
+    Ok(usual_places().into_iter().find(|path| path.exists()))
+}
+
+fn usual_places() -> Vec<PathBuf> {
+    let home = || std::env::var_os("HOME").map(|home| PathBuf::from(home).join(".config"));
+    let config = std::env::var_os("XDG_CONFIG_HOME").map(PathBuf::from).filter(|path| path.is_absolute());
+    let mut places = vec![PathBuf::from("devices.toml")];
+    places.extend(config.or_else(home).map(|folder| folder.join("rapid/devices.toml")));
+    places.push(PathBuf::from("/etc/rapid/devices.toml"));
+    places
+}
+
+fn runtime() -> io::Result<tokio::runtime::Runtime> {
+    tokio::runtime::Builder::new_multi_thread().enable_all().thread_name("worker").build()
+}
+
+fn palette() -> Palette {
+    ColourChoice::Auto.resolve(Terminal::of(&io::stdout()), |name| std::env::var(name).ok())
+}
+
+fn stderr_palette() -> Palette {
+    ColourChoice::Auto.resolve(Terminal::of(&io::stderr()), |name| std::env::var(name).ok())
+}
+
+fn columns() -> usize {
+    crossterm::terminal::size().map_or(100, |(columns, _)| usize::from(columns))
+}
