@@ -1,5 +1,79 @@
-//! `rapid`: hot-plug discovery, physical mask, streaming, synchronisation and recording for
+//! `rapid`: hot-plug discovery, Physical Mask, streaming, synchronisation and recording for
 //! robot-learning rigs, in one binary.
+//!
+//! # The picture
+//!
+//! ```text
+//!  L5   main   cli   commands                    what was typed
+//!  L4   app                                      puts the stages together, and alone knows them all
+//!       tui   headless   logging                 what is shown: Snapshots and Events of `status`
+//!
+//!  L3   rig                                      owns every device's life, and the mask
+//!        |  slot: may it run?  stream: run it    presence: publish the mask
+//!        |                        |
+//!  L2   hotplug      driver ----> | ----> bus -------.          .---- sync
+//!       plugged,     bytes in             topics in  |          |     which sample belongs
+//!       pulled out                        shared     |          |     to which tick
+//!                                         memory     v          v
+//!  L3                                                record      one episode, one MCAP file
+//!
+//!  L1   registry                                 devices.toml, checked
+//!       status                                   the board every stage reports on
+//!       text   outlet                            words and lines for people
+//!  L0   modality   mask   sample   time          nouns
+//! ```
+//!
+//! The arrows are the way of the data. Imports point down only; the stages of L3 do not know one
+//! another, nor do the mechanisms of L2. Every third-party crate has one home. `tests/layering.rs`
+//! holds all this as a table and checks it.
+//!
+//! A modality is what a policy would call one observation: a camera, the state of a motor. It has
+//! one number, [`modality::ModalityId`], which is its bit in the mask, its event on the bus, its index
+//! in every array and its row on screen.
+//!
+//! # One frame
+//!
+//! 1. A camera fills a buffer of the kernel; the descriptor becomes readable and wakes the device's
+//!    task. [`driver`] lends the buffer as a [`driver::Reading`], with the kernel's capture time.
+//! 2. `rig::stream` puts a [`sample::SampleHeader`] beside it and hands both to the topic's
+//!    [`bus::Writer`]: one copy, into shared memory, as the device gave it. Then it wakes whoever
+//!    waits; the event's number says which modality.
+//! 3. The `writer` thread of [`record`] takes it from its [`bus::Inbox`] and writes it to the episode
+//!    straight from shared memory, stamped with its capture time.
+//! 4. Once per tick of the observation grid, [`sync`] chooses of each modality the sample nearest to
+//!    the tick, and the recorder writes which ones those were, with the mask, beside the samples.
+//!
+//! Other programs subscribe to the same topics on the same terms.
+//!
+//! # One unplug
+//!
+//! 1. Three witnesses tell of a pulled cable: the stream's own error, the kernel's uevent, udev's
+//!    event. They come in any order, tens of milliseconds apart.
+//! 2. The first to reach the [`rig`] moves the slot of the device ([`rig::slot`], a pure state
+//!    machine) to `Absent`. What the others say carries an older [`sample::Epoch`], or tells what is
+//!    known, and changes nothing.
+//! 3. The bit is cleared and published at once, without waiting for the device or its task.
+//! 4. The topic stays: its recorder and every other subscriber go on and see a gap. A tick without
+//!    the device has its bit 0.
+//! 5. When a device of that identity comes back, the slot waits out the cooldown and opens it in a new
+//!    epoch; with its first sample the bit is set again.
+//!
+//! # Invariants
+//!
+//! * A bit is set exactly while its device is attached and has sent a sample in this epoch. Late data
+//!   does not clear it; the slot says `Stalled`.
+//! * Only [`rig`] decides the mask, and nothing it does may hold up its publication.
+//! * A writer never waits for a reader: who falls behind loses the oldest, and sees a hole in `seq`.
+//!   What is lost is counted and said.
+//! * Nothing downstream is re-wired on plug and unplug: topics live as long as the run.
+//! * A simulated device is a device: it enters as a hot-plug event and is opened as a driver, and
+//!   nothing beyond can tell.
+//! * Between two samples a stream allocates nothing, locks nothing and logs nothing.
+//! * Capture times are `CLOCK_MONOTONIC`; the wall clock is derived from it once an episode.
+//! * A screen sees [`status::Snapshot`]s and sends [`status::Command`]s; it holds no handle into a
+//!   stage.
+//! * Bytes from devices and files never make the program panic. `unsafe` stands in [`driver`] and
+//!   [`bus`] alone.
 
 pub mod app;
 pub mod bus;

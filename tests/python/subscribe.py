@@ -4,11 +4,12 @@
     subscribe.py TOPIC [COUNT] [SECONDS]
 
 Waits at most SECONDS (default 10) for the topic and for every next sample; exit code 3 if none came,
-1 if the topic is of other types than this program expects.
+1 if the topic is of other types than this program expects. RAPID_INSTANCE is what that `rapid` was given as --instance.
 """
 
 import ctypes
 import json
+import os
 import sys
 import time
 
@@ -35,7 +36,7 @@ class SampleHeader(ctypes.Structure):
     @staticmethod
     def type_name() -> str:
         """The name under which the service knows the header: both sides must say the same."""
-        return "SampleHeader"
+        return "RapidSampleHeader"
 
 
 assert ctypes.sizeof(SampleHeader) == 48
@@ -54,12 +55,16 @@ def open_service(node, topic, deadline):
             if time.monotonic() > deadline:
                 print(f"{topic}: no such topic; is rapid running?", file=sys.stderr)
                 sys.exit(NOTHING)
-        time.sleep(0.02)
+        node.wait(iox2.Duration.from_millis(20))
 
 
 def main(topic, count=10, patience=10.0):
     iox2.set_log_level(iox2.LogLevel.Error)
-    node = iox2.NodeBuilder.new().signal_handling_mode(iox2.SignalHandlingMode.Disabled).create(iox2.ServiceType.Ipc)
+    config = iox2.config.default()
+    instance = os.environ.get("RAPID_INSTANCE")
+    if instance:
+        config.global_cfg.prefix = iox2.FileName.new(f"iox2_{instance}_")
+    node = iox2.NodeBuilder.new().config(config).create(iox2.ServiceType.Ipc)
     subscriber = open_service(node, topic, time.monotonic() + patience).subscriber_builder().create()
     deadline = time.monotonic() + patience
     while count > 0:
@@ -68,12 +73,12 @@ def main(topic, count=10, patience=10.0):
             if time.monotonic() > deadline:
                 print(f"no sample on {topic} for {patience} s", file=sys.stderr)
                 return NOTHING
-            time.sleep(0.001)
+            node.wait(iox2.Duration.from_millis(1))
             continue
         header = sample.user_header().contents
         line = {field: getattr(header, field) for field, _ in SampleHeader._fields_}
         line["bytes"] = sample.payload().len()
-        line["first"] = bytes(sample.payload().as_memory_view()[:8]).hex()
+        line["begins"] = bytes(sample.payload().as_memory_view()[:8]).hex()
         print(json.dumps(line), flush=True)
         count -= 1
         deadline = time.monotonic() + patience

@@ -1,0 +1,188 @@
+//! Other programs read what `rapid` publishes: Python, from the wheels `make setup` installs.
+//!
+//! The examples of the README are run as they stand there, but for the names that keep a test apart
+//! from a rig on the same machine.
+
+// The binding is published as a wheel for this architecture alone.
+#![cfg(target_arch = "x86_64")]
+#![expect(clippy::expect_used, reason = "a test ends where what it needs is missing")]
+
+use std::io::{BufRead, BufReader, Read};
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdout, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use rapid::bus::{Bus, TopicId};
+use rapid::mask::{MaskRecord, PhysicalMask};
+use rapid::registry::Registry;
+use rapid::sample::{Encoding, SampleHeader};
+
+/// What the simulated wrist camera would send.
+const PAYLOAD: &[u8] = b"\xff\xd8\xff\xe0 a picture";
+
+/// The Python of `make setup`.
+fn python() -> PathBuf {
+    let python = std::env::var_os("RAPID_PYTHON").map_or_else(
+        || {
+            let cache = std::env::var_os("XDG_CACHE_HOME").map_or_else(
+                || PathBuf::from(std::env::var_os("HOME").expect("a home directory")).join(".cache"),
+                PathBuf::from,
+            );
+            cache.join("rapid/venv/bin/python")
+        },
+        PathBuf::from,
+    );
+    assert!(python.exists(), "no Python environment at {}: run `make setup`", python.display());
+    python
+}
+
+/// The Python example of the README with this text in it.
+fn readme_example(containing: &str) -> String {
+    let readme = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("README.md")).expect("README.md");
+    let mut examples = readme.split("```python\n").skip(1).filter_map(|rest| rest.split("```").next());
+    examples.find(|code| code.contains(containing)).expect("an example in README.md").to_owned()
+}
+
+/// Publishes the wrist camera's topic, twenty samples a second, until dropped.
+struct Camera {
+    instance: String,
+    end: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Camera {
+    fn start(test: &str) -> Self {
+        let instance = format!("py{test}{}", std::process::id());
+        let registry = Registry::builtin();
+        let bus = Bus::open(&registry, Some(&instance)).expect("bus");
+        let device = registry.named("cam_wrist").expect("an entry of the built-in registry").id;
+        let writer = bus.writer(TopicId::Modality(device)).expect("its writer");
+        let end = Arc::new(AtomicBool::new(false));
+        let ended = Arc::clone(&end);
+        let thread = std::thread::spawn(move || {
+            let _bus = bus;
+            for seq in 0.. {
+                if ended.load(Ordering::Relaxed) {
+                    break;
+                }
+                let header = SampleHeader {
+                    seq,
+                    capture_ns: 1_000_000 + seq,
+                    recv_ns: 2_000_000 + seq,
+                    id: u32::from(device.bit()),
+                    epoch: 5,
+                    encoding: Encoding::Mjpeg as u32,
+                    flags: 2,
+                    width: 640,
+                    height: 480,
+                };
+                writer.publish(header, PAYLOAD).expect("publish");
+                std::thread::sleep(Duration::from_millis(50));
+            }
+        });
+        Self { instance, end, thread: Some(thread) }
+    }
+}
+
+impl Drop for Camera {
+    fn drop(&mut self) {
+        self.end.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+/// A Python that is ended with the test.
+struct Running(Child);
+
+impl Running {
+    fn start(command: &mut Command) -> (Self, BufReader<ChildStdout>) {
+        let mut child = command.stdout(Stdio::piped()).spawn().expect("python");
+        let output = BufReader::new(child.stdout.take().expect("its output"));
+        (Self(child), output)
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+#[test]
+fn a_subscriber_in_python_sees_headers_and_payloads() {
+    let camera = Camera::start("sub");
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/subscribe.py");
+    let (mut python, mut output) = Running::start(
+        Command::new(python()).arg(script).args(["/rapid/camera/wrist", "5"]).env("RAPID_INSTANCE", &camera.instance),
+    );
+    let mut text = String::new();
+    output.read_to_string(&mut text).expect("its output");
+    assert!(python.0.wait().expect("its end").success(), "{text}");
+
+    let samples: Vec<serde_json::Value> =
+        text.lines().map(|line| serde_json::from_str(line).expect("a line of JSON")).collect();
+    assert_eq!(samples.len(), 5);
+    let first = samples[0]["seq"].as_u64().expect("a sequence number");
+    for (n, sample) in (first..).zip(&samples) {
+        let expected = serde_json::json!({
+            "seq": n, "capture_ns": 1_000_000 + n, "recv_ns": 2_000_000 + n, "id": 0, "epoch": 5, "encoding": 1,
+            "flags": 2, "width": 640, "height": 480, "bytes": PAYLOAD.len(), "begins": "ffd8ffe020612070",
+        });
+        assert_eq!(*sample, expected);
+    }
+}
+
+#[test]
+fn a_topic_that_is_not_there_is_said() {
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/subscribe.py");
+    let ended = Command::new(python())
+        .arg(script)
+        .args(["/rapid/camera/wrist", "1", "0.1"])
+        .env("RAPID_INSTANCE", format!("pynone{}", std::process::id()))
+        .output()
+        .expect("python");
+    assert_eq!(ended.status.code(), Some(3));
+    assert!(String::from_utf8_lossy(&ended.stderr).contains("no such topic"), "{ended:?}");
+}
+
+#[test]
+fn the_subscriber_of_the_readme_runs() {
+    let camera = Camera::start("readme");
+    let plain = "iox2.NodeBuilder.new()";
+    let apart = format!(
+        "config = iox2.config.default()\nconfig.global_cfg.prefix = iox2.FileName.new('iox2_{}_')\n",
+        camera.instance
+    );
+    let example = readme_example(plain).replace(plain, &format!("{plain}.config(config)"));
+    let code = example.replace("import iceoryx2 as iox2\n", &format!("import iceoryx2 as iox2\n{apart}"));
+    let (_python, output) = Running::start(Command::new(python()).args(["-u", "-c", &code]));
+    let line = output.lines().next().expect("a line").expect("of text");
+    let fields: Vec<&str> = line.split_whitespace().collect();
+    assert_eq!(fields[1..], ["640", "480", &PAYLOAD.len().to_string()], "{line}");
+    assert!(fields[0].parse::<u64>().is_ok(), "{line}");
+}
+
+#[test]
+fn the_mask_reader_of_the_readme_runs() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = folder.path().join("mask");
+    let record = MaskRecord {
+        device_count: 3,
+        generation: 4,
+        mask: PhysicalMask(0b101),
+        realtime_ns: 1_700_000_000_123_456_789,
+        sequence: 42,
+    };
+    std::fs::write(&file, record.to_bytes()).expect("the record");
+    let code = readme_example("struct.unpack").replace(rapid::mask::MASK_PATH, &file.to_string_lossy());
+    assert!(!code.contains(rapid::mask::MASK_PATH));
+    let ended = Command::new(python()).args(["-c", &code]).output().expect("python");
+    assert!(ended.status.success(), "{ended:?}");
+    assert_eq!(String::from_utf8_lossy(&ended.stdout).trim(), "42 0b101 True False True");
+}
