@@ -15,6 +15,7 @@ use crate::commands::{self, Format, Outcome, devices::Formats, mask::MaskOptions
 use crate::driver::replay;
 use crate::headless::style::{ColourChoice, Palette, Terminal};
 use crate::hotplug::udev;
+use crate::record::inspect::{self, InspectError};
 use crate::record::{EpisodeRequest, RecordError};
 use crate::registry::scenario::Scenario;
 use crate::registry::{Registry, RegistryErrors};
@@ -38,6 +39,8 @@ enum Failure {
     Presence(#[from] PresenceError),
     #[error(transparent)]
     Hotplug(#[from] crate::hotplug::HotplugError),
+    #[error(transparent)]
+    Inspect(#[from] InspectError),
     #[error(transparent)]
     Artifacts(#[from] commands::artifacts::ArtifactsError),
     #[error(transparent)]
@@ -121,8 +124,12 @@ fn print(global: &Global, run: &RunArgs, command: Command) -> Result<(), Failure
         }
         Command::Mask { watch } => mask(global, watch),
         Command::Inspect { file } => {
-            let _ = file;
-            Ok(())
+            let inspection = inspect::inspect(&file)?;
+            if format == Format::Json {
+                serde_json::to_writer(&mut *out, &inspection).map_err(io::Error::from)?;
+                return Ok(writeln!(out)?);
+            }
+            Ok(out.write_all(inspect::render(&inspection, columns(), paint()).as_bytes())?)
         }
         Command::Completions { shell } => Ok(commands::completions::completions(&mut Cli::command(), shell, out)?),
         Command::Replay { .. } => Ok(()),
@@ -249,6 +256,10 @@ fn palette() -> Palette {
 
 fn stderr_palette() -> Palette {
     ColourChoice::Auto.resolve(Terminal::of(&io::stderr()), |name| std::env::var(name).ok())
+}
+
+fn paint() -> inspect::Paint {
+    if palette() == Palette::Ansi { inspect::Paint::Ansi } else { inspect::Paint::Plain }
 }
 
 fn columns() -> usize {

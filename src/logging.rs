@@ -100,11 +100,11 @@ impl StderrSink {
 
     fn render(&self, line: &LogLine) -> String {
         if self.form == Stderr::Json {
-            let time = text::rfc3339(line.wall_ns);
+            let time = crate::time::rfc3339(line.wall_ns);
             let object = serde_json::json!({ "event": "log", "level": line.level, "text": line.text, "time": time });
             return format!("{object}\n");
         }
-        let time = self.palette.faint(&text::time_of_day(line.wall_ns));
+        let time = self.palette.faint(&crate::time::time_of_day(line.wall_ns));
         let level = format!("{:5}", line.level.word());
         format!("{}{time}  {}  {}\n", self.before, self.palette.level(line.level, &level), line.text)
     }

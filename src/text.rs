@@ -115,57 +115,11 @@ pub fn hertz(hz: f64) -> String {
     if hz < 999.95 { format!("{hz:.1}") } else { format!("{hz:.0}") }
 }
 
-/// A wall time as RFC 3339 in UTC with milliseconds: `2023-11-14T22:13:20.123Z`.
-#[must_use]
-pub fn rfc3339(wall_ns: u64) -> String {
-    let (year, month, day) = civil(wall_ns / NS_PER_DAY);
-    format!("{year:04}-{month:02}-{day:02}T{}", time_of_day(wall_ns))
-}
-
-/// The time of day of a wall time in UTC: `22:13:20.123Z`.
-#[must_use]
-pub fn time_of_day(wall_ns: u64) -> String {
-    let ms = wall_ns % NS_PER_DAY / 1_000_000;
-    format!("{:02}:{:02}:{:02}.{:03}Z", ms / 3_600_000, ms / 60_000 % 60, ms / 1000 % 60, ms % 1000)
-}
-
-const NS_PER_DAY: u64 = 86_400_000_000_000;
-
-/// Year, month and day of the proleptic Gregorian calendar, from days since 1970-01-01; the method of
-/// <https://howardhinnant.github.io/date_algorithms.html#civil_from_days> for dates from 1970 on.
-const fn civil(days: u64) -> (u64, u64, u64) {
-    let days = days + 719_468;
-    let era = days / 146_097;
-    let day_of_era = days % 146_097;
-    let year_of_era = (day_of_era - day_of_era / 1460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
-    let day_of_year = day_of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
-    let shifted_month = (5 * day_of_year + 2) / 153;
-    let day = day_of_year - (153 * shifted_month + 2) / 5 + 1;
-    let month = if shifted_month < 10 { shifted_month + 3 } else { shifted_month - 9 };
-    let year = year_of_era + era * 400 + if month <= 2 { 1 } else { 0 };
-    (year, month, day)
-}
-
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
 
     use super::*;
-
-    #[test]
-    fn dates_agree_with_date_minus_u() {
-        for (seconds, expected) in [
-            (0, "1970-01-01T00:00:00.000Z"),
-            (951_782_399, "2000-02-28T23:59:59.000Z"),
-            (951_782_400, "2000-02-29T00:00:00.000Z"),
-            (1_700_000_000, "2023-11-14T22:13:20.000Z"),
-            (1_709_164_800, "2024-02-29T00:00:00.000Z"),
-            (4_107_542_400, "2100-03-01T00:00:00.000Z"),
-        ] {
-            assert_eq!(rfc3339(seconds * 1_000_000_000), expected);
-        }
-        assert_eq!(time_of_day(1_700_000_000_123_456_789), "22:13:20.123Z");
-    }
 
     #[test]
     fn text_is_cut_at_columns_not_bytes() {

@@ -92,19 +92,30 @@ impl WallClock {
 /// A wall-clock time in UTC, to the millisecond: `2026-02-05T10:30:00.000Z` (RFC 3339).
 #[must_use]
 pub fn rfc3339(wall_ns: u64) -> String {
-    let (days, in_day) = (wall_ns / 86_400_000_000_000, wall_ns % 86_400_000_000_000 / 1_000_000);
-    let (year, month, day) = civil(days);
-    let (seconds, milliseconds) = (in_day / 1000, in_day % 1000);
-    let (hour, minute, second) = (seconds / 3600, seconds / 60 % 60, seconds % 60);
-    format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}.{milliseconds:03}Z")
+    let (year, month, day) = date(wall_ns);
+    format!("{year:04}-{month:02}-{day:02}T{}", time_of_day(wall_ns))
 }
+
+/// The time of day of a wall-clock time in UTC: `22:13:20.123Z`.
+#[must_use]
+pub fn time_of_day(wall_ns: u64) -> String {
+    let ms = wall_ns % NS_PER_DAY / 1_000_000;
+    format!("{:02}:{:02}:{:02}.{:03}Z", ms / 3_600_000, ms / 60_000 % 60, ms / 1000 % 60, ms % 1000)
+}
+
+/// Year, month and day of a wall-clock time in UTC.
+#[must_use]
+pub const fn date(wall_ns: u64) -> (u64, u64, u64) {
+    civil(wall_ns / NS_PER_DAY)
+}
+
+const NS_PER_DAY: u64 = 86_400_000_000_000;
 
 /// Year, month and day of a number of days since 1970-01-01, in the Gregorian calendar.
 ///
 /// The year is counted from March, so that the leap day is its last: then the months before any
 /// given one have 153 days for every five of them, and a cycle of 400 years has 146,097 days.
-#[must_use]
-pub const fn civil(days: u64) -> (u64, u64, u64) {
+const fn civil(days: u64) -> (u64, u64, u64) {
     // 0000-03-01 lies 719,468 days before 1970-01-01.
     let shifted = days + 719_468;
     let (cycle, in_cycle) = (shifted / 146_097, shifted % 146_097);
@@ -148,6 +159,7 @@ mod tests {
             assert_eq!(rfc3339(seconds * 1_000_000_000), text);
         }
         assert_eq!(rfc3339(1_770_287_400_250_000_000), "2026-02-05T10:30:00.250Z");
+        assert_eq!(time_of_day(1_700_000_000_123_456_789), "22:13:20.123Z");
     }
 
     #[test]

@@ -12,9 +12,10 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, mpsc};
 use std::time::Duration;
 
+use rapid::bus::TopicId;
 use rapid::mask::PhysicalMask;
 use rapid::modality::ModalityId;
-use rapid::record::{EpisodeRequest, Recorder, RecorderConfig, Source, SourceTopic, encode, schema::SampleSchema};
+use rapid::record::{EpisodeRequest, Recorder, RecorderConfig, Source, encode, schema::SampleSchema};
 use rapid::registry::{CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, WhenStale};
 use rapid::sample::{Encoding, Epoch, SampleHeader};
 use rapid::status::Board;
@@ -116,7 +117,7 @@ impl Source for Camera {
         Ok(())
     }
 
-    fn drain(&mut self, take: &mut dyn FnMut(SourceTopic, &SampleHeader, &[u8])) -> Result<(), String> {
+    fn drain(&mut self, take: &mut dyn FnMut(TopicId, &SampleHeader, &[u8])) -> Result<(), String> {
         if self.begin.is_none() || self.seq == SAMPLES {
             return Ok(());
         }
@@ -124,7 +125,7 @@ impl Source for Camera {
         let encoding = Encoding::Mjpeg as u32;
         let header =
             SampleHeader { seq: self.seq, capture_ns: now, recv_ns: now, epoch: 1, encoding, ..Default::default() };
-        let allocated = count(|| take(SourceTopic::Modality(id()), &header, &self.payload));
+        let allocated = count(|| take(TopicId::Modality(id()), &header, &self.payload));
         if self.seq >= WARM_UP {
             self.allocations.fetch_add(allocated, Ordering::Relaxed);
             self.quiet.fetch_add(u64::from(allocated == 0), Ordering::Relaxed);

@@ -146,7 +146,7 @@ pub fn render_json(record: &MaskRecord, layout: Option<&Layout>, now_ns: u64) ->
         device_count: record.device_count,
         online_count: record.mask.online_count(),
         sequence: record.sequence,
-        time: text::rfc3339(record.realtime_ns),
+        time: crate::time::rfc3339(record.realtime_ns),
         age_ms: (age(record, now_ns).as_secs_f64() * 1e6).round() / 1e3,
         stale: age(record, now_ns) > STALE_AFTER,
         devices: layout.map(|layout| {
@@ -264,7 +264,7 @@ impl Change {
                 Ok(render_json(record, names().as_deref(), now_ns)? + "\n")
             }
             Self::Gone(reason) if options.json => {
-                Ok(format!("{}\n", serde_json::json!({ "gone": reason, "time": text::rfc3339(now_ns) })))
+                Ok(format!("{}\n", serde_json::json!({ "gone": reason, "time": crate::time::rfc3339(now_ns) })))
             }
             Self::Mask { record, before } => {
                 let layout = names();
@@ -278,16 +278,18 @@ impl Change {
                 Ok(watched(record, &edges.join(" "), palette))
             }
             Self::Back(record) => Ok(watched(record, &palette.good("the publisher is back"), palette)),
-            Self::Gone(reason) => {
-                Ok(format!("{}  {}\n", palette.faint(&text::time_of_day(now_ns)), palette.bad(&text::plain(reason))))
-            }
+            Self::Gone(reason) => Ok(format!(
+                "{}  {}\n",
+                palette.faint(&crate::time::time_of_day(now_ns)),
+                palette.bad(&text::plain(reason))
+            )),
         }
     }
 }
 
 fn watched(record: &MaskRecord, remark: &str, palette: Palette) -> String {
     let count = usize::from(record.device_count);
-    let time = palette.faint(&text::time_of_day(record.realtime_ns));
+    let time = palette.faint(&crate::time::time_of_day(record.realtime_ns));
     format!("{time}  {}  {}  {remark}\n", record.mask.hex(count), record.mask.binary(count))
 }
 

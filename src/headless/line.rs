@@ -16,7 +16,7 @@ struct Timed<'a> {
 
 /// An event as one JSON object, with `time` as RFC 3339 in UTC; without a line end.
 pub(super) fn json(event: &Event, wall_ns: u64) -> serde_json::Result<String> {
-    serde_json::to_string(&Timed { event, time: text::rfc3339(wall_ns) })
+    serde_json::to_string(&Timed { event, time: crate::time::rfc3339(wall_ns) })
 }
 
 /// Columns of the lines for people.
@@ -72,7 +72,7 @@ impl Columns {
                 (&"log".to_owned(), None, word, text.clone())
             }
         };
-        let time = palette.faint(&text::time_of_day(wall_ns));
+        let time = palette.faint(&crate::time::time_of_day(wall_ns));
         let subject = text::left(&text::plain(subject), self.name, "…");
         let bit = bit.map_or_else(|| " ".repeat(6), |bit| format!("bit {:<2}", bit.bit()));
         format!("{time}  {subject}  {}  {word}  {}", palette.faint(&bit), text::plain(&rest))

@@ -179,10 +179,10 @@ impl Printer {
         self.tally.miss(missed);
         self.tally.agree(now);
         let line = if self.json {
-            let time = text::rfc3339(self.wall.wall_ns(now.taken));
+            let time = crate::time::rfc3339(self.wall.wall_ns(now.taken));
             serde_json::json!({ "event": "missed", "count": missed, "time": time }).to_string()
         } else {
-            let time = text::time_of_day(self.wall.wall_ns(now.taken));
+            let time = crate::time::time_of_day(self.wall.wall_ns(now.taken));
             let palette = self.columns.palette;
             format!("{}  {}", palette.faint(&time), palette.warn(&format!("{missed} events missed: output was behind")))
         };

@@ -72,7 +72,7 @@ pub(super) fn json(
     wall_ns: u64,
 ) -> serde_json::Result<String> {
     serde_json::to_string(&Progress {
-        time: text::rfc3339(wall_ns),
+        time: crate::time::rfc3339(wall_ns),
         elapsed: elapsed.as_secs_f64(),
         duration: duration.map(|duration| duration.as_secs_f64()),
         mask: snapshot.mask.hex(snapshot.devices.len()),

@@ -12,6 +12,7 @@ use rustix::io::Errno;
 use serde::Serialize;
 
 use super::RecordError;
+use crate::time;
 
 /// Longest slug of a task in bytes: with date, number and endings a name stays far below the 255
 /// bytes a file name may have.
@@ -147,16 +148,7 @@ pub(super) fn slug(task: &str) -> String {
 
 /// The day in UTC, `20261121`, so that names sort by time and do not depend on the rig's time zone.
 fn date(wall_ns: u64) -> String {
-    let days = wall_ns / 1_000_000_000 / 86_400;
-    // Days to a civil date: http://howardhinnant.github.io/date_algorithms.html, civil_from_days.
-    let z = days + 719_468;
-    let (era, day_of_era) = (z / 146_097, z % 146_097);
-    let year_of_era = (day_of_era - day_of_era / 1460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
-    let day_of_year = day_of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
-    let month_from_march = (5 * day_of_year + 2) / 153;
-    let day = day_of_year - (153 * month_from_march + 2) / 5 + 1;
-    let month = if month_from_march < 10 { month_from_march + 3 } else { month_from_march - 9 };
-    let year = year_of_era + era * 400 + u64::from(month <= 2);
+    let (year, month, day) = time::date(wall_ns);
     format!("{year:04}{month:02}{day:02}")
 }
 

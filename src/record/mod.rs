@@ -28,7 +28,7 @@ use std::path::PathBuf;
 pub use episode::{EpisodeReport, EpisodeRequest};
 pub use file::Sink;
 pub use recorder::{Recorder, RecorderConfig};
-pub use source::{Source, SourceTopic};
+pub use source::Source;
 
 /// Why an episode cannot be recorded.
 #[derive(Debug, thiserror::Error)]

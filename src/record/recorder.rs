@@ -23,7 +23,8 @@ use super::RecordError;
 use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest};
 use super::file::Sink;
 use super::session::{Attached, Beginning, MaskHistory, Session};
-use super::source::{Source, SourceTopic};
+use super::source::Source;
+use crate::bus::TopicId;
 use crate::mask::PhysicalMask;
 use crate::modality::MAX_MODALITIES;
 use crate::registry::Registry;
@@ -344,15 +345,15 @@ impl Writer {
 }
 
 impl Streams {
-    fn take(&mut self, session: Option<&mut Session>, topic: SourceTopic, header: &SampleHeader, payload: &[u8]) {
+    fn take(&mut self, session: Option<&mut Session>, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
         match topic {
-            SourceTopic::Modality(id) => {
+            TopicId::Modality(id) => {
                 let lost = self.next.get_mut(id.index()).map_or(0, |next| hole(next, header.seq));
                 if let Some(session) = session {
                     session.sample(id, header, payload, lost);
                 }
             }
-            SourceTopic::Mask => {
+            TopicId::Mask => {
                 let Some((mask, sequence)) = read_mask(payload) else { return };
                 let lost = hole(&mut self.next_mask, sequence);
                 self.masks.push(header, mask, sequence);

@@ -1,18 +1,9 @@
-//! What the recorder takes its samples from.
+//! What the recorder takes its samples from: an inbox of the bus, or a test's script.
 
 use std::time::Duration;
 
-use crate::modality::ModalityId;
+use crate::bus::{Inbox, TopicId};
 use crate::sample::SampleHeader;
-
-/// Where a sample comes from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum SourceTopic {
-    /// A modality.
-    Modality(ModalityId),
-    /// The physical mask: the payload is u64 mask, u64 sequence, little endian.
-    Mask,
-}
 
 /// A consumer's end of the bus.
 pub trait Source: Send {
@@ -26,22 +17,15 @@ pub trait Source: Send {
     ///
     /// # Errors
     /// When the bus cannot be read; the text says why.
-    fn drain(&mut self, take: &mut dyn FnMut(SourceTopic, &SampleHeader, &[u8])) -> Result<(), String>;
+    fn drain(&mut self, take: &mut dyn FnMut(TopicId, &SampleHeader, &[u8])) -> Result<(), String>;
 }
 
-impl Source for crate::bus::Inbox {
+impl Source for Inbox {
     fn wait(&mut self, timeout: Duration) -> Result<(), String> {
         Self::wait(self, timeout).map_err(|error| error.to_string())
     }
 
-    fn drain(&mut self, take: &mut dyn FnMut(SourceTopic, &SampleHeader, &[u8])) -> Result<(), String> {
-        Self::drain(self, &mut |topic, header, bytes| {
-            let topic = match topic {
-                crate::bus::TopicId::Modality(id) => SourceTopic::Modality(id),
-                crate::bus::TopicId::Mask => SourceTopic::Mask,
-            };
-            take(topic, header, bytes);
-        })
-        .map_err(|error| error.to_string())
+    fn drain(&mut self, take: &mut dyn FnMut(TopicId, &SampleHeader, &[u8])) -> Result<(), String> {
+        Self::drain(self, take).map_err(|error| error.to_string())
     }
 }

@@ -10,6 +10,7 @@ use std::time::Duration;
 use prost_reflect::{DescriptorPool, DynamicMessage, ReflectMessage, Value};
 
 use super::*;
+use crate::bus::TopicId;
 use crate::modality::ModalityId;
 use crate::registry::{
     CameraSpec, DeviceSpec, Framing, IdentitySpec, NodeSpec, Parse, PixelFormat, Registry, RigSpec, SerialSpec,
@@ -25,7 +26,7 @@ const TOF: u8 = 1;
 const NEVER: u8 = 5;
 const RAW: u8 = 7;
 
-type Sample = (SourceTopic, SampleHeader, Vec<u8>);
+type Sample = (TopicId, SampleHeader, Vec<u8>);
 
 /// A source that hands over what a test puts in.
 #[derive(Clone, Default)]
@@ -56,7 +57,7 @@ impl Source for Script {
         Ok(())
     }
 
-    fn drain(&mut self, take: &mut dyn FnMut(SourceTopic, &SampleHeader, &[u8])) -> Result<(), String> {
+    fn drain(&mut self, take: &mut dyn FnMut(TopicId, &SampleHeader, &[u8])) -> Result<(), String> {
         let (samples, panics) = {
             let mut queue = self.0.0.lock().unwrap();
             (std::mem::take(&mut queue.samples), queue.panics)
@@ -160,7 +161,7 @@ impl Bench {
             width: 4,
             height: 2,
         };
-        self.script.put((SourceTopic::Modality(id(bit)), header, payload));
+        self.script.put((TopicId::Modality(id(bit)), header, payload));
     }
 
     fn mask(&self, mask: u64, sequence: u64, capture: u64) {
@@ -172,7 +173,7 @@ impl Bench {
             encoding: Encoding::Mask as u32,
             ..SampleHeader::default()
         };
-        self.script.put((SourceTopic::Mask, header, payload));
+        self.script.put((TopicId::Mask, header, payload));
     }
 
     /// One second of a rig, laid out from `t0` on: the camera is away in the middle, the line of the
@@ -595,13 +596,13 @@ async fn what_a_device_should_not_send_is_recorded_as_bytes_and_never_lost() {
     let finished = bench.recorder.start(bench.request(None)).await.unwrap();
     let now = Stamp::now().0;
     let header = SampleHeader { seq: 0, capture_ns: now, recv_ns: now, epoch: 1, encoding: 99, ..Default::default() };
-    bench.script.put((SourceTopic::Modality(id(CAM)), header, b"??".to_vec()));
+    bench.script.put((TopicId::Modality(id(CAM)), header, b"??".to_vec()));
     let header = SampleHeader { seq: u64::MAX, encoding: Encoding::F64 as u32, ..header };
-    bench.script.put((SourceTopic::Modality(id(TOF)), header, b"12345".to_vec()));
+    bench.script.put((TopicId::Modality(id(TOF)), header, b"12345".to_vec()));
     let header = SampleHeader { seq: 3, encoding: Encoding::F64 as u32, ..header };
-    bench.script.put((SourceTopic::Modality(id(TOF)), header, b"12345678".to_vec()));
-    bench.script.put((SourceTopic::Modality(id(40)), header, b"not registered".to_vec()));
-    bench.script.put((SourceTopic::Mask, header, b"short".to_vec()));
+    bench.script.put((TopicId::Modality(id(TOF)), header, b"12345678".to_vec()));
+    bench.script.put((TopicId::Modality(id(40)), header, b"not registered".to_vec()));
+    bench.script.put((TopicId::Mask, header, b"short".to_vec()));
     while Stamp::now().0 <= now {}
     assert_eq!(bench.recorder.stop().await.unwrap().error, None);
     let read = read(&finished);

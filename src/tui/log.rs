@@ -34,7 +34,7 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Them
 }
 
 fn render(line: &LogLine, width: u16, theme: Theme) -> Line<'static> {
-    let time = text::time_of_day(line.wall_ns);
+    let time = crate::time::time_of_day(line.wall_ns);
     let time = time.trim_end_matches('Z').to_owned();
     let room = usize::from(width).saturating_sub(time.len() + 8);
     let text = text::cut(&theme.safe(&line.text), room, theme.ellipsis()).into_owned();

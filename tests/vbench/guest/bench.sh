@@ -1,0 +1,66 @@
+# The words a guest script is written in. The harness writes run.sh, which names the programs and sources this file.
+# Results belong in $out; whatever lies there when the script ends goes back to the host.
+set -u
+out=/tmp/bench/out
+
+# wait_for SECONDS COMMAND...: until the command succeeds.
+wait_for() {
+  local limit=$1 end=$((SECONDS + $1)); shift
+  until "$@" >/dev/null 2>&1; do
+    [ $SECONDS -lt "$end" ] || { echo "bench: gave up after $limit s: $*"; return 1; }
+    sleep 0.1
+  done
+}
+
+# said FILE FRAGMENT...: one line of FILE holds every fragment.
+said() {
+  local file=$1 lines fragment; shift
+  lines=$(cat "$file" 2>/dev/null)
+  for fragment in "$@"; do lines=$(grep -F -- "$fragment" <<<"$lines") || return 1; done
+}
+
+# emu_start SPEC...: the emulator. It opens its FIFO for writing too: at end of file it would unplug everything and quit.
+emu_start() {
+  mkfifo /tmp/emu.ctl
+  "${usbemu[@]}" "$@" 0<>/tmp/emu.ctl >"$out/emu.jsonl" 2>"$out/emu.err" &
+  emu_pid=$!
+  exec 7>/tmp/emu.ctl
+  wait_for 30 said "$out/emu.jsonl" '"action":"ready"' || fail "the emulator did not start: $(cat "$out/emu.err")"
+}
+
+# emu COMMAND...: one line to the emulator.
+emu() { echo "$*" >&7; }
+
+# emu_quit: what is still plugged is pulled, and the log is complete.
+emu_quit() { emu quit; wait "$emu_pid"; }
+
+# attached PORT... / detached PORT...: the kernel has, or no longer has, a device in each of these ports.
+attached() { local port; for port in "$@"; do [ -e "/sys/bus/usb/devices/1-$((port + 1))/bConfigurationValue" ] || return 1; done; }
+detached() { local port; for port in "$@"; do [ ! -e "/sys/bus/usb/devices/1-$((port + 1))" ] || return 1; done; }
+
+# property NODE KEY: a udev property of a device node.
+property() { udevadm info --query=property --name="$1" | sed -n "s/^$2=//p"; }
+
+# rapid_start ARGUMENT...: rapid in the background; its output in rapid.jsonl, its log in rapid.log.
+rapid_start() {
+  "${rapid[@]}" "$@" >"$out/rapid.jsonl" 2>"$out/rapid.log" &
+  rapid_pid=$!
+}
+
+# await_rapid SECONDS FRAGMENT...: until rapid has printed a line with all of them, or has ended without.
+await_rapid() {
+  local limit=$1 end=$((SECONDS + $1)); shift
+  until said "$out/rapid.jsonl" "$@"; do
+    kill -0 "$rapid_pid" 2>/dev/null || { echo "bench: rapid ended before it said: $*"; rapid_wait; return 1; }
+    [ $SECONDS -lt "$end" ] || { echo "bench: rapid did not say within $limit s: $*"; return 1; }
+    sleep 0.2
+  done
+}
+
+# rapid_wait: waits for its end and keeps its exit code.
+rapid_wait() {
+  wait "$rapid_pid"
+  echo $? >"$out/rapid.rc"
+}
+
+fail() { echo "bench: $*"; exit 1; }

@@ -1,0 +1,19 @@
+//! The emulator: USB devices in user space, attached to the stock kernel's `vhci_hcd` over a socket pair.
+//!
+//! A `DeviceSpec` becomes a `Function` (what the device is) inside a `Device` (its attachment and beat); the script plugs and
+//! unplugs. The kernel sees ordinary USB devices, so every driver, node and udev rule above is the real one.
+//!
+//! Invariant: a number (frame or line) is given out only to data that is sent whole, so a hole in what a reader got is the
+//! reader's loss, never the emulator's.
+//! Invariant: nothing a host asks of a device panics; what is unknown is stalled, as hardware does.
+
+pub mod descriptor;
+pub mod device;
+pub mod frame;
+pub mod function;
+pub mod log;
+pub mod script;
+pub mod serial;
+pub mod spec;
+pub mod uvc;
+pub mod wire;

@@ -1,0 +1,315 @@
+//! A USB Video Class 1.0 camera with one bulk endpoint.
+//!
+//! Bulk, because `vhci_hcd` completes bulk transfers as they come, while isochronous ones would need a schedule that a
+//! loaded machine cannot keep; above the endpoint `uvcvideo` treats both alike.
+//! Invariant: a stream lives from COMMIT to CLEAR_FEATURE(HALT), which is how Linux starts and stops a bulk camera.
+
+use std::time::Duration;
+
+use super::descriptor::{Answer, CS_INTERFACE, Configuration, DeviceClass, Setup};
+use super::frame::{self, FrameId};
+use super::function::{DATA_IN, Live};
+use super::spec::{Format, Mode};
+
+/// A payload fills one of `uvcvideo`'s bulk transfers, which are 32 packets of 512 bytes at most.
+const PAYLOAD: u32 = 16 * 1024;
+const PAYLOAD_HEADER: u8 = 2;
+const PROBE_LEN: usize = 26;
+const VS_INTERFACE: u16 = 1;
+/// Interval unit of the class: 100 ns.
+const INTERVALS_PER_SECOND: u32 = 10_000_000;
+
+const GUID_YUYV: [u8; 16] = [b'Y', b'U', b'Y', b'2', 0, 0, 0x10, 0, 0x80, 0, 0, 0xaa, 0, 0x38, 0x9b, 0x71];
+
+/// The pictures of one size, encoded once and shared by all cameras of that size.
+pub type Pictures = std::sync::Arc<Vec<Vec<u8>>>;
+
+/// A camera.
+#[derive(Debug)]
+pub struct Uvc {
+    formats: Vec<FormatGroup>,
+    probe: Selection,
+    committed: Selection,
+    stream: Option<u32>,
+    streams: u32,
+    next_frame: u32,
+    payload_parity: u8,
+}
+
+/// The modes of one pixel format, which the class numbers together.
+#[derive(Debug)]
+struct FormatGroup {
+    format: Format,
+    modes: Vec<(Mode, Pictures)>,
+}
+
+/// What probe and commit negotiate; indices count from 1 on the wire and from 0 here.
+#[derive(Clone, Copy, Debug)]
+struct Selection {
+    format: usize,
+    mode: usize,
+    interval: u32,
+}
+
+impl Uvc {
+    /// A camera with these modes, grouped by format in order of first appearance, whose first frame is number `first`.
+    pub fn new(modes: Vec<(Mode, Pictures)>, first: u32) -> Self {
+        let mut formats: Vec<FormatGroup> = Vec::new();
+        for (mode, pictures) in modes {
+            match formats.iter_mut().find(|group| group.format == mode.format) {
+                Some(group) => group.modes.push((mode, pictures)),
+                None => formats.push(FormatGroup { format: mode.format, modes: vec![(mode, pictures)] }),
+            }
+        }
+        let default = Selection { format: 0, mode: 0, interval: interval(formats[0].modes[0].0.fps[0]) };
+        Self {
+            formats,
+            probe: default,
+            committed: default,
+            stream: None,
+            streams: 0,
+            next_frame: first,
+            payload_parity: 0,
+        }
+    }
+
+    /// Miscellaneous device with an interface association, as every UVC camera.
+    pub fn class(&self) -> DeviceClass {
+        DeviceClass { class: [0xef, 2, 1], release: 0x0100 }
+    }
+
+    /// One camera terminal, one output terminal, one streaming interface.
+    pub fn configuration(&self) -> Vec<u8> {
+        let mut formats = Configuration::default();
+        for (index, group) in (1u8..).zip(&self.formats) {
+            group.describe(index, &mut formats);
+        }
+        let formats = formats.into_body();
+        let count = u8::try_from(self.formats.len()).expect("two formats exist");
+        let header_len = 13 + u16::from(count);
+        let total = (header_len + u16::try_from(formats.len()).expect("a few dozen modes")).to_le_bytes();
+        let mut header = vec![CS_INTERFACE, 1, count, total[0], total[1], DATA_IN, 0, 2, 0, 0, 0, 1];
+        header.resize(usize::from(header_len) - 1, 0);
+
+        let clock = 48_000_000u32.to_le_bytes();
+        let control_total = 13 + 18 + 9;
+        Configuration::default()
+            .push(&[11, 0, 2, 0x0e, 3, 0, 2])
+            .interface(0, 0, [0x0e, 1, 0])
+            .push(&[CS_INTERFACE, 1, 0x00, 0x01, control_total, 0, clock[0], clock[1], clock[2], clock[3], 1, 1])
+            .push(&[CS_INTERFACE, 2, 1, 0x01, 0x02, 0, 0, 0, 0, 0, 0, 0, 0, 3, 0, 0, 0])
+            .push(&[CS_INTERFACE, 3, 2, 0x01, 0x01, 0, 1, 0])
+            .interface(1, 1, [0x0e, 2, 0])
+            .push(&header)
+            .append(&formats)
+            .bulk(DATA_IN)
+            .finish()
+    }
+
+    /// Probe and commit; the camera has no other controls.
+    pub fn control(&mut self, setup: Setup, data: &[u8]) -> Answer {
+        let selector = setup.value >> 8;
+        if setup.kind & 0x7f != 0x21 || setup.index & 0xff != VS_INTERFACE || !(1..=2).contains(&selector) {
+            return Answer::Stall;
+        }
+        let is_commit = selector == 2;
+        match setup.request {
+            0x01 => {
+                let selection = self.negotiate(data);
+                self.probe = selection;
+                if is_commit {
+                    self.committed = selection;
+                    self.streams += 1;
+                    self.stream = Some(self.streams);
+                }
+                Answer::Done
+            }
+            0x81..=0x84 | 0x87 => Answer::Data(self.wire(if is_commit { self.committed } else { self.probe })),
+            0x85 => Answer::Data(vec![PROBE_LEN as u8, 0]),
+            0x86 => Answer::Data(vec![0b11]),
+            _ => Answer::Stall,
+        }
+    }
+
+    /// The stream is over.
+    pub fn stop(&mut self) {
+        self.stream = None;
+    }
+
+    /// The running stream and its frame period.
+    pub fn live(&self) -> Option<Live> {
+        let period = Duration::from_nanos(u64::from(self.committed.interval) * 100);
+        self.stream.map(|stream| Live { stream, period })
+    }
+
+    /// Writes the next frame over `out`.
+    pub fn frame(&mut self, sent_ns: u64, out: &mut Vec<u8>) {
+        let (mode, pictures) = self.mode(self.committed);
+        let id = FrameId { number: self.next_frame, sent_ns };
+        match mode.format {
+            Format::Mjpg => frame::stamp_jpeg(&pictures[id.number as usize % pictures.len()], id, out),
+            Format::Yuyv => frame::stamp_yuyv(mode.width, mode.height, id, out),
+        }
+    }
+
+    /// The frame was sent whole: the next one gets the next number.
+    pub fn sent(&mut self) {
+        self.next_frame = self.next_frame.wrapping_add(1);
+        self.payload_parity ^= 1;
+    }
+
+    /// Appends the payload that continues `frame` at `at` to `out`; returns where the next one continues.
+    pub fn payload(&self, frame: &[u8], at: usize, room: usize, out: &mut Vec<u8>) -> usize {
+        const END_OF_HEADER: u8 = 0x80;
+        const END_OF_FRAME: u8 = 0x02;
+        let room = room.min(PAYLOAD as usize).saturating_sub(usize::from(PAYLOAD_HEADER)).max(1);
+        let end = frame.len().min(at + room);
+        let last = if end == frame.len() { END_OF_FRAME } else { 0 };
+        out.extend_from_slice(&[PAYLOAD_HEADER, END_OF_HEADER | last | self.payload_parity]);
+        out.extend_from_slice(&frame[at..end]);
+        end
+    }
+
+    fn mode(&self, selection: Selection) -> &(Mode, Pictures) {
+        &self.formats[selection.format].modes[selection.mode]
+    }
+
+    /// The nearest the camera has to what the host proposes.
+    fn negotiate(&self, data: &[u8]) -> Selection {
+        let byte = |at: usize| usize::from(data.get(at).copied().unwrap_or(0));
+        let format = byte(2).saturating_sub(1).min(self.formats.len() - 1);
+        let modes = &self.formats[format].modes;
+        let mode = byte(3).saturating_sub(1).min(modes.len() - 1);
+        let wanted = data.get(4..8).map_or(0, |b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]));
+        let offered = modes[mode].0.fps.iter().map(|fps| interval(*fps));
+        let default = interval(modes[mode].0.fps[0]);
+        let interval =
+            if wanted == 0 { default } else { offered.min_by_key(|i| i.abs_diff(wanted)).unwrap_or(default) };
+        Selection { format, mode, interval }
+    }
+
+    fn wire(&self, selection: Selection) -> Vec<u8> {
+        let mut bytes = vec![0; PROBE_LEN];
+        bytes[0] = 1;
+        bytes[2] = selection.format as u8 + 1;
+        bytes[3] = selection.mode as u8 + 1;
+        bytes[4..8].copy_from_slice(&selection.interval.to_le_bytes());
+        bytes[18..22].copy_from_slice(&frame_bytes(&self.mode(selection).0).to_le_bytes());
+        bytes[22..26].copy_from_slice(&PAYLOAD.to_le_bytes());
+        bytes
+    }
+}
+
+impl FormatGroup {
+    fn describe(&self, index: u8, out: &mut Configuration) {
+        let count = u8::try_from(self.modes.len()).expect("a few dozen modes");
+        let frame_subtype = match self.format {
+            Format::Mjpg => {
+                out.push(&[CS_INTERFACE, 6, index, count, 1, 1, 0, 0, 0, 0]);
+                7
+            }
+            Format::Yuyv => {
+                out.push(&[&[CS_INTERFACE, 4, index, count], &GUID_YUYV[..], &[16, 1, 0, 0, 0, 0]].concat());
+                5
+            }
+        };
+        for (number, (mode, _)) in (1u8..).zip(&self.modes) {
+            let rate = |fps: &u32| frame_bytes(mode) * 8 * fps;
+            let (slow, fast) = (mode.fps.iter().map(rate).min(), mode.fps.iter().map(rate).max());
+            let mut frame = vec![CS_INTERFACE, frame_subtype, number, 0];
+            frame.extend(mode.width.to_le_bytes());
+            frame.extend(mode.height.to_le_bytes());
+            for word in [slow.unwrap_or(0), fast.unwrap_or(0), frame_bytes(mode), interval(mode.fps[0])] {
+                frame.extend(word.to_le_bytes());
+            }
+            frame.push(u8::try_from(mode.fps.len()).expect("a few rates"));
+            // The class wants them from shortest to longest.
+            let mut intervals: Vec<u32> = mode.fps.iter().map(|fps| interval(*fps)).collect();
+            intervals.sort_unstable();
+            frame.extend(intervals.iter().flat_map(|interval| interval.to_le_bytes()));
+            out.push(&frame);
+        }
+        out.push(&[CS_INTERFACE, 13, 1, 1, 4]);
+    }
+}
+
+fn interval(fps: u32) -> u32 {
+    INTERVALS_PER_SECOND / fps
+}
+
+/// An upper bound for both formats.
+fn frame_bytes(mode: &Mode) -> u32 {
+    u32::from(mode.width) * u32::from(mode.height) * 2
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::emu::descriptor::check_configuration;
+
+    fn camera() -> Uvc {
+        let pictures = Pictures::new(frame::jpegs(64, 48).unwrap());
+        let mode =
+            |format, width, height, fps: &[u32]| (Mode { format, width, height, fps: fps.to_vec() }, pictures.clone());
+        Uvc::new(
+            vec![
+                mode(Format::Mjpg, 640, 480, &[30, 15]),
+                mode(Format::Yuyv, 320, 240, &[30]),
+                mode(Format::Mjpg, 320, 240, &[30]),
+            ],
+            0,
+        )
+    }
+
+    #[test]
+    fn configuration_lengths_add_up() {
+        let bytes = camera().configuration();
+        check_configuration(&bytes);
+        // The streaming header's own wTotalLength spans from it to the endpoint.
+        let at = bytes.windows(4).position(|w| w == [15, CS_INTERFACE, 1, 2]).unwrap();
+        let total = usize::from(u16::from_le_bytes([bytes[at + 4], bytes[at + 5]]));
+        assert_eq!(at + total, bytes.len() - 7);
+    }
+
+    #[test]
+    fn negotiation_gives_the_nearest_mode() {
+        let mut camera = camera();
+        let mut wanted = vec![0; PROBE_LEN];
+        wanted[2] = 1;
+        wanted[3] = 1;
+        wanted[4..8].copy_from_slice(&600_000u32.to_le_bytes());
+        let set = |value| Setup { kind: 0x21, request: 1, value, index: 1, length: 26 };
+        assert_eq!(camera.control(set(0x0100), &wanted), Answer::Done);
+        assert!(camera.live().is_none());
+        assert_eq!(camera.control(set(0x0200), &wanted), Answer::Done);
+        assert_eq!(camera.live().map(|live| live.period), Some(Duration::from_nanos(66_666_600)));
+        let get = Setup { kind: 0xa1, request: 0x81, value: 0x0200, index: 1, length: 26 };
+        let Answer::Data(got) = camera.control(get, &[]) else { panic!("no data") };
+        assert_eq!((got[2], got[3], got.len()), (1, 1, PROBE_LEN));
+        assert_eq!(camera.control(Setup { value: 0x0900, ..get }, &[]), Answer::Stall);
+        camera.stop();
+        assert!(camera.live().is_none());
+    }
+
+    #[test]
+    fn payloads_put_the_frame_together_again() {
+        let mut camera = camera();
+        let mut frame = Vec::new();
+        camera.frame(7, &mut frame);
+        let (mut at, mut whole, mut packets) = (0, Vec::new(), 0);
+        while at < frame.len() {
+            let mut packet = Vec::new();
+            at = camera.payload(&frame, at, 512, &mut packet);
+            assert!(packet.len() <= 512);
+            assert_eq!(packet[1] & 0x02 != 0, at == frame.len());
+            whole.extend_from_slice(&packet[2..]);
+            packets += 1;
+        }
+        assert!(packets > 1);
+        assert_eq!(whole, frame);
+        assert_eq!(frame::identity(&frame), Some(FrameId { number: 0, sent_ns: 7 }));
+        camera.sent();
+        camera.frame(8, &mut frame);
+        assert_eq!(frame::identity(&frame).map(|id| id.number), Some(1));
+    }
+}

@@ -1,0 +1,60 @@
+//! Delays between what was done to a device and what came of it.
+//!
+//! Invariant: an effect counts for a cause only before the next cause; what never came is counted, not left out.
+
+use std::fmt;
+
+/// Delays of one kind, ms.
+#[derive(Clone, Debug, Default)]
+pub struct Delays {
+    found: Vec<f64>,
+    missing: usize,
+}
+
+impl Delays {
+    /// For each cause the first effect at or after it, before the next cause. Times are ns on one clock; effects are sorted.
+    pub fn between(causes: &[u64], effects: &[u64]) -> Self {
+        let mut delays = Self::default();
+        for (place, cause) in causes.iter().enumerate() {
+            let end = causes.get(place + 1).copied().unwrap_or(u64::MAX);
+            match effects.iter().find(|effect| (*cause..end).contains(effect)) {
+                Some(effect) => delays.found.push((effect - cause) as f64 / 1e6),
+                None => delays.missing += 1,
+            }
+        }
+        delays.found.sort_by(f64::total_cmp);
+        delays
+    }
+
+    /// The value that this share of the delays does not exceed (nearest rank).
+    pub fn quantile(&self, share: f64) -> Option<f64> {
+        let rank = (share * self.found.len() as f64).ceil() as usize;
+        self.found.get(rank.max(1) - 1).copied()
+    }
+}
+
+impl fmt::Display for Delays {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let of = self.found.len() + self.missing;
+        write!(f, "n={}/{of}", self.found.len())?;
+        for (name, share) in [("min", 0.0), ("p50", 0.5), ("p95", 0.95), ("max", 1.0)] {
+            if let Some(value) = self.quantile(share) {
+                write!(f, " {name}={value:.1}")?;
+            }
+        }
+        f.write_str(" ms")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn effects_belong_to_the_cause_before_them() {
+        let ms = |all: &[u64]| all.iter().map(|value| value * 1_000_000).collect::<Vec<_>>();
+        let delays = Delays::between(&ms(&[100, 200, 300]), &ms(&[50, 130, 140, 310]));
+        assert_eq!(delays.to_string(), "n=2/3 min=10.0 p50=10.0 p95=30.0 max=30.0 ms");
+        assert_eq!(Delays::between(&[], &[]).to_string(), "n=0/0 ms");
+    }
+}

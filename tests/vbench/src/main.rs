@@ -1,0 +1,76 @@
+//! `usbemu`: emulated USB devices, and the bench's eyes inside the guest.
+
+use std::io;
+use std::path::Path;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::time::Duration;
+
+use vbench::emu::device::Device;
+use vbench::emu::frame::first_number;
+use vbench::emu::function::{Function, PictureStore};
+use vbench::emu::log::{Log, Moment};
+use vbench::emu::script;
+use vbench::emu::spec::{DeviceSpec, PORTS};
+use vbench::probe::{mask, v4l};
+
+const USAGE: &str = "\
+usage: usbemu SPEC...                    emulate; commands on stdin (plug, unplug, silent, port, sleep, t0, at, quit)
+       usbemu --read NODE FRAMES         read a camera, print what came as one JSON object
+       usbemu --watch-mask [SECONDS]     print each change of the physical mask as a JSON line
+
+SPEC: uvc:vid=046d,pid=0825,serial=A,port=0,mode=MJPG-640x480@30[,mode=..]
+      acm:vid=2e8a,pid=000a,serial=B,hz=100
+      ftdi:vid=0403,pid=6001,serial=C,hz=50";
+
+type Failure = Box<dyn std::error::Error>;
+
+fn main() -> ExitCode {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let words: Vec<&str> = arguments.iter().map(String::as_str).collect();
+    let done = match words[..] {
+        [] | ["-h" | "--help"] => {
+            println!("{USAGE}");
+            return if words.is_empty() { ExitCode::FAILURE } else { ExitCode::SUCCESS };
+        }
+        ["--read", node, frames] => read(node, frames),
+        ["--watch-mask"] => watch(None),
+        ["--watch-mask", seconds] => watch(Some(seconds)),
+        _ => emulate(&words),
+    };
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("usbemu: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn emulate(specs: &[&str]) -> Result<(), Failure> {
+    let log = Arc::new(Log::new(Box::new(io::stdout())));
+    let mut store = PictureStore::new();
+    let mut devices = Vec::with_capacity(specs.len());
+    for (index, text) in specs.iter().enumerate() {
+        let spec: DeviceSpec = text.parse()?;
+        let function = Function::new(&spec, first_number(index), &mut store)?;
+        let port =
+            spec.port.or(u8::try_from(index).ok()).filter(|port| *port < PORTS).ok_or("more devices than ports")?;
+        devices.push(Device::new(index, port, function, Arc::clone(&log)));
+    }
+    log.say("ready", Moment::now(), serde_json::json!({"devices": devices.len()}));
+    script::run(io::stdin().lock(), &mut devices, &log);
+    Ok(())
+}
+
+fn read(node: &str, frames: &str) -> Result<(), Failure> {
+    println!("{}", v4l::read(Path::new(node), frames.parse()?)?);
+    Ok(())
+}
+
+fn watch(seconds: Option<&str>) -> Result<(), Failure> {
+    let limit = seconds.map(str::parse).transpose()?.map(Duration::from_secs);
+    let log = Log::new(Box::new(io::stdout()));
+    mask::watch(Path::new(mask::MASK_PATH), limit, &log);
+    Ok(())
+}

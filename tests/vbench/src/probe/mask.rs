@@ -1,0 +1,105 @@
+//! Watches `/dev/shm/rapid_hardware_mask` and prints each change, with the time it was first seen.
+//!
+//! Layout, little endian: bytes "RAPD", u8 version, u8 count, u16 write generation (odd while being written) at 6,
+//! u64 mask at 8, u64 CLOCK_REALTIME ns at 16, u64 sequence at 24.
+//! Invariant: reads only; a record that changed while it was read is read again.
+
+use std::fs::File;
+use std::os::unix::fs::{FileExt, MetadataExt};
+use std::path::Path;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use serde_json::json;
+
+use crate::emu::log::{Log, Moment};
+
+/// Where the mask is published.
+pub const MASK_PATH: &str = "/dev/shm/rapid_hardware_mask";
+const RECORD: usize = 32;
+/// Between two looks. The mask is published every 2 ms.
+const INTERVAL: Duration = Duration::from_micros(500);
+/// Looks between two checks that the file has not been replaced.
+const LOOKS_PER_CHECK: u32 = 100;
+
+/// One reading.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Record {
+    /// Bit per modality.
+    pub mask: u64,
+    /// CLOCK_REALTIME of the publication, ns.
+    pub published_ns: u64,
+    /// Publications so far.
+    pub sequence: u64,
+}
+
+/// A record, unless the bytes are not one.
+pub fn parse(bytes: &[u8; RECORD]) -> Option<Record> {
+    let word = |at: usize| bytes[at..at + 8].try_into().map(u64::from_le_bytes).ok();
+    (&bytes[..4] == b"RAPD").then_some(Record { mask: word(8)?, published_ns: word(16)?, sequence: word(24)? })
+}
+
+/// Prints `mask` lines (and `mask_gone`, `mask_seen` as the file comes and goes) until `limit` has passed.
+pub fn watch(path: &Path, limit: Option<Duration>, log: &Log) {
+    let started = Instant::now();
+    let running = || limit.is_none_or(|limit| started.elapsed() < limit);
+    while running() {
+        let Ok(file) = File::open(path) else {
+            thread::sleep(INTERVAL * 10);
+            continue;
+        };
+        log.say("mask_seen", Moment::now(), json!({}));
+        follow(&file, running, log);
+        log.say("mask_gone", Moment::now(), json!({}));
+    }
+}
+
+fn follow(file: &File, running: impl Fn() -> bool, log: &Log) {
+    let mut last: Option<Record> = None;
+    let mut looks = 0u32;
+    while running() {
+        if let Some(record) = read(file) {
+            if last.is_none_or(|last| last.mask != record.mask) {
+                let fields = json!({
+                    "mask": format!("{:#04x}", record.mask),
+                    "previous": last.map(|last| format!("{:#04x}", last.mask)),
+                    "sequence": record.sequence,
+                    "published_ns": record.published_ns,
+                });
+                log.say("mask", Moment::now(), fields);
+            }
+            last = Some(record);
+        }
+        looks += 1;
+        if looks.is_multiple_of(LOOKS_PER_CHECK) && file.metadata().is_ok_and(|meta| meta.nlink() == 0) {
+            return;
+        }
+        thread::sleep(INTERVAL);
+    }
+}
+
+fn read(file: &File) -> Option<Record> {
+    let mut bytes = [0; RECORD];
+    file.read_exact_at(&mut bytes, 0).ok()?;
+    let mut again = [0; 2];
+    file.read_exact_at(&mut again, 6).ok()?;
+    let torn = bytes[6] & 1 == 1 || bytes[6..8] != again;
+    (!torn).then(|| parse(&bytes)).flatten()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn reads_the_published_layout() {
+        let mut bytes = [0; RECORD];
+        bytes[..4].copy_from_slice(b"RAPD");
+        bytes[8] = 5;
+        bytes[16..24].copy_from_slice(&7u64.to_le_bytes());
+        bytes[24] = 9;
+        assert_eq!(parse(&bytes), Some(Record { mask: 5, published_ns: 7, sequence: 9 }));
+        bytes[0] = b'X';
+        assert_eq!(parse(&bytes), None);
+    }
+}

@@ -1,0 +1,189 @@
+//! A recorded episode, read back: messages by topic, and what the bench's devices put into them.
+//!
+//! Invariant: reads the file with the public `mcap` crate and the documented schemas only, never with `rapid`'s own code.
+
+use std::collections::BTreeSet;
+use std::ops::RangeBounds;
+use std::path::{Path, PathBuf};
+
+use thiserror::Error;
+
+use crate::emu::frame::{self, FrameId};
+use crate::proto;
+
+/// Why a recording could not be read.
+#[derive(Debug, Error)]
+pub enum RecordingError {
+    /// The file is not there or not readable.
+    #[error("reading {0}: {1}")]
+    Io(PathBuf, #[source] std::io::Error),
+    /// It is not a whole MCAP file.
+    #[error("{0} is not a whole mcap file: {1}")]
+    Mcap(PathBuf, #[source] mcap::McapError),
+}
+
+/// All messages of one file, in file order.
+#[derive(Debug)]
+pub struct Recording {
+    /// Where it was read from.
+    pub path: PathBuf,
+    /// Its messages.
+    pub messages: Vec<Message>,
+}
+
+/// One message.
+#[derive(Clone, Debug)]
+pub struct Message {
+    /// Topic of its channel.
+    pub topic: String,
+    /// Number of its channel.
+    pub channel: u16,
+    /// Name of its schema; empty without one.
+    pub schema: String,
+    /// Capture time on the wall clock, ns.
+    pub log_time: u64,
+    /// Receive time on the wall clock, ns.
+    pub publish_time: u64,
+    /// Encoded message.
+    pub data: Vec<u8>,
+}
+
+/// A change of one mask bit, at the message that first shows it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Edge {
+    /// Which bit.
+    pub bit: u32,
+    /// It became 1.
+    pub rises: bool,
+    /// Wall clock, ns.
+    pub log_time: u64,
+}
+
+/// A camera frame in a recording.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Frame {
+    /// What the emulator wrote into it; `None` when it cannot be read.
+    pub id: Option<FrameId>,
+    /// Wall clock, ns.
+    pub log_time: u64,
+    /// Starts and ends as a JPEG does.
+    pub whole: bool,
+}
+
+impl Recording {
+    /// Reads a whole file.
+    pub fn open(path: &Path) -> Result<Self, RecordingError> {
+        let bytes = std::fs::read(path).map_err(|error| RecordingError::Io(path.into(), error))?;
+        let bad = |error| RecordingError::Mcap(path.into(), error);
+        let mut messages = Vec::new();
+        for message in mcap::MessageStream::new(&bytes).map_err(bad)? {
+            let message = message.map_err(bad)?;
+            messages.push(Message {
+                topic: message.channel.topic.clone(),
+                channel: message.channel.id,
+                schema: message.channel.schema.as_ref().map(|schema| schema.name.clone()).unwrap_or_default(),
+                log_time: message.log_time,
+                publish_time: message.publish_time,
+                data: message.data.into_owned(),
+            });
+        }
+        Ok(Self { path: path.into(), messages })
+    }
+
+    /// The messages of a topic.
+    pub fn topic<'a>(&'a self, topic: &'a str) -> impl Iterator<Item = &'a Message> {
+        self.messages.iter().filter(move |message| message.topic == topic)
+    }
+
+    /// The numbers of the channels a topic was written on; one, unless something reconnected wrongly.
+    pub fn channels(&self, topic: &str) -> BTreeSet<u16> {
+        self.topic(topic).map(|message| message.channel).collect()
+    }
+
+    /// The frames of a camera topic (`foxglove.CompressedImage`: data is field 2).
+    pub fn frames(&self, topic: &str) -> Vec<Frame> {
+        let read = |message: &Message| {
+            let data = proto::bytes(&message.data, 2);
+            Frame { id: frame::identity(data), log_time: message.log_time, whole: frame::is_whole_jpeg(data) }
+        };
+        self.topic(topic).map(read).collect()
+    }
+
+    /// The rows of a serial topic (`rapid.Scalars`: values are field 2).
+    pub fn rows(&self, topic: &str) -> Vec<Vec<f64>> {
+        self.topic(topic).map(|message| proto::doubles(&message.data, 2)).collect()
+    }
+
+    /// The frame numbers of a camera topic whose frames were captured in this span of the wall clock.
+    pub fn numbers(&self, topic: &str, span: impl RangeBounds<u64>) -> Vec<u64> {
+        let within = self.frames(topic).into_iter().filter(|frame| span.contains(&frame.log_time));
+        within.filter_map(|frame| frame.id).map(|id| id.number.into()).collect()
+    }
+
+    /// Every change of a bit in `/rapid/mask` (`rapid.Mask`: mask is field 2), by time.
+    pub fn mask_edges(&self) -> Vec<Edge> {
+        let mut published: Vec<(u64, u64)> =
+            self.topic("/rapid/mask").map(|message| (message.log_time, proto::number(&message.data, 2))).collect();
+        published.sort_unstable();
+        let mut edges = Vec::new();
+        for pair in published.windows(2) {
+            let (before, after) = (pair[0].1, pair[1].1);
+            let changed = (0..u64::BITS).filter(|bit| (before ^ after) >> bit & 1 == 1);
+            edges.extend(changed.map(|bit| Edge { bit, rises: after >> bit & 1 == 1, log_time: pair[1].0 }));
+        }
+        edges
+    }
+}
+
+/// Times at which `bit` rose.
+pub fn rises(edges: &[Edge], bit: u32) -> Vec<u64> {
+    edges.iter().filter(|edge| edge.bit == bit && edge.rises).map(|edge| edge.log_time).collect()
+}
+
+/// Times at which `bit` fell.
+pub fn falls(edges: &[Edge], bit: u32) -> Vec<u64> {
+    edges.iter().filter(|edge| edge.bit == bit && !edge.rises).map(|edge| edge.log_time).collect()
+}
+
+/// Places where a sequence does not go up by exactly one, as (before, after).
+pub fn holes(numbers: impl IntoIterator<Item = u64>) -> Vec<(u64, u64)> {
+    let mut last = None;
+    let mut holes = Vec::new();
+    for number in numbers {
+        if let Some(last) = last.replace(number).filter(|last| last + 1 != number) {
+            holes.push((last, number));
+        }
+    }
+    holes
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn mask(log_time: u64, mask: u64) -> Message {
+        let data = [&[0x11][..], &mask.to_le_bytes()].concat();
+        Message {
+            topic: "/rapid/mask".into(),
+            channel: 1,
+            schema: "rapid.Mask".into(),
+            log_time,
+            publish_time: log_time,
+            data,
+        }
+    }
+
+    #[test]
+    fn edges_are_found_bit_by_bit() {
+        let messages = vec![mask(10, 0b01), mask(12, 0b01), mask(14, 0b10), mask(16, 0b10)];
+        let recording = Recording { path: PathBuf::new(), messages };
+        let expected = [Edge { bit: 0, rises: false, log_time: 14 }, Edge { bit: 1, rises: true, log_time: 14 }];
+        assert_eq!(recording.mask_edges(), expected);
+    }
+
+    #[test]
+    fn holes_are_jumps_and_repeats() {
+        assert_eq!(holes([3, 4, 5]), []);
+        assert_eq!(holes([3, 5, 5, 6]), [(3, 5), (5, 5)]);
+    }
+}

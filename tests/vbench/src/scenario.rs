@@ -1,0 +1,244 @@
+//! A scenario as data, and its outcome.
+//!
+//! Devices, a registry and a timeline become a guest script; after the boot the outcome holds what the emulator, `rapid`
+//! and the kernel said, and the recorded files.
+//!
+//! Invariant: the timeline's clock starts when `rapid` records and every device named in `streaming` streams, never after a guess.
+//! Invariant: an outcome dropped by a failing assertion prints the logs and keeps its folder.
+
+use std::fmt::Write as _;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use crate::emu::spec::DeviceSpec;
+use crate::guest::{GuestError, Image};
+use crate::outcome::Outcome;
+use crate::programs::{self, ProgramError};
+
+const WORDS: &str = include_str!("../guest/bench.sh");
+/// For each thing waited for before the timeline starts. Generous: the host may be busy, and nothing is measured by it.
+const READY_WITHIN_S: u32 = 60;
+
+/// Why a scenario gave no outcome.
+#[derive(Debug, thiserror::Error)]
+pub enum ScenarioError {
+    /// The guest could not be run.
+    #[error(transparent)]
+    Guest(#[from] GuestError),
+    /// A program is missing.
+    #[error(transparent)]
+    Program(#[from] ProgramError),
+    /// The share could not be prepared.
+    #[error("{0}: {1}")]
+    Share(PathBuf, #[source] std::io::Error),
+}
+
+/// What happens in the guest.
+#[derive(Clone, Debug)]
+pub struct Scenario {
+    name: String,
+    devices: Vec<(DeviceSpec, bool)>,
+    registry: String,
+    play: Play,
+    timeline: Vec<(u64, String)>,
+    watch_mask: bool,
+    limit: Duration,
+}
+
+#[derive(Clone, Debug)]
+enum Play {
+    /// The words of `guest/bench.sh`, without `rapid`.
+    Script(String),
+    /// `rapid` records.
+    Record { seconds: u32, streaming: Vec<String> },
+}
+
+impl Scenario {
+    /// An empty scenario. The name ends up in the folder's name.
+    pub fn new(name: &str) -> Self {
+        Self {
+            name: name.into(),
+            devices: Vec::new(),
+            registry: String::new(),
+            play: Play::Script(String::new()),
+            timeline: Vec::new(),
+            watch_mask: false,
+            limit: Duration::from_secs(120),
+        }
+    }
+
+    /// Adds a device that is plugged from the start. Devices are numbered in the order they are added.
+    #[must_use]
+    pub fn device(mut self, spec: DeviceSpec) -> Self {
+        self.devices.push((spec, true));
+        self
+    }
+
+    /// Adds a device that only the timeline plugs.
+    #[must_use]
+    pub fn spare(mut self, spec: DeviceSpec) -> Self {
+        self.devices.push((spec, false));
+        self
+    }
+
+    /// The text of `devices.toml`.
+    #[must_use]
+    pub fn registry(mut self, toml: &str) -> Self {
+        self.registry = toml.into();
+        self
+    }
+
+    /// Runs this script (bash with the words of `guest/bench.sh`) instead of `rapid`. Devices are defined and not plugged.
+    #[must_use]
+    pub fn script(mut self, script: &str) -> Self {
+        self.play = Play::Script(script.into());
+        self
+    }
+
+    /// Runs `rapid` recording for this long; the timeline starts when these registry entries stream.
+    #[must_use]
+    pub fn record(mut self, seconds: u32, streaming: &[&str]) -> Self {
+        self.play = Play::Record { seconds, streaming: streaming.iter().map(ToString::to_string).collect() };
+        self
+    }
+
+    /// Gives the emulator a command at this time of the timeline. Times must not go back.
+    #[must_use]
+    pub fn at(mut self, ms: u64, command: &str) -> Self {
+        self.timeline.push((ms, command.into()));
+        self
+    }
+
+    /// Samples the mask in shared memory as well, into `mask.jsonl`.
+    #[must_use]
+    pub fn watch_mask(mut self) -> Self {
+        self.watch_mask = true;
+        self
+    }
+
+    /// How long the guest's script may take.
+    #[must_use]
+    pub fn limit(mut self, limit: Duration) -> Self {
+        self.limit = limit;
+        self
+    }
+
+    /// Boots a guest and plays the scenario.
+    pub fn run(self) -> Result<Outcome, ScenarioError> {
+        let image = Image::locate()?;
+        let usbemu = programs::usbemu()?;
+        let rapid = match self.play {
+            Play::Script(_) => None,
+            Play::Record { .. } => Some(programs::rapid()?),
+        };
+        let share = fresh_folder(&self.name)?;
+        let inside = share.join("in");
+        let install = |program: &Path| programs::install(program, &inside, image.suite());
+        let usbemu = install(&usbemu)?;
+        let rapid = rapid.as_deref().map(install).transpose()?.unwrap_or_default();
+        let write = |name: &str, text: &str| {
+            let path = inside.join(name);
+            fs::write(&path, text).map_err(|error| ScenarioError::Share(path, error))
+        };
+        write("bench.sh", WORDS)?;
+        write("devices.toml", &self.registry)?;
+        write("run.sh", &self.guest_script(&usbemu, &rapid))?;
+        let boot = image
+            .boot(&share, self.limit)
+            .inspect_err(|_| eprintln!("vbench: the share is kept in {}", share.display()))?;
+        Ok(Outcome::collect(self.name, share, boot))
+    }
+
+    /// The script the guest runs.
+    fn guest_script(&self, usbemu: &[String], rapid: &[String]) -> String {
+        let mut script = format!("usbemu=({})\nrapid=({})\n. ./bench.sh\n", words(usbemu), words(rapid));
+        let specs: Vec<String> = self.devices.iter().map(|(spec, _)| spec.to_string()).collect();
+        let mut line = |text: String| {
+            script.push_str(&text);
+            script.push('\n');
+        };
+        line(format!("emu_start {}", words(&specs)));
+        match &self.play {
+            Play::Script(text) => line(text.clone()),
+            Play::Record { seconds, streaming } => {
+                for (index, port) in self.plugged() {
+                    line(format!(
+                        "emu plug {index}; wait_for {READY_WITHIN_S} attached {port} || fail 'device {index} did not attach'"
+                    ));
+                }
+                line("udevadm settle".into());
+                if self.watch_mask {
+                    line("\"${usbemu[@]}\" --watch-mask >$out/mask.jsonl & watch_pid=$!".into());
+                }
+                line(format!(
+                    "rapid_start --headless --record --duration {seconds}s --out $out/rec --config /tmp/bench/devices.toml --json"
+                ));
+                line(format!("await_rapid {READY_WITHIN_S} '\"event\":\"recording\"' || fail 'not recording'"));
+                for device in streaming {
+                    line(format!(
+                        "await_rapid {READY_WITHIN_S} '\"event\":\"state\"' '\"device\":\"{device}\"' '\"state\":\"streaming\"' \
+                         || fail '{device} does not stream'"
+                    ));
+                }
+                line("emu t0".into());
+                for (ms, command) in &self.timeline {
+                    line(format!("emu at {ms} {command}"));
+                }
+                line("rapid_wait\nemu_quit".into());
+                if self.watch_mask {
+                    line("kill $watch_pid".into());
+                }
+                line("exit 0".into());
+            }
+        }
+        script
+    }
+
+    /// Devices plugged from the start, with their ports.
+    fn plugged(&self) -> impl Iterator<Item = (usize, usize)> + '_ {
+        let all = self.devices.iter().enumerate().filter(|(_, (_, plugged))| *plugged);
+        all.map(|(index, (spec, _))| (index, spec.port.map_or(index, usize::from)))
+    }
+}
+
+fn words(all: &[String]) -> String {
+    let mut quoted = String::new();
+    for word in all {
+        let _infallible = write!(quoted, "'{}' ", word.replace('\'', r"'\''"));
+    }
+    quoted
+}
+
+fn fresh_folder(name: &str) -> Result<PathBuf, ScenarioError> {
+    let base = std::env::temp_dir();
+    let path = (0..)
+        .map(|number| base.join(format!("vbench-{name}-{}-{number}", std::process::id())))
+        .find(|path: &PathBuf| !Path::exists(path))
+        .expect("one of endless names is free");
+    for folder in ["in", "out"] {
+        fs::create_dir_all(path.join(folder)).map_err(|error| ScenarioError::Share(path.clone(), error))?;
+    }
+    Ok(path)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_timeline_follows_readiness() {
+        let script = Scenario::new("x")
+            .device(DeviceSpec::acm(0x2e8a, 0xa, 100.0).serial("it's").port(3))
+            .spare(DeviceSpec::uvc(0x046d, 0x0825))
+            .record(20, &["cam"])
+            .at(5000, "plug 1")
+            .guest_script(&["usbemu".into()], &["rapid".into()]);
+        assert!(script.contains(r"serial=it'\''s"));
+        assert!(script.contains("emu plug 0; wait_for 60 attached 3"));
+        assert!(!script.contains("emu plug 1;"));
+        let place = |text: &str| script.find(text).unwrap();
+        assert!(place("--duration 20s") < place("\"streaming\"") && place("\"streaming\"") < place("emu t0"));
+        assert!(place("emu t0") < place("emu at 5000 plug 1") && place("emu at 5000 plug 1") < place("rapid_wait"));
+    }
+}

@@ -1,0 +1,308 @@
+//! `rapid` on the virtual bench, and first the bench against itself.
+//!
+//! Wall-clock times in a recording are compared with the emulator's: both run in one guest, on one clock.
+
+use std::fmt::Write;
+
+use vbench::emu::spec::{DeviceSpec, Format};
+use vbench::outcome::Outcome;
+use vbench::recording::{Recording, falls, holes, rises};
+use vbench::scenario::Scenario;
+
+/// Two cameras of different formats and both serial kinds: nodes, udev properties, frames, and the way back.
+#[test]
+fn bench_shows_the_guest_real_devices() {
+    let script = r#"
+emu plug 0 1 2 3
+wait_for 60 attached 0 1 2 3 || fail 'not attached'
+wait_for 30 test -e /dev/video2 -a -e /dev/ttyACM0 -a -e /dev/ttyUSB0
+udevadm settle
+for node in video0 video2 ttyACM0 ttyUSB0; do
+  echo "$node $(property /dev/$node ID_SERIAL_SHORT) $(property /dev/$node ID_VENDOR_ID):$(property /dev/$node ID_MODEL_ID) $(property /dev/$node ID_V4L_CAPABILITIES)"
+done >$out/nodes
+"${usbemu[@]}" --read /dev/video0 90 >$out/mjpg.json
+"${usbemu[@]}" --read /dev/video2 45 >$out/yuyv.json
+for tty in ttyACM0 ttyUSB0; do
+  stty -F /dev/$tty raw -echo
+  timeout 10 head -n 50 /dev/$tty >$out/$tty.csv
+done
+emu silent 0 1
+sleep 1
+"${usbemu[@]}" --read /dev/video0 5 2>$out/silent.err
+emu silent 0 0
+"${usbemu[@]}" --read /dev/video0 5 >$out/again.json
+emu unplug 0 1 2 3
+wait_for 30 detached 0 1 2 3 || fail 'still attached'
+udevadm settle
+ls /dev | grep -E '^(video|ttyACM|ttyUSB)' >$out/left
+emu port 0 6
+emu plug 0
+wait_for 30 attached 6 || fail 'not in the other port'
+emu_quit
+exit 0
+"#;
+    let outcome = play(
+        Scenario::new("self")
+            .device(DeviceSpec::uvc(0x046d, 0x0825).serial("CAM00A1").mode(Format::Mjpg, 640, 480, &[30]))
+            .device(DeviceSpec::uvc(0x046d, 0x0825).mode(Format::Yuyv, 320, 240, &[15]))
+            .device(DeviceSpec::acm(0x2e8a, 0x000a, 100.0).serial("TOF1"))
+            .device(DeviceSpec::ftdi(0x0403, 0x6001, 50.0).serial("FT1"))
+            .script(script),
+    );
+    assert_eq!(outcome.code, 0, "{}", outcome.log);
+    assert!(outcome.emulator_errors().is_empty());
+
+    let nodes = outcome.file("nodes");
+    for line in ["video0 CAM00A1 046d:0825 :capture:", "ttyACM0 TOF1 2e8a:000a ", "ttyUSB0 FT1 0403:6001 "] {
+        assert!(nodes.lines().any(|found| found == line), "{line} not in:\n{nodes}");
+    }
+    // A device without a serial descriptor has no short serial either.
+    assert!(nodes.lines().any(|found| found == "video2  046d:0825 :capture:"), "{nodes}");
+
+    for (name, format, fps) in [("mjpg.json", "MJPG", 30.0), ("yuyv.json", "YUYV", 15.0), ("again.json", "MJPG", 30.0)]
+    {
+        let read: serde_json::Value = serde_json::from_str(&outcome.file(name)).unwrap();
+        println!("{name}: {read}");
+        assert_eq!(read["format"], format);
+        assert_eq!([&read["damaged"], &read["holes"], &read["repeats"]], [0, 0, 0], "{read}");
+        // Never faster than asked; slower only on a machine too busy to tell anything.
+        let got = read["fps"].as_f64().unwrap();
+        assert!(got < fps * 1.2 && got > fps / 3.0, "{got} fps instead of {fps}");
+    }
+    assert!(outcome.file("silent.err").contains("no frame within 5 s"), "{}", outcome.file("silent.err"));
+
+    for tty in ["ttyACM0.csv", "ttyUSB0.csv"] {
+        let text = outcome.file(tty);
+        // The first line may have been cut by opening the port.
+        let numbers: Vec<u64> =
+            text.lines().skip(1).map(|line| line.split(',').next().unwrap().parse().unwrap()).collect();
+        assert_eq!(numbers.len(), 49);
+        assert_eq!(holes(numbers), [], "{tty}");
+    }
+    assert_eq!(outcome.file("left"), "", "nodes outlived their devices");
+    assert_eq!((outcome.actions("plug", 0).len(), outcome.actions("unplug", 0).len()), (2, 2));
+}
+
+const NONE: [u64; 0] = [];
+const WRIST: &str = "/rapid/camera/wrist";
+const SIDE: &str = "/rapid/camera/side";
+const TOF: &str = "/rapid/tof";
+
+/// Two cameras and a distance sensor, recorded for 20 s; the second camera is out from 5 s to 9 s.
+#[test]
+fn unplugging_one_device_leaves_the_others_whole() {
+    let registry = registry(&[
+        camera("cam_wrist", WRIST, 0, Some("CAM00A1"), (640, 480)),
+        camera("cam_side", SIDE, 1, Some("CAM00B2"), (320, 240)),
+        distance_sensor(2),
+    ]);
+    let outcome = recorded(
+        Scenario::new("unplug")
+            .device(vga("CAM00A1"))
+            .device(DeviceSpec::uvc(0x046d, 0x0825).serial("CAM00B2").mode(Format::Mjpg, 320, 240, &[30]))
+            .device(DeviceSpec::acm(0x2e8a, 0x000a, 100.0).serial("TOF1"))
+            .registry(&registry)
+            .record(20, &["cam_wrist", "cam_side", "tof"])
+            .at(5_000, "unplug 1")
+            .at(9_000, "plug 1"),
+    );
+    let episode = episode(&outcome);
+    let edges = episode.mask_edges();
+    let unplugged = outcome.actions("unplug", 1)[0].real_ns;
+    let replugged = outcome.actions("plug", 1)[1].real_ns;
+
+    assert_eq!(falls(&edges, 0), NONE, "the wrist camera stayed plugged");
+    assert_eq!(falls(&edges, 2), NONE, "the sensor stayed plugged");
+    assert_eq!(outcome.actions("stream_on", 0).len(), 1, "the wrist camera was started once");
+    assert_eq!(outcome.actions("stream_off", 0).len(), 1, "the wrist camera was stopped once, at the end");
+    assert_whole(&episode, WRIST, ..);
+    let rows: Vec<u64> = episode.rows(TOF).iter().map(|row| row[0] as u64).collect();
+    assert!(rows.len() > 500, "{} rows in 20 s at 100 Hz", rows.len());
+    assert_eq!(holes(rows), [], "the sensor's lines have a hole");
+
+    let fell = only(&falls(&edges, 1));
+    assert!(fell >= unplugged, "the bit fell {} ms before the unplug", (unplugged - fell) / 1_000_000);
+    // The contract of the mask, not a benchmark: DESIGN.md 4.
+    let delay_ms = (fell - unplugged) / 1_000_000;
+    println!("bit cleared {delay_ms} ms after the unplug");
+    assert!(delay_ms <= 500, "the bit fell {delay_ms} ms after the unplug");
+    let rose = only(&rises_after(&edges, 1, fell));
+    assert!(rose >= replugged, "the bit rose before the replug");
+    println!("bit set {} ms after the replug", (rose - replugged) / 1_000_000);
+
+    assert_eq!(episode.channels(SIDE).len(), 1, "the camera came back on another channel");
+    assert_whole(&episode, SIDE, ..fell);
+    assert_whole(&episode, SIDE, replugged..);
+    assert_eq!(episode.numbers(SIDE, fell..replugged), NONE, "frames of a camera that was not there");
+}
+
+/// A camera is gone for 0.3 s, first back in its port, then in another: both times it streams again as the same modality.
+#[test]
+fn a_quick_replug_is_not_lost() {
+    let outcome = recorded(
+        Scenario::new("replug")
+            .device(vga("CAM00A1"))
+            .registry(&registry(&[camera("cam_wrist", WRIST, 0, Some("CAM00A1"), (640, 480))]))
+            .record(25, &["cam_wrist"])
+            .at(3_000, "unplug 0")
+            .at(3_300, "plug 0")
+            .at(12_000, "unplug 0")
+            .at(12_000, "port 0 5")
+            .at(12_300, "plug 0"),
+    );
+    let episode = episode(&outcome);
+    let edges = episode.mask_edges();
+    let plugs = outcome.actions("plug", 0);
+    let unplugs = outcome.actions("unplug", 0);
+    let fell = falls(&edges, 0);
+    assert_eq!(fell.len(), 2, "two unplugs, two falling edges: {edges:?}");
+    for ((fell, unplugged), replugged) in fell.iter().zip(&unplugs).zip(&plugs[1..]) {
+        assert!(*fell >= unplugged.real_ns);
+        let rose = *rises_after(&edges, 0, *fell).first().expect("the bit came back");
+        assert!(rose >= replugged.real_ns);
+        println!(
+            "out for 300 ms: cleared after {} ms, set {} ms after the replug",
+            ms(*fell, unplugged.real_ns),
+            ms(rose, replugged.real_ns)
+        );
+    }
+    assert_eq!(episode.channels(WRIST).len(), 1);
+    assert_whole(&episode, WRIST, ..unplugs[0].real_ns);
+    assert_whole(&episode, WRIST, plugs[1].real_ns..unplugs[1].real_ns);
+    assert_whole(&episode, WRIST, plugs[2].real_ns..);
+}
+
+/// Two units nothing tells apart but their ports fill two entries; each keeps its own when the other leaves, and gets it back.
+#[test]
+fn equal_units_keep_their_entries() {
+    let registry =
+        registry(&[camera("cam_left", WRIST, 0, None, (640, 480)), camera("cam_right", SIDE, 1, None, (640, 480))]);
+    let outcome = recorded(
+        Scenario::new("equal")
+            .device(vga(""))
+            .device(vga(""))
+            .registry(&registry)
+            .record(20, &["cam_left", "cam_right"])
+            .at(4_000, "unplug 1")
+            .at(8_000, "plug 1"),
+    );
+    let episode = episode(&outcome);
+    let edges = episode.mask_edges();
+    let unit = |topic| {
+        let mut units: Vec<usize> =
+            episode.frames(topic).iter().filter_map(|frame| frame.id).map(|id| id.device()).collect();
+        units.dedup();
+        units
+    };
+    let (left, right) = (unit(WRIST), unit(SIDE));
+    assert!(left.len() == 1 && right.len() == 1 && left != right, "an entry changed its unit: {left:?} {right:?}");
+    let (moved, stayed) = if right == [1] { ((1, SIDE), (0, WRIST)) } else { ((0, WRIST), (1, SIDE)) };
+
+    assert_eq!(falls(&edges, stayed.0), NONE, "the unit that stayed lost its bit");
+    assert_whole(&episode, stayed.1, ..);
+    let fell = only(&falls(&edges, moved.0));
+    let replugged = outcome.actions("plug", 1)[1].real_ns;
+    assert!(fell >= outcome.actions("unplug", 1)[0].real_ns && fell < replugged);
+    assert!(only(&rises_after(&edges, moved.0, fell)) >= replugged);
+    assert_whole(&episode, moved.1, ..fell);
+    assert_whole(&episode, moved.1, replugged..);
+}
+
+/// A camera that stops sending without leaving is stalled, not absent: the mask speaks of plugs, not of data.
+#[test]
+fn silence_is_not_absence() {
+    let outcome = recorded(
+        Scenario::new("silence")
+            .device(vga("CAM00A1"))
+            .registry(&registry(&[camera("cam_wrist", WRIST, 0, Some("CAM00A1"), (640, 480))]))
+            .record(20, &["cam_wrist"])
+            .at(4_000, "silent 0 1")
+            .at(9_000, "silent 0 0"),
+    );
+    let episode = episode(&outcome);
+    assert_eq!(falls(&episode.mask_edges(), 0), NONE, "silence cleared the bit");
+    let states = outcome.states("cam_wrist");
+    let place =
+        |state: &str, from: usize| states.iter().skip(from).position(|found| *found == state).map(|at| at + from);
+    let streaming = place("streaming", 0).expect("streaming at first");
+    let stalled = place("stalled", streaming).unwrap_or_else(|| panic!("never stalled: {states:?}"));
+    assert!(place("streaming", stalled).is_some(), "never streaming again: {states:?}");
+    for gone in ["absent", "backoff", "failed"] {
+        assert_eq!(place(gone, streaming), None, "{states:?}");
+    }
+    let silent: Vec<u64> = outcome.actions("silent", 0).iter().map(|moment| moment.real_ns).collect();
+    assert_whole(&episode, WRIST, ..silent[0]);
+    assert_whole(&episode, WRIST, silent[1]..);
+}
+
+fn vga(serial: &str) -> DeviceSpec {
+    DeviceSpec::uvc(0x046d, 0x0825).serial(serial).mode(Format::Mjpg, 640, 480, &[30])
+}
+
+/// The bench's own troubles end a test with a sentence that says what to do.
+fn play(scenario: Scenario) -> Outcome {
+    let outcome = scenario.run().unwrap_or_else(|error| panic!("{error}"));
+    println!("{:.1} s wall", outcome.wall.as_secs_f64());
+    outcome
+}
+
+/// Plays a scenario in which `rapid` records to its end without an error on any side.
+fn recorded(scenario: Scenario) -> Outcome {
+    let outcome = play(scenario);
+    assert_eq!(outcome.code, 0, "the guest's script");
+    assert_eq!(outcome.rapid_code, Some(0), "rapid's exit code");
+    assert!(outcome.emulator_errors().is_empty(), "{:?}", outcome.emulator_errors());
+    assert!(outcome.rapid.iter().any(|line| line["event"] == "episode"), "no episode was announced");
+    outcome
+}
+
+fn episode(outcome: &Outcome) -> Recording {
+    outcome.episode().unwrap_or_else(|error| panic!("{error}"))
+}
+
+/// Frames in this span are there, whole, and without a hole in their numbers.
+fn assert_whole(episode: &Recording, topic: &str, span: impl std::ops::RangeBounds<u64> + Clone) {
+    let frames = episode.frames(topic);
+    let damaged =
+        frames.iter().filter(|frame| span.contains(&frame.log_time)).filter(|frame| frame.id.is_none() || !frame.whole);
+    assert_eq!(damaged.count(), 0, "{topic}: damaged frames");
+    let numbers = episode.numbers(topic, span);
+    println!("{topic}: {} frames", numbers.len());
+    assert!(numbers.len() > 10, "{topic}: only {} frames", numbers.len());
+    assert_eq!(holes(numbers), [], "{topic}: a hole in the frame numbers");
+}
+
+fn rises_after(edges: &[vbench::recording::Edge], bit: u32, after: u64) -> Vec<u64> {
+    rises(edges, bit).into_iter().filter(|time| *time > after).collect()
+}
+
+fn only(times: &[u64]) -> u64 {
+    assert_eq!(times.len(), 1, "expected one edge");
+    times[0]
+}
+
+fn ms(later: u64, earlier: u64) -> u64 {
+    later.saturating_sub(earlier) / 1_000_000
+}
+
+fn registry(entries: &[String]) -> String {
+    format!("[rig]\nname = \"vbench\"\n\n{}", entries.join("\n"))
+}
+
+fn camera(name: &str, topic: &str, bit: u32, serial: Option<&str>, (width, height): (u32, u32)) -> String {
+    let mut text = format!("[device.{name}]\nvid = \"0x046d\"\npid = \"0x0825\"\nnode = \"camera\"\n");
+    if let Some(serial) = serial {
+        writeln!(text, "serial = \"{serial}\"").expect("writing to a string cannot fail");
+    }
+    writeln!(text, "topic = \"{topic}\"\nslot = \"top\"\nbit = {bit}").expect("writing to a string cannot fail");
+    writeln!(text, "[device.{name}.camera]\nwidth = {width}\nheight = {height}\nfps = 30\nformat = \"MJPG\"")
+        .expect("writing to a string cannot fail");
+    text
+}
+
+fn distance_sensor(bit: u32) -> String {
+    format!(
+        "[device.tof]\nvid = \"0x2e8a\"\npid = \"0x000a\"\nserial = \"TOF1\"\nnode = \"serial\"\ntopic = \"{TOF}\"\nslot = \"tip\"\n\
+         bit = {bit}\n[device.tof.serial]\nbaud = 115200\nframing = \"line\"\nparse = \"csv\"\nchannels = 4\n"
+    )
+}
