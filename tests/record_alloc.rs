@@ -68,13 +68,14 @@ fn count(work: impl FnOnce()) -> u64 {
     COUNT.get()
 }
 
-fn id() -> ModalityId {
-    ModalityId::new(0).unwrap()
-}
+const ID: ModalityId = match ModalityId::new(0) {
+    Some(id) => id,
+    None => panic!("0 is a bit"),
+};
 
 #[test]
 fn encoding_and_synchronising_do_not_allocate() {
-    let modality = SyncModality { id: id(), when_stale: WhenStale::Hold, capacity: 100 };
+    let modality = SyncModality { id: ID, when_stale: WhenStale::Hold, capacity: 100 };
     let mut sync = Synchronizer::new(&[modality], Duration::from_millis(25));
     let mut out = Vec::new();
     let payload = vec![7; 60_000];
@@ -82,7 +83,7 @@ fn encoding_and_synchronising_do_not_allocate() {
         let at = Stamp(n * 33_000_000);
         let header = SampleHeader { seq: n, capture_ns: at.0, encoding: Encoding::Mjpeg as u32, ..Default::default() };
         encode::sample(&mut out, SampleSchema::of(&header, &payload), at.0, "cam", &header, &payload);
-        sync.push(id(), SyncSample { capture: at, recv: at, seq: n, epoch: Epoch(1), keep: () });
+        sync.push(ID, SyncSample { capture: at, recv: at, seq: n, epoch: Epoch(1), keep: () });
         encode::mask(&mut out, at.0, PhysicalMask(1), n);
         let observation = sync.observe(at, at, PhysicalMask(1));
         assert!(observation.slots[0].valid);
@@ -125,7 +126,7 @@ impl Source for Camera {
         let encoding = Encoding::Mjpeg as u32;
         let header =
             SampleHeader { seq: self.seq, capture_ns: now, recv_ns: now, epoch: 1, encoding, ..Default::default() };
-        let allocated = count(|| take(TopicId::Modality(id()), &header, &self.payload));
+        let allocated = count(|| take(TopicId::Modality(ID), &header, &self.payload));
         if self.seq >= WARM_UP {
             self.allocations.fetch_add(allocated, Ordering::Relaxed);
             self.quiet.fetch_add(u64::from(allocated == 0), Ordering::Relaxed);
@@ -140,7 +141,7 @@ impl Source for Camera {
 async fn only_chunks_allocate() {
     let device = DeviceSpec {
         name: "cam".to_owned(),
-        id: id(),
+        id: ID,
         identity: IdentitySpec { vid: 1, pid: 1, serial: None, port: None },
         node: NodeSpec::Camera(CameraSpec {
             width: 640,
@@ -165,7 +166,7 @@ async fn only_chunks_allocate() {
     };
     let registry = Arc::new(Registry { rig, devices: vec![device], path: None, text: String::new() });
     let board = Arc::new(Board::new(&registry));
-    let (begin, begun) = mpsc::channel();
+    let (starter, begun) = mpsc::channel();
     let [allocations, quiet, done] = std::array::from_fn(|_| Arc::new(AtomicU64::new(0)));
     let source = Camera {
         begun,
@@ -180,7 +181,7 @@ async fn only_chunks_allocate() {
     let recorder = Recorder::spawn(source, RecorderConfig::new(registry, board)).unwrap();
     let request = EpisodeRequest { out: folder.path().to_owned(), task: "alloc".to_owned(), ..Default::default() };
     recorder.start(request).await.unwrap();
-    begin.send(()).unwrap();
+    starter.send(()).unwrap();
     while done.load(Ordering::Acquire) < SAMPLES {
         tokio::time::sleep(Duration::from_millis(1)).await;
     }
@@ -194,7 +195,6 @@ async fn only_chunks_allocate() {
     assert!(chunks >= SAMPLES * BYTES as u64 / (2 * CHUNK), "{chunks}");
     let allocated = allocations.load(Ordering::Relaxed);
     let quiet = quiet.load(Ordering::Relaxed);
-    println!("{allocated} allocations for {samples} samples in {chunks} chunks of 1 MiB; {quiet} samples without one");
     // Measured with 18 samples a chunk: 23 where a chunk ends and the next begins, and one each time
     // the vector of the chunk's message index doubles (after 1, 4, 8 and 16 messages). Every other
     // sample: none.

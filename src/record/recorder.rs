@@ -102,7 +102,7 @@ impl Recorder {
     /// whose duration has already ended it is waited for all the same.
     ///
     /// # Errors
-    /// When there is none.
+    /// When there is none: one that its duration or the disk ended is told by `What::Episode` alone.
     pub async fn stop(&self) -> Result<EpisodeReport, RecordError> {
         self.ask(Order::Stop).await
     }

@@ -9,8 +9,11 @@ use std::time::Duration;
 
 use prost_reflect::{DescriptorPool, DynamicMessage, ReflectMessage, Value};
 
+use super::episode::EpisodePath;
+use super::session::{Beginning, MaskHistory, Session};
 use super::*;
 use crate::bus::TopicId;
+use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::registry::{
     CameraSpec, DeviceSpec, Framing, IdentitySpec, NodeSpec, Parse, PixelFormat, Registry, RigSpec, SerialSpec,
@@ -18,7 +21,7 @@ use crate::registry::{
 };
 use crate::sample::{Encoding, FLAG_ERROR, SampleHeader};
 use crate::status::{Board, Level, What};
-use crate::time::Stamp;
+use crate::time::{Stamp, WallClock};
 
 const MS: u64 = 1_000_000;
 const CAM: u8 = 0;
@@ -42,6 +45,14 @@ impl Script {
     fn put(&self, sample: Sample) {
         self.0.0.lock().unwrap().samples.push_back(sample);
         self.0.1.notify_all();
+    }
+
+    /// Returns once everything put in has been handed over: whatever is asked of the recorder from
+    /// now on comes after it.
+    async fn taken(&self) {
+        while !self.0.0.lock().unwrap().samples.is_empty() {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
     }
 
     fn panic(&self) {
@@ -179,8 +190,11 @@ impl Bench {
     /// One second of a rig, laid out from `t0` on: the camera is away in the middle, the line of the
     /// `tof` loses seven samples and skips one beat, `raw` sends one damaged frame and has no bit in
     /// the mask at first.
-    pub(super) async fn one_second(&self) -> PathBuf {
+    ///
+    /// Returns the file's name and `t0`, which lies a little after the beginning of the episode.
+    pub(super) async fn one_second(&self) -> (PathBuf, Stamp) {
         self.mask(0b11, 1, Stamp::now().0);
+        self.script.taken().await;
         let finished = self.recorder.start(self.request(Some(Duration::from_secs(1)))).await.unwrap();
         let attach = What::Attach {
             device: "raw".to_owned(),
@@ -213,7 +227,7 @@ impl Bench {
         }
         self.sample(RAW, 1, 0, t0 + 230 * MS, 0);
         self.sample(RAW, 1, 1, t0 + 400 * MS, FLAG_ERROR);
-        finished
+        (finished, Stamp(t0))
     }
 
     /// Waits until a file has its final name.
@@ -301,7 +315,7 @@ fn text(message: &DynamicMessage, field: &str) -> String {
 async fn an_episode_holds_what_was_captured_and_nothing_else() {
     let bench = Bench::new();
     let mut events = bench.board.events();
-    let finished = bench.one_second().await;
+    let (finished, t0) = bench.one_second().await;
     let What::Episode { file, seconds, messages, bytes, dropped, error } = bench.until_closed(&mut events).await else {
         unreachable!()
     };
@@ -351,7 +365,10 @@ async fn an_episode_holds_what_was_captured_and_nothing_else() {
     }
     let tof: Vec<u32> = read.on("/rapid/tof").map(|m| m.1).collect();
     assert_eq!(tof.len() + read.on("/rapid/cam_wrist").count() + 2, written);
-    assert!(tof.len() > 90 && tof.is_sorted() && tof[0] == 101);
+    let late = t0.since(Stamp(about["begin_monotonic_ns"].parse().unwrap()));
+    let in_time = |n: &u64| *n != 20 && late + Duration::from_millis(n * 10) < Duration::from_secs(1);
+    assert_eq!(tof.len(), (0..100).filter(in_time).count());
+    assert!(tof.is_sorted() && tof[0] == 101);
     let values = read.on("/rapid/tof").next().unwrap().4.get_field_by_name("values").unwrap().into_owned();
     assert_eq!(values.as_list().unwrap().iter().map(|v| v.as_f64().unwrap()).collect::<Vec<_>>(), [101.0, 0.5]);
     let cam = read.on("/rapid/cam_wrist").nth(3).unwrap();
@@ -551,21 +568,103 @@ async fn a_disk_full_at_the_start_is_said_and_leaves_nothing() {
     assert!(matches!(bench.recorder.stop().await, Err(RecordError::Idle)));
 }
 
-#[tokio::test]
-async fn what_was_captured_before_the_stop_and_comes_later_is_recorded() {
-    let bench = Bench::new();
-    let finished = bench.recorder.start(bench.request(None)).await.unwrap();
-    let before = Stamp::now();
-    while Stamp::now() <= before {}
-    // Put in once the order to stop has been sent.
-    let late = async {
-        bench.sample(TOF, 1, 0, before.0, 0);
-        bench.sample(TOF, 1, 1, before.after(Duration::from_secs(60)).0, 0);
+/// A session of its own clock, one second after the monotonic clock's zero.
+fn session(folder: &Path, board: &Arc<Board>, masks: &MaskHistory) -> Session {
+    let clock = WallClock::with_offset(i128::from(1_700_000_000 * 1000 * MS));
+    let (path, file) = EpisodePath::create(folder, "t", clock.wall_ns(Stamp(0))).unwrap();
+    let beginning = Beginning {
+        registry: Arc::new(registry()),
+        board: Arc::clone(board),
+        request: &EpisodeRequest::default(),
+        path,
+        sink: Box::new(file),
+        attached: &BTreeMap::new(),
+        clock,
+        begin: Stamp(1000 * MS),
     };
-    let (report, ()) = tokio::join!(bench.recorder.stop(), late);
-    assert_eq!(report.unwrap().error, None);
-    let sequences: Vec<u32> = read(&finished).on("/rapid/tof").map(|m| m.1).collect();
-    assert_eq!(sequences, [0]);
+    Session::begin(beginning, masks).unwrap()
+}
+
+fn scalars(seq: u64, capture_ms: u64, recv_ms: u64) -> SampleHeader {
+    SampleHeader {
+        seq,
+        capture_ns: capture_ms * MS,
+        recv_ns: recv_ms * MS,
+        encoding: Encoding::F64 as u32,
+        ..SampleHeader::default()
+    }
+}
+
+#[test]
+fn what_comes_late_is_recorded_and_what_comes_too_late_belongs_to_no_frame() {
+    let folder = tempfile::tempdir().unwrap();
+    let board = Arc::new(Board::new(&registry()));
+    let mut masks = MaskHistory::new();
+    masks.push(&scalars(1, 990, 990), PhysicalMask(0b10), 1);
+    let mut session = session(folder.path(), &board, &masks);
+    let at = |ms: u64| Stamp(ms * MS);
+    // Tick 0 is at 1000 ms; its deadline 25 ms + 100 ms later. One sample comes in time, one does not.
+    session.sample(id(TOF), &scalars(0, 999, 999), &[0; 8], 0);
+    session.sample(id(TOF), &scalars(1, 1001, 1126), &[0; 8], 0);
+    session.sample(id(TOF), &scalars(2, 1010, 1124), &[0; 8], 0);
+    session.advance(at(1144), &masks);
+    assert_eq!(session.status(at(1144)).messages, 3, "two samples and a mask; the frame not before 1145 ms");
+    session.advance(at(1145), &masks);
+    assert_eq!(session.status(at(1145)).messages, 4);
+
+    session.end_at(at(1100));
+    session.end_at(at(1200));
+    // Captured before the end and arriving after it; captured at the end.
+    session.sample(id(TOF), &scalars(3, 1099, 1190), &[0; 8], 0);
+    session.sample(id(TOF), &scalars(4, 1100, 1190), &[0; 8], 0);
+    assert!(!session.is_over(at(1219)) && session.is_over(at(1220)));
+    let report = session.finish(at(1220), &masks, None);
+    assert_eq!((report.error, report.messages), (None, 7), "one sample and two frames more");
+    assert!((report.seconds - 0.1).abs() < 1e-9);
+
+    let read = read(&report.file);
+    assert_eq!(read.on("/rapid/tof").map(|m| m.1).collect::<Vec<_>>(), [1, 2, 3]);
+    let chosen: Vec<_> = read
+        .on("/rapid/frame")
+        .map(|(.., frame)| {
+            let list = frame.get_field_by_name("modalities").unwrap();
+            let slot = list.as_list().unwrap()[1].as_message().unwrap().clone();
+            (number(&slot, "valid"), number(&slot, "seq"), number(&slot, "age_ns"))
+        })
+        .collect();
+    // Ticks at 1000, 1033.3, 1066.7 ms, and none at 1100, the end. The sample of 1001 ms is nearer to
+    // the first but came too late for it; the second has one in its window, the third holds it.
+    assert_eq!(chosen, [(1, 2, -10_000_000), (1, 2, 23_333_333), (0, 2, 56_666_666)]);
+}
+
+#[test]
+fn losses_are_announced_once_a_second_and_counted_all() {
+    let folder = tempfile::tempdir().unwrap();
+    let board = Arc::new(Board::new(&registry()));
+    let mut events = board.events();
+    let masks = MaskHistory::new();
+    let mut session = session(folder.path(), &board, &masks);
+    for n in 0..200 {
+        let now = 1000 + n * 10;
+        session.sample(id(TOF), &scalars(n, now, now), &[0; 8], 2);
+        session.advance(Stamp(now * MS), &masks);
+    }
+    // One more, so that a number of hostile size comes to the others.
+    session.sample(id(CAM), &scalars(1, 3000, 3000), &[0; 8], u64::MAX);
+    assert_eq!(session.status(Stamp(0)).dropped, u64::MAX);
+    let report = session.finish(Stamp(3001 * MS), &masks, None);
+    assert_eq!((report.error, report.dropped), (None, u64::MAX));
+    let mut said = Vec::new();
+    while let Ok(event) = events.try_recv() {
+        if let What::Log { level: Level::Warn, text } = event.what {
+            said.push(text);
+        }
+    }
+    let lost = |count: u64, name: &str| format!("{name}: {count} samples lost on the way to the file");
+    assert_eq!(said, [lost(2, "tof"), lost(200, "tof"), lost(u64::MAX, "cam_wrist"), lost(198, "tof")]);
+    let tallies = &read(&report.file).metadata["rapid/summary"]["modalities"];
+    let tallies: serde_json::Value = serde_json::from_str(tallies).unwrap();
+    assert_eq!((&tallies["tof"]["samples"], &tallies["tof"]["dropped"]), (&200.into(), &400.into()));
 }
 
 #[tokio::test]

@@ -100,12 +100,13 @@ fn ending(inspection: &Inspection, paint: Paint) -> String {
 fn write_topic(out: &mut String, name: &str, topic: &TopicReport, frames: &str, column: usize) -> std::fmt::Result {
     let late =
         topic.lateness.map_or("-".to_owned(), |Lateness { p50, p99, max }| format!("{p50:.1}/{p99:.1}/{max:.1}"));
+    // Of a handful of messages a rate says nothing.
+    let hz = if topic.messages < 10 { "-".to_owned() } else { format!("{:.2}", topic.hz) };
     writeln!(
         out,
-        "{:column$} {:>8} {:>7.2} {:>7} {:>7.0} {late:>17}{frames}",
+        "{:column$} {:>8} {hz:>7} {:>7} {:>7.0} {late:>17}{frames}",
         clean(name),
         topic.messages,
-        topic.hz,
         topic.missing,
         topic.longest_gap * 1e3,
     )
@@ -113,20 +114,30 @@ fn write_topic(out: &mut String, name: &str, topic: &TopicReport, frames: &str, 
 
 /// One character a cell of time: present throughout, absent throughout, or both.
 fn timeline(modality: &ModalityReport, seconds: f64, cells: usize, paint: Paint) -> String {
+    if modality.presence.is_none() {
+        return "·".repeat(cells);
+    }
     let mut line = String::new();
+    let (mut run, mut run_code) = (String::new(), GREEN);
     for cell in 0..cells {
         let begin = seconds * cell as f64 / cells as f64;
         let end = seconds * (cell + 1) as f64 / cells as f64;
         let together: f64 = modality.present.iter().map(|(from, to)| (to.min(end) - from.max(begin)).max(0.0)).sum();
         let share = if end > begin { together / (end - begin) } else { 0.0 };
-        line.push_str(&match share {
-            // A rounding error is neither presence nor absence.
-            _ if modality.presence.is_none() => "·".to_owned(),
-            share if share > 0.999 => colour(paint, GREEN, "█"),
-            share if share < 0.001 => colour(paint, RED, "░"),
-            _ => colour(paint, YELLOW, "▓"),
-        });
+        // A rounding error is neither presence nor absence.
+        let (code, glyph) = match share {
+            share if share > 0.999 => (GREEN, '█'),
+            share if share < 0.001 => (RED, '░'),
+            _ => (YELLOW, '▓'),
+        };
+        if code != run_code && !run.is_empty() {
+            line.push_str(&colour(paint, run_code, &run));
+            run.clear();
+        }
+        run_code = code;
+        run.push(glyph);
     }
+    line.push_str(&colour(paint, run_code, &run));
     line
 }
 
@@ -152,8 +163,9 @@ fn or_dash(text: &str) -> &str {
 
 fn percent(share: f64) -> String {
     // Only what is whole is 100 %.
-    let percent = if share < 1.0 { (share * 100.0).min(99.0) } else { 100.0 };
-    format!("{percent:.0} %")
+    let percent = if share < 1.0 { (share * 100.0).clamp(0.0, 99.0) } else { 100.0 };
+    // An empty sum of floats is minus zero.
+    format!("{:.0} %", percent.abs())
 }
 
 fn size(bytes: u64) -> String {

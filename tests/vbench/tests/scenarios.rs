@@ -302,7 +302,7 @@ fn camera(name: &str, topic: &str, bit: u32, serial: Option<&str>, (width, heigh
 
 fn distance_sensor(bit: u32) -> String {
     format!(
-        "[device.tof]\nvid = \"0x2e8a\"\npid = \"0x000a\"\nserial = \"TOF1\"\nnode = \"serial\"\ntopic = \"{TOF}\"\nslot = \"tip\"\n\
+        "[device.tof]\nvid = \"0x2e8a\"\npid = \"0x000a\"\nserial_number = \"TOF1\"\nnode = \"serial\"\ntopic = \"{TOF}\"\nslot = \"tip\"\n\
          bit = {bit}\n[device.tof.serial]\nbaud = 115200\nframing = \"line\"\nparse = \"csv\"\nchannels = 4\n"
     )
 }
