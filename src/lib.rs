@@ -4,7 +4,7 @@
 //! # The picture
 //!
 //! ```text
-//!  L5   main   cli   commands                    what was typed
+//!  L5   main   dispatch   cli   commands         what was typed
 //!  L4   app                                      puts the stages together, and alone knows them all
 //!       tui   headless   logging                 what is shown: Snapshots and Events of `status`
 //!

@@ -25,7 +25,7 @@ const LAYERS: &[&[&str]] = &[
     &["hotplug", "driver", "bus", "sync"],
     &["rig", "record", "policy", "control"],
     &["app", "tui", "headless", "logging"],
-    &["main", "cli", "commands"],
+    &["main", "dispatch", "cli", "commands"],
 ];
 
 /// Imports within a layer. All nouns of layer 0 may speak of each other besides.
@@ -34,7 +34,8 @@ const SIDEWAYS: &[(&str, &[&str])] = &[
     ("app", &["tui", "headless", "logging"]),
     // Without a screen the log is lines among the lines of the run.
     ("logging", &["headless"]),
-    ("main", &["cli", "commands"]),
+    ("main", &["dispatch", "cli", "commands"]),
+    ("dispatch", &["cli", "commands"]),
     ("commands", &["cli"]),
 ];
 
@@ -47,8 +48,8 @@ const NARROW: &[(&str, &[&str], &str)] = &[
 
 /// The homes of third-party crates: modules, or files of them (`driver/camera`).
 const HOMES: &[(&str, &[&str])] = &[
-    ("clap", &["cli", "main", "commands"]),
-    ("clap_complete", &["cli", "main", "commands"]),
+    ("clap", &["cli", "dispatch", "main", "commands"]),
+    ("clap_complete", &["cli", "dispatch", "main", "commands"]),
     ("crossterm", &["tui"]),
     ("futures", &["hotplug", "driver", "bus", "rig", "record", "app", "tui", "headless", "commands"]),
     ("humantime", &["registry", "cli", "commands"]),
@@ -320,6 +321,13 @@ impl Source {
         self.paths.push((line, resolved));
     }
 
+    /// Does this file bring in a module of ours under this name?
+    fn imports_module(&self, name: &str) -> bool {
+        self.paths.iter().any(|(_, path)| {
+            path.first().is_some_and(|root| root == "crate") && path.last().is_some_and(|last| last == name)
+        })
+    }
+
     fn leave_out(&mut self, item: &[TokenTree], module: &[String]) {
         if let [.., TokenTree::Ident(word), TokenTree::Ident(name), TokenTree::Punct(_)] = item
             && word == "mod"
@@ -421,8 +429,8 @@ fn import(home: &str, path: &[String]) -> Option<String> {
 /// What is wrong with the file at `place` naming the crate `path` begins with.
 fn third_party(source: &Source, place: &str, path: &[String]) -> Option<String> {
     let name = path.first()?;
-    // `mod udev;` in hotplug/mod.rs: the name means the module there.
-    if source.declared.contains(name) {
+    // `mod udev;` in hotplug/mod.rs, `use crate::hotplug::udev;`: the name means the module there.
+    if source.declared.contains(name) || source.imports_module(name) {
         return None;
     }
     let (_, homes) = HOMES.iter().find(|(dependency, _)| dependency == name)?;

@@ -169,6 +169,35 @@ fn the_subscriber_of_the_readme_runs() {
 }
 
 #[test]
+fn the_mcap_library_of_python_reads_an_episode() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let recorded = Command::new(env!("CARGO_BIN_EXE_rapid"))
+        .args(["--sim", "--headless", "--record", "--duration", "2s", "--task", "python", "--out"])
+        .arg(folder.path())
+        .args(["--instance", &format!("pymcap{}", std::process::id())])
+        .output()
+        .expect("rapid");
+    assert!(recorded.status.success(), "{recorded:?}");
+    let mut files = std::fs::read_dir(folder.path()).expect("the folder");
+    let episode = files.next().expect("an episode").expect("its name").path();
+    assert!(files.next().is_none(), "one episode, nothing beside it");
+
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/episode.py");
+    let read = Command::new(python()).arg(script).arg(&episode).output().expect("python");
+    assert!(read.status.success(), "{read:?}");
+    let topics: serde_json::Value = serde_json::from_slice(&read.stdout).expect("JSON");
+    assert_eq!(topics["/rapid/camera/wrist"]["schema"], "foxglove.CompressedImage");
+    assert_eq!(topics["/rapid/camera/tactile"]["schema"], "foxglove.CompressedImage");
+    // Two seconds on the 30 Hz grid.
+    assert_eq!(topics["/rapid/frame"]["messages"], 60);
+    for topic in ["/rapid/camera/wrist", "/rapid/camera/tactile", "/rapid/serial/motor", "/rapid/mask"] {
+        assert_ne!(topics[topic]["messages"], 0, "{topics}");
+        assert_eq!(topics[topic]["messages"], topics[topic]["counted"], "{topics}");
+        assert_eq!(topics[topic]["backwards"], 0, "{topics}");
+    }
+}
+
+#[test]
 fn the_mask_reader_of_the_readme_runs() {
     let folder = tempfile::tempdir().expect("a folder");
     let file = folder.path().join("mask");
