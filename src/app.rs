@@ -6,15 +6,16 @@
 //! Invariant: only this module sees every stage.
 //! Invariant: whatever ends the run, an episode in progress is finished first.
 
+mod conductor;
+mod signals;
+
 use std::path::{Path, PathBuf};
 use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
-use tokio::signal::unix::{SignalKind, signal};
-use tokio::sync::{broadcast, mpsc};
+use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
-use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
 use tokio_util::sync::CancellationToken;
 
 use crate::bus::{Bus, BusError, TopicId};
@@ -29,17 +30,11 @@ use crate::record::{EpisodeRequest, RecordError, Recorder, RecorderConfig};
 use crate::registry::Registry;
 use crate::registry::scenario::Scenario;
 use crate::rig::presence::{Claim, Presence, PresenceError};
-use crate::rig::{Rig, RigCommand, RigError};
-use crate::status::{Board, Command, Event, SlotState, What};
+use crate::rig::{Rig, RigError};
+use crate::status::{Board, Command};
 use crate::tui::{self, TuiError};
-
-/// An episode asked for at the start begins when every attached device delivers, at the latest
-/// after this time.
-const SETTLE_LIMIT: Duration = Duration::from_secs(3);
-/// Devices that are attached at the start are known after this time.
-const SETTLE_LEAST: Duration = Duration::from_millis(100);
-/// How often it is looked whether they deliver.
-const SETTLE_LOOK: Duration = Duration::from_millis(20);
+use conductor::Conductor;
+use signals::Signals;
 
 /// Where devices come from.
 #[derive(Debug)]
@@ -160,7 +155,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     let recorder = Recorder::spawn(bus.inbox()?, RecorderConfig::new(Arc::clone(&registry), Arc::clone(&board)))?;
     let screen_stop = CancellationToken::new();
     let (commands, asked) = mpsc::channel(16);
-    let screen = start_screen(&options.screen, &board, commands, screen_stop.clone(), options.duration);
+    let screen = start_screen(options.screen, &board, commands, screen_stop.clone(), options.duration);
 
     let hotplug: HotplugStream = match options.devices {
         Devices::Machine => Box::pin(UdevMonitor::open()?),
@@ -198,20 +193,20 @@ pub async fn run(options: Options) -> Result<(), AppError> {
 type ScreenTask = JoinHandle<Result<(), AppError>>;
 
 fn start_screen(
-    screen: &Screen,
+    screen: Screen,
     board: &Arc<Board>,
     commands: mpsc::Sender<Command>,
     stop: CancellationToken,
     duration: Option<Duration>,
 ) -> ScreenTask {
     let board = Arc::clone(board);
-    if *screen == Screen::Monitor {
+    if screen == Screen::Monitor {
         return tokio::spawn(async move { Ok(tui::run(board, commands, stop).await?) });
     }
     let options = HeadlessOptions {
-        json: *screen == Screen::Json,
+        json: screen == Screen::Json,
         colour: ColourChoice::Auto,
-        progress: *screen == Screen::Lines,
+        progress: screen == Screen::Lines,
         duration,
     };
     let run = headless::run(board, stop, options, std::io::stdout());
@@ -233,123 +228,18 @@ struct Running {
     asked: mpsc::Receiver<Command>,
 }
 
-/// Does what the user asks for, from the first sample to the order to end.
-struct Conductor {
-    board: Arc<Board>,
-    events: broadcast::Receiver<Event>,
-    recorder: Recorder,
-    rig_commands: mpsc::Sender<RigCommand>,
-    episode: EpisodeRequest,
-    record: bool,
-    duration: Option<Duration>,
-    recording: bool,
-}
-
-impl Conductor {
-    /// Returns when the run is to end, and why if it is an error.
-    async fn conduct(&mut self, running: &mut Running) -> Result<(), AppError> {
-        let begun = Instant::now();
-        let mut look = interval(SETTLE_LOOK);
-        look.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let end = match (self.record, self.duration) {
-            (false, Some(duration)) => Some(begun + duration),
-            _ => None,
-        };
-        let mut begin_episode = self.record;
-        let mut screen_ended = false;
-        loop {
-            tokio::select! {
-                biased;
-                () = running.signals.next() => return Ok(()),
-                // Its outcome is taken when everything is taken down.
-                () = running.rig_ended.cancelled() => return Ok(()),
-                outcome = &mut running.screen, if !screen_ended => {
-                    outcome.unwrap_or(Err(AppError::Panicked("the screen")))?;
-                    // Nobody reads the output any more. An episode is worth more than its log lines.
-                    if !self.record {
-                        return Ok(());
-                    }
-                    screen_ended = true;
-                }
-                Some(command) = running.asked.recv() => match command {
-                    Command::ToggleRecording => self.toggle().await?,
-                    Command::Restart(id) => { let _ = self.rig_commands.send(RigCommand::Restart(id)).await; }
-                    Command::Quit => return Ok(()),
-                },
-                event = self.events.recv() => {
-                    if self.episode_ended(event)? { return Ok(()); }
-                }
-                _ = look.tick(), if begin_episode => {
-                    if self.has_settled(begun) {
-                        begin_episode = false;
-                        self.start().await?;
-                    }
-                }
-                () = sleep_until(end.unwrap_or(begun)), if end.is_some() => return Ok(()),
-            }
-        }
-    }
-
-    /// Has every device that is attached delivered its first sample?
-    fn has_settled(&self, begun: Instant) -> bool {
-        let waited = begun.elapsed();
-        let opening = self.board.snapshot().devices.iter().any(|device| device.state == SlotState::Opening);
-        waited >= SETTLE_LIMIT || (waited >= SETTLE_LEAST && !opening)
-    }
-
-    async fn toggle(&mut self) -> Result<(), AppError> {
-        if self.recording {
-            // What became of it is announced as an event and shown by the screen.
-            let _ = self.recorder.stop().await;
-            self.recording = false;
-            return Ok(());
-        }
-        match self.start().await {
-            Err(AppError::Record(error)) => {
-                // In the monitor, a full disk is no reason to leave: it is said and can be mended.
-                tracing::error!(%error, "the episode was not begun");
-                Ok(())
-            }
-            outcome => outcome,
-        }
-    }
-
-    async fn start(&mut self) -> Result<(), AppError> {
-        self.recorder.start(self.episode.clone()).await?;
-        self.recording = true;
-        Ok(())
-    }
-
-    /// True when the episode the run was for has ended.
-    fn episode_ended(&mut self, event: Result<Event, broadcast::error::RecvError>) -> Result<bool, AppError> {
-        let Ok(Event { what: What::Episode { file, error, .. }, .. }) = event else { return Ok(false) };
-        self.recording = false;
-        if !self.record {
-            return Ok(false);
-        }
-        match error {
-            Some(reason) => Err(AppError::Episode { file, reason }),
-            // The first episode was asked for on the command line; with a duration it was all.
-            None => Ok(self.duration.is_some()),
-        }
-    }
-}
-
 /// Takes everything down, in the order of the module's comment. The first error is the run's.
 async fn finish(mut running: Running, conductor: Conductor, mut outcome: Result<(), AppError>) -> Result<(), AppError> {
     let Conductor { recorder, recording, board, .. } = conductor;
     running.rig_stop.cancel();
     let rig = running.rig;
     let take_down = async {
-        let rig = match rig.await {
-            Ok((rig, ended)) => {
-                keep_first(&mut outcome, ended.map_err(AppError::from));
-                Some(rig)
-            }
-            Err(_) => {
-                keep_first(&mut outcome, Err(AppError::Panicked("the rig")));
-                None
-            }
+        let rig = if let Ok((rig, ended)) = rig.await {
+            keep_first(&mut outcome, ended.map_err(AppError::from));
+            Some(rig)
+        } else {
+            keep_first(&mut outcome, Err(AppError::Panicked("the rig")));
+            None
         };
         if recording && let Ok(report) = recorder.stop().await {
             let failed = report.error.map(|reason| AppError::Episode { file: report.file, reason });
@@ -385,30 +275,5 @@ async fn finish(mut running: Running, conductor: Conductor, mut outcome: Result<
 fn keep_first(outcome: &mut Result<(), AppError>, next: Result<(), AppError>) {
     if outcome.is_ok() {
         *outcome = next;
-    }
-}
-
-/// SIGINT, SIGTERM, and SIGHUP for a terminal that was closed: all of them end the run.
-struct Signals {
-    interrupt: tokio::signal::unix::Signal,
-    terminate: tokio::signal::unix::Signal,
-    hangup: tokio::signal::unix::Signal,
-}
-
-impl Signals {
-    fn listen() -> std::io::Result<Self> {
-        Ok(Self {
-            interrupt: signal(SignalKind::interrupt())?,
-            terminate: signal(SignalKind::terminate())?,
-            hangup: signal(SignalKind::hangup())?,
-        })
-    }
-
-    async fn next(&mut self) {
-        tokio::select! {
-            _ = self.interrupt.recv() => {}
-            _ = self.terminate.recv() => {}
-            _ = self.hangup.recv() => {}
-        }
     }
 }

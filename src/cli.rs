@@ -44,8 +44,8 @@ pub struct Global {
     /// Print JSON, one object a line, instead of text
     #[arg(long, global = true)]
     pub json: bool,
-    /// Keeps this rig apart from another one on the same machine: its mask is
-    /// /dev/shm/rapid_hardware_mask.NAME, its bus has its own prefix
+    /// Keeps this rig apart from another one on the same machine: the names of its mask file and of
+    /// its bus contain NAME
     #[arg(long, global = true, value_name = "NAME", value_parser = instance)]
     pub instance: Option<String>,
 }
@@ -75,10 +75,10 @@ pub struct RunArgs {
     /// unplugged and replugged
     #[arg(long, value_name = "SCENARIO", num_args = 0..=1, value_hint = ValueHint::FilePath)]
     pub sim: Option<Option<PathBuf>>,
-    /// Observations a second, instead of observation_hz of the registry
+    /// Observations a second, instead of what the registry says
     #[arg(long, value_name = "HZ", value_parser = rate)]
     pub rate: Option<f64>,
-    /// Half width of the window around a tick, instead of sync_window of the registry (25ms)
+    /// Half width of the window around a tick, instead of what the registry says (25ms)
     #[arg(long, value_name = "TIME", value_parser = duration)]
     pub window: Option<Duration>,
 }

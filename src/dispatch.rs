@@ -103,7 +103,7 @@ fn print(global: &Global, run: &RunArgs, command: Command) -> Result<(), Failure
             }
         }
         Command::Devices { formats } => {
-            let registry = find_registry(global)?.map(|path| load(&path)).transpose()?;
+            let registry = find_registry(global).map(|path| load(&path)).transpose()?;
             let formats = if formats { Formats::Ask } else { Formats::Skip };
             let plugged = commands::devices::list(registry.as_ref(), &attached(run, registry.as_ref())?, formats);
             if format == Format::Json {
@@ -172,7 +172,7 @@ fn run(global: &Global, args: &RunArgs, replayed: Option<&Path>) -> Result<(), F
             (loaded.registry, Devices::Simulated(scenario))
         }
         (None, Some(file)) => {
-            let registry = match find_registry(global)? {
+            let registry = match find_registry(global) {
                 Some(path) => load(&path)?,
                 None => Registry::builtin(),
             };
@@ -226,15 +226,15 @@ fn load(path: &Path) -> Result<Registry, Failure> {
 }
 
 fn registry_path(global: &Global) -> Result<PathBuf, Failure> {
-    find_registry(global)?.ok_or_else(|| Failure::NoRegistry(usual_places()))
+    find_registry(global).ok_or_else(|| Failure::NoRegistry(usual_places()))
 }
 
 /// The registry named, or the first of the usual places where there is one.
-fn find_registry(global: &Global) -> Result<Option<PathBuf>, Failure> {
+fn find_registry(global: &Global) -> Option<PathBuf> {
     if let Some(path) = &global.config {
-        return Ok(Some(path.clone()));
+        return Some(path.clone());
     }
-    Ok(usual_places().into_iter().find(|path| path.exists()))
+    usual_places().into_iter().find(|path| path.exists())
 }
 
 fn usual_places() -> Vec<PathBuf> {
@@ -263,5 +263,5 @@ fn paint() -> inspect::Paint {
 }
 
 fn columns() -> usize {
-    crossterm::terminal::size().map_or(100, |(columns, _)| usize::from(columns))
+    crate::tui::columns().unwrap_or(100)
 }

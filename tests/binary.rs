@@ -47,7 +47,7 @@ fn every_signal_that_asks_to_end_finishes_the_file_and_clears_the_mask() {
         assert_eq!(code, Some(0), "{signal:?}: {errors}");
         assert!(output.contains("\"event\":\"episode\""), "{signal:?}: {output}");
         let files = place.files("out");
-        assert!(files.len() == 1 && files[0].ends_with(".mcap"), "{signal:?}: {files:?}");
+        assert!(files.len() == 1 && files[0].ends_with("_001.mcap"), "{signal:?}: {files:?}");
         Episode::read(&place.path("out").join(&files[0]));
         assert!(!place.mask_file().exists(), "{signal:?}");
     }
@@ -155,7 +155,7 @@ fn a_reader_that_goes_away_does_not_end_the_recording() {
     let status = child.wait().expect("wait");
     assert_eq!(status.code(), Some(0));
     let files = place.files("out");
-    assert!(files.len() == 1 && files[0].ends_with(".mcap"), "{files:?}");
+    assert!(files.len() == 1 && files[0].ends_with("_001.mcap"), "{files:?}");
     Episode::read(&place.path("out").join(&files[0]));
 }
 

@@ -253,7 +253,7 @@ impl Rig {
     /// The next moment a slot wants to be woken; far away if none does.
     fn next_deadline(&self) -> Stamp {
         let deadlines = self.modalities.iter().filter_map(|modality| modality.slot.deadline());
-        deadlines.min().unwrap_or_else(|| Stamp::now().after(Duration::from_secs(3600)))
+        deadlines.min().unwrap_or_else(|| Stamp::now().after(Duration::from_hours(1)))
     }
 
     /// Applies an input to a slot, does what it says, and publishes the mask if it changed.

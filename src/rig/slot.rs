@@ -26,7 +26,7 @@ use crate::time::Stamp;
 /// A stream that ends while its device is attached is started again this many times...
 const MAX_RESTARTS: usize = 5;
 /// ...within this time, then the slot has failed.
-const RESTART_WINDOW: Duration = Duration::from_secs(60);
+const RESTART_WINDOW: Duration = Duration::from_mins(1);
 /// Delay before the first restart; each further one in the window waits twice as long.
 const FIRST_BACKOFF: Duration = Duration::from_millis(500);
 

@@ -70,7 +70,7 @@ impl Stream {
         let opened = timeout(OPEN_LIMIT, Driver::open(&self.spec, &self.attachment.node)).await;
         let mut driver = match opened {
             Ok(Ok(driver)) => driver,
-            Ok(Err(error)) => return end(error),
+            Ok(Err(error)) => return end(&error),
             Err(_) => return (End::Retry, format!("did not open within {} s", OPEN_LIMIT.as_secs())),
         };
         self.report(Report::Opened(driver.description())).await;
@@ -86,16 +86,14 @@ impl Stream {
                 reading = driver.read() => {
                     let reading = match reading {
                         Ok(reading) => reading,
-                        Err(error) => return end(error),
+                        Err(error) => return end(&error),
                     };
                     newest = Instant::now();
-                    match self.publish(&reading) {
-                        Ok(()) => {}
-                        Err(reason) if !refused => {
-                            refused = true;
-                            self.report(Report::Refused(reason)).await;
-                        }
-                        Err(_) => {}
+                    if let Err(reason) = self.publish(&reading)
+                        && !refused
+                    {
+                        refused = true;
+                        self.report(Report::Refused(reason)).await;
                     }
                     if pulse != Pulse::Beating {
                         let report = if pulse == Pulse::Silent { Report::Started } else { Report::Resumed };
@@ -161,7 +159,7 @@ enum Pulse {
     Stalled,
 }
 
-fn end(error: DriverError) -> (End, String) {
+fn end(error: &DriverError) -> (End, String) {
     let how = match error {
         DriverError::Gone => End::Gone,
         DriverError::Retry(_) => End::Retry,

@@ -49,6 +49,12 @@ pub enum TuiError {
     Gone(#[source] io::Error),
 }
 
+/// Width of the terminal in columns, if there is one.
+#[must_use]
+pub fn columns() -> Option<usize> {
+    crossterm::terminal::size().ok().map(|(columns, _)| usize::from(columns))
+}
+
 /// Shows the monitor until `shutdown`.
 ///
 /// Asking to quit only sends [`Command::Quit`]; the screen stays until whoever takes the commands

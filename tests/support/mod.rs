@@ -1,7 +1,7 @@
 //! What the tests of the binary share: a run of `rapid` with a folder and an instance of its own.
 
-// Each test binary uses its own part of this module.
-#![allow(dead_code)]
+#![allow(dead_code, reason = "each test binary uses its own part of this module")]
+#![allow(clippy::expect_used, reason = "what fails here fails a test")]
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 /// How long a condition may take to come true before a test gives up. It is no requirement: a slow
 /// machine only makes the test slow.
-pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
+pub(crate) const PATIENCE: Duration = Duration::from_mins(1);
 
 /// A folder and an instance name of a test's own.
 pub(crate) struct Place {

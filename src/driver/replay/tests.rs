@@ -38,7 +38,7 @@ fn options() -> mcap::WriteOptions {
 fn episode(options: mcap::WriteOptions) -> Vec<u8> {
     let mut bytes = Vec::new();
     let mut writer = options.create(Cursor::new(&mut bytes)).unwrap();
-    let mut channel = |writer: &mut mcap::Writer<_>, topic: &str, schema: &str| {
+    let channel = |writer: &mut mcap::Writer<_>, topic: &str, schema: &str| {
         let schema = writer.add_schema(schema, "protobuf", b"").unwrap();
         writer.add_channel(schema, topic, "protobuf", &BTreeMap::new()).unwrap()
     };

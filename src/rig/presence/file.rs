@@ -5,16 +5,22 @@ use std::io::ErrorKind;
 use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{Ordering, fence};
+use std::time::Duration;
 
 use rustix::fs::{FlockOperation, Mode, OFlags};
 use rustix::io::Errno;
 
 use crate::mask::{MaskRecord, MaskRecordError, PhysicalMask, RECORD_LEN};
+use crate::time::Stamp;
 
 /// A publisher that dies between making and locking a file leaves the next one to try again.
 const TRIES: usize = 10;
-/// A reader that meets a write in progress tries again.
-const READ_TRIES: usize = 1000;
+/// A reader that meets a write in progress tries again for this long: its writer may be waiting for
+/// a busy core.
+const READ_PATIENCE: Duration = Duration::from_secs(1);
+/// Looks in quick succession before a reader lets time pass between them.
+const QUICK_LOOKS: u32 = 50;
+const PAUSE: Duration = Duration::from_micros(100);
 
 /// Why the mask cannot be published or read.
 #[derive(Debug, thiserror::Error)]
@@ -173,7 +179,8 @@ pub fn read_mask(path: &Path) -> Result<MaskRecord, PresenceError> {
         _ => PresenceError::Io { path: path.to_owned(), error },
     };
     let file = File::open(path).map_err(io)?;
-    for _ in 0..READ_TRIES {
+    let begun = Stamp::now();
+    for look in 0_u32.. {
         let mut bytes = [0; RECORD_LEN];
         file.read_exact_at(&mut bytes, 0).map_err(io)?;
         fence(Ordering::SeqCst);
@@ -183,7 +190,14 @@ pub fn read_mask(path: &Path) -> Result<MaskRecord, PresenceError> {
             return MaskRecord::from_bytes(&bytes)
                 .map_err(|error| PresenceError::Record { path: path.to_owned(), error });
         }
-        std::thread::yield_now();
+        if Stamp::now().since(begun) > READ_PATIENCE {
+            break;
+        }
+        if look < QUICK_LOOKS {
+            std::thread::yield_now();
+        } else {
+            std::thread::sleep(PAUSE);
+        }
     }
     Err(PresenceError::Torn { path: path.to_owned() })
 }
