@@ -204,8 +204,8 @@ fn open_line(path: &Path, baud: u32) -> Result<SerialStream, DriverError> {
     let Some(name) = path.to_str() else {
         return Err(DriverError::Fatal(format!("{}: the path is not UTF-8", path.display())));
     };
-    let stream =
-        SerialStream::open(&tokio_serial::new(name, baud).exclusive(true)).map_err(|error| open_error(path, baud, &error))?;
+    let stream = SerialStream::open(&tokio_serial::new(name, baud).exclusive(true))
+        .map_err(|error| open_error(path, baud, &error))?;
     // Whatever waited in the kernel is older than this opening.
     let _ = stream.clear(ClearBuffer::Input);
     Ok(stream)

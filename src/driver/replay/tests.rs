@@ -97,7 +97,7 @@ async fn samples_come_in_order_at_their_recorded_distances_then_silence() {
     }
 }
 
-#[tokio::test(start_paused = true)]
+#[tokio::test]
 async fn a_replugged_device_goes_on_at_the_present_moment() {
     let file = file(&episode(options()));
     let first = device(file.path(), "/rapid/tof");
@@ -167,7 +167,7 @@ async fn what_cannot_be_played_is_said() {
 fn damaged_files_never_panic() {
     for options in [options(), options().compression(None), options().use_chunks(false)] {
         let whole = episode(options);
-        for at in (0..whole.len()).step_by(3) {
+        for at in (0..whole.len()).step_by(11) {
             let mut bytes = whole.clone();
             bytes[at] ^= 1 << (at % 8);
             if at % 7 == 0 {

@@ -34,8 +34,10 @@ fn le(values: &[f64]) -> Vec<u8> {
 
 #[test]
 fn malformed_messages_are_counted_and_the_stream_goes_on() {
-    let (found, lost) =
-        decode(&spec(Framing::Line, Parse::Csv, 2), &[b"9,9,9 first is partial\n1,2\n1\nx,y\n\xff\xfe\n3,4\n5,6\nbad\n"]);
+    let (found, lost) = decode(
+        &spec(Framing::Line, Parse::Csv, 2),
+        &[b"9,9,9 first is partial\n1,2\n1\nx,y\n\xff\xfe\n3,4\n5,6\nbad\n"],
+    );
     assert_eq!(found, [(le(&[1.0, 2.0]), 0), (le(&[3.0, 4.0]), 3), (le(&[5.0, 6.0]), 0)]);
     assert_eq!(lost, 1);
 }

@@ -72,7 +72,10 @@ fn control(name: &str, minimum: i64, maximum: i64) -> ControlInfo {
 fn controls_are_found_by_name_however_it_is_written() {
     let offered = [control("White Balance, Automatic", 0, 1), control("Exposure Time, Absolute", 3, 2047)];
     for name in ["white_balance_automatic", "White Balance, Automatic", "WHITE BALANCE AUTOMATIC"] {
-        assert_eq!(find_control(&offered, name, 1).map(|control| control.name.as_str()), Ok("White Balance, Automatic"));
+        assert_eq!(
+            find_control(&offered, name, 1).map(|control| control.name.as_str()),
+            Ok("White Balance, Automatic")
+        );
     }
     let unknown = find_control(&offered, "zoom", 1).unwrap_err();
     assert_eq!(unknown, "no control zoom; it offers white_balance_automatic, exposure_time_absolute");

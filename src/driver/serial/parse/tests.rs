@@ -27,7 +27,9 @@ fn json_arrays_hold_numbers_and_objects_hold_some() {
     assert_eq!(read(Parse::Json, b" [1, -2.5, 3e2] ", 3), Some(vec![1.0, -2.5, 300.0]));
     let object = br#"{"t": 7, "name": "tof\n", "ok": true, "none": null, "raw": [9, 9], "in": {"x": 9}, "z": -1}"#;
     assert_eq!(read(Parse::Json, object, 2), Some(vec![7.0, -1.0]));
-    for wrong in [&b"[1,2]"[..], b"[1,2,3,4]", b"[1,2,\"3\"]", b"[1,2,null]", b"[1,2,3", b"[1,2,3] 4", b"3", b"", b"[1,2,nan]"] {
+    for wrong in
+        [&b"[1,2]"[..], b"[1,2,3,4]", b"[1,2,\"3\"]", b"[1,2,null]", b"[1,2,3", b"[1,2,3] 4", b"3", b"", b"[1,2,nan]"]
+    {
         assert_eq!(read(Parse::Json, wrong, 3), None, "{wrong:?}");
     }
     assert_eq!(read(Parse::Json, &[b'['; 100_000], 3), None, "nesting is bounded");
