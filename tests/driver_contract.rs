@@ -1,6 +1,8 @@
 //! What every driver promises, tried on those that run without hardware: simulated camera, simulated
 //! serial line, a serial line over a pseudo terminal, and a recorded episode.
 
+#![expect(clippy::unwrap_used, clippy::expect_used, reason = "a test ends where what it needs is missing")]
+
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::collections::BTreeMap;
@@ -239,7 +241,7 @@ async fn allocations<T>(future: impl Future<Output = T>) -> (u64, T) {
 async fn a_simulated_reading_allocates_nothing() {
     for source in [CAMERA, SERIAL] {
         let (mut driver, _device) = open_sim(source).await;
-        for _ in 0..20 {
+        for _ in 0..200 {
             driver.read().await.unwrap();
         }
         for _ in 0..1_000 {
@@ -254,11 +256,13 @@ async fn a_simulated_reading_allocates_nothing() {
 async fn a_serial_reading_allocates_nothing() {
     for (parse, message) in [(Parse::Csv, &b"1.5,-2,3e4\n"[..]), (Parse::Json, b"{\"x\":1,\"y\":2.5,\"z\":-3}\n")] {
         let (mut driver, mut far) = open_pty(&serial_spec(Framing::Line, parse, 3)).await;
-        for round in 0..1_020 {
+        for round in 0..1_200 {
             far.write_all(message).await.unwrap();
             let (count, reading) = allocations(driver.read()).await;
             assert_eq!(reading.unwrap().bytes.len(), 24);
-            assert!(count == 0 || round < 20, "{count} allocations in round {round}");
+            // Warm once tokio's cooperative budget of 128 operations has run out: its list of tasks to
+            // wake after that grows then, once in a runtime's life.
+            assert!(count == 0 || round < 200, "{count} allocations in round {round}");
         }
     }
 }
