@@ -151,10 +151,12 @@ fn start(name: &str, spec: &CameraSpec, path: &Path) -> Result<(Ring, Layout, St
     let card = node.capture_card(path)?;
     set_controls(name, spec, &node, path)?;
     let agreed = match node.negotiate(spec) {
-        Ok(agreed) => agreed,
+        Ok(agreed) => agreed.accept(spec),
+        // Most drivers answer with what they can do instead; some refuse.
+        Err(error) if error.raw_os_error() == Some(libc::EINVAL) => None,
         Err(error) => return Err(node::setup_error(path, "format", &error)),
     };
-    let Some((layout, rate)) = agreed.accept(spec) else {
+    let Some((layout, rate)) = agreed else {
         // The listing sets a format by itself, which a node with one set by us would refuse.
         drop(node);
         let offered = query(path).map(|info| info.modes).unwrap_or_default();

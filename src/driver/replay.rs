@@ -1,7 +1,7 @@
 //! Replay: one topic of a recorded episode, played as a device.
 //!
-//! A thread reads the file a few messages ahead; what it hands over is due at the recorded distance
-//! from the scenario's beginning. When the messages are used up the device stays silent, as one that
+//! The file is read a batch of messages ahead on the blocking pool; each is due at its recorded
+//! distance from the scenario's beginning. When the messages are used up the device stays silent, as one that
 //! hangs does.
 //!
 //! Invariant: the file is read chunk by chunk, never held whole.
@@ -15,7 +15,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use tokio::sync::mpsc;
+use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
 use self::episode::{Episode, Messages};
@@ -27,8 +27,10 @@ use crate::registry::scenario::{SimDevice, SimSource};
 use crate::sample::FLAG_DEVICE_TIME;
 use crate::time::{Stamp, nanoseconds};
 
-/// Messages read ahead: at 1 kHz this bridges the reading of a chunk.
-const AHEAD: usize = 32;
+/// Messages read at once: at 1 kHz this bridges the reading of a chunk.
+const BATCH: usize = 32;
+/// Bytes of payload after which a batch is full, for large pictures.
+const BATCH_BYTES: usize = 8 << 20;
 /// How soon a pulled cable or a silence is noticed, at the latest.
 const NOTICE: Duration = Duration::from_millis(10);
 /// The first time a device is opened, what was recorded while it was being opened is still played.
@@ -38,13 +40,11 @@ const OPENING: Duration = Duration::from_secs(2);
 #[derive(Debug)]
 pub struct Replay {
     device: Arc<SimDevice>,
-    messages: mpsc::Receiver<Message>,
-    /// Used buffers, back to the thread.
-    used: mpsc::Sender<Vec<u8>>,
-    /// Read from the file, not yet due.
-    waiting: Option<Message>,
-    current: Option<Message>,
-    is_over: bool,
+    playing: Vec<Message>,
+    /// The message of `playing` that is next.
+    next: usize,
+    /// The batch after `playing`; `None` once the file is used up.
+    reading: Option<JoinHandle<Batch>>,
     description: String,
 }
 
@@ -71,13 +71,9 @@ impl Replay {
         let from_ns = begin_ns.saturating_add(nanoseconds(from));
         let description = format!("replay of {topic} in {}", file.display());
         let (messages, schema) = unblock(move || Episode::open(&file)?.play(&topic, from_ns)).await?;
-        let (ahead, receiver) = mpsc::channel(AHEAD);
-        let (used, returned) = mpsc::channel(AHEAD + 2);
-        std::thread::Builder::new()
-            .name("replay".to_owned())
-            .spawn(move || read_ahead(messages, schema, begin_ns, &ahead, returned))
-            .map_err(|error| DriverError::Retry(format!("no thread to read the recording: {error}")))?;
-        Ok(Self { device, messages: receiver, used, waiting: None, current: None, is_over: false, description })
+        let reader = Reader { messages, schema, begin_ns };
+        let reading = Some(tokio::task::spawn_blocking(move || reader.batch(Vec::new())));
+        Ok(Self { device, playing: Vec::new(), next: 0, reading, description })
     }
 
     /// The next recorded sample, when it is due.
@@ -88,12 +84,10 @@ impl Replay {
         let captured = self.wait_due().await?;
         // Nothing waits from here on: a future that is dropped has taken no sample.
         self.device.sequence.fetch_add(1, Ordering::AcqRel);
-        if let Some(previous) = self.current.take() {
-            // A full channel has buffers enough.
-            let _ = self.used.try_send(previous.payload);
-        }
-        self.current = self.waiting.take();
-        let Some(Message { payload, shape, .. }) = &self.current else { return Err(DriverError::Gone) };
+        let Some(Message { payload, shape, .. }) = self.playing.get(self.next) else {
+            return Err(DriverError::Gone);
+        };
+        self.next += 1;
         let Shape { encoding, width, height } = *shape;
         Ok(Reading { bytes: payload, encoding, captured, flags: FLAG_DEVICE_TIME, width, height, lost: 0 })
     }
@@ -104,22 +98,15 @@ impl Replay {
         &self.description
     }
 
+    /// Waits until the message at `next` is due.
     async fn wait_due(&mut self) -> Result<Stamp, DriverError> {
         loop {
             if self.device.is_unplugged() {
                 return Err(DriverError::Gone);
             }
             let now = Instant::now();
-            let Some(message) = &self.waiting else {
-                if self.is_over {
-                    tokio::time::sleep_until(now + NOTICE).await;
-                    continue;
-                }
-                // Dropped between the two, a receive leaves the message in the channel.
-                if let Ok(received) = tokio::time::timeout_at(now + NOTICE, self.messages.recv()).await {
-                    self.is_over = received.is_none();
-                    self.waiting = received;
-                }
+            let Some(message) = self.playing.get(self.next) else {
+                self.turn_over(now + NOTICE).await;
                 continue;
             };
             let due = self.device.begun.after(message.after);
@@ -128,38 +115,68 @@ impl Replay {
                 tokio::time::sleep_until((now + due.since(now_stamp)).min(now + NOTICE)).await;
             } else if self.device.is_silent() {
                 // What a silent device would have sent now is not sent later.
-                self.waiting = None;
+                self.next += 1;
             } else {
                 return Ok(due);
             }
         }
     }
+
+    /// Takes the batch that was read meanwhile and has the next one read; gives up at `until`.
+    async fn turn_over(&mut self, until: Instant) {
+        let Some(reading) = &mut self.reading else {
+            // The file is used up.
+            tokio::time::sleep_until(until).await;
+            return;
+        };
+        // Dropped here, the handle and the batch behind it stay.
+        let Ok(read) = tokio::time::timeout_at(until, reading).await else { return };
+        self.reading = None;
+        // It ends without a batch only when the runtime is going down.
+        let Ok(Batch { messages, rest }) = read else { return };
+        let used = std::mem::replace(&mut self.playing, messages);
+        self.next = 0;
+        self.reading = rest.map(|reader| tokio::task::spawn_blocking(move || reader.batch(used)));
+    }
 }
 
-/// The thread's work: ends with the file, with its first damage, or when nobody listens any more.
-fn read_ahead(
-    mut messages: Messages,
+/// Messages, and what is to be read after them; `None` at the end of the file.
+#[derive(Debug)]
+struct Batch {
+    messages: Vec<Message>,
+    rest: Option<Reader>,
+}
+
+/// Reads the file, on the blocking pool.
+#[derive(Debug)]
+struct Reader {
+    messages: Messages,
     schema: Schema,
     begin_ns: u64,
-    ahead: &mpsc::Sender<Message>,
-    mut returned: mpsc::Receiver<Vec<u8>>,
-) {
-    loop {
-        let mut payload = returned.try_recv().unwrap_or_default();
-        let next = match messages.next() {
-            Ok(Some(next)) => next,
-            Ok(None) => return,
-            Err(error) => {
-                tracing::warn!(%error, "the recording ends early");
-                return;
-            }
-        };
-        // A message that cannot be read was not recorded by us; it has no sample to play.
-        let Some(shape) = wire::payload(schema, next.data, &mut payload) else { continue };
-        let after = Duration::from_nanos(next.log_time.saturating_sub(begin_ns));
-        if ahead.blocking_send(Message { after, payload, shape }).is_err() {
-            return;
+}
+
+impl Reader {
+    /// The next messages, in the memory of `used` ones. The file's end or its first damage is the end.
+    fn batch(mut self, used: Vec<Message>) -> Batch {
+        let mut spare = used.into_iter().map(|message| message.payload);
+        let (mut messages, mut bytes) = (Vec::with_capacity(BATCH), 0);
+        while messages.len() < BATCH && bytes < BATCH_BYTES {
+            let next = match self.messages.next() {
+                Ok(Some(next)) => next,
+                Ok(None) => return Batch { messages, rest: None },
+                Err(error) => {
+                    tracing::warn!(%error, "the recording ends early");
+                    return Batch { messages, rest: None };
+                }
+            };
+            let mut payload = spare.next().unwrap_or_default();
+            // A message that cannot be read was not recorded by us; it has no sample to play.
+            let Some(shape) = wire::payload(self.schema, next.data, &mut payload) else { continue };
+            let after = Duration::from_nanos(next.log_time.saturating_sub(self.begin_ns));
+            bytes += payload.len();
+            messages.push(Message { after, payload, shape });
         }
+        Batch { messages, rest: Some(self) }
     }
 }
 

@@ -2,8 +2,9 @@
 //!
 //! nokhwa finds cameras and their formats. What it is known not to list is filled in through the
 //! v4l crate under it: it drops the numerator of an interval (2/15 s becomes 15 fps), knows six pixel
-//! formats, and steps through a range of sizes in both dimensions at once, without end if a driver
-//! gives a step of 0, so it is not asked about ranges at all.
+//! formats (grey under a name V4L2 does not have), and steps through a range of sizes in both
+//! dimensions at once, with a panic where a driver gives a step of 0, so it is not asked about ranges
+//! at all.
 //!
 //! Invariant: listing never leaves a descriptor open.
 

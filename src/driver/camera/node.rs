@@ -145,7 +145,7 @@ impl Node {
             {
                 controls.push(ControlInfo {
                     id: asked.id,
-                    name: text(&asked.name.map(i8::cast_unsigned)),
+                    name: text(&asked.name.map(|c| c.to_ne_bytes()[0])),
                     minimum: asked.minimum,
                     maximum: asked.maximum,
                     step: asked.step,

@@ -306,6 +306,12 @@ impl Source {
     }
 }
 
+impl std::fmt::Debug for Messages {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Messages").field("channels", &self.channels).finish_non_exhaustive()
+    }
+}
+
 /// The messages of a topic, ascending by log time where the file has an index of its chunks.
 pub(super) struct Messages {
     file: Source,

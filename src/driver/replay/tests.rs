@@ -78,7 +78,7 @@ fn value(reading: &Reading<'_>) -> f64 {
     f64::from_le_bytes(reading.bytes.try_into().unwrap())
 }
 
-#[tokio::test]
+#[tokio::test(start_paused = true)]
 async fn samples_come_in_order_at_their_recorded_distances_then_silence() {
     for options in [options(), options().use_chunks(false), options().compression(None)] {
         let file = file(&episode(options));
@@ -89,7 +89,7 @@ async fn samples_come_in_order_at_their_recorded_distances_then_silence() {
             assert_eq!(value(&reading).to_bits(), f64::from(i).to_bits());
             assert_eq!((reading.encoding, reading.width), (crate::sample::Encoding::F64, 1));
             assert_eq!(reading.captured.since(device.begun), Duration::from_millis(u64::from(i) * 10));
-            assert!(Stamp::now() >= reading.captured, "a sample is not given before its time");
+            assert!(stamp_of(Instant::now()) >= reading.captured, "a sample is not given before its time");
         }
         assert!(tokio::time::timeout(Duration::from_millis(50), replay.read()).await.is_err());
         device.unplug();
@@ -107,7 +107,7 @@ async fn a_replugged_device_goes_on_at_the_present_moment() {
     let second = Arc::new(SimDevice::new("tof", first.source.clone(), first.begun));
     second.sequence.store(first.sequence.load(Ordering::Acquire), Ordering::Release);
     let mut replay = Replay::open(second).await.unwrap();
-    assert!(value(&replay.read().await.unwrap()) >= 51.0);
+    assert_eq!(value(&replay.read().await.unwrap()).to_bits(), 51.0_f64.to_bits());
 }
 
 #[test]
@@ -167,7 +167,7 @@ async fn what_cannot_be_played_is_said() {
 fn damaged_files_never_panic() {
     for options in [options(), options().compression(None), options().use_chunks(false)] {
         let whole = episode(options);
-        for at in (0..whole.len()).step_by(3) {
+        for at in (0..whole.len()).step_by(11) {
             let mut bytes = whole.clone();
             bytes[at] ^= 1 << (at % 8);
             if at % 7 == 0 {

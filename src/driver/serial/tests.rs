@@ -13,9 +13,9 @@ fn decode(spec: &SerialSpec, chunks: &[&[u8]]) -> (Vec<(Vec<u8>, u64)>, u64) {
     for chunk in chunks {
         let mut rest = *chunk;
         while !rest.is_empty() {
-            let (taken, decoded) = decoder.feed(rest);
+            let (taken, outcome) = decoder.feed(rest);
             rest = &rest[taken..];
-            match decoded {
+            match outcome {
                 Decoded::Nothing => {}
                 Decoded::Malformed => lost += 1,
                 Decoded::Message => {

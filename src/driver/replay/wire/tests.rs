@@ -58,7 +58,7 @@ struct Mask {
     #[prost(message, optional, tag = "1")]
     timestamp: Option<Timestamp>,
     #[prost(fixed64, tag = "2")]
-    mask: u64,
+    bits: u64,
     #[prost(uint64, tag = "3")]
     sequence: u64,
 }
@@ -68,8 +68,8 @@ fn read(schema: Schema, message: &[u8]) -> Option<(Vec<u8>, Shape)> {
     payload(schema, message, &mut into).map(|shape| (into, shape))
 }
 
-fn now() -> Option<Timestamp> {
-    Some(Timestamp { seconds: 1_700_000_000, nanos: 5 })
+fn now() -> Timestamp {
+    Timestamp { seconds: 1_700_000_000, nanos: 5 }
 }
 
 /// Start of image, an application segment, and a frame header of 640x480.
@@ -83,7 +83,7 @@ fn jpeg() -> Vec<u8> {
 
 #[test]
 fn compressed_pictures_come_back_with_their_size() {
-    let image = CompressedImage { timestamp: now(), data: jpeg(), format: "jpeg".into(), frame_id: "cam".into() };
+    let image = CompressedImage { timestamp: Some(now()), data: jpeg(), format: "jpeg".into(), frame_id: "cam".into() };
     let shape = Shape { encoding: Encoding::Mjpeg, width: 640, height: 480 };
     assert_eq!(read(Schema::CompressedImage, &image.encode_to_vec()), Some((jpeg(), shape)));
     let png = CompressedImage { format: "png".into(), ..image };
@@ -113,7 +113,7 @@ fn numbers_come_back_packed_or_not() {
     let values = vec![1.5, -2.0, f64::INFINITY];
     let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
     let shape = Shape { encoding: Encoding::F64, width: 3, height: 0 };
-    let packed = Scalars { timestamp: now(), values: values.clone() }.encode_to_vec();
+    let packed = Scalars { timestamp: Some(now()), values: values.clone() }.encode_to_vec();
     assert_eq!(read(Schema::Scalars, &packed), Some((bytes.clone(), shape)));
     assert_eq!(read(Schema::Scalars, &Loose { values }.encode_to_vec()), Some((bytes, shape)));
     assert_eq!(read(Schema::Scalars, &[0x12, 3, 1, 2, 3]), None, "three bytes are no doubles");
@@ -121,7 +121,7 @@ fn numbers_come_back_packed_or_not() {
 
 #[test]
 fn masks_are_fixed_64_bit_words() {
-    let message = Mask { timestamp: now(), mask: 1 << 63 | 5, sequence: 300 }.encode_to_vec();
+    let message = Mask { timestamp: Some(now()), bits: 1 << 63 | 5, sequence: 300 }.encode_to_vec();
     assert_eq!(mask(&message), Some(PhysicalMask(1 << 63 | 5)));
     assert_eq!(mask(&[]), Some(PhysicalMask(0)), "zero is not written");
 }
@@ -138,7 +138,7 @@ proptest! {
 
     #[test]
     fn damaged_messages_are_read_or_refused(at in 0_usize..60, byte in any::<u8>(), cut in 0_usize..60) {
-        let image = CompressedImage { timestamp: now(), data: jpeg(), format: "jpeg".into(), frame_id: "cam".into() };
+        let image = CompressedImage { timestamp: Some(now()), data: jpeg(), format: "jpeg".into(), frame_id: "cam".into() };
         let mut message = image.encode_to_vec();
         if let Some(place) = message.get_mut(at) {
             *place = byte;

@@ -32,7 +32,7 @@ fn json_arrays_hold_numbers_and_objects_hold_some() {
     {
         assert_eq!(read(Parse::Json, wrong, 3), None, "{wrong:?}");
     }
-    assert_eq!(read(Parse::Json, &[b'['; 100_000], 3), None, "nesting is bounded");
+    assert_eq!(read(Parse::Json, &vec![b'['; 100_000], 3), None, "nesting is bounded");
 }
 
 #[test]
