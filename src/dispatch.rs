@@ -167,9 +167,8 @@ fn run(global: &Global, args: &RunArgs, replayed: Option<&Path>) -> Result<(), F
     let (mut registry, devices) = match (replayed, &args.sim) {
         (Some(file), _) => {
             let failed = |reason: String| Failure::Replay { file: file.to_owned(), reason };
-            let (text, scenario) = replay::scenario(file).map_err(|error| failed(error.to_string()))?;
-            let loaded = Registry::parse(&text, None).map_err(|errors| failed(errors.to_string()))?;
-            (loaded.registry, Devices::Simulated(scenario))
+            let (registry, scenario) = replay::scenario(file).map_err(|error| failed(error.to_string()))?;
+            (registry, Devices::Simulated(scenario))
         }
         (None, Some(file)) => {
             let registry = match find_registry(global) {

@@ -68,7 +68,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("tokio_serial", &["driver/serial"]),
     ("tokio_util", &[ABOVE_NOUNS]),
     ("thread_priority", &["rig/presence"]),
-    ("toml", &["registry", "driver/replay"]),
+    ("toml", &["registry"]),
     ("tracing", &[ABOVE_NOUNS]),
     ("tracing_subscriber", &["logging"]),
     ("udev", &["hotplug/udev"]),

@@ -11,6 +11,7 @@
 
 mod buffers;
 mod format;
+mod layout;
 mod listing;
 mod node;
 
@@ -22,9 +23,9 @@ use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
 use self::buffers::Ring;
-pub(super) use self::format::compact_rows;
 pub use self::format::{CameraInfo, ControlInfo, Mode, Rate, Rates, Size};
-use self::format::{Frame, Layout, Progress};
+pub(super) use self::layout::compact_rows;
+use self::layout::{Frame, Layout, Progress};
 pub use self::listing::{cameras, query};
 use self::node::Node;
 use super::{DriverError, Reading, unblock};

@@ -8,6 +8,7 @@
 //! Invariant: a damaged file ends the topic early; it never ends the program.
 
 mod episode;
+mod scenario;
 mod wire;
 
 use std::path::Path;
@@ -19,7 +20,8 @@ use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
 use self::episode::{Episode, Messages};
-pub use self::episode::{EpisodeDescription, TopicDescription, describe, scenario};
+pub use self::episode::{EpisodeDescription, TopicDescription, describe};
+pub use self::scenario::scenario;
 use self::wire::{Schema, Shape};
 use super::sim::stamp_of;
 use super::{DriverError, Reading, unblock};

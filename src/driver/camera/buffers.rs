@@ -16,7 +16,7 @@ use v4l::v4l_sys::{
 };
 use v4l::v4l2::{self, vidioc};
 
-use super::format::Frame;
+use super::layout::Frame;
 use super::node::{CAPTURE, Node, Plain as _};
 use crate::time::Stamp;
 

@@ -5,7 +5,6 @@
 use std::fs::File;
 use std::os::unix::fs::FileExt as _;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use mcap::records::Record;
 use mcap::sans_io::indexed_reader::{IndexedReadEvent, IndexedReader, IndexedReaderOptions};
@@ -17,16 +16,12 @@ use super::wire::{self, Schema};
 use super::{DriverError, fatal};
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
-use crate::registry::UsbIdentity;
-use crate::registry::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, SimSource};
 
 /// Largest record or chunk that is read; a 4K raw picture has 16 MiB.
 const RECORD_LIMIT: usize = 256 << 20;
 const MASK_TOPIC: &str = "/rapid/mask";
 /// Name of the metadata record that holds layout and registry.
 const METADATA: &str = "rapid";
-/// A device is attached before its first sample, with which its bit begins: by this much.
-const LEAD: Duration = Duration::from_millis(100);
 
 /// What an episode holds.
 #[derive(Debug, Clone, PartialEq)]
@@ -64,74 +59,6 @@ pub struct TopicDescription {
 /// When the file cannot be read, or is damaged or was never closed.
 pub fn describe(file: &Path) -> Result<EpisodeDescription, DriverError> {
     Episode::open(file)?.describe()
-}
-
-/// The registry text of a recorded episode, and a scenario in which each modality is a device that
-/// plays its topic and is plugged and unplugged as the recorded mask says; blocks.
-///
-/// # Errors
-/// When the file cannot be read, or does not hold the registry, the layout or a modality's topic.
-pub fn scenario(file: &Path) -> Result<(String, Scenario), DriverError> {
-    let episode = describe(file)?;
-    if episode.layout.is_empty() || episode.registry.is_empty() {
-        return Err(fatal(file, "holds no layout and registry: it was not recorded by rapid"));
-    }
-    let registry: toml::Table =
-        episode.registry.parse().map_err(|error| fatal(file, format!("its registry cannot be read: {error}")))?;
-    let mut devices = Vec::new();
-    let mut events = Vec::new();
-    for (name, id) in &episode.layout {
-        let entry = registry.get("device").and_then(|devices| devices.get(name));
-        let Some(topic) = entry.and_then(|entry| entry.get("topic")).and_then(toml::Value::as_str) else {
-            return Err(fatal(file, format!("its registry names no topic of [device.{name}]")));
-        };
-        devices.push(ScenarioDevice {
-            name: name.clone(),
-            usb: usb_identity(entry, *id),
-            source: SimSource::Replay { file: file.to_owned(), topic: topic.to_owned(), begin_ns: episode.begin_ns },
-            plugged: episode.mask.first().is_some_and(|(_, mask)| mask.contains(*id)),
-        });
-        events.extend(plug_events(&episode, name, *id));
-    }
-    events.sort_by_key(|event| event.at);
-    Ok((episode.registry, Scenario { devices, events, repeat: None }))
-}
-
-/// Plugs and unplugs of one modality, from the changes of its bit.
-fn plug_events(episode: &EpisodeDescription, name: &str, id: ModalityId) -> Vec<ScenarioEvent> {
-    let mut events: Vec<ScenarioEvent> = Vec::new();
-    for pair in episode.mask.windows(2) {
-        let [(_, before), (time, after)] = pair else { continue };
-        let at = Duration::from_nanos(time.saturating_sub(episode.begin_ns));
-        let earliest = events.last().map_or(Duration::ZERO, |event| event.at);
-        let (at, action) = match (before.contains(id), after.contains(id)) {
-            (false, true) => (at.saturating_sub(LEAD).max(earliest), ScenarioAction::Plug { port: None }),
-            (true, false) => (at, ScenarioAction::Unplug),
-            _ => continue,
-        };
-        events.push(ScenarioEvent { at, device: name.to_owned(), action });
-    }
-    events
-}
-
-/// What the entry says the device is; ports are made up where it names none.
-fn usb_identity(entry: Option<&toml::Value>, id: ModalityId) -> UsbIdentity {
-    let field = |name: &str| entry.and_then(|entry| entry.get(name));
-    let number = |name| match field(name)? {
-        toml::Value::String(text) => {
-            u16::from_str_radix(text.trim_start_matches("0x").trim_start_matches("0X"), 16).ok()
-        }
-        toml::Value::Integer(number) => u16::try_from(*number).ok(),
-        _ => None,
-    };
-    let text = |name| field(name).and_then(toml::Value::as_str).map(str::to_owned);
-    UsbIdentity {
-        vid: number("vid").unwrap_or(0),
-        pid: number("pid").unwrap_or(0),
-        serial: text("serial"),
-        port: text("port").unwrap_or_else(|| format!("9-{}", id.bit() + 1)),
-        product: Some(String::from("replay")),
-    }
 }
 
 /// An open file with its index.

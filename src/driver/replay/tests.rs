@@ -10,12 +10,18 @@ const REGISTRY: &str = r#"
 [device.tof]
 vid = "0x10c4"
 pid = 0xea60
-serial = "T1"
+serial_number = "T1"
+node = "serial"
+bit = 0
 topic = "/rapid/tof"
+[device.tof.serial]
+channels = 1
 [device.cam]
 vid = "046d"
 pid = "0825"
 port = "1-2.3"
+node = "camera"
+bit = 3
 topic = "/rapid/cam"
 "#;
 
@@ -128,7 +134,7 @@ fn an_episode_describes_itself() {
 fn a_scenario_follows_the_recorded_mask() {
     let file = file(&episode(options()));
     let (registry, scenario) = scenario(file.path()).unwrap();
-    assert_eq!(registry, REGISTRY);
+    assert_eq!(registry, crate::registry::Registry::parse(REGISTRY, None).unwrap().registry);
     let plugged: Vec<_> = scenario.devices.iter().map(|device| (device.name.as_str(), device.plugged)).collect();
     assert_eq!(plugged, [("tof", true), ("cam", false)]);
     let [tof, cam] = &scenario.devices[..] else { panic!("two devices") };

@@ -1,4 +1,7 @@
+use super::super::layout::{Frame, Layout, Progress};
 use super::*;
+use crate::sample::FLAG_ERROR;
+use crate::time::Stamp;
 
 fn spec(format: PixelFormat) -> CameraSpec {
     CameraSpec { width: 640, height: 480, fps: 30, format, controls: Vec::new() }
