@@ -89,7 +89,8 @@ impl Scenario {
         self
     }
 
-    /// Runs this script (bash with the words of `guest/bench.sh`) instead of `rapid`. Devices are defined and not plugged.
+    /// Runs this script (bash with the words of `guest/bench.sh`). Devices are defined and not plugged.
+    /// With a registry, `"${rapid[@]}"` is there to be run.
     #[must_use]
     pub fn script(mut self, script: &str) -> Self {
         self.play = Play::Script(script.into());
@@ -129,8 +130,8 @@ impl Scenario {
         let image = Image::locate()?;
         let usbemu = programs::usbemu()?;
         let rapid = match self.play {
-            Play::Script(_) => None,
-            Play::Record { .. } => Some(programs::rapid()?),
+            Play::Script(_) if self.registry.is_empty() => None,
+            Play::Script(_) | Play::Record { .. } => Some(programs::rapid()?),
         };
         let share = fresh_folder(&self.name)?;
         let inside = share.join("in");
