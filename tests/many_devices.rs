@@ -5,6 +5,7 @@
 mod support;
 
 use std::fmt::Write as _;
+use std::path::Path;
 
 use rapid::bus::Bus;
 use rapid::driver::sim;
@@ -102,7 +103,8 @@ fn their_topics_reserve_no_more_than_the_memory_budget() {
     let registry = Registry::parse(&registry(64), None).expect("accepted").registry;
     assert_eq!(registry.rig.memory_budget, BUDGET);
     let bus = Bus::open(&registry, Some(&place.instance)).expect("bus");
-    let pools = place.shared_memory().into_iter().filter(|file| file.ends_with(".data"));
+    let pools =
+        place.shared_memory().into_iter().filter(|file| Path::new(file).extension().is_some_and(|kind| kind == "data"));
     let in_memory: u64 = pools.map(|file| std::fs::metadata(format!("/dev/shm/{file}")).expect("file").len()).sum();
     assert!(in_memory >= bus.reserved_bytes(), "the files of the pools are all there: {in_memory}");
     assert!(in_memory <= BUDGET, "{in_memory} bytes of {BUDGET}");

@@ -37,6 +37,8 @@ use std::time::Duration;
 use rapid::driver::sim;
 use rapid::registry::scenario::{Scenario, SimSource};
 use rapid::registry::{DeviceSpec, Registry};
+use rapid::sync::Grid;
+use rapid::time::Stamp;
 use serde::Deserialize;
 use serde_json::Value;
 use support::{Episode, EventMessage, Message, Place, events};
@@ -314,7 +316,9 @@ fn frames(run: &Run) {
     let duration = humantime::parse_duration(&run.expected.duration).expect("a duration");
     let window = u64::try_from(run.registry.rig.sync_window.as_nanos()).expect("short");
     let frames = run.episode.frames();
-    assert_eq!(frames.len() as f64, (duration.as_secs_f64() * run.registry.rig.observation_hz).ceil());
+    let begin = Stamp(run.episode.said("rapid", "begin_monotonic_ns").parse().expect("a number"));
+    let grid = Grid::new(begin, run.registry.rig.observation_hz);
+    assert_eq!(frames.len() as u64, grid.ticks_before(begin.after(duration)));
     let masks: Vec<(u64, u64)> = run
         .episode
         .topic("/rapid/mask")
@@ -326,6 +330,7 @@ fn frames(run: &Run) {
     for (index, (message, frame)) in frames.iter().enumerate() {
         assert_eq!((frame.index, message.sequence as usize), (index as u64, index));
         let tick = message.log_time;
+        assert_eq!(run.monotonic(tick), grid.tick(frame.index).0, "frame {index}");
         let in_force = masks.iter().rfind(|(time, _)| *time <= tick).expect("the mask before the first tick").1;
         assert_eq!(frame.mask, in_force, "frame {index}");
         assert_eq!(frame.modalities.len(), run.registry.devices.len());

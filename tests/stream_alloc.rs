@@ -20,6 +20,8 @@
 //!
 //! One test, so that no other thread of this process works meanwhile.
 
+#![allow(clippy::unwrap_used, reason = "what fails here fails a test")]
+
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
@@ -224,7 +226,6 @@ fn whole_rig(registry: &Registry, scenario: Scenario) {
         noisy += u64::from(COUNT.load(Ordering::Relaxed) > 0);
     }
     let elapsed = Stamp::now().since(begun);
-    println!("{noisy} of {stretches} stretches allocated, in {elapsed:?}");
     stop.cancel();
     runtime.block_on(task).unwrap();
     drop((commands, inbox, bus));
