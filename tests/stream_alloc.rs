@@ -1,0 +1,258 @@
+//! How often the path of a sample allocates once it has warmed up: exactly once, 1 allocation a sample
+//! published, and that one is iceoryx2's.
+//!
+//! iceoryx2 0.10 puts the state that a loaned sample shares with its publisher into an `Arc` of its
+//! own (`ChunkMut`'s shared state, `arc_sync_policy::ArcSyncPolicy::new`), whatever the service
+//! variant: `Publisher::loan_slice_uninit` cannot be had without it. It is small, of one size, and
+//! freed by `send`. Nothing of `rapid`, of tokio and of the receiving side allocates.
+//!
+//! Seen twice, because `rig::stream` is private:
+//!
+//! 1. On one thread, by public parts: `Driver::read` of a simulated device, header, `Writer::publish`
+//!    (loan, one copy, send, notify), `Inbox::wait` and `Inbox::drain`. That is what a stream does
+//!    between two samples, without its `select!`, timer and counters. Exactly one allocation a sample,
+//!    all of one size.
+//! 2. The rig as it is: `Rig::run` on a multi-thread runtime, the `mask` thread at 500 Hz, and an
+//!    inbox as the recorder has. Every thread of the process counts; allocations of the size found
+//!    above are left out. Beside the samples the rig writes the mask's JSON file once a second, which
+//!    allocates. So samples are counted in stretches much shorter than a second: a stretch without a
+//!    JSON file has none.
+//!
+//! One test, so that no other thread of this process works meanwhile.
+
+#![allow(clippy::unwrap_used, reason = "what fails here fails a test")]
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::time::Duration;
+
+use rapid::bus::{Bus, Inbox, TopicId};
+use rapid::driver::Driver;
+use rapid::hotplug::script::Script;
+use rapid::registry::scenario::{Scenario, SimDevice};
+use rapid::registry::{DeviceNode, Registry};
+use rapid::rig::Rig;
+use rapid::rig::presence::{Claim, Presence};
+use rapid::sample::SampleHeader;
+use rapid::status::Board;
+use rapid::time::Stamp;
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+
+struct Counting;
+
+static COUNTING: AtomicBool = AtomicBool::new(false);
+static COUNT: AtomicU64 = AtomicU64::new(0);
+/// Smallest and largest allocation counted, bytes.
+static LEAST: AtomicUsize = AtomicUsize::new(usize::MAX);
+static MOST: AtomicUsize = AtomicUsize::new(0);
+/// Allocations of this size are not counted.
+static LEFT_OUT: AtomicUsize = AtomicUsize::new(usize::MAX);
+
+// SAFETY: every call is handed to the system's allocator as it came; counting is atomic and does not
+// allocate.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        note(layout.size());
+        // SAFETY: the caller's promise, passed on.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: the caller's promise, passed on.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+
+    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        note(size);
+        // SAFETY: the caller's promise, passed on.
+        unsafe { System.realloc(pointer, layout, size) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+fn note(size: usize) {
+    if COUNTING.load(Ordering::Relaxed) && size != LEFT_OUT.load(Ordering::Relaxed) {
+        COUNT.fetch_add(1, Ordering::Relaxed);
+        LEAST.fetch_min(size, Ordering::Relaxed);
+        MOST.fetch_max(size, Ordering::Relaxed);
+    }
+}
+
+/// What a device sends has the size the registry lets it have: a picture, and a vector of numbers.
+const REGISTRY: &str = r#"
+[device.cam]
+vid = "1209"
+pid = "0001"
+node = "camera"
+bit = 0
+[device.cam.camera]
+width = 320
+height = 240
+fps = 500
+
+[device.state]
+vid = "1209"
+pid = "0002"
+node = "serial"
+bit = 1
+[device.state.serial]
+baud = 115200
+parse = "csv"
+channels = 8
+"#;
+
+const SCENARIO: &str = r#"
+[[device]]
+name = "cam"
+hz = 500
+
+[[device]]
+name = "state"
+hz = 1000
+"#;
+
+const WARM_UP: usize = 200;
+const SAMPLES: usize = 1000;
+/// Samples of a stretch: at 1,500 a second, some 30 ms.
+const STRETCH: usize = 50;
+/// How often the rig writes its JSON file.
+const JSON_PERIOD: Duration = Duration::from_secs(1);
+
+#[test]
+fn a_sample_costs_the_one_allocation_of_its_loan_and_no_other() {
+    let registry = Registry::parse(REGISTRY, None).unwrap().registry;
+    let scenario = Scenario::parse(SCENARIO, None, &registry).unwrap();
+    for device in 0..registry.devices.len() {
+        one_thread(&registry, &scenario, device);
+    }
+    let (least, most) = (LEAST.load(Ordering::Relaxed), MOST.load(Ordering::Relaxed));
+    assert_eq!(least, most, "they are all the one that iceoryx2 makes for a loan");
+    assert!(least <= 256, "{least} bytes");
+    LEFT_OUT.store(least, Ordering::Relaxed);
+    whole_rig(&registry, scenario);
+}
+
+fn one_thread(registry: &Registry, scenario: &Scenario, device: usize) {
+    let instance = format!("alloc{device}-{}", std::process::id());
+    let bus = Bus::open(registry, Some(&instance)).unwrap();
+    let inbox = bus.inbox().unwrap();
+    let spec = &registry.devices[device];
+    let writer = bus.writer(TopicId::Modality(spec.id)).unwrap();
+    let source = scenario.devices[device].source.clone();
+    // A paused clock goes on by itself whenever nothing is ready: the device delivers as it is read.
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().start_paused(true).build().unwrap();
+    let allocated = runtime.block_on(async {
+        let node = DeviceNode::Sim(Arc::new(SimDevice::new(&spec.name, source, Stamp::now())));
+        let mut driver = Driver::open(spec, &node).await.unwrap();
+        let mut bytes = 0;
+        for seq in 0..WARM_UP + SAMPLES {
+            if seq == WARM_UP {
+                COUNT.store(0, Ordering::Relaxed);
+                COUNTING.store(true, Ordering::Relaxed);
+            }
+            let reading = driver.read().await.unwrap();
+            let header = SampleHeader {
+                seq: seq as u64,
+                capture_ns: reading.captured.0,
+                recv_ns: Stamp::now().0,
+                id: u32::from(spec.id.bit()),
+                epoch: 1,
+                encoding: reading.encoding as u32,
+                flags: reading.flags,
+                width: reading.width,
+                height: reading.height,
+            };
+            writer.publish(header, reading.bytes).unwrap();
+            inbox.wait(Duration::from_millis(20)).unwrap();
+            let mut taken = 0;
+            inbox
+                .drain(&mut |topic, header, payload| {
+                    assert!(topic == TopicId::Modality(spec.id) && header.seq == seq as u64);
+                    assert!(payload == reading.bytes);
+                    bytes += payload.len();
+                    taken += 1;
+                })
+                .unwrap();
+            assert!(taken == 1);
+        }
+        COUNTING.store(false, Ordering::Relaxed);
+        assert!(bytes > SAMPLES * 8);
+        COUNT.load(Ordering::Relaxed)
+    });
+    assert_eq!(allocated, SAMPLES as u64, "{}: allocations for {SAMPLES} samples", spec.name);
+    drop((inbox, writer, bus));
+    remove_leftovers(&instance);
+}
+
+fn whole_rig(registry: &Registry, scenario: Scenario) {
+    let instance = format!("alloc-rig-{}", std::process::id());
+    let folder = tempfile::tempdir().unwrap();
+    let bus = Bus::open(registry, Some(&instance)).unwrap();
+    let board = Arc::new(Board::new(registry));
+    let claim = Claim::new(&folder.path().join("mask"), 2).unwrap();
+    let presence = Presence::start(claim, bus.writer(TopicId::Mask).unwrap(), Arc::clone(&board)).unwrap();
+    let inbox = bus.inbox().unwrap();
+    let mut rig = Rig::new(registry, &bus, presence, board);
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
+    let stop = CancellationToken::new();
+    let (commands, asked) = mpsc::channel(1);
+    let task = runtime.spawn({
+        let stop = stop.clone();
+        async move {
+            rig.run(Box::pin(Script::new(scenario)), asked, stop).await.unwrap();
+        }
+    });
+
+    let mut counts = [0; 3];
+    while counts[0] < WARM_UP || counts[1] < WARM_UP {
+        take(&inbox, &mut counts);
+    }
+    let begun = Stamp::now();
+    let mut counts = [0; 3];
+    let (mut stretches, mut noisy) = (0, 0);
+    while counts[0] < SAMPLES || counts[1] < SAMPLES {
+        let end = counts[0] + counts[1] + STRETCH;
+        COUNT.store(0, Ordering::Relaxed);
+        COUNTING.store(true, Ordering::Relaxed);
+        while counts[0] + counts[1] < end {
+            take(&inbox, &mut counts);
+        }
+        COUNTING.store(false, Ordering::Relaxed);
+        stretches += 1;
+        noisy += u64::from(COUNT.load(Ordering::Relaxed) > 0);
+    }
+    let elapsed = Stamp::now().since(begun);
+    stop.cancel();
+    runtime.block_on(task).unwrap();
+    drop((commands, inbox, bus));
+    remove_leftovers(&instance);
+
+    // A file may fall between two stretches or be cut by their border.
+    let files = elapsed.as_secs() / JSON_PERIOD.as_secs() + 1;
+    assert!(noisy <= 2 * files, "{noisy} of {stretches} stretches allocated, {files} JSON files in {elapsed:?}");
+    assert!(counts[2] > 0, "no mask came");
+}
+
+fn take(inbox: &Inbox, counts: &mut [usize; 3]) {
+    inbox.wait(Duration::from_millis(20)).unwrap();
+    inbox
+        .drain(&mut |topic, _, _| match topic {
+            TopicId::Modality(id) => counts[id.index()] += 1,
+            TopicId::Mask => counts[2] += 1,
+        })
+        .unwrap();
+}
+
+/// iceoryx2 leaves one small file an instance behind.
+fn remove_leftovers(instance: &str) {
+    let prefix = format!("iox2_{instance}_");
+    for entry in std::fs::read_dir("/dev/shm").unwrap().flatten() {
+        if entry.file_name().to_string_lossy().starts_with(&prefix) {
+            let _ = std::fs::remove_file(entry.path());
+        }
+    }
+}
