@@ -331,13 +331,13 @@ mod tests {
     #[test]
     fn text_lines_replace_a_progress_line_on_the_same_terminal() {
         let line = LogLine { wall_ns: 1_700_000_000_123_000_000, level: Level::Warn, text: "late".to_owned() };
-        let sink = sink(Stderr::Text, "", io::sink());
+        let sink = sink_to(Stderr::Text, "", io::sink());
         assert_eq!(sink.render(&line), "22:13:20.123Z  warn   late\n");
-        let sink = sink(Stderr::Text, ERASE_LINE, io::sink());
+        let sink = sink_to(Stderr::Text, ERASE_LINE, io::sink());
         assert_eq!(sink.render(&line), "\r\x1b[K22:13:20.123Z  warn   late\n");
     }
 
-    fn sink(form: Stderr, before: &'static str, out: impl Write + Send + 'static) -> StderrSink {
+    fn sink_to(form: Stderr, before: &'static str, out: impl Write + Send + 'static) -> StderrSink {
         let palette = crate::headless::style::Palette::Plain;
         StderrSink { form, palette, before, pieces: spawn_writer(out).unwrap(), lost: AtomicU64::new(0) }
     }
@@ -345,7 +345,7 @@ mod tests {
     #[test]
     fn a_reader_that_does_not_read_holds_nobody_up_and_learns_what_it_missed() {
         let (mut reader, writer) = io::pipe().unwrap();
-        let sink = sink(Stderr::Text, "", writer);
+        let sink = sink_to(Stderr::Text, "", writer);
         let line = |text: String| LogLine { wall_ns: 0, level: Level::Warn, text };
         // More than the pipe and the queue hold together.
         let many = DEPTH + 2000;
@@ -376,7 +376,7 @@ mod tests {
 
     #[test]
     fn json_lines_are_objects_and_long_lines_are_cut() {
-        let sink = sink(Stderr::Json, "", io::sink());
+        let sink = sink_to(Stderr::Json, "", io::sink());
         let line = LogLine { wall_ns: 1_700_000_000_123_000_000, level: Level::Warn, text: "a \"b\"".to_owned() };
         let object: serde_json::Value = serde_json::from_str(&sink.render(&line)).unwrap();
         assert_eq!(object["event"], "log");

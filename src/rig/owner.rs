@@ -359,3 +359,6 @@ impl Rig {
         self.modalities.iter_mut().find(|modality| modality.spec.id == id)
     }
 }
+
+#[cfg(test)]
+mod tests;
