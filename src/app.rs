@@ -143,7 +143,8 @@ pub async fn run(options: Options) -> Result<(), AppError> {
         Screen::Lines => Stderr::Text,
         Screen::Json => Stderr::Json,
     };
-    logging::init(Arc::clone(&board), std::env::var("RAPID_LOG").ok().as_deref(), stderr)?;
+    // Lines still on their way to standard error are waited for when this goes.
+    let _log = logging::init(Arc::clone(&board), std::env::var("RAPID_LOG").ok().as_deref(), stderr)?;
     let signals = Signals::listen()?;
 
     // First of all: are we the only one? A registry has at most 64 devices.
@@ -153,14 +154,15 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     let Some(mask_writer) = bus.writer(TopicId::Mask) else { return Err(AppError::Panicked("the bus")) };
     let presence = Presence::start(claim, mask_writer, Arc::clone(&board))?;
     let recorder = Recorder::spawn(bus.inbox()?, RecorderConfig::new(Arc::clone(&registry), Arc::clone(&board)))?;
-    let screen_stop = CancellationToken::new();
-    let (commands, asked) = mpsc::channel(16);
-    let screen = start_screen(options.screen, &board, commands, screen_stop.clone(), options.duration);
-
+    // Before the screen: what fails until here is said on an ordinary terminal.
     let hotplug: HotplugStream = match options.devices {
         Devices::Machine => Box::pin(UdevMonitor::open()?),
         Devices::Simulated(scenario) => Box::pin(Script::new(scenario)),
     };
+    let screen_stop = CancellationToken::new();
+    let (commands, asked) = mpsc::channel(16);
+    let screen = start_screen(options.screen, &board, commands, screen_stop.clone(), options.duration);
+
     let rig_stop = CancellationToken::new();
     let (rig_commands, rig_asked) = mpsc::channel(16);
     let mut rig = Rig::new(&registry, &bus, presence, Arc::clone(&board));
@@ -229,8 +231,11 @@ struct Running {
 }
 
 /// Takes everything down, in the order of the module's comment. The first error is the run's.
-async fn finish(mut running: Running, conductor: Conductor, mut outcome: Result<(), AppError>) -> Result<(), AppError> {
-    let Conductor { recorder, recording, board, .. } = conductor;
+async fn finish(
+    mut running: Running,
+    mut conductor: Conductor,
+    mut outcome: Result<(), AppError>,
+) -> Result<(), AppError> {
     running.rig_stop.cancel();
     let rig = running.rig;
     let take_down = async {
@@ -241,13 +246,10 @@ async fn finish(mut running: Running, conductor: Conductor, mut outcome: Result<
             keep_first(&mut outcome, Err(AppError::Panicked("the rig")));
             None
         };
-        if recording && let Ok(report) = recorder.stop().await {
-            let failed = report.error.map(|reason| AppError::Episode { file: report.file, reason });
-            keep_first(&mut outcome, failed.map_or(Ok(()), Err));
-        }
+        keep_first(&mut outcome, conductor.finish_episode().await);
         // Dropping joins threads: the writer's, which has nothing left to write, and the mask's.
         let dropped = tokio::task::spawn_blocking(move || {
-            drop(recorder);
+            drop(conductor);
             drop(rig);
         });
         keep_first(&mut outcome, dropped.await.map_err(|_| AppError::Panicked("the recorder")));
@@ -268,7 +270,6 @@ async fn finish(mut running: Running, conductor: Conductor, mut outcome: Result<
         let ended = (&mut running.screen).await;
         keep_first(&mut outcome, ended.unwrap_or(Err(AppError::Panicked("the screen"))));
     }
-    drop(board);
     if twice { outcome.and(Err(AppError::InterruptedTwice)) } else { outcome }
 }
 

@@ -5,6 +5,7 @@
 use std::io::{self, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::time::Duration;
 
 use clap::CommandFactory;
 use tokio_util::sync::CancellationToken;
@@ -20,6 +21,9 @@ use crate::record::{EpisodeRequest, RecordError};
 use crate::registry::scenario::Scenario;
 use crate::registry::{Registry, RegistryErrors};
 use crate::rig::presence::{PresenceError, json_path, read_mask};
+
+/// Tasks that are left at the end have this long to go.
+const LAST_TASKS: Duration = Duration::from_millis(500);
 
 /// Why a command ended without having done what it was asked.
 #[derive(Debug, thiserror::Error)]
@@ -151,7 +155,7 @@ fn mask(global: &Global, watch: bool) -> Result<(), Failure> {
     let read = || read_mask(&path).map_err(|error| error.to_string());
     let options = MaskOptions { watch, json: global.json, palette: palette() };
     let stop = CancellationToken::new();
-    runtime()?.block_on(async {
+    block_on(async {
         let interrupted = stop.clone();
         tokio::spawn(async move {
             if tokio::signal::ctrl_c().await.is_ok() {
@@ -159,7 +163,7 @@ fn mask(global: &Global, watch: bool) -> Result<(), Failure> {
             }
         });
         Ok(commands::mask::run(read, names, crate::time::realtime_ns, options, stop, io::stdout()).await?)
-    })
+    })?
 }
 
 /// The rig: on this machine, simulated, or played from an episode.
@@ -205,7 +209,7 @@ fn run(global: &Global, args: &RunArgs, replayed: Option<&Path>) -> Result<(), F
         duration: args.duration,
         instance: global.instance.clone(),
     };
-    Ok(runtime()?.block_on(app::run(options))?)
+    Ok(block_on(app::run(options))??)
 }
 
 fn scenario(file: Option<&Path>, registry: &Registry) -> Result<Scenario, Failure> {
@@ -245,8 +249,13 @@ fn usual_places() -> Vec<PathBuf> {
     places
 }
 
-fn runtime() -> io::Result<tokio::runtime::Runtime> {
-    tokio::runtime::Builder::new_multi_thread().enable_all().thread_name("worker").build()
+/// Runs `work` on a runtime of its own. When it is done nothing is waited for: a thread that is
+/// still opening a device that does not answer would hold up the end for as long as the kernel likes.
+fn block_on<T>(work: impl Future<Output = T>) -> io::Result<T> {
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().thread_name("worker").build()?;
+    let done = runtime.block_on(work);
+    runtime.shutdown_timeout(LAST_TASKS);
+    Ok(done)
 }
 
 fn palette() -> Palette {
@@ -263,4 +272,26 @@ fn paint() -> inspect::Paint {
 
 fn columns() -> usize {
     crate::tui::columns().unwrap_or(100)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_thread_stuck_in_a_device_does_not_hold_up_the_end() {
+        let (release, stuck) = std::sync::mpsc::channel::<()>();
+        let done = block_on(async move {
+            let (tell, begun) = tokio::sync::oneshot::channel();
+            tokio::task::spawn_blocking(move || {
+                let _ = tell.send(());
+                stuck.recv()
+            });
+            begun.await.expect("begun");
+            7
+        });
+        assert_eq!(done.expect("runtime"), 7);
+        // Only now may the device answer: a runtime that waited for it would not have come here.
+        drop(release);
+    }
 }

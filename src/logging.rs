@@ -7,11 +7,15 @@
 //! `RAPID_LOG=debug` or `RAPID_LOG=rapid::rig=trace,warn`. Without it the board gets what [`DEFAULT`]
 //! says, and standard error only warnings and errors: state changes are printed as events already.
 //!
+//! Invariant: who logs never waits for standard error: a reader that is behind loses lines, and is told.
 //! Invariant: a line has no control characters and no line breaks, and at most [`LONGEST`] characters.
 
 use std::fmt::{Debug, Write as _};
 use std::io::{self, IsTerminal, Write};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::{self, SyncSender};
+use std::time::Duration;
 
 use tracing::field::{Field, Visit};
 use tracing::span::{Attributes, Id, Record};
@@ -33,6 +37,11 @@ pub const DEFAULT: &str = "warn,rapid=info,iceoryx2=error";
 /// Characters of a line; what is longer is cut.
 pub const LONGEST: usize = 2000;
 
+/// Lines the reader of standard error may be behind.
+const DEPTH: usize = 1024;
+/// How long the reader may take for the rest at the end.
+const LAST: Duration = Duration::from_millis(500);
+
 /// What standard error gets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Stderr {
@@ -53,22 +62,65 @@ pub enum LoggingError {
     /// There is a log already.
     #[error("logging was started twice")]
     Twice(#[from] tracing_subscriber::util::TryInitError),
+    /// The system allows no further thread.
+    #[error("the thread that writes the log: {0}")]
+    Thread(#[from] io::Error),
+}
+
+/// Dropping it waits, for a moment, until standard error has taken what was logged.
+#[derive(Debug)]
+#[must_use = "dropped at once it waits for nothing"]
+pub struct Log(Option<SyncSender<Piece>>);
+
+impl Drop for Log {
+    fn drop(&mut self) {
+        let Some(pieces) = self.0.take() else { return };
+        let (done, is_done) = mpsc::channel();
+        // Where there is no room for this, the reader is not reading.
+        if pieces.try_send(Piece::Flush(done)).is_ok() {
+            let _ = is_done.recv_timeout(LAST);
+        }
+    }
+}
+
+/// What the thread `stderr` is sent.
+#[derive(Debug)]
+enum Piece {
+    Line(String),
+    /// Answered when everything before it is written.
+    Flush(mpsc::Sender<()>),
+}
+
+/// Starts the thread that writes the log's lines to `out`.
+fn spawn_writer(mut out: impl Write + Send + 'static) -> io::Result<SyncSender<Piece>> {
+    let (sender, pieces) = mpsc::sync_channel(DEPTH);
+    std::thread::Builder::new().name("stderr".to_owned()).spawn(move || {
+        for piece in pieces {
+            // There is nowhere left to report that the reader is gone, nor that nobody waits.
+            let _ = match piece {
+                Piece::Line(line) => out.write_all(line.as_bytes()),
+                Piece::Flush(done) => done.send(()).map_err(io::Error::other),
+            };
+        }
+    })?;
+    Ok(sender)
 }
 
 /// Sends the program's log to `board` and to standard error. `filter` is the value of `RAPID_LOG`.
 ///
 /// # Errors
 /// When the filter is wrong, or when called twice in a process.
-pub fn init(board: Arc<Board>, filter: Option<&str>, stderr: Stderr) -> Result<(), LoggingError> {
+pub fn init(board: Arc<Board>, filter: Option<&str>, stderr: Stderr) -> Result<Log, LoggingError> {
     let chosen = filter.filter(|filter| !filter.is_empty());
     let filter = EnvFilter::try_new(chosen.unwrap_or(DEFAULT))?;
     let least = if chosen.is_some() { LevelFilter::TRACE } else { LevelFilter::WARN };
-    let printed = match stderr {
+    let pieces = match stderr {
         Stderr::Nothing => None,
-        Stderr::Text | Stderr::Json => Some(Lines { sink: StderrSink::new(stderr) }.with_filter(least)),
+        Stderr::Text | Stderr::Json => Some(spawn_writer(io::stderr())?),
     };
+    let printed = pieces.clone().map(|pieces| Lines { sink: StderrSink::new(stderr, pieces) }.with_filter(least));
     Registry::default().with(filter).with(Lines { sink: board }).with(printed).try_init()?;
-    Ok(())
+    Ok(Log(pieces))
 }
 
 /// Where formatted lines go.
@@ -88,14 +140,17 @@ struct StderrSink {
     palette: crate::headless::style::Palette,
     /// Erases a progress line that stands on the same terminal.
     before: &'static str,
+    pieces: SyncSender<Piece>,
+    /// Lines there was no room for, since the last that had some.
+    lost: AtomicU64,
 }
 
 impl StderrSink {
-    fn new(form: Stderr) -> Self {
+    fn new(form: Stderr, pieces: SyncSender<Piece>) -> Self {
         let terminal = Terminal::of(&io::stderr());
         let palette = ColourChoice::Auto.resolve(terminal, |name| std::env::var(name).ok());
         let shared = form == Stderr::Text && terminal == Terminal::Yes && io::stdout().is_terminal();
-        Self { form, palette, before: if shared { ERASE_LINE } else { "" } }
+        Self { form, palette, before: if shared { ERASE_LINE } else { "" }, pieces, lost: AtomicU64::new(0) }
     }
 
     fn render(&self, line: &LogLine) -> String {
@@ -112,9 +167,15 @@ impl StderrSink {
 
 impl Sink for StderrSink {
     fn take(&self, line: LogLine) {
-        // In one piece, so that lines of several threads do not mix. There is nowhere left to report
-        // that standard error is gone.
-        let _ = io::stderr().write_all(self.render(&line).as_bytes());
+        let mut text = self.render(&line);
+        let lost = self.lost.swap(0, Ordering::Relaxed);
+        if lost > 0 {
+            let told = format!("{lost} lines of the log lost: their reader was behind");
+            text.insert_str(0, &self.render(&LogLine { level: Level::Warn, text: told, ..line }));
+        }
+        if self.pieces.try_send(Piece::Line(text)).is_err() {
+            self.lost.fetch_add(lost + 1, Ordering::Relaxed);
+        }
     }
 }
 
@@ -269,12 +330,41 @@ mod tests {
 
     #[test]
     fn text_lines_replace_a_progress_line_on_the_same_terminal() {
-        use crate::headless::style::Palette;
         let line = LogLine { wall_ns: 1_700_000_000_123_000_000, level: Level::Warn, text: "late".to_owned() };
-        let sink = StderrSink { form: Stderr::Text, palette: Palette::Plain, before: "" };
+        let sink = sink_to(Stderr::Text, "", io::sink());
         assert_eq!(sink.render(&line), "22:13:20.123Z  warn   late\n");
-        let sink = StderrSink { form: Stderr::Text, palette: Palette::Plain, before: ERASE_LINE };
+        let sink = sink_to(Stderr::Text, ERASE_LINE, io::sink());
         assert_eq!(sink.render(&line), "\r\x1b[K22:13:20.123Z  warn   late\n");
+    }
+
+    fn sink_to(form: Stderr, before: &'static str, out: impl Write + Send + 'static) -> StderrSink {
+        let palette = crate::headless::style::Palette::Plain;
+        StderrSink { form, palette, before, pieces: spawn_writer(out).unwrap(), lost: AtomicU64::new(0) }
+    }
+
+    #[test]
+    fn a_reader_that_does_not_read_holds_nobody_up_and_learns_what_it_missed() {
+        let (mut reader, writer) = io::pipe().unwrap();
+        let sink = sink_to(Stderr::Text, "", writer);
+        let line = |text: String| LogLine { wall_ns: 0, level: Level::Warn, text };
+        // More than the pipe and the queue hold together.
+        let many = DEPTH + 2000;
+        for number in 0..many {
+            sink.take(line(format!("{number:0200}")));
+        }
+        assert!(sink.lost.load(Ordering::Relaxed) > 0);
+        let reading = std::thread::spawn(move || {
+            let mut text = String::new();
+            io::Read::read_to_string(&mut reader, &mut text).map(|_| text)
+        });
+        while sink.lost.load(Ordering::Relaxed) > 0 {
+            sink.take(line("last".to_owned()));
+            std::thread::yield_now();
+        }
+        drop(sink);
+        let text = reading.join().unwrap().unwrap();
+        assert!(text.contains("lines of the log lost: their reader was behind"));
+        assert!(text.ends_with("last\n"));
     }
 
     #[test]
@@ -286,7 +376,7 @@ mod tests {
 
     #[test]
     fn json_lines_are_objects_and_long_lines_are_cut() {
-        let sink = StderrSink { form: Stderr::Json, palette: crate::headless::style::Palette::Plain, before: "" };
+        let sink = sink_to(Stderr::Json, "", io::sink());
         let line = LogLine { wall_ns: 1_700_000_000_123_000_000, level: Level::Warn, text: "a \"b\"".to_owned() };
         let object: serde_json::Value = serde_json::from_str(&sink.render(&line)).unwrap();
         assert_eq!(object["event"], "log");

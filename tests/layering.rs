@@ -30,7 +30,7 @@ const LAYERS: &[&[&str]] = &[
 
 /// Imports within a layer. All nouns of layer 0 may speak of each other besides.
 const SIDEWAYS: &[(&str, &[&str])] = &[
-    ("status", &["registry"]),
+    ("status", &["registry", "text"]),
     ("app", &["tui", "headless", "logging"]),
     // Without a screen the log is lines among the lines of the run.
     ("logging", &["headless"]),

@@ -60,7 +60,8 @@ impl Conductor {
                 }
                 Some(command) = running.asked.recv() => match command {
                     Command::ToggleRecording => self.toggle().await?,
-                    Command::Restart(id) => { let _ = self.rig_commands.send(RigCommand::Restart(id)).await; }
+                    // A rig that is so far behind will not get to it in time either.
+                    Command::Restart(id) => { let _ = self.rig_commands.try_send(RigCommand::Restart(id)); }
                     Command::Quit => return Ok(()),
                 },
                 event = self.events.recv() => {
@@ -104,6 +105,26 @@ impl Conductor {
     async fn start(&mut self) -> Result<(), AppError> {
         self.recorder.start(self.episode.clone()).await?;
         self.recording = true;
+        Ok(())
+    }
+
+    /// Ends the episode in progress, if there is one; an error if its file is not whole.
+    pub(super) async fn finish_episode(&mut self) -> Result<(), AppError> {
+        if !std::mem::take(&mut self.recording) {
+            return Ok(());
+        }
+        if let Ok(report) = self.recorder.stop().await {
+            return match report.error {
+                Some(reason) => Err(AppError::Episode { file: report.file, reason }),
+                None => Ok(()),
+            };
+        }
+        // It ended by itself while the run did: how, is among the events that nobody took.
+        while let Ok(event) = self.events.try_recv() {
+            if let What::Episode { file, error: Some(reason), .. } = event.what {
+                return Err(AppError::Episode { file, reason });
+            }
+        }
         Ok(())
     }
 

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use iceoryx2::port::listener::Listener;
-use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::port::subscriber::{Subscriber, SubscriberCreateError};
 
 use super::{BusError, EventFactory, Service, TopicFactory, TopicId, TopicSpec, topic_error};
 use crate::sample::SampleHeader;
@@ -29,11 +29,13 @@ impl std::fmt::Debug for Inbox {
 impl Inbox {
     pub(super) fn open(topics: &[(TopicSpec, TopicFactory)], wake: &EventFactory<Service>) -> Result<Self, BusError> {
         let subscribe = |(spec, factory): &(TopicSpec, TopicFactory)| {
-            let subscriber = factory
-                .subscriber_builder()
-                .buffer_size(spec.depth)
-                .create()
-                .map_err(|error| topic_error(&spec.name, &error))?;
+            let subscriber =
+                factory.subscriber_builder().buffer_size(spec.depth).create().map_err(|error| match error {
+                    SubscriberCreateError::ExceedsMaxSupportedSubscribers => {
+                        BusError::Full { topic: spec.name.clone() }
+                    }
+                    other => topic_error(&spec.name, &other),
+                })?;
             Ok(Subscription { id: spec.id, name: spec.name.clone(), subscriber })
         };
         let topics = topics.iter().map(subscribe).collect::<Result<Vec<_>, BusError>>()?;

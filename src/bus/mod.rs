@@ -60,6 +60,12 @@ pub enum BusError {
         /// What iceoryx2 says.
         reason: String,
     },
+    /// All places of a topic's subscribers are taken.
+    #[error("topic {topic}: {MAX_SUBSCRIBERS} programs subscribe already, and no more may; end one")]
+    Full {
+        /// The topic.
+        topic: String,
+    },
     /// The node could not be created.
     #[error("shared-memory bus: {0}")]
     Node(String),

@@ -110,3 +110,99 @@ fn a_consumer_that_comes_later_gets_what_is_published_from_then_on() {
     let got: Vec<u64> = sequences(&inbox).into_iter().map(|(_, seq, _)| seq).collect();
     assert_eq!(got, [1]);
 }
+
+/// A subscriber of the one device's topic that keeps what it receives.
+fn holder(registry: &Registry, bus: &Bus) -> iceoryx2::port::subscriber::Subscriber<Service, [u8], SampleHeader> {
+    let id = TopicId::Modality(registry.devices[0].id);
+    let (_, factory) = bus.topics.iter().find(|(spec, _)| spec.id == id).expect("topic");
+    factory.subscriber_builder().create().expect("subscriber")
+}
+
+#[test]
+fn the_pool_is_enough_when_every_subscriber_holds_all_it_may() {
+    let (registry, bus) = open("f", 16);
+    let writer = bus.writer(TopicId::Modality(registry.devices[0].id)).expect("writer");
+    let subscribers: Vec<_> = (0..MAX_SUBSCRIBERS).map(|_| holder(&registry, &bus)).collect();
+    let mut held = Vec::new();
+    let mut seq = 0;
+    let mut publish = |count: u64| {
+        for _ in 0..count {
+            writer.publish(SampleHeader { seq, ..SampleHeader::default() }, &[1; 64]).expect("the pool is enough");
+            seq += 1;
+        }
+    };
+    // Each holds samples of other moments than all the others.
+    for subscriber in &subscribers {
+        for _ in 0..MAX_BORROWED {
+            publish(40);
+            held.push(subscriber.receive().expect("receive").expect("sample"));
+        }
+    }
+    let distinct: std::collections::BTreeSet<u64> = held.iter().map(|sample| sample.user_header().seq).collect();
+    assert_eq!(distinct.len(), MAX_SUBSCRIBERS * MAX_BORROWED);
+    publish(1000);
+    drop(held);
+    publish(1000);
+}
+
+/// Not a test of its own: the process that the next one kills.
+#[test]
+fn held_samples_helper() {
+    let Ok(instance) = std::env::var("RAPID_TEST_HOLD") else { return };
+    let registry = registry(16);
+    let bus = Bus::open(&registry, Some(&instance)).expect("bus");
+    let subscriber = holder(&registry, &bus);
+    let mut held = Vec::new();
+    loop {
+        held.extend(subscriber.receive().ok().flatten().filter(|_| held.len() < MAX_BORROWED));
+        if held.len() == MAX_BORROWED {
+            std::fs::write(std::env::temp_dir().join(&instance), "held").expect("tell");
+            std::thread::sleep(Duration::from_mins(10));
+        }
+        std::thread::yield_now();
+    }
+}
+
+#[test]
+fn a_subscriber_killed_while_it_holds_samples_costs_no_sample_and_its_place_is_given_back() {
+    let name = format!("busg{}", std::process::id());
+    let registry = registry(16);
+    let bus = Bus::open(&registry, Some(&name)).expect("bus");
+    let writer = bus.writer(TopicId::Modality(registry.devices[0].id)).expect("writer");
+    let told = std::env::temp_dir().join(&name);
+    for _ in 0..3 {
+        let mut process = std::process::Command::new(std::env::current_exe().expect("this test"))
+            .args(["--exact", "bus::tests::held_samples_helper", "--nocapture"])
+            .env("RAPID_TEST_HOLD", &name)
+            .stdout(std::process::Stdio::null())
+            .spawn()
+            .expect("process");
+        while !told.exists() {
+            assert!(process.try_wait().expect("process").is_none(), "the helper ended");
+            writer.publish(SampleHeader::default(), &[1; 64]).expect("the pool is enough");
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        process.kill().expect("kill");
+        process.wait().expect("killed");
+        std::fs::remove_file(&told).expect("clean");
+        for _ in 0..1000 {
+            writer.publish(SampleHeader::default(), &[1; 64]).expect("the pool is enough");
+        }
+    }
+    // A node that is made cleans up after the dead ones: all places can be taken.
+    let other = Bus::open(&registry, Some(&name));
+    drop(other);
+    let all: Vec<_> = (0..MAX_SUBSCRIBERS).map(|_| holder(&registry, &bus)).collect();
+    writer.publish(SampleHeader { seq: 7, ..SampleHeader::default() }, &[1]).expect("publish");
+    for subscriber in &all {
+        assert_eq!(subscriber.receive().expect("receive").expect("sample").user_header().seq, 7);
+    }
+}
+
+#[test]
+fn one_subscriber_too_many_is_told_how_many_there_may_be() {
+    let (_registry, bus) = open("h", 16);
+    let _all: Vec<Inbox> = (0..MAX_SUBSCRIBERS).map(|_| bus.inbox().expect("inbox")).collect();
+    let error = bus.inbox().expect_err("too many");
+    assert_eq!(error.to_string(), "topic /rapid/serial/motor: 8 programs subscribe already, and no more may; end one");
+}

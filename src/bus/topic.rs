@@ -46,13 +46,18 @@ impl TopicSpec {
         Self { id: TopicId::Mask, name: MASK_TOPIC.to_owned(), depth: MASK_DEPTH, max_bytes: MASK_BYTES }
     }
 
-    /// Samples in the pool.
+    /// Samples in the pool, for queues of `depth`.
+    pub(super) fn pool_samples(&self) -> usize {
+        Self::pool_for(self.depth)
+    }
+
+    /// Samples in a pool that is never exhausted.
     ///
     /// Every subscriber's queue holds the newest `depth` samples at most, so the queues of all of
     /// them together hold no more than `depth` different ones; beside these each may hold a few, and
     /// the writer one. iceoryx2's own bound counts every queue as if it held other samples.
-    pub(super) fn pool_samples(&self) -> usize {
-        self.depth + super::MAX_SUBSCRIBERS * super::MAX_BORROWED + 2
+    pub(super) const fn pool_for(depth: usize) -> usize {
+        depth + super::MAX_SUBSCRIBERS * super::MAX_BORROWED + 2
     }
 
     /// Bytes of the pool.

@@ -28,7 +28,8 @@ impl Writer {
         factory: &TopicFactory,
         wake: &EventFactory<Service>,
     ) -> Result<Self, BusError> {
-        let pool = spec.pool_samples();
+        // A topic that another program kept open from an earlier run may have deeper queues than asked.
+        let pool = TopicSpec::pool_for(factory.static_config().subscriber_max_buffer_size().max(spec.depth));
         let publisher = factory
             .publisher_builder()
             .initial_max_slice_len(spec.max_bytes)

@@ -6,6 +6,7 @@
 //! Invariant: what is attached when the stream begins is told as `Added` before anything else.
 //! Invariant: a node told twice as `Added` without a removal between is the same attachment.
 
+mod known;
 pub mod script;
 pub mod udev;
 
@@ -45,6 +46,19 @@ pub enum Witness {
     Enumeration,
     /// A scenario.
     Script,
+}
+
+impl Witness {
+    /// The word for it, as in JSON.
+    #[must_use]
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::Kernel => "kernel",
+            Self::Udev => "udev",
+            Self::Enumeration => "enumeration",
+            Self::Script => "script",
+        }
+    }
 }
 
 /// Why plugging can no longer be watched.

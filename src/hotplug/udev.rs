@@ -4,12 +4,10 @@
 //! missed. A removal is told by whichever witness is first (on the virtual bench the kernel's uevent
 //! comes some 50 ms before udev's); an addition only by udev, once rules and permissions are in place.
 //!
-//! Invariant: a node of `known` has been told as `Added` and not since as `Removed`.
 //! Invariant: lost events are never silent: when a socket overflows, devices are enumerated again
 //! and the difference is told.
 
-use std::collections::{HashMap, VecDeque};
-use std::path::{Path, PathBuf};
+use std::collections::VecDeque;
 use std::pin::Pin;
 use std::task::{Context, Poll, ready};
 
@@ -18,6 +16,7 @@ use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 use udev::{Device, Enumerator, EventType, MonitorBuilder, MonitorSocket};
 
+use super::known::{Known, Look, Present};
 use super::{HotplugError, HotplugEvent, Witness};
 use crate::registry::{Attachment, DeviceNode, UsbIdentity};
 use crate::time::Stamp;
@@ -29,17 +28,8 @@ const NODE_SUBSYSTEMS: [&str; 2] = ["video4linux", "tty"];
 pub struct UdevMonitor {
     kernel: AsyncFd<MonitorSocket>,
     udev: AsyncFd<MonitorSocket>,
-    known: HashMap<PathBuf, Node>,
-    /// Sequence number of the kernel's removal of a path whose udev events are still to come.
-    removals: HashMap<PathBuf, u64>,
+    known: Known,
     queue: VecDeque<HotplugEvent>,
-}
-
-/// What is remembered of a node to notice that it was exchanged while events were lost.
-#[derive(Debug, Clone, PartialEq, Eq)]
-struct Node {
-    /// Number the kernel gave the USB device at this enumeration; another after each plug.
-    device_number: Option<String>,
 }
 
 impl std::fmt::Debug for UdevMonitor {
@@ -57,8 +47,7 @@ impl UdevMonitor {
         let mut monitor = Self {
             kernel: listen(MonitorBuilder::new_kernel())?,
             udev: listen(MonitorBuilder::new())?,
-            known: HashMap::new(),
-            removals: HashMap::new(),
+            known: Known::default(),
             queue: VecDeque::new(),
         };
         monitor.enumerate()?;
@@ -67,58 +56,30 @@ impl UdevMonitor {
 
     /// Tells the difference between what is there and what is known.
     fn enumerate(&mut self) -> Result<(), HotplugError> {
-        let present = attached()?;
-        let now = Stamp::now();
-        let gone = self.known.iter().filter(|(path, node)| {
-            !present.iter().any(|(attachment, found)| attachment.syspath == **path && found == *node)
-        });
-        for path in gone.map(|(path, _)| path.clone()).collect::<Vec<_>>() {
-            self.known.remove(&path);
-            let witness = Witness::Enumeration;
-            self.queue.push_back(HotplugEvent::Removed { syspath: path, witnessed: now, witness });
-        }
-        for (attachment, node) in present {
-            if self.known.insert(attachment.syspath.clone(), node).is_none() {
-                self.queue.push_back(HotplugEvent::Added(attachment));
-            }
-        }
+        // Read before the devices: an event up to here may tell of a device that is gone by now.
+        let sequence = newest_event();
+        self.queue.extend(self.known.enumerated(attached()?, sequence, Stamp::now()));
         Ok(())
     }
 
-    fn take(&mut self, event: &udev::Event, witness: Witness) {
+    fn take(&mut self, event: &udev::Event, witness: Witness) -> Result<(), HotplugError> {
+        let (sequence, now) = (event.sequence_number(), Stamp::now());
         match event.event_type() {
-            EventType::Remove => self.removed(event.syspath(), event.sequence_number(), witness),
-            EventType::Add | EventType::Change if witness == Witness::Udev => self.added(event),
+            EventType::Remove => {
+                let (gone, look) = self.known.removed(event.syspath(), sequence, witness, now);
+                self.queue.extend(gone);
+                if look == Look::Again {
+                    self.enumerate()?;
+                }
+            }
+            EventType::Add | EventType::Change if witness == Witness::Udev => {
+                if let Some(present) = present(event) {
+                    self.queue.extend(self.known.added(present, sequence, now));
+                }
+            }
             _ => {}
         }
-    }
-
-    fn added(&mut self, event: &udev::Event) {
-        let Some((attachment, node)) = attachment(event) else { return };
-        let path = &attachment.syspath;
-        let removed_since = self
-            .removals
-            .iter()
-            .any(|(removed, sequence)| path.starts_with(removed) && *sequence > event.sequence_number());
-        if removed_since || self.known.contains_key(path) {
-            return;
-        }
-        self.known.insert(path.clone(), node);
-        self.queue.push_back(HotplugEvent::Added(attachment));
-    }
-
-    fn removed(&mut self, path: &Path, sequence: u64, witness: Witness) {
-        if witness == Witness::Kernel {
-            self.removals.insert(path.to_owned(), sequence);
-        } else if self.removals.get(path).is_some_and(|kernel| *kernel <= sequence) {
-            self.removals.remove(path);
-        }
-        let before = self.known.len();
-        self.known.retain(|known, _| !known.starts_with(path));
-        if self.known.len() < before {
-            let (syspath, witnessed) = (path.to_owned(), Stamp::now());
-            self.queue.push_back(HotplugEvent::Removed { syspath, witnessed, witness });
-        }
+        Ok(())
     }
 
     /// Moves what waits on a socket into the queue. Ready when the socket is drained and will wake us.
@@ -138,7 +99,7 @@ impl UdevMonitor {
                 continue;
             };
             drop(guard);
-            self.take(&event, witness);
+            self.take(&event, witness)?;
         }
     }
 }
@@ -167,7 +128,7 @@ impl Stream for UdevMonitor {
 /// # Errors
 /// When sysfs cannot be read.
 pub fn enumerate() -> Result<Vec<Attachment>, HotplugError> {
-    Ok(attached()?.into_iter().map(|(attachment, _)| attachment).collect())
+    Ok(attached()?.into_iter().map(|present| present.attachment).collect())
 }
 
 fn listen(builder: std::io::Result<MonitorBuilder>) -> Result<AsyncFd<MonitorSocket>, HotplugError> {
@@ -179,20 +140,29 @@ fn listen(builder: std::io::Result<MonitorBuilder>) -> Result<AsyncFd<MonitorSoc
     Ok(AsyncFd::with_interest(builder.listen()?, Interest::READABLE)?)
 }
 
-fn attached() -> Result<Vec<(Attachment, Node)>, HotplugError> {
+/// Number of the newest event the kernel has sent; 0 where it does not say.
+fn newest_event() -> u64 {
+    let number = std::fs::read_to_string("/sys/kernel/uevent_seqnum").ok();
+    number.and_then(|number| number.trim().parse().ok()).unwrap_or(0)
+}
+
+fn attached() -> Result<Vec<Present>, HotplugError> {
     let mut enumerator = Enumerator::new()?;
     for subsystem in NODE_SUBSYSTEMS {
         enumerator.match_subsystem(subsystem)?;
     }
     enumerator.match_is_initialized()?;
-    let mut found: Vec<_> = enumerator.scan_devices()?.filter_map(|device| attachment(&device)).collect();
+    let mut found: Vec<_> = enumerator.scan_devices()?.filter_map(|device| present(&device)).collect();
     // In the order of ports, so that a start assigns equal units the same way each time.
-    found.sort_by(|(a, _), (b, _)| (&a.usb.port, &a.syspath).cmp(&(&b.usb.port, &b.syspath)));
+    found.sort_by(|a, b| {
+        let (a, b) = (&a.attachment, &b.attachment);
+        (&a.usb.port, &a.syspath).cmp(&(&b.usb.port, &b.syspath))
+    });
     Ok(found)
 }
 
 /// The attachment of a node that can be opened; `None` for any other device.
-fn attachment(device: &Device) -> Option<(Attachment, Node)> {
+fn present(device: &Device) -> Option<Present> {
     let path = device.devnode()?.to_owned();
     let node = match device.subsystem()?.to_str()? {
         "video4linux" if captures(device) => DeviceNode::Video(path),
@@ -212,8 +182,8 @@ fn attachment(device: &Device) -> Option<(Attachment, Node)> {
         port: usb_device.sysname().to_string_lossy().into_owned(),
         product: text("product"),
     };
-    let known = Node { device_number: text("devnum") };
-    Some((Attachment { syspath: device.syspath().to_owned(), node, usb }, known))
+    let attachment = Attachment { syspath: device.syspath().to_owned(), node, usb };
+    Some(Present { attachment, device_number: text("devnum") })
 }
 
 /// A UVC camera offers a second video node for metadata, which has no pictures.

@@ -321,9 +321,6 @@ impl Writer {
             board.set_last_episode(report.file.clone());
         }
         let EpisodeReport { file, seconds, messages, bytes, dropped, error } = report.clone();
-        if let Some(error) = &error {
-            tracing::error!(file = %file.display(), %error, "episode not whole");
-        }
         board.announce(What::Episode { file, seconds, messages, bytes, dropped, error });
         for reply in self.waiting.drain(..) {
             let _ = reply.send(Ok(report.clone()));
@@ -339,7 +336,6 @@ impl Writer {
     }
 
     fn complain(&self, level: Level, text: String) {
-        tracing::error!("{text}");
         self.config.board.announce(What::Log { level, text });
     }
 }

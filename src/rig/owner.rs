@@ -51,6 +51,8 @@ pub struct Rig {
     presence: Presence,
     board: Arc<Board>,
     mask: PhysicalMask,
+    /// The mask's JSON file is to be written, once for everything that one event changes.
+    json_is_stale: bool,
     streams: JoinSet<(End, String)>,
     /// Which stream a task is.
     tasks: HashMap<Id, (ModalityId, Epoch)>,
@@ -92,6 +94,7 @@ impl Rig {
             presence,
             board,
             mask: PhysicalMask::EMPTY,
+            json_is_stale: false,
             streams: JoinSet::new(),
             tasks: HashMap::new(),
             reports: mpsc::channel(1).0,
@@ -128,7 +131,10 @@ impl Rig {
                 Some((id, epoch, report)) = reported.recv() => self.report(id, epoch, report),
                 Some(RigCommand::Restart(id)) = commands.recv() => self.apply(id, Input::Restart),
                 () = sleep(deadline.since(Stamp::now())) => self.deadlines_passed(),
-                _ = json.tick() => self.write_json(),
+                _ = json.tick() => self.json_is_stale = true,
+            }
+            if std::mem::take(&mut self.json_is_stale) {
+                self.write_json();
             }
         };
         self.stop_streams().await;
@@ -139,7 +145,7 @@ impl Rig {
         match event {
             HotplugEvent::Added(attachment) => {
                 if self.assigner.replaces(&attachment) {
-                    self.removed(&attachment.syspath, "enumeration");
+                    self.removed(&attachment.syspath, Witness::Enumeration);
                 }
                 match self.assigner.attach(&attachment) {
                     Assignment::Entry(id) => self.attached(id, attachment),
@@ -147,21 +153,12 @@ impl Rig {
                         let usb = &attachment.usb;
                         let serial = usb.serial.as_deref().unwrap_or("no serial");
                         let device = format!("{:04x}:{:04x} ({serial}) at {}", usb.vid, usb.pid, usb.port);
-                        tracing::info!(%device, %reason, "not used");
                         self.board.announce(What::Unregistered { device, reason });
                     }
                     Assignment::WrongNode { reason } => tracing::debug!(%reason, "node not used"),
                 }
             }
-            HotplugEvent::Removed { syspath, witness, .. } => self.removed(
-                &syspath,
-                match witness {
-                    Witness::Kernel => "kernel",
-                    Witness::Udev => "udev",
-                    Witness::Enumeration => "enumeration",
-                    Witness::Script => "script",
-                },
-            ),
+            HotplugEvent::Removed { syspath, witness, .. } => self.removed(&syspath, witness),
         }
     }
 
@@ -181,13 +178,10 @@ impl Rig {
         self.apply(id, Input::Attached(attachment));
     }
 
-    fn removed(&mut self, syspath: &Path, witness: &str) {
+    fn removed(&mut self, syspath: &Path, witness: Witness) {
         let detached = self.assigner.detach(syspath);
         for id in detached.freed {
-            // Where the stream was first, the unplug has been told already.
-            if self.modality(id).is_some_and(|modality| modality.slot.state() != SlotState::Absent) {
-                self.announce_detach(id, witness);
-            }
+            self.tell_detach(id, witness.word());
             self.apply(id, Input::Detached);
         }
         for (id, attachment) in detached.assigned {
@@ -195,8 +189,13 @@ impl Rig {
         }
     }
 
-    fn announce_detach(&mut self, id: ModalityId, witness: &str) {
+    /// Says who saw an unplug, unless another witness was first.
+    fn tell_detach(&mut self, id: ModalityId, witness: &str) {
         let Some(modality) = self.modality(id) else { return };
+        if modality.slot.state() == SlotState::Absent {
+            return;
+        }
+        modality.detail = format!("unplugged, told by {witness}");
         let (device, witness) = (modality.spec.name.clone(), witness.to_owned());
         self.board.announce(What::Detach { device, bit: id, witness });
     }
@@ -210,22 +209,17 @@ impl Rig {
             Err(error) => (error.id(), End::Retry, error.to_string()),
         };
         let Some((id, epoch)) = self.tasks.remove(&task) else { return };
-        let Some(modality) = self.modality(id) else { return };
-        if modality.slot.epoch() != epoch {
-            return;
-        }
-        modality.detail = reason;
-        if end == End::Gone && modality.slot.state() != SlotState::Absent {
-            self.announce_detach(id, "stream");
+        let Some(modality) = self.modality(id).filter(|modality| modality.slot.is_current(epoch)) else { return };
+        match end {
+            End::Gone => self.tell_detach(id, "stream"),
+            End::Retry | End::Fatal => modality.detail = reason,
         }
         self.apply(id, Input::Ended(epoch, end));
     }
 
     fn report(&mut self, id: ModalityId, epoch: Epoch, report: Report) {
-        let Some(modality) = self.modality(id) else { return };
-        if modality.slot.epoch() != epoch {
-            return;
-        }
+        // A report may arrive after the end of its stream, whose reason must stay.
+        let Some(modality) = self.modality(id).filter(|modality| modality.slot.is_current(epoch)) else { return };
         match report {
             Report::Opened(description) => {
                 modality.detail = description;
@@ -236,7 +230,6 @@ impl Rig {
             Report::Resumed => self.apply(id, Input::Resumed(epoch)),
             Report::Refused(reason) => {
                 let text = format!("{}: samples are lost: {reason}", modality.spec.name);
-                tracing::error!("{text}");
                 self.board.announce(What::Log { level: Level::Error, text });
             }
         }
@@ -273,24 +266,23 @@ impl Rig {
         if stop.is_some() {
             modality.stop.cancel();
         }
-        if state == SlotState::Backoff
+        let changed = state != before || start.is_some();
+        if changed
+            && state == SlotState::Backoff
             && let Some(deadline) = modality.slot.deadline()
         {
             let wait = deadline.since(now).as_secs_f64();
-            let reason = if modality.detail.is_empty() { "cooldown" } else { modality.detail.as_str() };
+            let reason = if before == SlotState::Absent { "cooldown" } else { modality.detail.as_str() };
             modality.detail = format!("{reason}; starts in {wait:.1} s");
         }
-        if state == SlotState::Absent {
-            modality.detail.clear();
-        }
         if let Some((epoch, attachment)) = start {
-            modality.detail = format!("opening {}", attachment.node.label());
+            modality.detail = attachment.node.label();
             self.start(id, epoch, attachment);
         }
-        if state != before {
+        if changed {
             self.show(id);
             self.announce_state(id);
-            self.write_json();
+            self.json_is_stale = true;
         }
     }
 
@@ -322,12 +314,6 @@ impl Rig {
         let (mask, count, board) = (self.mask, self.modalities.len(), Arc::clone(&self.board));
         let Some(modality) = self.modality(id) else { return };
         let (device, detail, state) = (modality.spec.name.clone(), modality.detail.clone(), modality.slot.state());
-        match state {
-            SlotState::Failed => tracing::error!(%device, %detail, "failed"),
-            SlotState::Stalled => tracing::warn!(%device, "stalled: attached, but no samples come"),
-            SlotState::Backoff => tracing::warn!(%device, %detail, "waits"),
-            _ => tracing::info!(%device, ?state, %detail),
-        }
         board.announce(What::State { device, bit: id, state, mask: mask.hex(count), detail });
     }
 
@@ -373,3 +359,6 @@ impl Rig {
         self.modalities.iter_mut().find(|modality| modality.spec.id == id)
     }
 }
+
+#[cfg(test)]
+mod tests;

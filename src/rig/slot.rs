@@ -150,8 +150,9 @@ impl<A: Clone> Slot<A> {
         }
     }
 
-    /// Is this the stream that is running now?
-    fn is_current(&self, epoch: Epoch) -> bool {
+    /// Is this the stream that is running now? What any other says changes nothing.
+    #[must_use]
+    pub fn is_current(&self, epoch: Epoch) -> bool {
         self.is_running() && epoch == self.epoch
     }
 

@@ -6,6 +6,7 @@
 //! Invariant: what is written per sample is an atomic; the locks here guard what changes a few times
 //! a second at most and are never held over anything that waits.
 
+use std::borrow::Cow;
 use std::collections::VecDeque;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -18,7 +19,8 @@ use crate::mask::PhysicalMask;
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::registry::Registry;
 use crate::sample::Epoch;
-use crate::time::Stamp;
+use crate::text;
+use crate::time::{Stamp, realtime_ns};
 
 /// Log lines kept for the screen.
 const LOG_LINES: usize = 500;
@@ -131,11 +133,10 @@ impl Board {
         *lock(&self.last_episode) = Some(file);
     }
 
-    /// Adds a line to the log; control characters become spaces, so that no text of a device can
-    /// move the cursor of a terminal.
+    /// Adds a line to the log, without what of a device's text could move the cursor of a terminal.
     pub fn log(&self, mut line: LogLine) {
-        if line.text.contains(char::is_control) {
-            line.text = line.text.replace(char::is_control, " ");
+        if let Cow::Owned(plain) = text::plain(&line.text) {
+            line.text = plain;
         }
         let mut log = lock(&self.log);
         if log.len() == LOG_LINES {
@@ -144,8 +145,11 @@ impl Board {
         log.push_back(line);
     }
 
-    /// Announces an event, now, to whoever subscribed.
+    /// Announces an event, now, to whoever subscribed, and adds it to the log.
     pub fn announce(&self, what: What) {
+        if let Some((level, text)) = what.sentence() {
+            self.log(LogLine { wall_ns: realtime_ns(), level, text });
+        }
         // An error only says that nobody listens.
         let _ = self.events.send(Event { stamp: Stamp::now(), what });
     }

@@ -92,3 +92,72 @@ pub enum What {
         text: String,
     },
 }
+
+impl What {
+    /// The event as a line of the log; `None` where the event that follows says it all.
+    pub(super) fn sentence(&self) -> Option<(Level, String)> {
+        Some(match self {
+            Self::Attach { device, node, port, serial, .. } => {
+                let serial = serial.as_deref().map(|serial| format!(", serial {serial}")).unwrap_or_default();
+                (Level::Info, format!("{device} attached ({node} at port {port}{serial})"))
+            }
+            // The slot's state changes with it and names the witness.
+            Self::Detach { .. } => return None,
+            Self::State { device, state, detail, .. } => {
+                let level = match state {
+                    SlotState::Failed => Level::Error,
+                    SlotState::Stalled | SlotState::Backoff => Level::Warn,
+                    SlotState::Absent | SlotState::Opening | SlotState::Streaming => Level::Info,
+                };
+                let state = state.word();
+                let text = if detail.is_empty() {
+                    format!("{device} {state}")
+                } else {
+                    format!("{device} {state} ({detail})")
+                };
+                (level, text)
+            }
+            Self::Unregistered { device, reason } => (Level::Info, format!("{device} is not used: {reason}")),
+            Self::Recording { file } => (Level::Info, format!("recording {}", file.display())),
+            Self::Episode { file, seconds, error: Some(error), .. } => {
+                (Level::Error, format!("{} is not whole after {seconds:.1} s: {error}", file.display()))
+            }
+            Self::Episode { file, seconds, dropped, error: None, .. } => {
+                let level = if *dropped > 0 { Level::Warn } else { Level::Info };
+                (level, format!("{} finished, {seconds:.1} s, {dropped} samples dropped", file.display()))
+            }
+            Self::Log { level, text } => (*level, text.clone()),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_state_is_a_sentence_of_the_log() {
+        let bit = ModalityId::new(1).expect("below 64");
+        let state = |state, detail: &str| What::State {
+            device: "tactile_tip".into(),
+            bit,
+            state,
+            mask: "0x05".into(),
+            detail: detail.into(),
+        };
+        let table = [
+            (
+                state(SlotState::Absent, "unplugged, told by kernel"),
+                Level::Info,
+                "tactile_tip absent (unplugged, told by kernel)",
+            ),
+            (state(SlotState::Streaming, ""), Level::Info, "tactile_tip streaming"),
+            (state(SlotState::Failed, "busy"), Level::Error, "tactile_tip failed (busy)"),
+        ];
+        for (what, level, text) in table {
+            assert_eq!(what.sentence(), Some((level, text.to_owned())));
+        }
+        let detach = What::Detach { device: "tactile_tip".into(), bit, witness: "kernel".into() };
+        assert_eq!(detach.sentence(), None);
+    }
+}

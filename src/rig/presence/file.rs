@@ -1,6 +1,6 @@
 //! The mask's file: made without following links, locked, written so that no reader sees half.
 
-use std::fs::File;
+use std::fs::{File, Metadata};
 use std::io::ErrorKind;
 use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
@@ -135,6 +135,7 @@ fn take(path: &Path) -> Result<File, PresenceError> {
             Ok(descriptor) => File::from(descriptor),
             Err(Errno::LOOP) => return Err(foreign("it is a symbolic link, and rapid follows none there")),
             Err(Errno::ISDIR) => return Err(foreign("it is a folder")),
+            Err(error @ (Errno::ACCESS | Errno::PERM)) => return Err(refused(path, error)),
             Err(error) => return Err(io(error)),
         };
         let opened = file.metadata().map_err(|error| PresenceError::Io { path: path.to_owned(), error })?;
@@ -144,7 +145,7 @@ fn take(path: &Path) -> Result<File, PresenceError> {
         match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {
             Ok(()) => {}
             Err(Errno::WOULDBLOCK) => {
-                return Err(PresenceError::Taken { path: path.to_owned(), pid: holder(opened.ino()) });
+                return Err(PresenceError::Taken { path: path.to_owned(), pid: holder(&opened) });
             }
             Err(error) => return Err(io(error)),
         }
@@ -158,14 +159,28 @@ fn take(path: &Path) -> Result<File, PresenceError> {
     Err(PresenceError::Taken { path: path.to_owned(), pid: None })
 }
 
-/// Who holds a lock on the file with this inode, from /proc/locks (proc(5)): the fifth field is the
-/// pid, the sixth `major:minor:inode`.
-fn holder(inode: u64) -> Option<u32> {
+/// Why a file that is there may not be opened: it is another user's. In a folder like /dev/shm not
+/// even root may open it for writing (fs.protected_regular in proc_sys_fs(5)).
+pub(super) fn refused(path: &Path, error: Errno) -> PresenceError {
+    match std::fs::symlink_metadata(path) {
+        Ok(there) if holder(&there).is_some() => PresenceError::Taken { path: path.to_owned(), pid: holder(&there) },
+        Ok(there) if there.uid() != rustix::process::geteuid().as_raw() => {
+            PresenceError::Foreign { path: path.to_owned(), what: "it was left behind by another user's rapid" }
+        }
+        _ => PresenceError::Io { path: path.to_owned(), error: error.into() },
+    }
+}
+
+/// Who holds a lock on this file, from /proc/locks (proc(5)): the fifth field is the pid, the sixth
+/// `major:minor:inode`, the device in hexadecimal.
+fn holder(file: &Metadata) -> Option<u32> {
+    let (major, minor) = (rustix::fs::major(file.dev()), rustix::fs::minor(file.dev()));
+    let wanted = format!("{major:02x}:{minor:02x}:{}", file.ino());
     let locks = std::fs::read_to_string("/proc/locks").ok()?;
     locks.lines().find_map(|line| {
         let fields: Vec<&str> = line.split_whitespace().collect();
         let [_, "FLOCK", _, "WRITE", pid, file, ..] = fields[..] else { return None };
-        (file.rsplit(':').next()?.parse() == Ok(inode)).then(|| pid.parse().ok())?
+        (file == wanted).then(|| pid.parse().ok())?
     })
 }
 

@@ -73,6 +73,10 @@ pub(super) fn write(
     // `create_new` follows none.
     let _ = std::fs::remove_file(&temporary);
     let mut file = std::fs::OpenOptions::new().write(true).create_new(true).open(&temporary).map_err(io)?;
-    file.write_all(&text).map_err(io)?;
-    std::fs::rename(&temporary, path).map_err(io)
+    let written = file.write_all(&text).and_then(|()| std::fs::rename(&temporary, path));
+    if written.is_err() {
+        // Shared memory may be full: leave it no fuller than it was.
+        let _ = std::fs::remove_file(&temporary);
+    }
+    written.map_err(io)
 }

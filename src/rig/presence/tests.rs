@@ -32,6 +32,23 @@ fn a_second_publisher_is_told_the_pid_of_the_first() {
 }
 
 #[test]
+fn a_file_that_may_not_be_opened_is_explained() {
+    let path = path();
+    let first = MaskFile::create(&path, 1).expect("first");
+    let error = file::refused(&path, rustix::io::Errno::ACCESS);
+    assert!(matches!(error, PresenceError::Taken { pid: Some(pid), .. } if pid == std::process::id()), "{error}");
+    drop(first);
+    std::fs::write(&path, "").expect("leftover");
+    // Only root can give a file away.
+    if std::os::unix::fs::chown(&path, Some(12_345), None).is_ok() {
+        let error = file::refused(&path, rustix::io::Errno::ACCESS);
+        assert!(error.to_string().contains("another user's rapid; remove it: rm "), "{error}");
+    }
+    std::fs::remove_file(&path).expect("clean");
+    assert!(matches!(file::refused(&path, rustix::io::Errno::ACCESS), PresenceError::Io { .. }));
+}
+
+#[test]
 fn the_file_of_a_dead_process_is_taken_over() {
     let path = path();
     std::fs::write(&path, [0xff; 7]).expect("leftover");

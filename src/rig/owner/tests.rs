@@ -1,0 +1,282 @@
+//! The whole owner with scripted hot-plug and simulated devices, under the real runtime.
+
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use futures::channel::mpsc::{UnboundedSender, unbounded};
+use tokio::sync::broadcast;
+
+use super::*;
+use crate::registry::scenario::{SimDevice, SimSource};
+use crate::registry::{
+    DeviceNode, Framing, IdentitySpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbIdentity, WhenStale,
+};
+use crate::rig::presence::{Claim, read_mask};
+use crate::status::Event;
+
+const CHANNELS: usize = 2;
+/// How long a condition may take before a test gives up; no requirement.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+/// Two interchangeable entries, `a` and `b`.
+fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
+    let serial = SerialSpec { baud: 115_200, framing: Framing::Line, parse: Parse::Csv, channels: CHANNELS };
+    let device = |(bit, name): (u8, &str)| DeviceSpec {
+        name: name.into(),
+        id: ModalityId::new(bit).expect("below 64"),
+        identity: IdentitySpec { vid: 1, pid: 2, serial: None, port: None },
+        node: NodeSpec::Serial(serial.clone()),
+        topic: format!("/rapid/serial/{name}"),
+        mount: None,
+        stall_after,
+        max_bytes: 64,
+        depth: 16,
+        when_stale: WhenStale::Hold,
+    };
+    Registry {
+        rig: RigSpec {
+            name: "test".into(),
+            observation_hz: 30.0,
+            sync_window: Duration::from_millis(25),
+            cooldown,
+            memory_budget: 1 << 20,
+        },
+        devices: [(0, "a"), (1, "b")].into_iter().map(device).collect(),
+        path: None,
+        text: String::new(),
+    }
+}
+
+enum Step {
+    /// A unit of the model, which sends this many numbers, is told as attached at a port.
+    Plug(&'static str, usize),
+    /// The cable is pulled: the device notices, hot-plug has yet to tell.
+    Pull(&'static str),
+    /// Hot-plug tells of the removal of a port.
+    Removed(&'static str, Witness),
+    Silence(&'static str),
+    Resume(&'static str),
+    Restart(u8),
+    /// Takes events until this one.
+    Until(&'static str),
+    /// The mask other processes read becomes this.
+    Mask(u64),
+}
+use Step::{Mask, Plug, Pull, Removed, Restart, Resume, Silence, Until};
+
+struct Bench {
+    hotplug: UnboundedSender<Result<HotplugEvent, HotplugError>>,
+    commands: mpsc::Sender<RigCommand>,
+    events: broadcast::Receiver<Event>,
+    units: HashMap<&'static str, Arc<SimDevice>>,
+    path: PathBuf,
+    told: Vec<String>,
+}
+
+impl Bench {
+    async fn step(&mut self, step: &Step) {
+        match step {
+            Plug(port, channels) => {
+                let source = SimSource::Serial { channels: *channels, hz: 200, seed: 1 };
+                let unit = Arc::new(SimDevice::new(port, source, Stamp::now()));
+                self.units.insert(port, Arc::clone(&unit));
+                let usb = UsbIdentity { vid: 1, pid: 2, serial: None, port: (*port).into(), product: None };
+                let syspath = PathBuf::from("/test").join(port);
+                self.tell(HotplugEvent::Added(Attachment { syspath, node: DeviceNode::Sim(unit), usb }));
+            }
+            Pull(port) => self.units[port].unplug(),
+            Removed(port, witness) => {
+                let syspath = PathBuf::from("/test").join(port);
+                self.tell(HotplugEvent::Removed { syspath, witnessed: Stamp::now(), witness: *witness });
+            }
+            Silence(port) => self.units[port].set_silent(true),
+            Resume(port) => self.units[port].set_silent(false),
+            Restart(bit) => {
+                let id = ModalityId::new(*bit).expect("below 64");
+                self.commands.send(RigCommand::Restart(id)).await.expect("rig");
+            }
+            Until(wanted) => loop {
+                let event = timeout(PATIENCE, self.events.recv()).await;
+                let event = event.unwrap_or_else(|_| panic!("no {wanted:?} after {:?}", self.told)).expect("event");
+                let Some(word) = word(&event.what) else { continue };
+                self.told.push(word.clone());
+                if word == *wanted {
+                    return;
+                }
+            },
+            Mask(wanted) => {
+                let begun = Instant::now();
+                while read_mask(&self.path).expect("mask").mask.0 != *wanted {
+                    assert!(begun.elapsed() < PATIENCE, "mask is not {wanted:#x} after {:?}", self.told);
+                    tokio::time::sleep(Duration::from_millis(1)).await;
+                }
+            }
+        }
+    }
+
+    fn tell(&self, event: HotplugEvent) {
+        self.hotplug.unbounded_send(Ok(event)).expect("rig");
+    }
+}
+
+fn word(what: &What) -> Option<String> {
+    match what {
+        What::Attach { device, port, .. } => Some(format!("{device} at {port}")),
+        What::Detach { device, witness, .. } => Some(format!("{device} gone {witness}")),
+        What::State { device, state, .. } => Some(format!("{device} {}", state.word())),
+        What::Unregistered { .. } => Some("unused".into()),
+        _ => None,
+    }
+}
+
+async fn told(cooldown: Duration, stall_after: Duration, steps: &[Step]) -> Vec<String> {
+    static NEXT: AtomicU32 = AtomicU32::new(0);
+    let name = format!("owner{}x{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
+    let path = PathBuf::from(format!("/dev/shm/rapid_test_mask_{name}"));
+    let registry = registry(cooldown, stall_after);
+    let board = Arc::new(Board::new(&registry));
+    let bus = Bus::open(&registry, Some(&name)).expect("bus");
+    let claim = Claim::new(&path, 2).expect("claim");
+    let presence = Presence::start(claim, bus.writer(TopicId::Mask).expect("mask"), Arc::clone(&board)).expect("mask");
+    let (hotplug, plugged) = unbounded();
+    let (commands, asked) = mpsc::channel(4);
+    let stop = CancellationToken::new();
+    let mut rig = Rig::new(&registry, &bus, presence, Arc::clone(&board));
+    let mut bench = Bench { hotplug, commands, events: board.events(), units: HashMap::new(), path, told: Vec::new() };
+    let running = tokio::spawn({
+        let stop = stop.clone();
+        async move { rig.run(Box::pin(plugged), asked, stop).await }
+    });
+    for step in steps {
+        bench.step(step).await;
+    }
+    stop.cancel();
+    running.await.expect("no panic").expect("no error");
+    while let Ok(event) = bench.events.try_recv() {
+        bench.told.extend(word(&event.what));
+    }
+    bench.told
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_first_witness_wins_and_no_replug_is_lost() {
+    let up: &[&str] = &["a at 1", "a opening", "a streaming"];
+    let table: &[(&str, &[Step], &[&str])] = &[
+        (
+            "the kernel first, then the stream, then udev",
+            &[
+                Plug("1", CHANNELS),
+                Until("a streaming"),
+                Mask(1),
+                Removed("1", Witness::Kernel),
+                Until("a absent"),
+                Mask(0),
+                Pull("1"),
+                Removed("1", Witness::Udev),
+                Plug("1", CHANNELS),
+                Until("a streaming"),
+                Mask(1),
+            ],
+            &["a gone kernel", "a absent", "a at 1", "a backoff", "a opening", "a streaming"],
+        ),
+        (
+            "the stream first, then the kernel",
+            &[
+                Plug("1", CHANNELS),
+                Until("a streaming"),
+                Pull("1"),
+                Until("a absent"),
+                Mask(0),
+                Removed("1", Witness::Kernel),
+                Plug("1", CHANNELS),
+                Until("a streaming"),
+                Mask(1),
+            ],
+            &["a gone stream", "a absent", "a at 1", "a backoff", "a opening", "a streaming"],
+        ),
+        (
+            "removal and replug in one breath: the old stream's end is no second unplug",
+            &[
+                Plug("1", CHANNELS),
+                Until("a streaming"),
+                Removed("1", Witness::Enumeration),
+                Plug("1", CHANNELS),
+                Until("a streaming"),
+                Mask(1),
+            ],
+            &["a gone enumeration", "a absent", "a at 1", "a backoff", "a opening", "a streaming"],
+        ),
+        (
+            "a unit seen in its new port before its old one is empty waits, as do two",
+            &[
+                Plug("1", CHANNELS),
+                Until("a streaming"),
+                Plug("2", CHANNELS),
+                Until("b streaming"),
+                Plug("3", CHANNELS),
+                Plug("4", CHANNELS),
+                Until("unused"),
+                Until("unused"),
+                Mask(3),
+                Removed("1", Witness::Kernel),
+                Until("a streaming"),
+                Removed("2", Witness::Kernel),
+                Until("b streaming"),
+                Mask(3),
+            ],
+            &[
+                "b at 2",
+                "b opening",
+                "b streaming",
+                "unused",
+                "unused",
+                "a gone kernel",
+                "a absent",
+                "a at 3",
+                "a backoff",
+                "a opening",
+                "a streaming",
+                "b gone kernel",
+                "b absent",
+                "b at 4",
+                "b backoff",
+                "b opening",
+                "b streaming",
+            ],
+        ),
+        (
+            "silence is no removal",
+            &[
+                Plug("1", CHANNELS),
+                Until("a streaming"),
+                Silence("1"),
+                Until("a stalled"),
+                Mask(1),
+                Resume("1"),
+                Until("a streaming"),
+                Mask(1),
+            ],
+            &["a stalled", "a streaming"],
+        ),
+    ];
+    for (name, steps, expected) in table {
+        let got = told(Duration::from_millis(100), Duration::from_millis(150), steps).await;
+        assert_eq!(got, [up, *expected].concat(), "{name}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_failed_device_is_started_again_by_hand() {
+    // It sends three numbers and the entry wants two.
+    let steps = [Plug("1", 3), Until("a failed"), Mask(0), Restart(0), Until("a failed"), Restart(1)];
+    let got = told(Duration::from_millis(100), Duration::from_millis(150), &steps).await;
+    assert_eq!(got, ["a at 1", "a opening", "a failed", "a opening", "a failed"]);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_stream_that_panics_is_started_again_and_its_bit_stays_clear() {
+    // A time no clock can hold, which the registry refuses, makes the stream panic once it is open.
+    let steps = [Plug("1", CHANNELS), Until("a backoff"), Mask(0), Until("a backoff"), Mask(0)];
+    let got = told(Duration::from_millis(100), Duration::MAX, &steps).await;
+    assert_eq!(got, ["a at 1", "a opening", "a backoff", "a opening", "a backoff"]);
+}
