@@ -24,9 +24,8 @@ demo: setup-build ## build, then the simulated rig: the monitor on a terminal, o
 	cargo build --release --locked
 	@if [ -t 0 ] && [ -t 1 ]; then exec '$(TARGET)/release/rapid' --sim; else scripts/demo.sh '$(TARGET)/release/rapid' $(DEMO_DIR); fi
 
-# The dev profile is optimised a little because the virtual bench runs this very binary under software emulation.
+# `cargo test` builds the program as well, into this place: no build of its own goes before it.
 test: setup lint ## set up, format, lints, all tests
-	cargo build --locked
 	RAPID_BIN='$(TARGET)/debug/rapid' RAPID_PYTHON='$(CACHE)/venv/bin/python' cargo test --locked --workspace --no-fail-fast
 
 lint: ## format and clippy
