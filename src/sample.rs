@@ -59,13 +59,17 @@ pub const FLAG_ERROR: u32 = 1;
 /// Header flag: the capture time comes from the kernel or the device, not from the moment of arrival.
 pub const FLAG_DEVICE_TIME: u32 = 2;
 
-/// Travels beside every payload, as iceoryx2 user header. 48 bytes, native alignment 8.
+/// Travels beside every payload, as iceoryx2 user header. 56 bytes, native alignment 8.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[repr(C)]
 pub struct SampleHeader {
     /// Counts the samples of this modality within a run of `rapid`, from 0, over all epochs: a hole
-    /// is a lost sample.
+    /// is a lost sample, or several.
     pub seq: u64,
+    /// Of all holes in `seq` so far, the part that the device lost itself before `rapid` had the
+    /// samples; over all epochs. By as much as it grows over a hole, the hole is the device's; the
+    /// rest of it did not reach this reader.
+    pub lost: u64,
     /// Capture time, `CLOCK_MONOTONIC` ns; from the kernel where it gives one.
     pub capture_ns: u64,
     /// When `rapid` had the bytes in hand, `CLOCK_MONOTONIC` ns.
@@ -89,10 +93,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_header_has_no_padding_and_48_bytes() {
-        assert_eq!(std::mem::size_of::<SampleHeader>(), 48);
-        assert_eq!(std::mem::offset_of!(SampleHeader, id), 24);
-        assert_eq!(std::mem::offset_of!(SampleHeader, height), 44);
+    fn the_header_has_no_padding_and_56_bytes() {
+        assert_eq!(std::mem::size_of::<SampleHeader>(), 56);
+        assert_eq!(std::mem::offset_of!(SampleHeader, id), 32);
+        assert_eq!(std::mem::offset_of!(SampleHeader, height), 52);
     }
 
     #[test]

@@ -70,6 +70,7 @@ impl Camera {
                 }
                 let header = SampleHeader {
                     seq,
+                    lost: 9,
                     capture_ns: 1_000_000 + seq,
                     recv_ns: 2_000_000 + seq,
                     id: u32::from(device.bit()),
@@ -131,7 +132,7 @@ fn a_subscriber_in_python_sees_headers_and_payloads() {
     let first = samples[0]["seq"].as_u64().expect("a sequence number");
     for (n, sample) in (first..).zip(&samples) {
         let expected = serde_json::json!({
-            "seq": n, "capture_ns": 1_000_000 + n, "recv_ns": 2_000_000 + n, "id": 0, "epoch": 5, "encoding": 1,
+            "seq": n, "lost": 9, "capture_ns": 1_000_000 + n, "recv_ns": 2_000_000 + n, "id": 0, "epoch": 5, "encoding": 1,
             "flags": 2, "width": 640, "height": 480, "bytes": PAYLOAD.len(), "begins": "ffd8ffe020612070",
         });
         assert_eq!(*sample, expected);

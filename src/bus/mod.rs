@@ -44,7 +44,7 @@ const MAX_BORROWED: usize = 4;
 // SAFETY: `SampleHeader` is `repr(C)`, holds only integers, no padding and no pointers.
 unsafe impl ZeroCopySend for SampleHeader {
     unsafe fn type_name() -> &'static str {
-        // The name under which other languages describe the same 48 bytes.
+        // The name under which other languages describe the same 56 bytes.
         "RapidSampleHeader"
     }
 }

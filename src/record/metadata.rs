@@ -80,25 +80,29 @@ pub(super) struct Ending<'a> {
 
 /// The record at the end.
 ///
-/// JSON: `modalities` `{name: {samples, bytes, dropped, damaged}}`, `serials` as at the beginning,
-/// of whatever was attached at some time.
+/// JSON: `modalities` `{name: {samples, bytes, lost, dropped, damaged}}` (`lost` by the device,
+/// `dropped` between the driver and the file), `serials` as at the beginning, of whatever was
+/// attached at some time.
 pub(super) fn end(registry: &Registry, ending: &Ending<'_>) -> BTreeMap<String, String> {
     let tally = |id: ModalityId| ending.tallies.get(id.index()).copied().unwrap_or_default();
     let modalities: Map<String, Value> = registry
         .devices
         .iter()
         .map(|device| {
-            let Tally { samples, bytes, dropped, damaged, .. } = tally(device.id);
-            let said = json!({"samples": samples, "bytes": bytes, "dropped": dropped, "damaged": damaged});
+            let Tally { samples, bytes, lost, dropped, damaged, .. } = tally(device.id);
+            let said =
+                json!({"samples": samples, "bytes": bytes, "lost": lost, "dropped": dropped, "damaged": damaged});
             (device.name.clone(), said)
         })
         .collect();
-    let dropped = ending.tallies.iter().fold(0_u64, |sum, tally| sum.saturating_add(tally.dropped));
+    let sum = |count: fn(&Tally) -> u64| ending.tallies.iter().map(count).fold(0, u64::saturating_add).to_string();
     text_map([
         ("duration_s", ending.seconds.to_string()),
         ("messages", ending.messages.to_string()),
         ("frames", ending.frames.to_string()),
-        ("dropped", dropped.to_string()),
+        ("lost", sum(|tally| tally.lost)),
+        ("dropped", sum(|tally| tally.dropped)),
+        ("damaged", sum(|tally| tally.damaged)),
         ("masks_dropped", ending.masks_dropped.to_string()),
         ("events_missed", ending.events_missed.to_string()),
         ("modalities", Value::Object(modalities).to_string()),

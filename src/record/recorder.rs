@@ -22,7 +22,7 @@ use tokio::sync::oneshot;
 use super::RecordError;
 use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest};
 use super::file::Sink;
-use super::session::{Attached, Beginning, MaskHistory, Session};
+use super::session::{Attached, Beginning, Hole, MaskHistory, Session};
 use super::source::Source;
 use crate::bus::TopicId;
 use crate::mask::PhysicalMask;
@@ -142,9 +142,17 @@ struct Writer {
 /// What is kept of the samples that pass, recording or not.
 struct Streams {
     masks: MaskHistory,
-    /// Sequence number expected next, by modality.
-    next: [Option<u64>; MAX_MODALITIES],
-    next_mask: Option<u64>,
+    /// The last sample of each modality.
+    last: [Option<Last>; MAX_MODALITIES],
+    last_mask: Option<Last>,
+}
+
+/// What of a sample says whether others are missing between it and the next.
+#[derive(Debug, Clone, Copy)]
+struct Last {
+    seq: u64,
+    lost: u64,
+    captured: Stamp,
 }
 
 enum Turn {
@@ -154,7 +162,7 @@ enum Turn {
 
 impl Writer {
     fn new(config: RecorderConfig, inbox: Receiver<Order>, events: broadcast::Receiver<Event>) -> Self {
-        let streams = Streams { masks: MaskHistory::new(), next: [None; MAX_MODALITIES], next_mask: None };
+        let streams = Streams { masks: MaskHistory::new(), last: [None; MAX_MODALITIES], last_mask: None };
         Self {
             config,
             inbox,
@@ -344,29 +352,31 @@ impl Streams {
     fn take(&mut self, session: Option<&mut Session>, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
         match topic {
             TopicId::Modality(id) => {
-                let lost = self.next.get_mut(id.index()).map_or(0, |next| hole(next, header.seq));
+                let now = Last { seq: header.seq, lost: header.lost, captured: Stamp(header.capture_ns) };
+                let hole = self.last.get_mut(id.index()).and_then(|last| hole(last.replace(now)?, now));
                 if let Some(session) = session {
-                    session.sample(id, header, payload, lost);
+                    session.sample(id, header, payload, hole);
                 }
             }
             TopicId::Mask => {
                 let Some((mask, sequence)) = read_mask(payload) else { return };
-                let lost = hole(&mut self.next_mask, sequence);
+                let now = Last { seq: sequence, lost: 0, captured: Stamp(header.capture_ns) };
+                let hole = self.last_mask.replace(now).and_then(|last| hole(last, now));
                 self.masks.push(header, mask, sequence);
                 if let Some(session) = session {
-                    session.mask(header, mask, sequence, lost);
+                    session.mask(header, mask, sequence, hole);
                 }
             }
         }
     }
 }
 
-/// How many sequence numbers are missing before `seq`. One below the expected is a publisher that
-/// began anew: nothing is known to be missing.
-fn hole(next: &mut Option<u64>, seq: u64) -> u64 {
-    let lost = next.map_or(0, |next| seq.saturating_sub(next));
-    *next = Some(seq.wrapping_add(1));
-    lost
+/// What is missing between two samples. A number below the expected one is a publisher that began
+/// anew: nothing is known to be missing.
+fn hole(last: Last, now: Last) -> Option<Hole> {
+    let missing = now.seq.checked_sub(last.seq)?.checked_sub(1).filter(|missing| *missing > 0)?;
+    let lost = now.lost.saturating_sub(last.lost).min(missing);
+    Some(Hole { after: last.captured, before: now.captured, lost, dropped: missing - lost })
 }
 
 fn read_mask(payload: &[u8]) -> Option<(PhysicalMask, u64)> {

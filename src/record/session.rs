@@ -57,13 +57,46 @@ pub(super) struct Tally {
     pub(super) samples: u64,
     /// Payload bytes written.
     pub(super) bytes: u64,
-    /// Samples lost: holes in the sequence numbers.
+    /// Samples that the device lost before we had them.
+    pub(super) lost: u64,
+    /// Samples lost between the driver and the file.
     pub(super) dropped: u64,
     /// Samples the driver called damaged.
     pub(super) damaged: u64,
     /// Of `dropped`, those not announced yet.
     unannounced: u64,
     announced: Option<Stamp>,
+}
+
+/// Samples missing between two that came.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Hole {
+    /// Capture of the sample before the hole.
+    pub(super) after: Stamp,
+    /// Capture of the sample behind the hole.
+    pub(super) before: Stamp,
+    /// Of the missing ones, those that the device lost.
+    pub(super) lost: u64,
+    /// Of the missing ones, those that were on their way.
+    pub(super) dropped: u64,
+}
+
+impl Hole {
+    /// How many of `count` samples that are missing here were captured before `moment`, if they lie
+    /// at even distances.
+    fn before(&self, moment: Stamp, count: u64) -> u64 {
+        let span = u128::from(self.before.0.saturating_sub(self.after.0));
+        let until = u128::from(moment.0.saturating_sub(self.after.0));
+        if span == 0 {
+            return if moment > self.before { count } else { 0 };
+        }
+        if until >= span {
+            return count;
+        }
+        // Sample k of n lies at k / (n + 1) of the span. At most 2^64 * 2^64 - 2^64: no overflow.
+        let before = (until * (u128::from(count) + 1)).div_ceil(span).saturating_sub(1);
+        u64::try_from(before).unwrap_or(u64::MAX).min(count)
+    }
 }
 
 /// The last publications of the mask, in the order of publication.
@@ -157,8 +190,18 @@ impl Session {
         })
     }
 
-    /// Takes a sample that `lost` others before it did not reach.
-    pub(super) fn sample(&mut self, id: ModalityId, header: &SampleHeader, payload: &[u8], lost: u64) {
+    /// Takes a sample, and the hole before it.
+    pub(super) fn sample(&mut self, id: ModalityId, header: &SampleHeader, payload: &[u8], hole: Option<Hole>) {
+        if let (Some(hole), None) = (hole, &self.failed) {
+            // Also before a sample that lies beyond the end: a part of the hole may not.
+            let (lost, dropped) = (self.share(&hole, hole.lost), self.share(&hole, hole.dropped));
+            if let Some(tally) = self.tallies.get_mut(id.index()) {
+                // Saturating: the numbers come from whoever publishes.
+                tally.lost = tally.lost.saturating_add(lost);
+                tally.dropped = tally.dropped.saturating_add(dropped);
+                tally.unannounced = tally.unannounced.saturating_add(dropped);
+            }
+        }
         if !self.holds(Stamp(header.capture_ns)) || self.failed.is_some() {
             return;
         }
@@ -169,9 +212,6 @@ impl Session {
         let Some(tally) = self.tallies.get_mut(id.index()) else { return };
         tally.samples += 1;
         tally.bytes += payload.len() as u64;
-        // Saturating: the numbers come from whoever publishes.
-        tally.dropped = tally.dropped.saturating_add(lost);
-        tally.unannounced = tally.unannounced.saturating_add(lost);
         if header.flags & FLAG_ERROR != 0 {
             tally.damaged += 1;
             return;
@@ -186,12 +226,14 @@ impl Session {
         self.sync.push(id, sample);
     }
 
-    /// Takes a publication of the mask.
-    pub(super) fn mask(&mut self, header: &SampleHeader, mask: PhysicalMask, sequence: u64, lost: u64) {
+    /// Takes a publication of the mask, and the hole before it.
+    pub(super) fn mask(&mut self, header: &SampleHeader, mask: PhysicalMask, sequence: u64, hole: Option<Hole>) {
+        if let (Some(hole), None) = (hole, &self.failed) {
+            self.masks_dropped = self.masks_dropped.saturating_add(self.share(&hole, hole.dropped));
+        }
         if !self.holds(Stamp(header.capture_ns)) || self.failed.is_some() {
             return;
         }
-        self.masks_dropped = self.masks_dropped.saturating_add(lost);
         self.failed = self.file.mask(header, mask, sequence).err();
     }
 
@@ -307,6 +349,12 @@ impl Session {
 
     fn holds(&self, capture: Stamp) -> bool {
         capture >= self.begin && self.end.is_none_or(|end| capture < end)
+    }
+
+    /// How many of `count` samples missing in `hole` were captured within the episode.
+    fn share(&self, hole: &Hole, count: u64) -> u64 {
+        let until_end = self.end.map_or(count, |end| hole.before(end, count));
+        until_end.saturating_sub(hole.before(self.begin, count))
     }
 
     fn deadline(&self, tick: u64) -> Stamp {

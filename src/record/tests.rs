@@ -10,7 +10,7 @@ use std::time::Duration;
 use prost_reflect::{DescriptorPool, DynamicMessage, ReflectMessage, Value};
 
 use super::episode::EpisodePath;
-use super::session::{Beginning, MaskHistory, Session};
+use super::session::{Beginning, Hole, MaskHistory, Session};
 use super::*;
 use crate::bus::TopicId;
 use crate::mask::PhysicalMask;
@@ -156,6 +156,11 @@ impl Bench {
     }
 
     fn sample(&self, bit: u8, epoch: u32, seq: u64, capture: u64, flags: u32) {
+        self.sample_after(0, bit, epoch, seq, capture, flags);
+    }
+
+    /// A sample of a device that says it lost `lost` ones so far.
+    fn sample_after(&self, lost: u64, bit: u8, epoch: u32, seq: u64, capture: u64, flags: u32) {
         let (encoding, payload) = match bit {
             CAM => (Encoding::Mjpeg, seq.to_le_bytes().repeat(100)),
             TOF => (Encoding::F64, [seq as f64, 0.5].iter().flat_map(|v| v.to_le_bytes()).collect()),
@@ -163,6 +168,7 @@ impl Bench {
         };
         let header = SampleHeader {
             seq,
+            lost,
             capture_ns: capture,
             recv_ns: capture + 5 * MS,
             id: bit.into(),
@@ -187,8 +193,8 @@ impl Bench {
         self.script.put((TopicId::Mask, header, payload));
     }
 
-    /// One second of a rig, laid out from `t0` on: the camera is away in the middle, the line of the
-    /// `tof` loses seven samples and skips one beat, `raw` sends one damaged frame and has no bit in
+    /// One second of a rig, laid out from `t0` on: the camera is away in the middle, the
+    /// `tof` loses seven samples itself and one of its is lost on the way, `raw` sends one damaged frame and has no bit in
     /// the mask at first.
     ///
     /// Returns the file's name and `t0`, which lies a little after the beginning of the episode.
@@ -222,7 +228,7 @@ impl Bench {
         for n in 0..100 {
             seq += if n == 50 { 8 } else { 1 };
             if n != 20 {
-                self.sample(TOF, 1, seq, t0 + n * 10 * MS, 0);
+                self.sample_after(if n < 50 { 0 } else { 7 }, TOF, 1, seq, t0 + n * 10 * MS, 0);
             }
         }
         self.sample(RAW, 1, 0, t0 + 230 * MS, 0);
@@ -376,15 +382,16 @@ async fn an_episode_holds_what_was_captured_and_nothing_else() {
     assert_eq!(data, u64::from(cam.1).to_le_bytes().repeat(100));
     assert_eq!([text(&cam.4, "format"), text(&cam.4, "frame_id")], ["jpeg", "cam_wrist"]);
 
-    // Losses: seven jumped over and one left out on the line.
-    assert_eq!(dropped, 8);
+    // Losses: seven of the device's own and one on the way.
+    assert_eq!(dropped, 1);
     let summary = &read.metadata["rapid/summary"];
     let tallies: serde_json::Value = serde_json::from_str(&summary["modalities"]).unwrap();
-    assert_eq!((&tallies["tof"]["dropped"], &tallies["cam_wrist"]["dropped"]), (&8.into(), &0.into()));
+    assert_eq!((&tallies["tof"]["lost"], &tallies["tof"]["dropped"]), (&7.into(), &1.into()));
+    assert_eq!((&tallies["cam_wrist"]["lost"], &tallies["cam_wrist"]["dropped"]), (&0.into(), &0.into()));
     assert_eq!((&tallies["raw"]["damaged"], &tallies["raw"]["samples"]), (&1.into(), &2.into()));
     assert_eq!(tallies["never"]["samples"], 0);
-    assert_eq!((summary["dropped"].as_str(), summary["serials"].as_str()), ("8", r#"{"raw":"S7"}"#));
-    assert_eq!(summary["duration_s"], "1");
+    assert_eq!((summary["dropped"].as_str(), summary["serials"].as_str()), ("1", r#"{"raw":"S7"}"#));
+    assert_eq!((summary["duration_s"].as_str(), summary["lost"].as_str()), ("1", "7"));
 
     // The mask: first the one in force before the beginning, then every edge at its time.
     let masks: Vec<(u64, i128)> = read.on("/rapid/mask").map(|m| (m.2, number(&m.4, "mask"))).collect();
@@ -604,9 +611,9 @@ fn what_comes_late_is_recorded_and_what_comes_too_late_belongs_to_no_frame() {
     let mut session = session(folder.path(), &board, &masks);
     let at = |ms: u64| Stamp(ms * MS);
     // Tick 0 is at 1000 ms; its deadline 25 ms + 100 ms later. One sample comes in time, one does not.
-    session.sample(id(TOF), &scalars(0, 999, 999), &[0; 8], 0);
-    session.sample(id(TOF), &scalars(1, 1001, 1126), &[0; 8], 0);
-    session.sample(id(TOF), &scalars(2, 1010, 1124), &[0; 8], 0);
+    session.sample(id(TOF), &scalars(0, 999, 999), &[0; 8], None);
+    session.sample(id(TOF), &scalars(1, 1001, 1126), &[0; 8], None);
+    session.sample(id(TOF), &scalars(2, 1010, 1124), &[0; 8], None);
     session.advance(at(1144), &masks);
     assert_eq!(session.status(at(1144)).messages, 3, "two samples and a mask; the frame not before 1145 ms");
     session.advance(at(1145), &masks);
@@ -615,8 +622,8 @@ fn what_comes_late_is_recorded_and_what_comes_too_late_belongs_to_no_frame() {
     session.end_at(at(1100));
     session.end_at(at(1200));
     // Captured before the end and arriving after it; captured at the end.
-    session.sample(id(TOF), &scalars(3, 1099, 1190), &[0; 8], 0);
-    session.sample(id(TOF), &scalars(4, 1100, 1190), &[0; 8], 0);
+    session.sample(id(TOF), &scalars(3, 1099, 1190), &[0; 8], None);
+    session.sample(id(TOF), &scalars(4, 1100, 1190), &[0; 8], None);
     assert!(!session.is_over(at(1219)) && session.is_over(at(1220)));
     let report = session.finish(at(1220), &masks, None);
     assert_eq!((report.error, report.messages), (None, 7), "one sample and two frames more");
@@ -646,11 +653,13 @@ fn losses_are_announced_once_a_second_and_counted_all() {
     let mut session = session(folder.path(), &board, &masks);
     for n in 0..200 {
         let now = 1000 + n * 10;
-        session.sample(id(TOF), &scalars(n, now, now), &[0; 8], 2);
+        let hole = Hole { after: Stamp((now - 9) * MS), before: Stamp(now * MS), lost: 1, dropped: 2 };
+        session.sample(id(TOF), &scalars(n, now, now), &[0; 8], Some(hole));
         session.advance(Stamp(now * MS), &masks);
     }
     // One more, so that a number of hostile size comes to the others.
-    session.sample(id(CAM), &scalars(1, 3000, 3000), &[0; 8], u64::MAX);
+    let hole = Hole { after: Stamp(1500 * MS), before: Stamp(3000 * MS), lost: 0, dropped: u64::MAX };
+    session.sample(id(CAM), &scalars(1, 3000, 3000), &[0; 8], Some(hole));
     assert_eq!(session.status(Stamp(0)).dropped, u64::MAX);
     let report = session.finish(Stamp(3001 * MS), &masks, None);
     assert_eq!((report.error, report.dropped), (None, u64::MAX));
@@ -661,10 +670,36 @@ fn losses_are_announced_once_a_second_and_counted_all() {
         }
     }
     let lost = |count: u64, name: &str| format!("{name}: {count} samples lost on the way to the file");
-    assert_eq!(said, [lost(2, "tof"), lost(200, "tof"), lost(u64::MAX, "cam_wrist"), lost(198, "tof")]);
+    assert_eq!(said, [lost(2, "tof"), lost(200, "tof"), lost(u64::MAX, "cam_wrist"), lost(196, "tof")]);
     let tallies = &read(&report.file).metadata["rapid/summary"]["modalities"];
     let tallies: serde_json::Value = serde_json::from_str(tallies).unwrap();
-    assert_eq!((&tallies["tof"]["samples"], &tallies["tof"]["dropped"]), (&200.into(), &400.into()));
+    assert_eq!((&tallies["tof"]["samples"], &tallies["tof"]["dropped"]), (&200.into(), &398.into()));
+    // The hole before the first sample lies before the episode.
+    assert_eq!(tallies["tof"]["lost"], 199);
+}
+
+#[test]
+fn of_a_hole_across_the_beginning_or_the_end_only_the_part_within_counts() {
+    let folder = tempfile::tempdir().unwrap();
+    let board = Arc::new(Board::new(&registry()));
+    let masks = MaskHistory::new();
+    let mut session = session(folder.path(), &board, &masks);
+    let hole = |after: u64, before: u64, missing| {
+        Some(Hole { after: Stamp(after * MS), before: Stamp(before * MS), lost: 0, dropped: missing })
+    };
+    // Every 10 ms; the episode begins at 1000 ms: 960 to 990 do not count.
+    session.sample(id(TOF), &scalars(9, 1050, 1050), &[0; 8], hole(950, 1050, 9));
+    assert_eq!(session.status(Stamp(0)).dropped, 5);
+    // As after a disk that stood still beyond the end: what is left is of later moments, and yet 1060
+    // to 1090 ms are lost.
+    session.end_at(Stamp(1100 * MS));
+    session.sample(id(TOF), &scalars(29, 1250, 1250), &[0; 8], hole(1050, 1250, 19));
+    assert_eq!(session.status(Stamp(0)).dropped, 9);
+    // Neither a hole in another time nor one of no length.
+    session.sample(id(TOF), &scalars(40, 1300, 1300), &[0; 8], hole(1250, 1300, 10));
+    session.sample(id(TOF), &scalars(50, 1300, 1300), &[0; 8], hole(1300, 1300, 10));
+    let report = session.finish(Stamp(1300 * MS), &masks, None);
+    assert_eq!((report.error, report.dropped), (None, 9));
 }
 
 #[tokio::test]

@@ -3,7 +3,6 @@
 use std::collections::HashMap;
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::AtomicU64;
 use std::time::Duration;
 
 use futures::StreamExt;
@@ -15,7 +14,7 @@ use tokio_util::sync::CancellationToken;
 use super::RigCommand;
 use super::presence::{JsonDevice, Presence, PresenceError};
 use super::slot::{Effects, End, Input, Slot};
-use super::stream::{Report, Reported, Stream};
+use super::stream::{Numbers, Report, Reported, Stream};
 use crate::bus::{Bus, TopicId, Writer};
 use crate::hotplug::{HotplugError, HotplugEvent, HotplugStream, Witness};
 use crate::mask::PhysicalMask;
@@ -65,7 +64,7 @@ struct Modality {
     spec: Arc<DeviceSpec>,
     slot: Slot<Attachment>,
     writer: Arc<Writer>,
-    sequence: Arc<AtomicU64>,
+    numbers: Arc<Numbers>,
     /// Tells the running stream to end.
     stop: CancellationToken,
     /// What was agreed with the device, or why it does not run.
@@ -82,7 +81,7 @@ impl Rig {
                 spec: Arc::new(spec.clone()),
                 slot: Slot::new(registry.rig.cooldown),
                 writer,
-                sequence: Arc::new(AtomicU64::new(0)),
+                numbers: Arc::default(),
                 stop: CancellationToken::new(),
                 detail: String::new(),
             })
@@ -295,7 +294,7 @@ impl Rig {
             attachment,
             epoch,
             writer: Arc::clone(&modality.writer),
-            sequence: Arc::clone(&modality.sequence),
+            numbers: Arc::clone(&modality.numbers),
             board,
             reports,
             stop: modality.stop.clone(),

@@ -40,6 +40,25 @@ pub(super) enum Report {
 /// A report with its sender.
 pub(super) type Reported = (crate::modality::ModalityId, Epoch, Report);
 
+/// How far a modality has come, over all its epochs.
+#[derive(Debug, Default)]
+pub(super) struct Numbers {
+    /// Sequence number of the next sample.
+    next: AtomicU64,
+    /// Samples that its devices lost.
+    lost: AtomicU64,
+}
+
+impl Numbers {
+    /// `seq` and `lost` of a sample before which the device lost `lost` others: these leave a hole,
+    /// so that every consumer can see it.
+    fn take(&self, lost: u64) -> (u64, u64) {
+        // One stream at a time counts here: an older one publishes no more.
+        let seq = self.next.fetch_add(lost + 1, Ordering::Relaxed) + lost;
+        (seq, self.lost.fetch_add(lost, Ordering::Relaxed) + lost)
+    }
+}
+
 /// Everything a stream needs.
 #[derive(Debug)]
 pub(super) struct Stream {
@@ -47,8 +66,7 @@ pub(super) struct Stream {
     pub(super) attachment: Attachment,
     pub(super) epoch: Epoch,
     pub(super) writer: Arc<Writer>,
-    /// Next sequence number of the modality, over all its epochs.
-    pub(super) sequence: Arc<AtomicU64>,
+    pub(super) numbers: Arc<Numbers>,
     pub(super) board: Arc<Board>,
     pub(super) reports: mpsc::Sender<Reported>,
     pub(super) stop: CancellationToken,
@@ -119,10 +137,10 @@ impl Stream {
 
     /// One copy, from the driver's buffer into shared memory.
     fn publish(&self, reading: &Reading<'_>) -> Result<(), String> {
-        // What the device says it lost leaves a hole, so that every consumer can see it.
-        let seq = self.sequence.fetch_add(reading.lost + 1, Ordering::Relaxed) + reading.lost;
+        let (seq, lost) = self.numbers.take(reading.lost);
         let header = SampleHeader {
             seq,
+            lost,
             capture_ns: reading.captured.0,
             recv_ns: Stamp::now().0,
             id: u32::from(self.spec.id.bit()),
@@ -166,4 +184,15 @@ fn end(error: &DriverError) -> (End, String) {
         DriverError::Fatal(_) => End::Fatal,
     };
     (how, error.to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_device_lost_leaves_a_hole_that_is_its_own() {
+        let numbers = Numbers::default();
+        assert_eq!([0, 2, 0].map(|lost| numbers.take(lost)), [(0, 0), (3, 2), (4, 2)]);
+    }
 }

@@ -19,10 +19,11 @@ NOTHING = 3
 
 
 class SampleHeader(ctypes.Structure):
-    """`rapid::sample::SampleHeader`: 48 bytes beside every payload."""
+    """`rapid::sample::SampleHeader`: 56 bytes beside every payload."""
 
     _fields_ = [
         ("seq", ctypes.c_uint64),
+        ("lost", ctypes.c_uint64),
         ("capture_ns", ctypes.c_uint64),
         ("recv_ns", ctypes.c_uint64),
         ("id", ctypes.c_uint32),
@@ -39,7 +40,7 @@ class SampleHeader(ctypes.Structure):
         return "RapidSampleHeader"
 
 
-assert ctypes.sizeof(SampleHeader) == 48
+assert ctypes.sizeof(SampleHeader) == 56
 
 
 def open_service(node, topic, deadline):
