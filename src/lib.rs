@@ -68,7 +68,8 @@
 //! * Nothing downstream is re-wired on plug and unplug: topics live as long as the run.
 //! * A simulated device is a device: it enters as a hot-plug event and is opened as a driver, and
 //!   nothing beyond can tell.
-//! * Between two samples a stream allocates nothing, locks nothing and logs nothing.
+//! * Between two samples a stream allocates nothing, locks nothing and logs nothing of its own;
+//!   iceoryx2 makes one small allocation a sample.
 //! * Capture times are `CLOCK_MONOTONIC`; the wall clock is derived from it once an episode.
 //! * A screen sees [`status::Snapshot`]s and sends [`status::Command`]s; it holds no handle into a
 //!   stage.

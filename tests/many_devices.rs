@@ -97,7 +97,6 @@ fn sixty_four_devices_are_recorded_without_a_hole() {
 }
 
 #[test]
-#[ignore = "known defect: the registry counts depth * max_bytes, a pool has depth + 34 samples and their headers"]
 fn their_topics_reserve_no_more_than_the_memory_budget() {
     let place = Place::new();
     let registry = Registry::parse(&registry(64), None).expect("accepted").registry;

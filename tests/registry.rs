@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use proptest::prelude::*;
 use rapid::registry::scenario::Scenario;
-use rapid::registry::{BUILTIN, Framing, Loaded, NodeSpec, Parse, Registry};
+use rapid::registry::{BUILTIN, Framing, Loaded, NodeSpec, POOL_SPARE, Parse, Registry};
 
 fn files(folder: &str) -> Vec<PathBuf> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/registry").join(folder);
@@ -100,12 +100,12 @@ fn missing_bits_are_the_lowest_free_in_the_order_of_the_file() {
 #[test]
 fn depths_shrink_to_the_budget_but_not_those_that_were_written() {
     let Loaded { registry, warnings } = valid("depths_within_budget");
-    assert_eq!(warnings[0].message, "depth lowered from 60 to 33 to keep all topics within memory_budget = 64MiB");
+    assert_eq!(warnings[0].message, "depth lowered from 60 to 38 to keep all topics within memory_budget = 144MiB");
     assert_eq!(warnings.len(), 1);
     let depths: Vec<_> = registry.devices.iter().map(|device| device.depth).collect();
-    let total: usize = registry.devices.iter().map(|device| device.depth * device.max_bytes).sum();
-    assert_eq!(depths, [33, 20]);
-    assert!(total <= 64 << 20, "{total}");
+    let total: usize = registry.devices.iter().map(|device| (device.depth + POOL_SPARE) * device.max_bytes).sum();
+    assert_eq!(depths, [38, 20]);
+    assert!(total <= 144 << 20, "{total}");
 }
 
 #[test]

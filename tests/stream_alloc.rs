@@ -157,6 +157,7 @@ fn one_thread(registry: &Registry, scenario: &Scenario, device: usize) {
             let reading = driver.read().await.unwrap();
             let header = SampleHeader {
                 seq: seq as u64,
+                lost: 0,
                 capture_ns: reading.captured.0,
                 recv_ns: Stamp::now().0,
                 id: u32::from(spec.id.bit()),

@@ -1,7 +1,7 @@
 //! Topics: name, depth and memory of each, decided once from the registry.
 
 use crate::modality::ModalityId;
-use crate::registry::DeviceSpec;
+use crate::registry::{DeviceSpec, POOL_SPARE};
 
 /// Topic of the physical mask, on the bus and in recordings.
 pub const MASK_TOPIC: &str = "/rapid/mask";
@@ -57,7 +57,7 @@ impl TopicSpec {
     /// them together hold no more than `depth` different ones; beside these each may hold a few, and
     /// the writer one. iceoryx2's own bound counts every queue as if it held other samples.
     pub(super) const fn pool_for(depth: usize) -> usize {
-        depth + super::MAX_SUBSCRIBERS * super::MAX_BORROWED + 2
+        depth + POOL_SPARE
     }
 
     /// Bytes of the pool.

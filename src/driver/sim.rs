@@ -103,10 +103,11 @@ impl Sim {
     /// nobody read them.
     async fn next_due(&mut self) -> Result<u64, DriverError> {
         loop {
+            // Before the look at the cable: what is stamped now was sent while it was plugged.
+            let now = Instant::now();
             if self.device.is_unplugged() {
                 return Err(DriverError::Gone);
             }
-            let now = Instant::now();
             if self.device.is_silent() {
                 // A silent device makes no samples: its sequence stands still, nothing is lost.
                 self.next = self.next.max(self.grid.first_after(stamp_of(now)));

@@ -10,6 +10,20 @@ use std::time::Duration;
 use serde::Serialize;
 
 use crate::modality::{Modality, ModalityId, ModalityKind};
+use crate::sample::SampleHeader;
+
+/// Samples that the pool of a topic holds beyond its depth: what 8 subscribers hold back, 4 each, the
+/// one being written, and one that is on its way out. The bus reserves them.
+pub const POOL_SPARE: usize = MAX_SUBSCRIBERS * MAX_BORROWED + 2;
+/// Programs that may subscribe to a topic at once: recorder, policy, and others'.
+pub const MAX_SUBSCRIBERS: usize = 8;
+/// Samples a subscriber may hold without giving them back.
+pub const MAX_BORROWED: usize = 4;
+/// Shared memory beside the payload of each sample, bytes: our header, and at most this much for that
+/// of iceoryx2 0.10 and for alignment.
+pub(super) const SAMPLE_OVERHEAD: usize = size_of::<SampleHeader>() + 64;
+/// Shared memory of the mask's topic and of iceoryx2's own books, bytes; part of the budget.
+pub(super) const RESERVED_BYTES: u64 = 512 << 10;
 
 /// A checked `devices.toml`.
 #[derive(Debug, Clone, PartialEq)]

@@ -1,6 +1,7 @@
 //! A stream: one device being read, from the opening of its node to its end.
 //!
-//! Invariant: between two samples a stream allocates nothing, locks nothing and logs nothing.
+//! Invariant: between two samples a stream allocates nothing, locks nothing and logs nothing of its
+//! own; what publishing costs is said in `bus`.
 //! Invariant: a stream that was told to stop publishes no more.
 
 use std::sync::Arc;

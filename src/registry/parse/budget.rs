@@ -3,6 +3,7 @@
 use super::device::Draft;
 use crate::registry::diagnostic::Diagnostic;
 use crate::registry::section::Problems;
+use crate::registry::spec::{POOL_SPARE, RESERVED_BYTES, SAMPLE_OVERHEAD};
 use crate::registry::units::show_size;
 
 /// Fewer pictures than this cannot cover the pauses of a writer.
@@ -25,7 +26,7 @@ pub(super) fn fit(
         (draft.depth * permille / 1000).max(LEAST_CAMERA_DEPTH)
     };
     let total = |drafts: &[Draft<'_>], permille| -> u64 {
-        drafts.iter().map(|draft| draft.max_bytes.saturating_mul(scaled(draft, permille))).fold(0, u64::saturating_add)
+        drafts.iter().map(|draft| pool(draft, scaled(draft, permille))).fold(RESERVED_BYTES, u64::saturating_add)
     };
     if total(drafts, 0) > budget {
         report(drafts, total(drafts, 0), budget, rig_at, problems);
@@ -49,10 +50,16 @@ pub(super) fn fit(
     warnings
 }
 
+/// Shared memory that the topic of `draft` takes with this depth, in bytes.
+fn pool(draft: &Draft<'_>, depth: u64) -> u64 {
+    let sample = draft.max_bytes.saturating_add(SAMPLE_OVERHEAD as u64);
+    sample.saturating_mul(depth + POOL_SPARE as u64)
+}
+
 fn report(drafts: &[Draft<'_>], total: u64, budget: u64, rig_at: usize, problems: &mut Problems<'_>) {
     let size = |draft: &Draft<'_>| {
         let depth = if draft.depth_written || !draft.is_camera() { draft.depth } else { LEAST_CAMERA_DEPTH };
-        (draft.max_bytes.saturating_mul(depth), depth)
+        (pool(draft, depth), depth)
     };
     let mut largest: Vec<_> = drafts.iter().map(|draft| (size(draft), draft)).collect();
     largest.sort_by_key(|((bytes, _), _)| std::cmp::Reverse(*bytes));
@@ -60,7 +67,8 @@ fn report(drafts: &[Draft<'_>], total: u64, budget: u64, rig_at: usize, problems
         .iter()
         .take(3)
         .map(|((bytes, depth), draft)| {
-            format!("{} {} ({} x {depth})", draft.name, show_size(*bytes), show_size(draft.max_bytes))
+            let samples = depth + POOL_SPARE as u64;
+            format!("{} {} ({} x {samples})", draft.name, show_size(*bytes), show_size(draft.max_bytes))
         })
         .collect();
     let message = format!(
