@@ -158,6 +158,7 @@ async fn told(cooldown: Duration, stall_after: Duration, steps: &[Step]) -> Vec<
     bench.told
 }
 
+#[expect(clippy::too_many_lines, reason = "a table")]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_first_witness_wins_and_no_replug_is_lost() {
     let up: &[&str] = &["a at 1", "a opening", "a streaming"];

@@ -160,7 +160,7 @@ fn take(path: &Path) -> Result<File, PresenceError> {
 }
 
 /// Why a file that is there may not be opened: it is another user's. In a folder like /dev/shm not
-/// even root may open it for writing (fs.protected_regular in proc_sys_fs(5)).
+/// even root may open it for writing (`fs.protected_regular`, see proc(5)).
 pub(super) fn refused(path: &Path, error: Errno) -> PresenceError {
     match std::fs::symlink_metadata(path) {
         Ok(there) if holder(&there).is_some() => PresenceError::Taken { path: path.to_owned(), pid: holder(&there) },
