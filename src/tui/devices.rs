@@ -48,7 +48,7 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, (rows, selection): (u16, u
     if selection > 0
         && let (Some(device), Some(line)) = (model.selected_device(), lines.next())
     {
-        frame.render_widget(about(device, line.width, theme), line);
+        frame.render_widget(about(device, line.width, model, theme), line);
     }
 }
 
@@ -97,7 +97,7 @@ fn row(device: &DeviceStatus, name: usize, width: u16, model: &Model, theme: The
     let word = format!("{} {}", theme.state_symbol(device.state), device.state.word());
     let used = BIT + name + STATE + RATE + AGE + GAPS + TOTAL + 2;
     let detail = usize::from(width).saturating_sub(used);
-    let detail = text::cut(&theme.safe(&device.detail), detail, theme.ellipsis()).into_owned();
+    let detail = text::cut(&told(device, model, theme), detail, theme.ellipsis()).into_owned();
     let figures = if running { Style::new() } else { theme.faint() };
     Line::from(vec![
         Span::styled(if selected { theme.symbol("▸", ">") } else { " " }, theme.title()),
@@ -123,14 +123,24 @@ fn compact(count: u64) -> String {
     }
 }
 
-/// What the table has no room for.
-fn about(device: &DeviceStatus, width: u16, theme: Theme) -> Line<'static> {
-    let mut parts = vec![theme.safe(&device.topic), text::size(device.bytes)];
+/// The detail of a device; of an absent one, since when it is.
+fn told(device: &DeviceStatus, model: &Model, theme: Theme) -> String {
+    if device.state != SlotState::Absent || !device.detail.is_empty() {
+        return theme.safe(&device.detail);
+    }
+    match model.unplugged_for(device) {
+        Some(since) => format!("unplugged {} ago", text::about(since)),
+        None if device.samples > 0 => "unplugged".to_owned(),
+        None => "not plugged in".to_owned(),
+    }
+}
+
+/// What the table has no room for: the whole detail first, as it is what the table cuts.
+fn about(device: &DeviceStatus, width: u16, model: &Model, theme: Theme) -> Line<'static> {
+    let mut parts = vec![told(device, model, theme), theme.safe(&device.topic), text::size(device.bytes)];
+    parts.retain(|part| !part.is_empty());
     if device.epoch.0 > 1 {
         parts.push(format!("started {} times", device.epoch.0));
-    }
-    if !device.detail.is_empty() {
-        parts.push(theme.safe(&device.detail));
     }
     let text = parts.join(theme.symbol(" · ", " | "));
     let arrow = theme.symbol("└ ", "` ");
