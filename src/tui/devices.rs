@@ -31,7 +31,7 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, (rows, selection): (u16, u
     let name = name_width(model.shown(), inner.width);
     let mut lines = inner.rows();
     if let Some(line) = lines.next() {
-        frame.render_widget(head(name, theme), line);
+        frame.render_widget(head(name, line.width, theme), line);
     }
     if devices.is_empty()
         && let Some(line) = lines.next()
@@ -70,16 +70,22 @@ fn name_width(snapshot: &Snapshot, width: u16) -> usize {
     longest.clamp(6, if width >= 110 { 28 } else { 14 })
 }
 
-fn head(name: usize, theme: Theme) -> Line<'static> {
+/// Columns of the total: none where it does not fit whole. Part of a number is another number.
+fn total_width(name: usize, width: u16) -> usize {
+    if BIT + name + STATE + RATE + AGE + GAPS + TOTAL <= usize::from(width) { TOTAL } else { 0 }
+}
+
+fn head(name: usize, width: u16, theme: Theme) -> Line<'static> {
+    let total = total_width(name, width);
     let head = format!(
-        "{:>4} {:name$} {:width$}{:>RATE$}{:>AGE$}{:>GAPS$}{:>TOTAL$}  detail",
+        "{:>4} {:name$} {:width$}{:>RATE$}{:>AGE$}{:>GAPS$}{:>total$}  detail",
         "bit",
         "name",
         "state",
         "Hz",
         "age",
         "gaps",
-        "total",
+        if total > 0 { "total" } else { "" },
         width = STATE - 1
     );
     Line::styled(head, theme.faint())
@@ -95,7 +101,8 @@ fn row(device: &DeviceStatus, name: usize, width: u16, model: &Model, theme: The
     let is_old = device.state == SlotState::Stalled || reading.age.is_some_and(|age| age >= Duration::from_secs(1));
     let gaps = if device.gaps > 0 { theme.level(Level::Warn) } else { theme.faint() };
     let word = format!("{} {}", theme.state_symbol(device.state), device.state.word());
-    let used = BIT + name + STATE + RATE + AGE + GAPS + TOTAL + 2;
+    let total = total_width(name, width);
+    let used = BIT + name + STATE + RATE + AGE + GAPS + total + 2;
     let detail = usize::from(width).saturating_sub(used);
     let detail = text::cut(&told(device, model, theme), detail, theme.ellipsis()).into_owned();
     let figures = if running { Style::new() } else { theme.faint() };
@@ -108,7 +115,7 @@ fn row(device: &DeviceStatus, name: usize, width: u16, model: &Model, theme: The
         Span::styled(format!("{rate:>RATE$}"), figures),
         Span::styled(format!("{age:>AGE$}"), if running && is_old { theme.warning() } else { figures }),
         Span::styled(format!("{:>GAPS$}", compact(device.gaps)), gaps),
-        Span::styled(format!("{:>TOTAL$}", compact(device.samples)), figures),
+        Span::styled(if total > 0 { format!("{:>total$}", compact(device.samples)) } else { String::new() }, figures),
         Span::raw("  "),
         Span::styled(detail, if device.state == SlotState::Failed { theme.alarm() } else { theme.faint() }),
     ])

@@ -198,6 +198,17 @@ fn an_edge_is_highlighted_for_a_second() {
 }
 
 #[test]
+fn a_number_that_does_not_fit_is_left_out_and_not_cut() {
+    let mut end = three_streaming();
+    end.devices[0].name = "a_name_of_14_c".to_owned();
+    end.devices[0].samples = 123_456;
+    let screen = draw(&measured(&end), (60, 12), THEME).to_string();
+    assert!(!screen.contains("12345") && !screen.contains("tota"), "{screen}");
+    let screen = draw(&measured(&end), (80, 24), THEME).to_string();
+    assert!(screen.contains("123456") && screen.contains("total"), "{screen}");
+}
+
+#[test]
 fn an_absent_device_says_since_when() {
     let mut end = three_streaming();
     end.devices.push(device(3, "imu", SlotState::Absent, ""));
