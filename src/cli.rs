@@ -1,85 +1,107 @@
 //! The command line: what can be typed, and nothing of what it does.
 
+use std::ffi::OsString;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use clap::{Args, Parser, Subcommand, ValueHint};
+use clap::error::{ContextKind, ContextValue, ErrorKind};
+use clap::parser::ValueSource;
+use clap::{ArgAction, ArgMatches, Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueHint};
 
-/// Records robot demonstrations from sensors that come and go.
-///
-/// Without a command, `rapid` opens the monitor: it finds the sensors named in devices.toml, streams
-/// them, publishes the Physical Mask and records episodes on request.
+/// Records robot demonstrations from sensors that come and go
 #[derive(Debug, Parser)]
-#[command(version, max_term_width = 100, after_help = EXAMPLES)]
+#[command(
+    version, max_term_width = 100, after_help = EXAMPLES, override_usage = "rapid [OPTIONS]\n       rapid <COMMAND> [OPTIONS]",
+    disable_help_flag = true, disable_version_flag = true, disable_help_subcommand = true
+)]
 pub struct Cli {
     /// What to do instead of running the rig.
     #[command(subcommand)]
     pub command: Option<Command>,
-    /// Options that every command understands.
-    #[command(flatten)]
-    pub global: Global,
     /// Options of a run.
     #[command(flatten)]
     pub run: RunArgs,
+    /// Where devices come from.
+    #[command(flatten, next_help_heading = RUN)]
+    pub simulation: SimArgs,
+    /// Options that every command understands.
+    #[command(flatten)]
+    pub global: Global,
+    /// Print version
+    #[arg(long, short = 'V', action = ArgAction::Version, help_heading = GENERAL)]
+    version: Option<bool>,
 }
 
 const EXAMPLES: &str = "\
+Without a command, rapid runs the rig and shows the monitor: it finds the sensors that devices.toml
+names, streams them, publishes the Physical Mask and records episodes (space starts and ends one).
+
 Examples:
-  rapid --sim                                      look around, without any hardware
-  rapid devices                                    what is plugged in, and which entry it is
-  rapid                                            the monitor; space starts and stops an episode
+  rapid --sim                           look around, without any hardware
+  rapid devices                         what is plugged in, and which entry it is
+  rapid                                 the monitor on the real rig
   rapid --headless --record --duration 30s --task \"place block\" --tag finger=soft
   rapid inspect episodes/20260101_place-block_001.mcap
 
-Exit codes: 0 done; 1 failed while running; 2 bad configuration or arguments;
-            3 a required device is missing; 130 interrupted twice.";
+Exit codes: 0 done, 1 failed while running, 2 bad configuration or arguments,
+            130 interrupted twice";
+
+const RUN: &str = "Options of a run";
+const GENERAL: &str = "General options";
 
 /// Options that every command understands, before or after it.
 #[derive(Debug, Clone, Args)]
+#[command(next_help_heading = GENERAL)]
 pub struct Global {
-    /// Registry of the rig's devices [default: ./devices.toml, then ~/.config/rapid/devices.toml, then
-    /// /etc/rapid/devices.toml]
+    /// Registry [default: devices.toml here, ~/.config/rapid/ or /etc/rapid/]
     #[arg(long, short, global = true, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub config: Option<PathBuf>,
-    /// Print JSON, one object a line, instead of text
+    /// JSON objects, one a line, instead of text
     #[arg(long, global = true)]
     pub json: bool,
-    /// Keeps this rig apart from another one on the same machine: the names of its mask file and of
-    /// its bus contain NAME
+    /// Name of this rig, to run beside another one on the same machine
     #[arg(long, global = true, value_name = "NAME", value_parser = instance)]
     pub instance: Option<String>,
+    /// Print help
+    #[arg(long, short, global = true, action = ArgAction::Help)]
+    help: Option<bool>,
+}
+
+/// Where devices come from.
+#[derive(Debug, Clone, Args)]
+pub struct SimArgs {
+    /// Simulated devices: those of the registry, or what a scenario file says
+    #[arg(long, value_name = "SCENARIO", num_args = 0..=1, value_hint = ValueHint::FilePath)]
+    pub sim: Option<Option<PathBuf>>,
 }
 
 /// Options of a run.
 #[derive(Debug, Clone, Args)]
+#[command(next_help_heading = RUN)]
 pub struct RunArgs {
-    /// Log lines instead of the monitor
+    /// Lines instead of the monitor
     #[arg(long)]
     pub headless: bool,
     /// Record an episode from the start
     #[arg(long)]
     pub record: bool,
-    /// End after this time of recording, or of running when nothing is recorded (30s, 5m)
+    /// End after so much recording, or running if nothing is recorded: 30s, 5m
     #[arg(long, value_name = "TIME", value_parser = duration)]
     pub duration: Option<Duration>,
     /// Folder for episodes
     #[arg(long, value_name = "DIR", default_value = "episodes", value_hint = ValueHint::DirPath)]
     pub out: PathBuf,
-    /// What is demonstrated; part of the file's name
+    /// What is demonstrated; also in the file's name
     #[arg(long, value_name = "TEXT", default_value = "episode")]
     pub task: String,
-    /// A property of the episode, recorded with it; may be repeated
+    /// Property of the episode, such as finger=soft; may be repeated
     #[arg(long, value_name = "KEY=VALUE", value_parser = tag)]
     pub tag: Vec<(String, String)>,
-    /// Simulated devices instead of real ones; without a file, those of the registry, of which one is
-    /// unplugged and replugged
-    #[arg(long, value_name = "SCENARIO", num_args = 0..=1, value_hint = ValueHint::FilePath)]
-    pub sim: Option<Option<PathBuf>>,
-    /// Observations a second, instead of what the registry says
+    /// Observations a second [default: as the registry says]
     #[arg(long, value_name = "HZ", value_parser = rate)]
     pub rate: Option<f64>,
-    /// Half width of the window around a tick, instead of what the registry says (25ms)
-    #[arg(long, value_name = "TIME", value_parser = duration)]
+    /// Half width of an observation's window [default: as the registry says]
+    #[arg(long, value_name = "TIME", value_parser = window)]
     pub window: Option<Duration>,
 }
 
@@ -87,14 +109,21 @@ pub struct RunArgs {
 #[derive(Debug, Subcommand)]
 pub enum Command {
     /// Lists what is plugged in, which entry of the registry it is, and if none, why not
+    #[command(after_help = "Examples:\n  rapid devices --formats        with what the cameras offer\n  \
+        rapid devices --sim            how the simulated rig is matched")]
     Devices {
         /// Also list formats and controls of cameras
         #[arg(long)]
         formats: bool,
+        /// Where devices come from.
+        #[command(flatten)]
+        simulation: SimArgs,
     },
     /// Checks the registry and says everything that is wrong with it
     Check,
     /// Writes what follows from the registry: udev rules, descriptors, systemd unit
+    #[command(after_help = "Examples:\n  rapid artifacts                look at them first, in udev/\n  \
+        sudo rapid artifacts --install")]
     Artifacts {
         /// Copy them into /etc and make udev read them (needs root)
         #[arg(long)]
@@ -111,11 +140,12 @@ pub enum Command {
     },
     /// Tells what an episode holds: messages, rates, gaps, lateness, presence over time
     Inspect {
-        /// Episode
+        /// Episode, finished or .partial
         #[arg(value_hint = ValueHint::FilePath)]
         file: PathBuf,
     },
     /// Plays an episode as if its devices were plugged in
+    #[command(after_help = "The registry is the one in the episode; --config is not looked at.")]
     Replay {
         /// Episode
         #[arg(value_hint = ValueHint::FilePath)]
@@ -131,8 +161,85 @@ pub enum Command {
     },
 }
 
+impl Cli {
+    /// Reads what was typed, the name of the program first.
+    ///
+    /// # Errors
+    /// When it makes no sense; help and version are such an "error" too.
+    pub fn read(typed: impl IntoIterator<Item = OsString>) -> Result<Self, clap::Error> {
+        let typed: Vec<_> = typed.into_iter().collect();
+        let mut command = Self::command();
+        if typed.get(1).is_some_and(|first| first == "-h") {
+            command = command.after_help("--help adds examples and exit codes");
+        }
+        let matches = command.try_get_matches_from_mut(typed).map_err(|error| explained(error, &mut command))?;
+        let cli = Self::from_arg_matches(&matches)?;
+        if let Some((name, _)) = matches.subcommand()
+            && let Some(option) = stray(&matches, name)
+        {
+            let text = match name {
+                "replay" => {
+                    format!("--{option} stands before the command; write it after: rapid replay FILE --{option}")
+                }
+                _ => format!("--{option} is an option of a run, and `rapid {name}` runs nothing: leave it out"),
+            };
+            return Err(command.error(ErrorKind::ArgumentConflict, text));
+        }
+        if let Some(Some(file)) = &cli.simulation.sim
+            && let Some(name) = file.to_str().filter(|name| command.find_subcommand(name).is_some())
+        {
+            let fix = match name {
+                "devices" => "write `rapid devices --sim`",
+                _ => "leave --sim out, or name a scenario file",
+            };
+            let text = format!("--sim takes {name:?} for the name of a scenario file: {fix}");
+            return Err(command.error(ErrorKind::ArgumentConflict, text));
+        }
+        Ok(cli)
+    }
+}
+
+/// An option of a run before a command that would not look at it.
+fn stray(matches: &ArgMatches, command: &str) -> Option<String> {
+    let run = RunArgs::augment_args(clap::Command::new("run"));
+    let simulation = SimArgs::augment_args(clap::Command::new("run"));
+    // `rapid --sim --json devices` is understood.
+    let known = run.get_arguments().chain(simulation.get_arguments().filter(|_| command != "devices"));
+    let typed = |id: &str| matches.value_source(id) == Some(ValueSource::CommandLine);
+    known.map(|argument| argument.get_id().as_str()).find(|id| typed(id)).map(str::to_owned)
+}
+
+/// A file where a command should stand: says where files stand.
+fn explained(error: clap::Error, command: &mut clap::Command) -> clap::Error {
+    let (ErrorKind::InvalidSubcommand, Some(ContextValue::String(word))) =
+        (error.kind(), error.get(ContextKind::InvalidSubcommand))
+    else {
+        return error;
+    };
+    let place = match word.rsplit_once('.') {
+        Some((_, "toml")) => {
+            format!("a scenario stands right after --sim (rapid --sim {word}), a registry after --config")
+        }
+        Some((_, "mcap" | "partial")) => format!("an episode stands after a command: rapid inspect {word}"),
+        _ => return error,
+    };
+    command.error(ErrorKind::InvalidSubcommand, format!("{word:?} is no command; {place}"))
+}
+
 fn duration(text: &str) -> Result<Duration, String> {
-    humantime::parse_duration(text).map_err(|error| format!("{error}; write a number and a unit: 30s, 500ms, 2m"))
+    match humantime::parse_duration(text) {
+        Ok(Duration::ZERO) => Err("must be longer than nothing".to_owned()),
+        Ok(duration) => Ok(duration),
+        Err(_) => Err("write a number and a unit, for example 30s, 500ms or 2m".to_owned()),
+    }
+}
+
+fn window(text: &str) -> Result<Duration, String> {
+    match humantime::parse_duration(text) {
+        Ok(window) if (Duration::from_millis(1)..=Duration::from_secs(10)).contains(&window) => Ok(window),
+        Ok(_) => Err("must lie between 1ms and 10s".to_owned()),
+        Err(_) => Err("write a number and a unit, for example 25ms".to_owned()),
+    }
 }
 
 fn rate(text: &str) -> Result<f64, String> {
@@ -150,4 +257,76 @@ fn tag(text: &str) -> Result<(String, String), String> {
 fn instance(text: &str) -> Result<String, String> {
     let plain = !text.is_empty() && text.len() <= 32 && text.chars().all(|c| c.is_ascii_alphanumeric() || c == '-');
     if plain { Ok(text.to_owned()) } else { Err("1 to 32 letters, digits and dashes".to_owned()) }
+}
+
+#[cfg(test)]
+mod tests {
+    use insta::assert_snapshot;
+
+    use super::*;
+
+    /// What is printed for `rapid WORDS`, at the width of a usual terminal.
+    fn printed(words: &str) -> String {
+        let typed = std::iter::once("rapid").chain(words.split_whitespace()).map(OsString::from);
+        match Cli::read(typed) {
+            Ok(cli) => panic!("understood: {cli:?}"),
+            Err(error) => error.to_string(),
+        }
+    }
+
+    #[test]
+    fn help() {
+        for words in ["-h", "--help"] {
+            assert_snapshot!(format!("help_{}", words.trim_matches('-')), printed(words));
+        }
+        let commands: Vec<_> = Cli::command().get_subcommands().map(|command| command.get_name().to_owned()).collect();
+        for command in commands {
+            let help = printed(&format!("{command} --help"));
+            assert!(help.lines().count() <= 40, "{help}");
+            assert_snapshot!(format!("help_of_{command}"), help);
+        }
+    }
+
+    #[test]
+    fn the_command_is_well_formed() {
+        Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn options_stand_before_or_after_a_command_or_it_is_said_where() {
+        let read = |words: &str| Cli::read(words.split_whitespace().map(OsString::from)).unwrap();
+        assert!(read("rapid --json check").global.json && read("rapid check --json").global.json);
+        assert!(read("rapid --sim --json devices").simulation.sim.is_some());
+        let Some(Command::Devices { simulation, .. }) = read("rapid devices --sim x.toml").command else { panic!() };
+        assert_eq!(simulation.sim, Some(Some("x.toml".into())));
+        for (words, expected) in [
+            ("--headless replay a.mcap", "write it after: rapid replay FILE --headless"),
+            ("--record inspect a.mcap", "`rapid inspect` runs nothing"),
+            ("--sim devices", "write `rapid devices --sim`"),
+            ("--sim mask", "leave --sim out"),
+            ("--sim --headless play.toml", "right after --sim (rapid --sim play.toml)"),
+            ("a.mcap", "rapid inspect a.mcap"),
+            ("devces", "'devices'"),
+        ] {
+            let said = printed(words);
+            assert!(said.contains(expected), "{words}: {said}");
+        }
+    }
+
+    #[test]
+    fn quantities_say_how_they_are_written() {
+        for (words, expected) in [
+            ("--duration 30", "a number and a unit, for example 30s"),
+            ("--duration 0s", "longer than nothing"),
+            ("--window 1h", "between 1ms and 10s"),
+            ("--window 25", "25ms"),
+            ("--rate abc", "a number, for example 30"),
+            ("--rate 0", "between 0.1 and 1000 Hz"),
+            ("--tag soft", "finger=soft"),
+            ("--instance a/b", "letters, digits and dashes"),
+        ] {
+            let said = printed(words);
+            assert!(said.contains(expected), "{words}: {said}");
+        }
+    }
 }

@@ -11,9 +11,10 @@ use clap::CommandFactory;
 use tokio_util::sync::CancellationToken;
 
 use crate::app::{self, AppError, Devices, Options, Screen, mask_path};
-use crate::cli::{Cli, Command, Global, RunArgs};
-use crate::commands::{self, Format, Outcome, devices::Formats, mask::MaskOptions};
-use crate::driver::replay;
+use crate::cli::{Cli, Command, Global, RunArgs, SimArgs};
+use crate::commands::devices::{Entries, Formats};
+use crate::commands::{self, Format, Outcome, mask::MaskOptions};
+use crate::driver::{DriverError, replay};
 use crate::headless::style::{ColourChoice, Palette, Terminal};
 use crate::hotplug::udev;
 use crate::record::inspect::{self, InspectError};
@@ -35,7 +36,7 @@ enum Failure {
     Registry(#[from] RegistryErrors),
     /// There is none.
     #[error(
-        "no devices.toml: looked for {}\n  fix: write one (`rapid devices` lists what is plugged in), name one with --config, \
+        "no devices.toml: looked for {}\n    fix: write one (`rapid devices` lists what is plugged in), name one with --config, \
          or look around with `rapid --sim`", .0.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ")
     )]
     NoRegistry(Vec<PathBuf>),
@@ -49,8 +50,12 @@ enum Failure {
     Artifacts(#[from] commands::artifacts::ArtifactsError),
     #[error(transparent)]
     Mask(#[from] commands::mask::MaskError),
-    #[error("{}: {reason}", file.display())]
-    Replay { file: PathBuf, reason: String },
+    /// The episode to play is none.
+    #[error(transparent)]
+    Replay(DriverError),
+    /// The folder for episodes cannot be written to.
+    #[error(transparent)]
+    Folder(RecordError),
     /// What was wrong has been printed.
     #[error("")]
     Told,
@@ -63,10 +68,18 @@ impl Failure {
     fn code(&self) -> u8 {
         match self {
             Self::App(AppError::InterruptedTwice) => 130,
-            Self::App(AppError::Record(RecordError::NoFolder(_)) | AppError::Logging(_))
+            Self::App(AppError::Logging(_))
             | Self::Registry(_)
             | Self::NoRegistry(_)
+            | Self::Replay(_)
+            | Self::Folder(_)
+            | Self::Inspect(InspectError::NotMcap(_))
             | Self::Told => 2,
+            Self::Inspect(InspectError::Io { source, .. })
+                if matches!(source.kind(), io::ErrorKind::NotFound | io::ErrorKind::IsADirectory) =>
+            {
+                2
+            }
             _ => 1,
         }
     }
@@ -76,9 +89,9 @@ impl Failure {
 #[must_use]
 pub fn dispatch(cli: Cli) -> ExitCode {
     let outcome = match cli.command {
-        None => run(&cli.global, &cli.run, None),
-        Some(Command::Replay { ref file, run: ref args }) => run(&cli.global, args, Some(file)),
-        Some(command) => print(&cli.global, &cli.run, command),
+        None => run(&cli.global, &cli.run, Source::of(cli.simulation)),
+        Some(Command::Replay { file, run: ref args }) => run(&cli.global, args, Source::Episode(file)),
+        Some(command) => print(&cli.global, cli.simulation, command),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
@@ -95,7 +108,7 @@ pub fn dispatch(cli: Cli) -> ExitCode {
 }
 
 /// Everything that prints and ends.
-fn print(global: &Global, run: &RunArgs, command: Command) -> Result<(), Failure> {
+fn print(global: &Global, before: SimArgs, command: Command) -> Result<(), Failure> {
     let out = &mut io::stdout().lock();
     let format = if global.json { Format::Json } else { Format::Text };
     match command {
@@ -106,18 +119,15 @@ fn print(global: &Global, run: &RunArgs, command: Command) -> Result<(), Failure
                 Outcome::BadConfiguration => Err(Failure::Told),
             }
         }
-        Command::Devices { formats } => {
-            let registry = find_registry(global).map(|path| load(&path)).transpose()?;
+        Command::Devices { formats, simulation } => {
             let formats = if formats { Formats::Ask } else { Formats::Skip };
-            let plugged = commands::devices::list(registry.as_ref(), &attached(run, registry.as_ref())?, formats);
-            if format == Format::Json {
-                for device in &plugged {
-                    serde_json::to_writer(&mut *out, device).map_err(io::Error::from)?;
-                    writeln!(out)?;
-                }
-                return Ok(());
-            }
-            Ok(commands::devices::print(&plugged, registry.as_ref(), out)?)
+            devices(
+                global,
+                Source::of(if simulation.sim.is_some() { simulation } else { before }),
+                formats,
+                format,
+                out,
+            )
         }
         Command::Artifacts { install, to } => {
             let registry = load(&registry_path(global)?)?;
@@ -140,12 +150,52 @@ fn print(global: &Global, run: &RunArgs, command: Command) -> Result<(), Failure
     }
 }
 
-/// What is attached: to this machine, or at the beginning of a scenario.
-fn attached(run: &RunArgs, registry: Option<&Registry>) -> Result<Vec<crate::registry::Attachment>, Failure> {
-    match (&run.sim, registry) {
-        (Some(file), Some(registry)) => Ok(crate::hotplug::script::attached(scenario(file.as_deref(), registry)?)),
-        _ => Ok(udev::enumerate()?),
+/// Where devices come from.
+enum Source {
+    /// This machine.
+    Machine,
+    /// A scenario: the demonstration, or that of a file.
+    Scenario(Option<PathBuf>),
+    /// A recorded episode.
+    Episode(PathBuf),
+}
+
+impl Source {
+    fn of(simulation: SimArgs) -> Self {
+        simulation.sim.map_or(Self::Machine, Self::Scenario)
     }
+}
+
+/// What is plugged in is worth knowing even while the registry is wrong: it is told first.
+fn devices(
+    global: &Global,
+    source: Source,
+    formats: Formats,
+    format: Format,
+    out: &mut dyn Write,
+) -> Result<(), Failure> {
+    if let Source::Scenario(file) = source {
+        let registry = registry_or_builtin(global)?;
+        // A script keeps time on tokio's clock.
+        let runtime = runtime()?;
+        let _inside = runtime.enter();
+        let attached = crate::hotplug::script::attached(scenario(file.as_deref(), &registry)?);
+        let plugged = commands::devices::list(Entries::Of(&registry), &attached, formats);
+        return Ok(commands::devices::print(&plugged, Some(&registry), format, out)?);
+    }
+    let (entries, wrong) = match find_registry(global).map(|path| load(&path)) {
+        None => (None, None),
+        Some(Ok(registry)) => (Some(registry), None),
+        Some(Err(wrong)) => (None, Some(wrong)),
+    };
+    let known = match (&entries, &wrong) {
+        (Some(registry), _) => Entries::Of(registry),
+        (None, Some(_)) => Entries::Wrong,
+        (None, None) => Entries::NoFile,
+    };
+    let plugged = commands::devices::list(known, &udev::enumerate()?, formats);
+    commands::devices::print(&plugged, entries.as_ref(), format, out)?;
+    wrong.map_or(Ok(()), Err)
 }
 
 fn mask(global: &Global, watch: bool) -> Result<(), Failure> {
@@ -167,28 +217,27 @@ fn mask(global: &Global, watch: bool) -> Result<(), Failure> {
 }
 
 /// The rig: on this machine, simulated, or played from an episode.
-fn run(global: &Global, args: &RunArgs, replayed: Option<&Path>) -> Result<(), Failure> {
-    let (mut registry, devices) = match (replayed, &args.sim) {
-        (Some(file), _) => {
-            let failed = |reason: String| Failure::Replay { file: file.to_owned(), reason };
-            let (registry, scenario) = replay::scenario(file).map_err(|error| failed(error.to_string()))?;
+fn run(global: &Global, args: &RunArgs, source: Source) -> Result<(), Failure> {
+    let (mut registry, devices) = match source {
+        Source::Episode(file) => {
+            let (registry, scenario) = replay::scenario(&file).map_err(Failure::Replay)?;
             (registry, Devices::Simulated(scenario))
         }
-        (None, Some(file)) => {
-            let registry = match find_registry(global) {
-                Some(path) => load(&path)?,
-                None => Registry::builtin(),
-            };
+        Source::Scenario(file) => {
+            let registry = registry_or_builtin(global)?;
             let scenario = scenario(file.as_deref(), &registry)?;
             (registry, Devices::Simulated(scenario))
         }
-        (None, None) => (load(&registry_path(global)?)?, Devices::Machine),
+        Source::Machine => (load(&registry_path(global)?)?, Devices::Machine),
     };
     if let Some(rate) = args.rate {
         registry.rig.observation_hz = rate;
     }
     if let Some(window) = args.window {
         registry.rig.sync_window = window;
+    }
+    if args.record {
+        prepare(&args.out).map_err(Failure::Folder)?;
     }
     let screen = match (args.headless || !io::stdout().is_terminal(), global.json) {
         (_, true) => Screen::Json,
@@ -210,6 +259,25 @@ fn run(global: &Global, args: &RunArgs, replayed: Option<&Path>) -> Result<(), F
         instance: global.instance.clone(),
     };
     Ok(block_on(app::run(options))??)
+}
+
+/// The folder an episode is to be written to at once: better refused before the devices are started.
+fn prepare(out: &Path) -> Result<(), RecordError> {
+    let refused = |source| RecordError::Io { path: out.to_owned(), source };
+    match std::fs::create_dir(out) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Err(RecordError::NoFolder(out.to_owned())),
+        Err(error) if error.kind() != io::ErrorKind::AlreadyExists => return Err(refused(error)),
+        _ => {}
+    }
+    if !out.is_dir() {
+        return Err(refused(io::Error::new(io::ErrorKind::NotADirectory, "not a folder; choose another with --out")));
+    }
+    let enter_and_write = rustix::fs::Access::WRITE_OK | rustix::fs::Access::EXEC_OK;
+    rustix::fs::access(out, enter_and_write).map_err(|error| refused(error.into()))
+}
+
+fn registry_or_builtin(global: &Global) -> Result<Registry, Failure> {
+    find_registry(global).map_or_else(|| Ok(Registry::builtin()), |path| load(&path))
 }
 
 fn scenario(file: Option<&Path>, registry: &Registry) -> Result<Scenario, Failure> {

@@ -2,10 +2,8 @@
 
 use std::process::ExitCode;
 
-use clap::Parser;
-
 fn main() -> ExitCode {
-    match rapid::cli::Cli::try_parse() {
+    match rapid::cli::Cli::read(std::env::args_os()) {
         Ok(cli) => rapid::dispatch::dispatch(cli),
         Err(error) => {
             // Help and version go to standard output and are no error.

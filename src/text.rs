@@ -91,6 +91,16 @@ pub fn age(duration: Duration) -> String {
     }
 }
 
+/// A time in its largest unit, as one would say it: `3 s`, `12 min`, `2 h`.
+#[must_use]
+pub fn about(duration: Duration) -> String {
+    match duration.as_secs() {
+        seconds @ 0..60 => format!("{seconds} s"),
+        seconds @ 60..3600 => format!("{} min", seconds / 60),
+        seconds => format!("{} h", seconds / 3600),
+    }
+}
+
 /// A number of bytes in decimal units: `512 B`, `1.5 kB`, `12.3 MB`.
 #[must_use]
 pub fn size(bytes: u64) -> String {
@@ -146,6 +156,9 @@ mod tests {
         assert_eq!(age(Duration::from_millis(999)), "999 ms");
         assert_eq!(age(Duration::from_millis(1250)), "1.2 s");
         assert_eq!(age(Duration::from_secs(123)), "02:03");
+        assert_eq!(about(Duration::from_millis(3900)), "3 s");
+        assert_eq!(about(Duration::from_secs(150)), "2 min");
+        assert_eq!(about(Duration::from_hours(30)), "30 h");
         assert_eq!(size(999), "999 B");
         assert_eq!(size(999_999), "1.0 MB");
         assert_eq!(size(12_345_678), "12.3 MB");

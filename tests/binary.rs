@@ -89,6 +89,44 @@ fn an_output_folder_that_cannot_be_made_is_said_before_anything_is_recorded() {
     let said = text(&output.stderr);
     assert!(said.contains("no/such/folder: no such folder"), "{said}");
     assert!(!place.mask_file().exists());
+    place.write("file", "");
+    let output = place.run(&["--sim", "--headless", "--record", "--out", "file", "--duration", "1s"]);
+    assert_eq!(output.status.code(), Some(2), "{}", text(&output.stderr));
+    assert_eq!(text(&output.stdout), "", "no device is started");
+    assert!(text(&output.stderr).contains("file: not a folder; choose another with --out"), "{}", text(&output.stderr));
+}
+
+#[test]
+fn what_is_plugged_is_told_whatever_the_registry_is() {
+    let place = Place::new();
+    let simulated = place.run(&["devices", "--sim"]);
+    assert_eq!(simulated.status.code(), Some(0), "{}", text(&simulated.stderr));
+    let listed = text(&simulated.stdout);
+    assert!(listed.contains("[device.tactile_tip]") && listed.contains("sim:tactile_tip"), "{listed}");
+    place.write(
+        "stranger.toml",
+        "[[device]]\nname = \"cam_wrist\"\n[[device]]\nname = \"other\"\nlike = \"cam_wrist\"\nserial = \"CAM00B7\"\n",
+    );
+    let stranger = text(&place.run(&["--sim=stranger.toml", "devices"]).stdout);
+    assert!(stranger.contains("its serial is \"CAM00A1\" and this unit says \"CAM00B7\""), "{stranger}");
+    place.write("wrong.toml", "[device.cam]\nvid = \"046d\"\npid = \"0825\"\nnode = \"camra\"\n");
+    let wrong = place.run(&["devices", "--config", "wrong.toml"]);
+    assert_eq!(wrong.status.code(), Some(2));
+    assert!(!wrong.stdout.is_empty(), "the list comes first");
+    assert!(text(&wrong.stderr).contains("did you mean \"camera\"?"), "{}", text(&wrong.stderr));
+}
+
+#[test]
+fn a_file_that_is_no_episode_is_a_bad_argument_and_named_once() {
+    let place = Place::new();
+    place.write("no.mcap", "hello");
+    for arguments in [["inspect", "none.mcap"], ["inspect", "no.mcap"], ["replay", "none.mcap"], ["replay", "no.mcap"]]
+    {
+        let output = place.run(&arguments);
+        let said = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{arguments:?}: {said}");
+        assert_eq!(said.matches(arguments[1]).count(), 1, "{said}");
+    }
 }
 
 #[test]

@@ -4,8 +4,10 @@ use std::io::{self, Write};
 
 use serde::Serialize;
 
+use super::Format;
 use crate::driver::camera::{CameraInfo, query};
-use crate::registry::{Assigner, Assignment, Attachment, DeviceNode, Registry, UsbIdentity};
+use crate::registry::{Assigner, Assignment, Attachment, DeviceNode, DeviceSpec, IdentitySpec, Registry, UsbIdentity};
+use crate::text;
 
 /// One node that is plugged in.
 #[derive(Debug, Clone, Serialize)]
@@ -36,14 +38,31 @@ pub enum Formats {
     Skip,
 }
 
+/// What there is to match against.
+#[derive(Debug, Clone, Copy)]
+pub enum Entries<'a> {
+    /// The entries of a registry.
+    Of(&'a Registry),
+    /// Nothing: there is no registry.
+    NoFile,
+    /// Nothing: the registry cannot be used.
+    Wrong,
+}
+
 /// Matches what is attached against the registry, as a starting rig would.
 #[must_use]
-pub fn list(registry: Option<&Registry>, attached: &[Attachment], formats: Formats) -> Vec<Plugged> {
-    let mut assigner = registry.map(Assigner::new);
+pub fn list(entries: Entries<'_>, attached: &[Attachment], formats: Formats) -> Vec<Plugged> {
+    let mut assigner = match entries {
+        Entries::Of(registry) => Some((Assigner::new(registry), registry)),
+        Entries::NoFile | Entries::Wrong => None,
+    };
     let plugged = |attachment: &Attachment| {
-        let (entry, reasons) = match (&mut assigner, registry) {
-            (Some(assigner), Some(registry)) => explain(assigner, registry, attachment),
-            _ => (None, vec!["there is no registry; write a devices.toml".to_owned()]),
+        let (entry, reasons) = match (&mut assigner, entries) {
+            (Some((assigner, registry)), _) => explain(assigner, registry, attachment),
+            (None, Entries::Wrong) => {
+                (None, vec!["the registry cannot be used; what is wrong is said below".to_owned()])
+            }
+            (None, _) => (None, vec!["there is no registry; write a devices.toml".to_owned()]),
         };
         let (camera, camera_error) = match (&attachment.node, formats) {
             (DeviceNode::Video(path), Formats::Ask) => match query(path) {
@@ -58,59 +77,110 @@ pub fn list(registry: Option<&Registry>, attached: &[Attachment], formats: Forma
 }
 
 fn explain(assigner: &mut Assigner, registry: &Registry, attachment: &Attachment) -> (Option<String>, Vec<String>) {
-    let why = assigner.explain(attachment).reasons;
+    let mut why = assigner.explain(attachment).reasons;
     match assigner.attach(attachment) {
         Assignment::Entry(id) => (registry.device(id).map(|device| device.name.clone()), why),
-        Assignment::Waiting { reason } | Assignment::Unregistered { reason } | Assignment::WrongNode { reason } => {
-            let reasons = if why.is_empty() { vec![reason] } else { why };
-            (None, reasons)
+        // It fits, and something stands in the way.
+        Assignment::Waiting { reason } | Assignment::WrongNode { reason } => {
+            why.push(reason);
+            (None, why)
         }
+        Assignment::Unregistered { reason } => (None, if why.is_empty() { vec![reason] } else { why }),
     }
 }
 
-/// Prints the list for people.
+/// Prints the list, and the entries of which nothing is plugged in.
 ///
 /// # Errors
 /// When `out` cannot be written.
-pub fn print(plugged: &[Plugged], registry: Option<&Registry>, out: &mut dyn Write) -> io::Result<()> {
-    if plugged.is_empty() {
-        writeln!(out, "No camera and no serial device is plugged in.")?;
+pub fn print(plugged: &[Plugged], registry: Option<&Registry>, format: Format, out: &mut dyn Write) -> io::Result<()> {
+    let entries = registry.map(|registry| registry.devices.as_slice()).unwrap_or_default();
+    let is_missing = |entry: &&DeviceSpec| !plugged.iter().any(|device| device.entry.as_ref() == Some(&entry.name));
+    let missing: Vec<&DeviceSpec> = entries.iter().filter(is_missing).collect();
+    match format {
+        Format::Json => print_json(plugged, &missing, out),
+        Format::Text => print_text(plugged, &missing, out),
     }
-    for device in plugged {
-        let usb = &device.usb;
-        let product = crate::text::plain(usb.product.as_deref().unwrap_or("(no product name)"));
-        let serial = usb.serial.as_ref().map(|serial| format!("serial {serial:?}"));
-        let entry = device.entry.as_ref().map_or("not used".to_owned(), |entry| format!("[device.{entry}]"));
-        writeln!(
-            out,
-            "{:<14} {:04x}:{:04x}  port {:<8} {:<22} {:<20} {product}",
-            device.node,
-            usb.vid,
-            usb.pid,
-            usb.port,
-            serial.unwrap_or_else(|| "no serial".to_owned()),
-            entry,
-        )?;
-        for reason in &device.reasons {
-            writeln!(out, "               {}", crate::text::plain(reason))?;
-        }
-        if let Some(camera) = &device.camera {
-            for line in camera.to_string().lines() {
-                writeln!(out, "               {line}")?;
-            }
-        }
-        if let Some(error) = &device.camera_error {
-            writeln!(out, "               formats unknown: {error}")?;
-        }
+}
+
+/// One object of the list as JSON.
+#[derive(Serialize)]
+struct Line<T> {
+    plugged: bool,
+    #[serde(flatten)]
+    what: T,
+}
+
+/// An entry of which nothing is plugged in.
+#[derive(Serialize)]
+struct Missing<'a> {
+    entry: &'a str,
+    #[serde(flatten)]
+    identity: &'a IdentitySpec,
+}
+
+fn print_json(plugged: &[Plugged], missing: &[&DeviceSpec], out: &mut dyn Write) -> io::Result<()> {
+    for what in plugged {
+        serde_json::to_writer(&mut *out, &Line { plugged: true, what })?;
+        writeln!(out)?;
     }
-    let Some(registry) = registry else { return Ok(()) };
-    let missing = registry
-        .devices
-        .iter()
-        .filter(|entry| !plugged.iter().any(|device| device.entry.as_deref() == Some(entry.name.as_str())));
     for entry in missing {
-        let identity = &entry.identity;
-        writeln!(out, "[device.{}] {:04x}:{:04x} is not plugged in", entry.name, identity.vid, identity.pid)?;
+        let what = Missing { entry: &entry.name, identity: &entry.identity };
+        serde_json::to_writer(&mut *out, &Line { plugged: false, what })?;
+        writeln!(out)?;
     }
     Ok(())
 }
+
+fn print_text(plugged: &[Plugged], missing: &[&DeviceSpec], out: &mut dyn Write) -> io::Result<()> {
+    if plugged.is_empty() {
+        writeln!(out, "No camera and no serial device is plugged in.")?;
+    }
+    let cells = |device: &Plugged| {
+        let usb = &device.usb;
+        let entry = device.entry.as_ref().map_or("not used".to_owned(), |entry| format!("[device.{entry}]"));
+        let serial = usb.serial.as_ref().map_or("no serial".to_owned(), |serial| format!("serial {serial:?}"));
+        let port = format!("port {}", usb.port);
+        let product = usb.product.as_deref().unwrap_or("(no product name)");
+        let model = format!("{:04x}:{:04x}", usb.vid, usb.pid);
+        [entry, device.node.clone(), model, port, serial, product.to_owned()]
+            .map(|cell| text::plain(&cell).into_owned())
+    };
+    let rows: Vec<_> = plugged.iter().map(cells).collect();
+    let width = |column: usize| rows.iter().filter_map(|row| row.get(column)).map(|cell| text::width(cell)).max();
+    let widths: [usize; 6] = std::array::from_fn(|column| width(column).unwrap_or(0).min(WIDEST));
+    for (device, row) in plugged.iter().zip(&rows) {
+        let row = row.iter().zip(widths).map(|(cell, width)| {
+            let missing = width.saturating_sub(text::width(cell));
+            format!("{cell}{:missing$}", "")
+        });
+        writeln!(out, "{}", row.collect::<Vec<_>>().join("  ").trim_end())?;
+        for reason in &device.reasons {
+            writeln!(out, "    {}", text::plain(reason))?;
+        }
+        if let Some(camera) = &device.camera {
+            for line in camera.to_string().lines() {
+                writeln!(out, "    {}", text::plain(line))?;
+            }
+        }
+        if let Some(error) = &device.camera_error {
+            writeln!(out, "    formats unknown: {}", text::plain(error))?;
+        }
+    }
+    for entry in missing {
+        let IdentitySpec { vid, pid, serial, port } = &entry.identity;
+        let unit = match (serial, port) {
+            (Some(serial), _) => format!(" serial {serial:?}"),
+            (None, Some(port)) => format!(" at port {port}"),
+            (None, None) => String::new(),
+        };
+        writeln!(out, "[device.{}] {vid:04x}:{pid:04x}{unit} is not plugged in", entry.name)?;
+    }
+    Ok(())
+}
+
+/// Columns to which a column is padded at most: one long serial number does not move all the others.
+const WIDEST: usize = 28;
+
+#[cfg(test)]
+mod tests;

@@ -3,7 +3,8 @@
 use serde::Serialize;
 
 use super::style::Palette;
-use crate::status::{Event, What};
+use crate::modality::ModalityId;
+use crate::status::{DeviceStatus, Event, Snapshot, What};
 use crate::text;
 
 /// An event with its time on the wall clock.
@@ -19,6 +20,34 @@ pub(super) fn json(event: &Event, wall_ns: u64) -> serde_json::Result<String> {
     serde_json::to_string(&Timed { event, time: crate::time::rfc3339(wall_ns) })
 }
 
+/// The beginning of a run, as JSON: `{"event":"begin",...}`.
+#[derive(Serialize)]
+#[serde(tag = "event", rename = "begin")]
+struct Begin<'a> {
+    rig: &'a str,
+    devices: Vec<BeginDevice<'a>>,
+    time: String,
+}
+
+#[derive(Serialize)]
+struct BeginDevice<'a> {
+    device: &'a str,
+    bit: ModalityId,
+    topic: &'a str,
+}
+
+/// The rig and its modalities as one JSON object, without a line end.
+pub(super) fn begin_json(snapshot: &Snapshot, wall_ns: u64) -> serde_json::Result<String> {
+    fn device(device: &DeviceStatus) -> BeginDevice<'_> {
+        BeginDevice { device: &device.name, bit: device.id, topic: &device.topic }
+    }
+    serde_json::to_string(&Begin {
+        rig: &snapshot.rig,
+        devices: snapshot.devices.iter().map(device).collect(),
+        time: crate::time::rfc3339(wall_ns),
+    })
+}
+
 /// Columns of the lines for people.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Columns {
@@ -28,12 +57,18 @@ pub(super) struct Columns {
     pub(super) palette: Palette,
 }
 
-/// Columns of the detail of a state; a longer one pushes the mask to the right.
-const DETAIL: usize = 28;
 /// Columns of the word that says what happened.
 const WORD: usize = 12;
 
 impl Columns {
+    /// The rig and its modalities as a line; without a line end.
+    pub(super) fn begin(self, snapshot: &Snapshot, wall_ns: u64) -> String {
+        let time = self.palette.faint(&crate::time::time_of_day(wall_ns));
+        let names: Vec<_> = snapshot.devices.iter().map(|device| text::plain(&device.name)).collect();
+        let rig = self.palette.bold(&text::plain(&snapshot.rig));
+        format!("{time}  rig {rig} looks for {}; ctrl-c ends the run", names.join(", "))
+    }
+
     /// An event as a line; without a line end.
     pub(super) fn line(self, event: &Event, wall_ns: u64) -> String {
         let palette = self.palette;
@@ -47,8 +82,7 @@ impl Columns {
             }
             What::State { device, bit, state, mask, detail } => {
                 let word = palette.state(*state, &pad(state.word()));
-                let missing = DETAIL.saturating_sub(text::width(&text::plain(detail)));
-                (device, Some(bit), word, format!("{detail}{:missing$}   mask {mask}", ""))
+                (device, Some(bit), word, format!("mask {mask}  {detail}"))
             }
             What::Unregistered { device, reason } => {
                 (&"usb".to_owned(), None, palette.warn(&pad("unregistered")), format!("{device}   {reason}"))
@@ -75,7 +109,7 @@ impl Columns {
         let time = palette.faint(&crate::time::time_of_day(wall_ns));
         let subject = text::left(&text::plain(subject), self.name, "…");
         let bit = bit.map_or_else(|| " ".repeat(6), |bit| format!("bit {:<2}", bit.bit()));
-        format!("{time}  {subject}  {}  {word}  {}", palette.faint(&bit), text::plain(&rest))
+        format!("{time}  {subject}  {}  {word}  {}", palette.faint(&bit), text::plain(rest.trim_end()))
     }
 }
 

@@ -131,6 +131,7 @@ impl Printer {
     ) -> io::Result<()> {
         let mut looks = tokio::time::interval(LOOK);
         let mut rest = String::new();
+        let _ = outlet.send(self.opening(&board.snapshot())?.into_bytes()).await;
         looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             let piece = tokio::select! {
@@ -166,6 +167,13 @@ impl Printer {
         rest.push_str(&self.summary(&board.snapshot())?);
         let _ = tokio::time::timeout(LAST, outlet.send(rest.into_bytes())).await;
         outlet.finish(LAST).await
+    }
+
+    /// What the run begins with: the rig and its modalities.
+    fn opening(&mut self, snapshot: &Snapshot) -> io::Result<String> {
+        let wall_ns = self.wall.wall_ns(snapshot.taken);
+        let line = if self.json { line::begin_json(snapshot, wall_ns)? } else { self.columns.begin(snapshot, wall_ns) };
+        Ok(self.whole_line(&line))
     }
 
     fn event(&mut self, event: &Event) -> io::Result<String> {

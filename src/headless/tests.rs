@@ -73,9 +73,9 @@ fn lines_for_people_have_their_columns() {
     let lines: Vec<_> = all_events().into_iter().map(|what| columns.line(&event(what), WALL_NS)).collect();
     insta::assert_snapshot!(lines.join("\n"), @r#"
     22:13:20.000Z  cam_wrist  bit 0   attached      /dev/video0 port 1-2.3 serial CAM [2J00
-    22:13:20.000Z  cam_wrist  bit 0   streaming     /dev/video0 MJPG 640x480@30    mask 0x05
+    22:13:20.000Z  cam_wrist  bit 0   streaming     mask 0x05  /dev/video0 MJPG 640x480@30
     22:13:20.000Z  tof        bit 12  detached      told by kernel
-    22:13:20.000Z  tof        bit 12  absent                                       mask 0x05
+    22:13:20.000Z  tof        bit 12  absent        mask 0x05
     22:13:20.000Z  usb                unregistered  046d:0825  X   no entry has this serial
     22:13:20.000Z  episode            recording     out/a.mcap
     22:13:20.000Z  episode            finished      out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped
@@ -107,6 +107,17 @@ fn json_is_the_event_with_its_wall_time() {
         assert!(!text.contains('\n') && !text.contains('\x1b'), "{text}");
         assert!(serde_json::from_str::<Value>(&text).unwrap()["event"].is_string(), "{text}");
     }
+}
+
+#[test]
+fn a_run_begins_with_what_it_looks_for() {
+    let snapshot = three_streaming();
+    let columns = line::Columns { name: 9, palette: Palette::Plain };
+    let line = columns.begin(&snapshot, WALL_NS);
+    assert_eq!(line, "22:13:20.000Z  rig bench-1 looks for cam_wrist, cam_top, tof; ctrl-c ends the run");
+    let object: Value = serde_json::from_str(&line::begin_json(&snapshot, WALL_NS).unwrap()).unwrap();
+    assert_eq!((&object["event"], &object["rig"]), (&"begin".into(), &"bench-1".into()));
+    assert_eq!((&object["devices"][2]["device"], &object["devices"][2]["bit"]), (&"tof".into(), &2.into()));
 }
 
 #[test]
@@ -175,7 +186,7 @@ async fn what_is_announced_before_the_end_is_printed_and_summed_up() {
     shutdown.cancel();
     output.await.unwrap();
     let text = kept.text();
-    assert!(text.contains("cam_wrist  bit 0   streaming     /dev/video0                    mask 0x05\n"), "{text}");
+    assert!(text.contains("cam_wrist  bit 0   streaming     mask 0x05  /dev/video0\n"), "{text}");
     assert!(text.contains("episode out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped\n"), "{text}");
     assert!(text.contains("cam_wrist    0          1"), "{text}");
 }

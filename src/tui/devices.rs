@@ -31,7 +31,7 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, (rows, selection): (u16, u
     let name = name_width(model.shown(), inner.width);
     let mut lines = inner.rows();
     if let Some(line) = lines.next() {
-        frame.render_widget(head(name, theme), line);
+        frame.render_widget(head(name, line.width, theme), line);
     }
     if devices.is_empty()
         && let Some(line) = lines.next()
@@ -48,7 +48,7 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, (rows, selection): (u16, u
     if selection > 0
         && let (Some(device), Some(line)) = (model.selected_device(), lines.next())
     {
-        frame.render_widget(about(device, line.width, theme), line);
+        frame.render_widget(about(device, line.width, model, theme), line);
     }
 }
 
@@ -70,16 +70,22 @@ fn name_width(snapshot: &Snapshot, width: u16) -> usize {
     longest.clamp(6, if width >= 110 { 28 } else { 14 })
 }
 
-fn head(name: usize, theme: Theme) -> Line<'static> {
+/// Columns of the total: none where it does not fit whole. Part of a number is another number.
+fn total_width(name: usize, width: u16) -> usize {
+    if BIT + name + STATE + RATE + AGE + GAPS + TOTAL <= usize::from(width) { TOTAL } else { 0 }
+}
+
+fn head(name: usize, width: u16, theme: Theme) -> Line<'static> {
+    let total = total_width(name, width);
     let head = format!(
-        "{:>4} {:name$} {:width$}{:>RATE$}{:>AGE$}{:>GAPS$}{:>TOTAL$}  detail",
+        "{:>4} {:name$} {:width$}{:>RATE$}{:>AGE$}{:>GAPS$}{:>total$}  detail",
         "bit",
         "name",
         "state",
         "Hz",
         "age",
         "gaps",
-        "total",
+        if total > 0 { "total" } else { "" },
         width = STATE - 1
     );
     Line::styled(head, theme.faint())
@@ -95,9 +101,10 @@ fn row(device: &DeviceStatus, name: usize, width: u16, model: &Model, theme: The
     let is_old = device.state == SlotState::Stalled || reading.age.is_some_and(|age| age >= Duration::from_secs(1));
     let gaps = if device.gaps > 0 { theme.level(Level::Warn) } else { theme.faint() };
     let word = format!("{} {}", theme.state_symbol(device.state), device.state.word());
-    let used = BIT + name + STATE + RATE + AGE + GAPS + TOTAL + 2;
+    let total = total_width(name, width);
+    let used = BIT + name + STATE + RATE + AGE + GAPS + total + 2;
     let detail = usize::from(width).saturating_sub(used);
-    let detail = text::cut(&theme.safe(&device.detail), detail, theme.ellipsis()).into_owned();
+    let detail = text::cut(&told(device, model, theme), detail, theme.ellipsis()).into_owned();
     let figures = if running { Style::new() } else { theme.faint() };
     Line::from(vec![
         Span::styled(if selected { theme.symbol("▸", ">") } else { " " }, theme.title()),
@@ -108,7 +115,7 @@ fn row(device: &DeviceStatus, name: usize, width: u16, model: &Model, theme: The
         Span::styled(format!("{rate:>RATE$}"), figures),
         Span::styled(format!("{age:>AGE$}"), if running && is_old { theme.warning() } else { figures }),
         Span::styled(format!("{:>GAPS$}", compact(device.gaps)), gaps),
-        Span::styled(format!("{:>TOTAL$}", compact(device.samples)), figures),
+        Span::styled(if total > 0 { format!("{:>total$}", compact(device.samples)) } else { String::new() }, figures),
         Span::raw("  "),
         Span::styled(detail, if device.state == SlotState::Failed { theme.alarm() } else { theme.faint() }),
     ])
@@ -123,14 +130,24 @@ fn compact(count: u64) -> String {
     }
 }
 
-/// What the table has no room for.
-fn about(device: &DeviceStatus, width: u16, theme: Theme) -> Line<'static> {
-    let mut parts = vec![theme.safe(&device.topic), text::size(device.bytes)];
+/// The detail of a device; of an absent one, since when it is.
+fn told(device: &DeviceStatus, model: &Model, theme: Theme) -> String {
+    if device.state != SlotState::Absent || !device.detail.is_empty() {
+        return theme.safe(&device.detail);
+    }
+    match model.unplugged_for(device) {
+        Some(since) => format!("unplugged {} ago", text::about(since)),
+        None if device.samples > 0 => "unplugged".to_owned(),
+        None => "not plugged in".to_owned(),
+    }
+}
+
+/// What the table has no room for: the whole detail first, as it is what the table cuts.
+fn about(device: &DeviceStatus, width: u16, model: &Model, theme: Theme) -> Line<'static> {
+    let mut parts = vec![told(device, model, theme), theme.safe(&device.topic), text::size(device.bytes)];
+    parts.retain(|part| !part.is_empty());
     if device.epoch.0 > 1 {
         parts.push(format!("started {} times", device.epoch.0));
-    }
-    if !device.detail.is_empty() {
-        parts.push(theme.safe(&device.detail));
     }
     let text = parts.join(theme.symbol(" · ", " | "));
     let arrow = theme.symbol("└ ", "` ");

@@ -79,6 +79,8 @@ pub struct Model {
     readings: [Reading; MAX_MODALITIES],
     totals: Totals,
     edges: [Option<Stamp>; MAX_MODALITIES],
+    /// When a device was pulled out, as far as this screen has seen it.
+    pulled: [Option<Stamp>; MAX_MODALITIES],
     selected: usize,
     scroll: usize,
     help: bool,
@@ -99,6 +101,7 @@ impl Model {
             readings: [Reading::default(); MAX_MODALITIES],
             totals: Totals::default(),
             edges: [None; MAX_MODALITIES],
+            pulled: [None; MAX_MODALITIES],
             selected: 0,
             scroll: 0,
             help: false,
@@ -129,6 +132,16 @@ impl Model {
         for (bit, edge) in self.edges.iter_mut().enumerate() {
             if (snapshot.mask.0 ^ self.latest.mask.0) >> bit & 1 == 1 {
                 *edge = Some(snapshot.taken);
+            }
+        }
+        for device in &snapshot.devices {
+            let before = self.latest.devices.iter().find(|before| before.id == device.id);
+            let was_attached = before.is_some_and(|before| before.state != SlotState::Absent);
+            if let Some(pulled) = self.pulled.get_mut(device.id.index())
+                && device.state == SlotState::Absent
+                && was_attached
+            {
+                *pulled = Some(snapshot.taken);
             }
         }
         if self.scroll > 0 && self.frozen.is_none() {
@@ -282,6 +295,14 @@ impl Model {
             }
             _ => Edge::None,
         }
+    }
+
+    /// How long a device has been unplugged; `None` if it is not, or was never seen plugged in.
+    #[must_use]
+    pub fn unplugged_for(&self, device: &DeviceStatus) -> Option<Duration> {
+        let pulled = self.pulled.get(device.id.index()).copied().flatten()?;
+        let shown = self.shown().taken;
+        (device.state == SlotState::Absent && pulled <= shown).then(|| shown.since(pulled))
     }
 
     /// Row of the selected device.

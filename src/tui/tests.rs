@@ -198,6 +198,46 @@ fn an_edge_is_highlighted_for_a_second() {
 }
 
 #[test]
+fn a_number_that_does_not_fit_is_left_out_and_not_cut() {
+    let mut end = three_streaming();
+    end.devices[0].name = "a_name_of_14_c".to_owned();
+    end.devices[0].samples = 123_456;
+    let screen = draw(&measured(&end), (60, 12), THEME).to_string();
+    assert!(!screen.contains("12345") && !screen.contains("tota"), "{screen}");
+    let screen = draw(&measured(&end), (80, 24), THEME).to_string();
+    assert!(screen.contains("123456") && screen.contains("total"), "{screen}");
+}
+
+#[test]
+fn an_absent_device_says_since_when() {
+    let mut end = three_streaming();
+    end.devices.push(device(3, "imu", SlotState::Absent, ""));
+    end.devices[3].samples = 0;
+    let mut model = measured(&end);
+    let mut later = end.clone();
+    later.devices[1].state = SlotState::Absent;
+    later.devices[1].detail.clear();
+    later.taken = Stamp(TAKEN.0 + 100_000_000);
+    model.update(Msg::Snapshot(Box::new(later.clone())));
+    later.taken = Stamp(TAKEN.0 + 3_200_000_000);
+    model.update(Msg::Snapshot(Box::new(later.clone())));
+    model.update(press(KeyCode::Down));
+    let screen = draw(&model, (80, 24), THEME).to_string();
+    assert!(screen.contains("unplugged 3 s ago · /rapid/cam_top"), "{screen}");
+    assert!(screen.contains("not plugged in"), "{screen}");
+    // Plugged in again and pulled again: counted from then.
+    later.devices[1].state = SlotState::Streaming;
+    model.update(Msg::Snapshot(Box::new(later.clone())));
+    later.devices[1].state = SlotState::Absent;
+    later.taken = Stamp(TAKEN.0 + 70_000_000_000);
+    model.update(Msg::Snapshot(Box::new(later.clone())));
+    later.taken = Stamp(TAKEN.0 + 200_000_000_000);
+    model.update(Msg::Snapshot(Box::new(later)));
+    let screen = draw(&model, (80, 24), THEME).to_string();
+    assert!(screen.contains("unplugged 2 min ago"), "{screen}");
+}
+
+#[test]
 fn a_pause_shows_in_the_header_and_a_question_in_the_footer() {
     let mut end = three_streaming();
     end.recording = Some(recording(0));
