@@ -34,13 +34,18 @@ main() {
     flock 9
     rm -rf "$CACHE"/onnxruntime.partial.*
 
+    # The packages of all parts come first, in one go: whoever has to ask somebody for root asks once.
+    local wanted=() part
     for part in "$@"; do
         case "$part" in
-            build) toolchain; packages "${BUILD_PACKAGES[@]}" ;;
-            test) lint_tools; test_packages; python_venv; onnxruntime; guest_image ;;
+            build) wanted+=("${BUILD_PACKAGES[@]}") ;;
+            test) mapfile -t -O "${#wanted[@]}" wanted < <(test_packages) ;;
             *) die "unknown part '$part': build or test" ;;
         esac
     done
+    toolchain
+    packages "${wanted[@]}"
+    [[ " $* " != *" test "* ]] || { lint_tools; python_venv; onnxruntime; guest_image; }
     if [[ $changed = 0 ]]; then say "nothing to do ($*)"; else say "done ($*)"; fi
 }
 
@@ -55,12 +60,11 @@ lint_tools() {
     rustup component add rustfmt clippy
 }
 
+# The packages of the test part, a line each.
 test_packages() {
-    local list=tests/vbench/image/packages.txt wanted=("${TEST_PACKAGES[@]}")
-    if [[ -f $list ]]; then
-        mapfile -t -O "${#wanted[@]}" wanted < <(sed 's/#.*//' "$list" | tr -s '[:space:]' '\n' | sed '/^$/d')
-    fi
-    packages "${wanted[@]}"
+    local list=tests/vbench/image/packages.txt
+    printf '%s\n' "${TEST_PACKAGES[@]}"
+    [[ ! -f $list ]] || sed 's/#.*//' "$list" | tr -s '[:space:]' '\n' | sed '/^$/d'
 }
 
 # Installs those of the packages that are missing; asks for root only then.
@@ -77,7 +81,7 @@ packages() {
 
     local as_root=()
     if [[ $(id -u) != 0 ]]; then
-        command -v sudo >/dev/null || die "as root, run: apt-get install ${missing[*]}"
+        command -v sudo >/dev/null || die "there is no sudo; as root, run: apt-get update && apt-get install ${missing[*]}"
         as_root=(sudo)
     fi
     did "installing with apt: ${missing[*]}"

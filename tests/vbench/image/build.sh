@@ -6,7 +6,7 @@
 #   build.sh           builds what is missing, prints the directory last
 #   build.sh --check   prints the directory when it is built, otherwise says what to run and exits 3
 #
-# Needs the packages of packages.txt and root, or unprivileged user namespaces, or sudo.
+# Needs the packages of packages.txt and root, or unprivileged user namespaces with a range of ids, or sudo.
 set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 cache=${RAPID_VBENCH_DIR:-${XDG_CACHE_HOME:-$HOME/.cache}/rapid/vbench}
@@ -40,11 +40,15 @@ if [ -f "$image/manifest" ]; then
   exit 0
 fi
 
-# `as_root` runs a command that must see root-owned files: plainly as root, inside a user namespace, or through sudo.
-if [ "$(id -u)" = 0 ]; then as_root=()
-elif unshare -r true 2>/dev/null; then as_root=(unshare -r)
-elif command -v sudo >/dev/null; then as_root=(sudo)
-else die "needs root, unprivileged user namespaces (unshare -r) or sudo"; fi
+# `as_root` runs a command that must see root-owned files, `bootstrap` one that makes a system of many owners: plainly as
+# root, inside user namespaces (the second kind wants a range of ids of the user's own), or through sudo.
+as_root=() bootstrap=()
+if [ "$(id -u)" != 0 ]; then
+  if unshare -r true 2>/dev/null && command -v newuidmap >/dev/null && grep -q "^$(id -un):" /etc/subuid 2>/dev/null; then
+    as_root=(unshare -r)
+  elif command -v sudo >/dev/null; then as_root=(sudo) bootstrap=(sudo)
+  else die "needs sudo, or user namespaces: package uidmap and a line for $(id -un) in /etc/subuid"; fi
+fi
 
 # A build that was cut off leaves only such a directory; holding the lock, every one of them is dead.
 "${as_root[@]}" rm -rf "$cache"/.build.*
@@ -54,7 +58,7 @@ mkdir "$work/out"
 started=$SECONDS
 
 step "installing Debian $suite with its kernel ($(tr '\n' ' ' <"$here/guest-packages.txt"))"
-"$here/rootfs.sh" "$suite" "$work"
+"${bootstrap[@]}" "$here/rootfs.sh" "$suite" "$work"
 step "unpacking the kernel"
 kernel=$("$here/kernel.sh" "$work")
 step "packing the disk and the initramfs (kernel $kernel)"
