@@ -17,11 +17,12 @@ const SCHEMAS: [&str; 8] = [
     "rapid/Scalars",
 ];
 
-/// Where `make setup` has put the pinned onnxruntime library; the Makefile sets it.
-const ONNXRUNTIME: &str = "RAPID_ONNXRUNTIME";
+/// The pinned files of onnxruntime, as `sha256sum` lists them: `<sum>  <arch>/<file>`.
+const PINNED: &str = "scripts/onnxruntime.sha256";
+const LIBRARY: &str = "libonnxruntime.so.";
 
 fn main() -> Result<(), Box<dyn Error>> {
-    onnxruntime();
+    onnxruntime()?;
     println!("cargo::rerun-if-changed={PROTO}");
     println!("cargo::rerun-if-changed=build.rs");
     let out = PathBuf::from(std::env::var("OUT_DIR")?);
@@ -36,17 +37,32 @@ fn main() -> Result<(), Box<dyn Error>> {
 
 /// This version runs no policy and embeds nothing: it says what a build leaves out, so that nobody
 /// who builds by hand is surprised later.
-fn onnxruntime() {
-    println!("cargo::rerun-if-env-changed={ONNXRUNTIME}");
-    let found = std::env::var_os(ONNXRUNTIME).is_some_and(|path| PathBuf::from(path).is_file());
-    let built_with = if found {
-        "onnxruntime: at hand, not embedded (this version runs no policy)"
-    } else {
+fn onnxruntime() -> Result<(), Box<dyn Error>> {
+    println!("cargo::rerun-if-changed={PINNED}");
+    let arch = std::env::var("CARGO_CFG_TARGET_ARCH")?;
+    let pinned = std::fs::read_to_string(PINNED)?;
+    let version =
+        pinned.lines().find_map(|line| line.split_whitespace().nth(1)?.strip_prefix(&format!("{arch}/{LIBRARY}")));
+    // Where `make setup` puts it. A path that does not exist is not watched: cargo would run this
+    // script at every build.
+    let cache = std::env::var_os("XDG_CACHE_HOME")
+        .map(PathBuf::from)
+        .or_else(|| Some(PathBuf::from(std::env::var_os("HOME")?).join(".cache")));
+    let library = cache
+        .zip(version)
+        .map(|(cache, version)| cache.join(format!("rapid/onnxruntime/{version}-{arch}/{LIBRARY}{version}")))
+        .filter(|path| path.is_file());
+    let (Some(library), Some(version)) = (library, version) else {
         println!(
             "cargo::warning=built without onnxruntime, which `make setup` fetches: recording needs none, and \
              this version runs no policy"
         );
-        "onnxruntime: left out (this version runs no policy)"
+        println!("cargo::rustc-env=RAPID_BUILT_WITH=onnxruntime: left out (this version runs no policy)");
+        return Ok(());
     };
-    println!("cargo::rustc-env=RAPID_BUILT_WITH={built_with}");
+    println!("cargo::rerun-if-changed={}", library.display());
+    println!(
+        "cargo::rustc-env=RAPID_BUILT_WITH=onnxruntime: {version} at hand, not embedded (this version runs no policy)"
+    );
+    Ok(())
 }

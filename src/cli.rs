@@ -11,7 +11,7 @@ use clap::{ArgAction, ArgMatches, Args, CommandFactory, FromArgMatches, Parser, 
 /// Records robot demonstrations from sensors that come and go
 #[derive(Debug, Parser)]
 #[command(
-    version, max_term_width = 100, after_help = EXAMPLES, override_usage = "rapid [OPTIONS]\n       rapid <COMMAND> [OPTIONS]",
+    version, long_version = LONG_VERSION, max_term_width = 100, after_help = EXAMPLES, override_usage = "rapid [OPTIONS]\n       rapid <COMMAND> [OPTIONS]",
     disable_help_flag = true, disable_version_flag = true, disable_help_subcommand = true
 )]
 pub struct Cli {
@@ -31,6 +31,9 @@ pub struct Cli {
     #[arg(long, short = 'V', action = ArgAction::Version, help_heading = GENERAL)]
     version: Option<bool>,
 }
+
+/// `rapid --version`; `-V` says the first line alone.
+const LONG_VERSION: &str = concat!(env!("CARGO_PKG_VERSION"), "\n", env!("RAPID_BUILT_WITH"));
 
 const EXAMPLES: &str = "\
 Without a command, rapid runs the rig and shows the monitor: it finds the sensors that devices.toml

@@ -176,10 +176,7 @@ fn devices(
 ) -> Result<(), Failure> {
     if let Source::Scenario(file) = source {
         let registry = registry_or_builtin(global)?;
-        // A script keeps time on tokio's clock.
-        let runtime = runtime()?;
-        let _inside = runtime.enter();
-        let attached = crate::hotplug::script::attached(scenario(file.as_deref(), &registry)?);
+        let attached = crate::hotplug::script::attached(&scenario(file.as_deref(), &registry)?);
         let plugged = commands::devices::list(Entries::Of(&registry), &attached, formats);
         return Ok(commands::devices::print(&plugged, Some(&registry), format, out)?);
     }
@@ -218,9 +215,14 @@ fn mask(global: &Global, watch: bool) -> Result<(), Failure> {
 
 /// The rig: on this machine, simulated, or played from an episode.
 fn run(global: &Global, args: &RunArgs, source: Source) -> Result<(), Failure> {
+    let mut duration = args.duration;
     let (mut registry, devices) = match source {
         Source::Episode(file) => {
-            let (registry, scenario) = replay::scenario(&file).map_err(Failure::Replay)?;
+            let replay::Replayed { registry, scenario, length } = replay::scenario(&file).map_err(Failure::Replay)?;
+            // Without anybody at the screen, a replay ends where the episode does.
+            if args.headless && duration.is_none() {
+                duration = Some(length);
+            }
             (registry, Devices::Simulated(scenario))
         }
         Source::Scenario(file) => {
@@ -248,14 +250,9 @@ fn run(global: &Global, args: &RunArgs, source: Source) -> Result<(), Failure> {
         registry,
         devices,
         screen,
-        episode: EpisodeRequest {
-            out: args.out.clone(),
-            task: args.task.clone(),
-            tags: args.tag.clone(),
-            duration: args.duration,
-        },
+        episode: EpisodeRequest { out: args.out.clone(), task: args.task.clone(), tags: args.tag.clone(), duration },
         record: args.record,
-        duration: args.duration,
+        duration,
         instance: global.instance.clone(),
     };
     Ok(block_on(app::run(options))??)

@@ -21,7 +21,7 @@ use tokio::time::Instant;
 
 use self::episode::{Episode, Messages};
 pub use self::episode::{EpisodeDescription, TopicDescription, describe};
-pub use self::scenario::scenario;
+pub use self::scenario::{Replayed, scenario};
 use self::wire::{Schema, Shape};
 use super::sim::stamp_of;
 use super::{DriverError, Reading, unblock};

@@ -72,12 +72,10 @@ impl Script {
         if let Some(port) = port {
             port.clone_into(&mut device.usb.port);
         }
-        let sim = Arc::new(SimDevice::new(name, device.source.clone(), self.begun));
+        let (attachment, sim) = attachment(device, self.begun);
         sim.sequence.store(self.sequences.get(name).copied().unwrap_or(0), Ordering::Relaxed);
-        let syspath = PathBuf::from("/sim").join(&device.usb.port);
-        self.plugged.insert(name.to_owned(), (syspath.clone(), Arc::clone(&sim)));
-        let (node, usb) = (DeviceNode::Sim(sim), device.usb.clone());
-        self.queue.push_back(HotplugEvent::Added(Attachment { syspath, node, usb }));
+        self.plugged.insert(name.to_owned(), (attachment.syspath.clone(), sim));
+        self.queue.push_back(HotplugEvent::Added(attachment));
     }
 
     fn unplug(&mut self, name: &str) {
@@ -107,13 +105,17 @@ impl Script {
 
 /// What is plugged in when a scenario begins.
 #[must_use]
-pub fn attached(scenario: Scenario) -> Vec<Attachment> {
-    let events = Script::new(scenario).queue;
-    let added = |event| match event {
-        HotplugEvent::Added(attachment) => Some(attachment),
-        HotplugEvent::Removed { .. } => None,
-    };
-    events.into_iter().filter_map(added).collect()
+pub fn attached(scenario: &Scenario) -> Vec<Attachment> {
+    let begun = Stamp::now();
+    scenario.devices.iter().filter(|device| device.plugged).map(|device| attachment(device, begun).0).collect()
+}
+
+/// The attachment of a device that is plugged in now, and its cable.
+fn attachment(device: &ScenarioDevice, begun: Stamp) -> (Attachment, Arc<SimDevice>) {
+    let sim = Arc::new(SimDevice::new(&device.name, device.source.clone(), begun));
+    let syspath = PathBuf::from("/sim").join(&device.usb.port);
+    let (node, usb) = (DeviceNode::Sim(Arc::clone(&sim)), device.usb.clone());
+    (Attachment { syspath, node, usb }, sim)
 }
 
 impl Stream for Script {

@@ -76,7 +76,10 @@ impl Episode {
         let summary = match file.summary() {
             Ok(Some(summary)) => summary,
             Ok(None) | Err(McapError::BadMagic) => {
-                return Err(fatal(path, "has no index, it was not closed: `rapid recover` repairs it"));
+                return Err(fatal(
+                    path,
+                    "has no index: it was not closed, and cannot be played; `rapid inspect` reads what is there",
+                ));
             }
             Err(error) => return Err(fatal(path, format!("its index cannot be read: {error}"))),
         };

@@ -12,12 +12,23 @@ use crate::registry::{DeviceSpec, Registry, UsbIdentity};
 /// A device is attached before its first sample, with which its bit begins: by this much.
 const LEAD: Duration = Duration::from_millis(100);
 
-/// The registry of a recorded episode, and a scenario in which each modality is a device that plays
-/// its topic and is plugged and unplugged as the recorded mask says; blocks.
+/// A recorded episode, to be played.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Replayed {
+    /// The registry it was recorded with.
+    pub registry: Registry,
+    /// Each modality is a device that plays its topic and is plugged and unplugged as the recorded
+    /// mask says.
+    pub scenario: Scenario,
+    /// From its first message to its last.
+    pub length: Duration,
+}
+
+/// Makes devices of a recorded episode; blocks.
 ///
 /// # Errors
 /// When the file cannot be read, or does not hold the registry and the layout.
-pub fn scenario(file: &Path) -> Result<(Registry, Scenario), DriverError> {
+pub fn scenario(file: &Path) -> Result<Replayed, DriverError> {
     let episode = describe(file)?;
     if episode.layout.is_empty() || episode.registry.is_empty() {
         return Err(fatal(file, "holds no layout and registry: it was not recorded by rapid"));
@@ -35,7 +46,8 @@ pub fn scenario(file: &Path) -> Result<(Registry, Scenario), DriverError> {
         registry.devices.iter().flat_map(|spec| plug_events(&episode, &spec.name, spec.id)).collect();
     events.sort_by_key(|event| event.at);
     let devices = registry.devices.iter().map(device).collect();
-    Ok((registry, Scenario { devices, events, repeat: None }))
+    let length = Duration::from_nanos(episode.end_ns.saturating_sub(episode.begin_ns));
+    Ok(Replayed { registry, scenario: Scenario { devices, events, repeat: None }, length })
 }
 
 /// Plugs and unplugs of one modality, from the changes of its bit.

@@ -133,7 +133,8 @@ fn an_episode_describes_itself() {
 #[test]
 fn a_scenario_follows_the_recorded_mask() {
     let file = file(&episode(options()));
-    let (registry, scenario) = scenario(file.path()).unwrap();
+    let Replayed { registry, scenario, length } = scenario(file.path()).unwrap();
+    assert_eq!(length.as_millis(), 990);
     assert_eq!(registry, crate::registry::Registry::parse(REGISTRY, None).unwrap().registry);
     let plugged: Vec<_> = scenario.devices.iter().map(|device| (device.name.as_str(), device.plugged)).collect();
     assert_eq!(plugged, [("tof", true), ("cam", false)]);
@@ -163,7 +164,7 @@ async fn what_cannot_be_played_is_said() {
     let bytes = episode(options());
     let cut = file(&bytes[..bytes.len() - 20]);
     let unclosed = refused(cut.path(), "/rapid/tof").await;
-    assert!(unclosed.contains("rapid recover"), "{unclosed}");
+    assert!(unclosed.contains("rapid inspect"), "{unclosed}");
     assert!(refused(Path::new("/no/such.mcap"), "/rapid/tof").await.contains("/no/such.mcap"));
     assert!(describe(file(b"").path()).is_err());
 }
