@@ -110,3 +110,21 @@ fn a_consumer_that_comes_later_gets_what_is_published_from_then_on() {
     let got: Vec<u64> = sequences(&inbox).into_iter().map(|(_, seq, _)| seq).collect();
     assert_eq!(got, [1]);
 }
+
+#[test]
+fn a_topic_filled_faster_than_it_is_emptied_does_not_hold_the_consumer() {
+    let (registry, bus) = open("f", 16);
+    let inbox = bus.inbox().expect("inbox");
+    let writer = bus.writer(TopicId::Modality(registry.devices[0].id)).expect("writer");
+    let publish = |seq| writer.publish(SampleHeader { seq, ..SampleHeader::default() }, &[1]).expect("publish");
+    publish(0);
+    let mut taken = Vec::new();
+    inbox
+        .drain(&mut |_, header, _| {
+            taken.push(header.seq);
+            publish(header.seq + 1);
+        })
+        .expect("drain");
+    assert_eq!(taken, (0..16).collect::<Vec<_>>());
+    assert_eq!(sequences(&inbox).len(), 1);
+}
