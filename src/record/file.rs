@@ -3,7 +3,7 @@
 //! Invariant: every channel the registry lets expect is in the file from the start, so that a
 //! modality that never appears is still named.
 //! Invariant: only whole chunks reach the file: what a crash leaves ends between two records, save
-//! for a write that the crash or the disk cut in two, and nothing follows it.
+//! for a write that the crash cut in two.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -52,43 +52,9 @@ impl Sink for File {
     }
 }
 
-/// Takes nothing more after its first error. The writer writes a summary when it is dropped, and
-/// behind half a chunk, on a disk that has room again, that would be taken for the chunk's rest.
-struct Fused {
-    sink: Box<dyn Sink>,
-    broken: bool,
-}
-
-impl Fused {
-    fn new(sink: Box<dyn Sink>) -> Self {
-        Self { sink, broken: false }
-    }
-
-    fn pass<T>(&mut self, work: impl FnOnce(&mut (dyn Sink + 'static)) -> io::Result<T>) -> io::Result<T> {
-        if self.broken {
-            return Err(io::Error::other("an earlier write failed"));
-        }
-        let result = work(self.sink.as_mut());
-        self.broken = result.as_ref().is_err_and(|error| error.kind() != io::ErrorKind::Interrupted);
-        result
-    }
-}
-
-impl Write for Fused {
-    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        self.pass(|sink| sink.write(bytes))
-    }
-
-    fn flush(&mut self) -> io::Result<()> {
-        self.pass(Write::flush)
-    }
-}
-
-type FileWriter = Writer<NoSeek<BufWriter<Fused>>>;
-
 /// See the module's comment.
 pub(super) struct EpisodeFile {
-    writer: FileWriter,
+    writer: Writer<NoSeek<BufWriter<Box<dyn Sink>>>>,
     clock: WallClock,
     message: Vec<u8>,
     tracks: Vec<Option<Track>>,
@@ -127,7 +93,7 @@ impl EpisodeFile {
             .chunk_size(Some(CHUNK_BYTES))
             .disable_seeking(true)
             .library(concat!("rapid/", env!("CARGO_PKG_VERSION")));
-        let sink = NoSeek::new(BufWriter::with_capacity(BUFFER_BYTES, Fused::new(sink)));
+        let sink = NoSeek::new(BufWriter::with_capacity(BUFFER_BYTES, sink));
         let mut writer = Writer::with_options(sink, options).map_err(io_error)?;
         writer.write_metadata(&Metadata { name: "rapid".to_owned(), metadata }).map_err(io_error)?;
         let wall_ns = clock.wall_ns(begin);
@@ -221,7 +187,7 @@ impl EpisodeFile {
         self.writer.finish().map_err(io_error)?;
         let buffered = self.writer.into_inner().into_inner();
         let mut sink = buffered.into_inner().map_err(io::IntoInnerError::into_error)?;
-        sink.pass(Sink::sync)
+        sink.sync()
     }
 
     fn write(&mut self, channel_id: u16, sequence: u64, log_time: u64, published: Stamp) -> io::Result<()> {
@@ -235,7 +201,11 @@ impl EpisodeFile {
 }
 
 impl Track {
-    fn channel(&mut self, writer: &mut FileWriter, schema: SampleSchema) -> io::Result<u16> {
+    fn channel(
+        &mut self,
+        writer: &mut Writer<NoSeek<BufWriter<Box<dyn Sink>>>>,
+        schema: SampleSchema,
+    ) -> io::Result<u16> {
         if let Some(Some(channel)) = self.channels.get(schema.index()) {
             return Ok(*channel);
         }
@@ -248,7 +218,7 @@ impl Track {
 }
 
 fn add_channel(
-    writer: &mut FileWriter,
+    writer: &mut Writer<NoSeek<BufWriter<Box<dyn Sink>>>>,
     schema: Schema,
     topic: &str,
     metadata: &BTreeMap<String, String>,
