@@ -17,6 +17,8 @@ pub struct Inbox {
 struct Subscription {
     id: TopicId,
     name: String,
+    /// Samples that can wait here.
+    depth: usize,
     subscriber: Subscriber<Service, [u8], SampleHeader>,
 }
 
@@ -36,7 +38,7 @@ impl Inbox {
                     }
                     other => topic_error(&spec.name, &other),
                 })?;
-            Ok(Subscription { id: spec.id, name: spec.name.clone(), subscriber })
+            Ok(Subscription { id: spec.id, name: spec.name.clone(), depth: spec.depth, subscriber })
         };
         let topics = topics.iter().map(subscribe).collect::<Result<Vec<_>, BusError>>()?;
         let wake = wake.listener_builder().create().map_err(|error| topic_error(super::WAKE_SERVICE, &error))?;
@@ -52,22 +54,28 @@ impl Inbox {
         self.wake.timed_wait(|_| {}, timeout).map(|_| ()).map_err(|error| topic_error(super::WAKE_SERVICE, &error))
     }
 
-    /// Hands over every sample that waits, oldest first within a topic; the bytes are lent from
-    /// shared memory for the call.
+    /// Hands over every sample that waits at the time of the call, oldest first within a topic; the
+    /// bytes are lent from shared memory for the call. Ends however fast more are published.
     ///
     /// # Errors
-    /// When a topic cannot be read; what was handed over before stays handed over.
+    /// The first topic that cannot be read; the others are handed over all the same.
     pub fn drain(&self, take: &mut dyn FnMut(TopicId, &SampleHeader, &[u8])) -> Result<(), BusError> {
+        let mut result = Ok(());
         for topic in &self.topics {
-            loop {
-                let received = topic
-                    .subscriber
-                    .receive()
-                    .map_err(|error| BusError::Transfer { topic: topic.name.clone(), reason: format!("{error:?}") })?;
-                let Some(sample) = received else { break };
-                take(topic.id, sample.user_header(), sample.payload());
+            // No more than this wait at any time: a topic that is filled faster than `take` empties
+            // it must not keep the others, or the caller, waiting.
+            for _ in 0..topic.depth {
+                match topic.subscriber.receive() {
+                    Ok(Some(sample)) => take(topic.id, sample.user_header(), sample.payload()),
+                    Ok(None) => break,
+                    Err(error) => {
+                        let (topic, reason) = (topic.name.clone(), format!("{error:?}"));
+                        result = result.and(Err(BusError::Transfer { topic, reason }));
+                        break;
+                    }
+                }
             }
         }
-        Ok(())
+        result
     }
 }

@@ -206,3 +206,21 @@ fn one_subscriber_too_many_is_told_how_many_there_may_be() {
     let error = bus.inbox().expect_err("too many");
     assert_eq!(error.to_string(), "topic /rapid/serial/motor: 8 programs subscribe already, and no more may; end one");
 }
+
+#[test]
+fn a_topic_filled_faster_than_it_is_emptied_does_not_hold_the_consumer() {
+    let (registry, bus) = open("i", 16);
+    let inbox = bus.inbox().expect("inbox");
+    let writer = bus.writer(TopicId::Modality(registry.devices[0].id)).expect("writer");
+    let publish = |seq| writer.publish(SampleHeader { seq, ..SampleHeader::default() }, &[1]).expect("publish");
+    publish(0);
+    let mut taken = Vec::new();
+    inbox
+        .drain(&mut |_, header, _| {
+            taken.push(header.seq);
+            publish(header.seq + 1);
+        })
+        .expect("drain");
+    assert_eq!(taken, (0..16).collect::<Vec<_>>());
+    assert_eq!(sequences(&inbox).len(), 1);
+}

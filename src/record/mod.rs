@@ -12,6 +12,7 @@
 pub mod encode;
 mod episode;
 mod file;
+mod hole;
 pub mod inspect;
 mod metadata;
 mod recorder;

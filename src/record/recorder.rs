@@ -22,7 +22,8 @@ use tokio::sync::oneshot;
 use super::RecordError;
 use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest};
 use super::file::Sink;
-use super::session::{Attached, Beginning, Hole, MaskHistory, Session};
+use super::hole::Last;
+use super::session::{Attached, Beginning, MaskHistory, Session};
 use super::source::Source;
 use crate::bus::TopicId;
 use crate::mask::PhysicalMask;
@@ -145,14 +146,6 @@ struct Streams {
     /// The last sample of each modality.
     last: [Option<Last>; MAX_MODALITIES],
     last_mask: Option<Last>,
-}
-
-/// What of a sample says whether others are missing between it and the next.
-#[derive(Debug, Clone, Copy)]
-struct Last {
-    seq: u64,
-    lost: u64,
-    captured: Stamp,
 }
 
 enum Turn {
@@ -353,7 +346,7 @@ impl Streams {
         match topic {
             TopicId::Modality(id) => {
                 let now = Last { seq: header.seq, lost: header.lost, captured: Stamp(header.capture_ns) };
-                let hole = self.last.get_mut(id.index()).and_then(|last| hole(last.replace(now)?, now));
+                let hole = self.last.get_mut(id.index()).and_then(|last| last.replace(now)?.hole(now));
                 if let Some(session) = session {
                     session.sample(id, header, payload, hole);
                 }
@@ -361,7 +354,7 @@ impl Streams {
             TopicId::Mask => {
                 let Some((mask, sequence)) = read_mask(payload) else { return };
                 let now = Last { seq: sequence, lost: 0, captured: Stamp(header.capture_ns) };
-                let hole = self.last_mask.replace(now).and_then(|last| hole(last, now));
+                let hole = self.last_mask.replace(now).and_then(|last| last.hole(now));
                 self.masks.push(header, mask, sequence);
                 if let Some(session) = session {
                     session.mask(header, mask, sequence, hole);
@@ -369,14 +362,6 @@ impl Streams {
             }
         }
     }
-}
-
-/// What is missing between two samples. A number below the expected one is a publisher that began
-/// anew: nothing is known to be missing.
-fn hole(last: Last, now: Last) -> Option<Hole> {
-    let missing = now.seq.checked_sub(last.seq)?.checked_sub(1).filter(|missing| *missing > 0)?;
-    let lost = now.lost.saturating_sub(last.lost).min(missing);
-    Some(Hole { after: last.captured, before: now.captured, lost, dropped: missing - lost })
 }
 
 fn read_mask(payload: &[u8]) -> Option<(PhysicalMask, u64)> {

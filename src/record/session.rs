@@ -25,6 +25,7 @@ use std::time::Duration;
 use super::encode::EventText;
 use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest};
 use super::file::{EpisodeFile, Sink};
+use super::hole::Hole;
 use super::metadata::{self, Ending};
 use crate::mask::PhysicalMask;
 use crate::modality::{MAX_MODALITIES, ModalityId};
@@ -66,37 +67,6 @@ pub(super) struct Tally {
     /// Of `dropped`, those not announced yet.
     unannounced: u64,
     announced: Option<Stamp>,
-}
-
-/// Samples missing between two that came.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Hole {
-    /// Capture of the sample before the hole.
-    pub(super) after: Stamp,
-    /// Capture of the sample behind the hole.
-    pub(super) before: Stamp,
-    /// Of the missing ones, those that the device lost.
-    pub(super) lost: u64,
-    /// Of the missing ones, those that were on their way.
-    pub(super) dropped: u64,
-}
-
-impl Hole {
-    /// How many of `count` samples that are missing here were captured before `moment`, if they lie
-    /// at even distances.
-    fn before(&self, moment: Stamp, count: u64) -> u64 {
-        let span = u128::from(self.before.0.saturating_sub(self.after.0));
-        let until = u128::from(moment.0.saturating_sub(self.after.0));
-        if span == 0 {
-            return if moment > self.before { count } else { 0 };
-        }
-        if until >= span {
-            return count;
-        }
-        // Sample k of n lies at k / (n + 1) of the span. At most 2^64 * 2^64 - 2^64: no overflow.
-        let before = (until * (u128::from(count) + 1)).div_ceil(span).saturating_sub(1);
-        u64::try_from(before).unwrap_or(u64::MAX).min(count)
-    }
 }
 
 /// The last publications of the mask, in the order of publication.

@@ -120,7 +120,9 @@ pub(super) fn read<'a>(text: &'a str, problems: &mut Problems<'a>) -> Spanned<De
 fn syntax_fix(message: &str, source: &str) -> String {
     let (key, value) = source.split_once('=').unwrap_or((source, ""));
     let digits = value.split_whitespace().next().unwrap_or_default();
-    if message == "duplicate key" && source.starts_with('[') && source.contains("serial") {
+    let is_serial_table = (message == "duplicate key" && source.starts_with('[') && source.contains("serial"))
+        || (message.starts_with("cannot extend value") && source.contains("serial."));
+    if is_serial_table {
         "`serial` can stand only once in an entry: beside a [device.NAME.serial] table write the device's serial \
          number as `serial_number = \"...\"`"
             .to_owned()

@@ -44,8 +44,10 @@ pub struct SyncModality {
 /// The rules, for a tick and a moment `now` at which it is evaluated:
 ///
 /// 1. A sample counts only if it was received and captured by `now`.
-/// 2. A sample of an older epoch than the newest epoch that counts by rule 1 does not count: what
-///    was seen before the device was last attached says nothing about what is attached.
+/// 2. A sample of an older epoch than the newest one of which a sample that counts by rule 1 was
+///    captured by the end of the window does not count: what was seen before the device was last
+///    attached says nothing about what is attached. A replug later than that is another tick's:
+///    who looks back at a tick sees what was to be seen at it.
 /// 3. Bit clear in the mask: absent. Not valid, not stale, nothing kept, whatever the ring holds.
 /// 4. Bit set: of the samples that count, the one captured nearest to the tick is chosen if it lies
 ///    within the window (both ends included); of two equally near the earlier, then the one of the
@@ -133,7 +135,8 @@ impl<T> Synchronizer<T> {
 impl<T> Lane<T> {
     fn choose(&self, tick: Stamp, now: Stamp, window_ns: u64, slot: &mut Slot) {
         let known = || self.ring.iter().filter(move |(_, s)| s.recv <= now && s.capture <= now);
-        let epoch = known().map(|(_, s)| s.epoch).max().unwrap_or(Epoch(0));
+        let reach = tick.0.saturating_add(window_ns);
+        let epoch = known().filter(|(_, s)| s.capture.0 <= reach).map(|(_, s)| s.epoch).max().unwrap_or(Epoch(0));
         let current = || known().filter(move |(_, s)| s.epoch == epoch);
 
         let nearest = current()

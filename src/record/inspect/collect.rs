@@ -167,6 +167,8 @@ impl Collected {
             seconds,
             messages: self.messages,
             dropped: said(&self.summary, "dropped").parse().ok(),
+            lost: said(&self.summary, "lost").parse().ok(),
+            damaged: said(&self.summary, "damaged").parse().ok(),
             frames: self.frames,
             modalities,
             topics,

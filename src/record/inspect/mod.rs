@@ -33,6 +33,9 @@ pub enum InspectError {
         /// What the system says.
         source: io::Error,
     },
+    /// It is a folder, a pipe or a device.
+    #[error("{}: not a file; name an episode, a file that ends in .mcap or .mcap.partial", .0.display())]
+    NotFile(PathBuf),
     /// It does not begin as an MCAP file does.
     #[error("{}: not an MCAP file", .0.display())]
     NotMcap(PathBuf),
@@ -67,6 +70,10 @@ pub struct Inspection {
     pub messages: u64,
     /// Samples the recorder says were lost on the way to the file; unknown in an unfinished file.
     pub dropped: Option<u64>,
+    /// Samples the recorder says the devices lost themselves; unknown in an unfinished file.
+    pub lost: Option<u64>,
+    /// Samples the drivers called damaged; unknown in an unfinished file.
+    pub damaged: Option<u64>,
     /// Ticks of the frame index.
     pub frames: u64,
     /// The modalities, ascending by bit.
@@ -155,6 +162,11 @@ pub struct EventReport {
 /// When it cannot be read or is no MCAP file. An unfinished or damaged one is no error.
 pub fn inspect(path: &Path) -> Result<Inspection, InspectError> {
     let io = |source| InspectError::Io { path: path.to_owned(), source };
+    // Asked before it is opened: opening a pipe would wait for its writer.
+    let metadata = std::fs::metadata(path).map_err(io)?;
+    if !metadata.is_file() {
+        return Err(InspectError::NotFile(path.to_owned()));
+    }
     let file = File::open(path).map_err(io)?;
     let size = file.metadata().map_err(io)?.len();
     // One that grows meanwhile is read as it was.

@@ -46,6 +46,14 @@ fn write_all(out: &mut String, inspection: &Inspection, width: usize, paint: Pai
         inspection.messages,
         inspection.frames
     )?;
+    let others = [(inspection.lost, "lost by the devices themselves"), (inspection.damaged, "damaged")];
+    let others: Vec<_> = others
+        .into_iter()
+        .filter_map(|(count, what)| Some(format!("{} {what}", count.filter(|count| *count > 0)?)))
+        .collect();
+    if !others.is_empty() {
+        writeln!(out, "{}", colour(paint, YELLOW, &others.join(", ")))?;
+    }
 
     let names = inspection.modalities.iter().map(|modality| clean(&modality.name).chars().count());
     let topics = inspection.topics.iter().map(|topic| clean(&topic.topic).chars().count());

@@ -23,6 +23,7 @@ async fn a_finished_episode_is_told_as_it_was() {
     assert_eq!((said.end, said.unread_bytes, said.damaged_chunks), (FileEnd::Finished, 0, 0));
     assert_eq!((said.rig.as_str(), said.task.as_str(), said.tags["finger"].as_str()), ("bench", "place block", "soft"));
     assert_eq!((said.seconds, said.frames, said.dropped), (1.0, 30, Some(1)));
+    assert_eq!((said.lost, said.damaged), (Some(7), Some(1)));
     let names: Vec<_> = said.modalities.iter().map(|m| (m.bit, m.name.as_str())).collect();
     assert_eq!(names, [(0, "cam_wrist"), (1, "tof"), (5, "never"), (7, "raw")]);
     let [cam, tof, never, raw] = said.modalities.as_slice() else { unreachable!() };
@@ -141,6 +142,10 @@ fn what_is_no_mcap_file_is_said() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("x.mcap");
     assert!(matches!(inspect(&path), Err(InspectError::Io { .. })));
+    assert!(inspect(folder.path()).unwrap_err().to_string().contains(": not a file"));
+    let pipe = folder.path().join("pipe");
+    rustix::fs::mknodat(rustix::fs::CWD, &pipe, rustix::fs::FileType::Fifo, 0o600.into(), 0).unwrap();
+    assert!(matches!(inspect(&pipe), Err(InspectError::NotFile(_))));
     std::fs::write(&path, "no").unwrap();
     let error = inspect(&path).unwrap_err();
     assert!(error.to_string().ends_with("x.mcap: not an MCAP file"));
@@ -171,6 +176,8 @@ fn the_report_on_a_screen() {
         seconds: 10.0,
         messages: 5300,
         dropped: None,
+        lost: Some(3),
+        damaged: None,
         frames: 300,
         modalities: vec![
             ModalityReport {

@@ -1,0 +1,169 @@
+//! Disks that fail, kills and panics.
+
+use super::*;
+
+/// A disk of few bytes.
+struct SmallDisk(File, usize);
+
+impl Write for SmallDisk {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        if self.1 == 0 {
+            return Err(io::ErrorKind::StorageFull.into());
+        }
+        let taken = self.0.write(&bytes[..bytes.len().min(self.1)])?;
+        self.1 -= taken;
+        Ok(taken)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.0.flush()
+    }
+}
+
+impl Sink for SmallDisk {
+    fn sync(&mut self) -> io::Result<()> {
+        self.0.sync_all()
+    }
+}
+
+#[tokio::test]
+async fn a_full_disk_ends_the_episode_and_not_the_recorder() {
+    let mut episodes = 0;
+    let bench = Bench::with_sink(move |file| {
+        episodes += 1;
+        if episodes == 1 { Box::new(SmallDisk(file, 100_000)) } else { Box::new(file) }
+    });
+    let mut events = bench.board.events();
+    let finished = bench.recorder.start(bench.request(None)).await.unwrap();
+    for seq in 0..4000 {
+        bench.sample(CAM, 1, seq, Stamp::now().0, 0);
+    }
+    let What::Episode { file, bytes, error, .. } = bench.until_closed(&mut events).await else { unreachable!() };
+    assert_eq!(file, finished.with_extension("mcap.partial"));
+    assert_eq!(bytes, 100_000);
+    let error = error.unwrap();
+    assert!(error.contains("no storage space") && error.contains("place-block_001.mcap.partial"), "{error}");
+    assert!(!finished.exists() && bench.board.snapshot().recording.is_none());
+    // The next one goes well.
+    let second = bench.recorder.start(bench.request(None)).await.unwrap();
+    assert!(second.to_str().unwrap().ends_with("_002.mcap"));
+    assert_eq!(bench.recorder.stop().await.unwrap().error, None);
+}
+
+/// A disk that is full once and has room again.
+struct Recovering(SmallDisk);
+
+impl Write for Recovering {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let written = self.0.write(bytes);
+        if written.is_err() {
+            self.0.1 = usize::MAX;
+        }
+        written
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.0.flush()
+    }
+}
+
+impl Sink for Recovering {
+    fn sync(&mut self) -> io::Result<()> {
+        self.0.sync()
+    }
+}
+
+#[tokio::test]
+async fn nothing_is_written_behind_a_write_that_failed() {
+    let bench = Bench::with_sink(|file| Box::new(Recovering(SmallDisk(file, 100_000))));
+    let mut events = bench.board.events();
+    bench.recorder.start(bench.request(None)).await.unwrap();
+    for seq in 0..4000 {
+        bench.sample(CAM, 1, seq, Stamp::now().0, 0);
+    }
+    let What::Episode { file, bytes, error, .. } = bench.until_closed(&mut events).await else { unreachable!() };
+    assert!(error.is_some());
+    assert_eq!(bytes, 100_000);
+    assert_eq!(inspect::inspect(&file).unwrap().end, inspect::FileEnd::Torn);
+}
+
+/// A disk that takes everything and keeps nothing for sure.
+struct Unsure(File);
+
+impl Write for Unsure {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0.write(bytes)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.0.flush()
+    }
+}
+
+impl Sink for Unsure {
+    fn sync(&mut self) -> io::Result<()> {
+        Err(io::Error::other("cable of the disk pulled"))
+    }
+}
+
+#[tokio::test]
+async fn a_file_that_is_not_on_the_disk_keeps_its_partial_name() {
+    let bench = Bench::with_sink(|file| Box::new(Unsure(file)));
+    let finished = bench.recorder.start(bench.request(None)).await.unwrap();
+    let report = bench.recorder.stop().await.unwrap();
+    assert_eq!(report.file, finished.with_extension("mcap.partial"));
+    assert!(report.error.unwrap().contains("cable of the disk pulled") && !finished.exists());
+    assert_eq!(bench.board.snapshot().last_episode, None);
+}
+
+#[tokio::test]
+async fn a_disk_full_at_the_start_is_said_and_leaves_nothing() {
+    let bench = Bench::with_sink(|file| Box::new(SmallDisk(file, 0)));
+    let mut request = bench.request(None);
+    // More than the buffer in front of the disk holds.
+    request.task = "x".repeat(200_000);
+    let error = bench.recorder.start(request).await.unwrap_err();
+    assert!(error.to_string().contains("no storage space"), "{error}");
+    assert_eq!(std::fs::read_dir(bench.folder.path().join("out")).unwrap().count(), 0);
+    assert!(matches!(bench.recorder.stop().await, Err(RecordError::Idle)));
+}
+
+#[tokio::test]
+async fn a_partial_file_holds_what_was_flushed() {
+    let bench = Bench::new();
+    let finished = bench.recorder.start(bench.request(None)).await.unwrap();
+    let partial = finished.with_extension("mcap.partial");
+    for seq in 0..10 {
+        bench.sample(TOF, 1, seq, Stamp::now().0, 0);
+    }
+    // As a kill would leave it: the file as it is at a moment before its end.
+    let said = loop {
+        match inspect::inspect(&partial) {
+            Ok(said) if said.modalities.iter().any(|m| m.topic.messages == 10) => break said,
+            _ => tokio::time::sleep(Duration::from_millis(20)).await,
+        }
+    };
+    assert_eq!((said.end, said.damaged_chunks, said.dropped), (inspect::FileEnd::Unfinished, 0, None));
+    assert_eq!((said.rig.as_str(), said.modalities.len()), ("bench", 4));
+    assert!(!finished.exists());
+    bench.recorder.stop().await.unwrap();
+    assert!(finished.exists() && !partial.exists());
+}
+
+#[tokio::test]
+async fn a_panic_leaves_a_finished_file_and_says_so() {
+    let bench = Bench::new();
+    let mut events = bench.board.events();
+    let finished = bench.recorder.start(bench.request(None)).await.unwrap();
+    let now = Stamp::now();
+    bench.sample(TOF, 1, 0, now.0, 0);
+    while bench.board.snapshot().recording.is_none_or(|status| status.bytes == 0) {
+        tokio::task::yield_now().await;
+    }
+    bench.script.panic();
+    let What::Episode { file, error, .. } = bench.until_closed(&mut events).await else { unreachable!() };
+    assert_eq!(file, finished);
+    assert!(error.unwrap().contains("scripted panic"));
+    assert_eq!(read(&finished).on("/rapid/tof").count(), 1);
+    assert!(matches!(bench.recorder.start(bench.request(None)).await, Err(RecordError::Ended)));
+}

@@ -1,0 +1,134 @@
+//! A session on a clock of its own: deadlines, losses, edges.
+
+use super::super::episode::EpisodePath;
+use super::super::hole::Hole;
+use super::super::session::{Beginning, MaskHistory, Session};
+use super::*;
+use crate::time::WallClock;
+
+/// A session of its own clock, one second after the monotonic clock's zero.
+fn session(folder: &Path, board: &Arc<Board>, masks: &MaskHistory) -> Session {
+    let clock = WallClock::with_offset(i128::from(1_700_000_000 * 1000 * MS));
+    let (path, file) = EpisodePath::create(folder, "t", clock.wall_ns(Stamp(0))).unwrap();
+    let beginning = Beginning {
+        registry: Arc::new(registry()),
+        board: Arc::clone(board),
+        request: &EpisodeRequest::default(),
+        path,
+        sink: Box::new(file),
+        attached: &BTreeMap::new(),
+        clock,
+        begin: Stamp(1000 * MS),
+    };
+    Session::begin(beginning, masks).unwrap()
+}
+
+fn scalars(seq: u64, capture_ms: u64, recv_ms: u64) -> SampleHeader {
+    SampleHeader {
+        seq,
+        capture_ns: capture_ms * MS,
+        recv_ns: recv_ms * MS,
+        encoding: Encoding::F64 as u32,
+        ..SampleHeader::default()
+    }
+}
+
+#[test]
+fn what_comes_late_is_recorded_and_what_comes_too_late_belongs_to_no_frame() {
+    let folder = tempfile::tempdir().unwrap();
+    let board = Arc::new(Board::new(&registry()));
+    let mut masks = MaskHistory::new();
+    masks.push(&scalars(1, 990, 990), PhysicalMask(0b10), 1);
+    let mut session = session(folder.path(), &board, &masks);
+    let at = |ms: u64| Stamp(ms * MS);
+    // Tick 0 is at 1000 ms; its deadline 25 ms + 100 ms later. One sample comes in time, one does not.
+    session.sample(id(TOF), &scalars(0, 999, 999), &[0; 8], None);
+    session.sample(id(TOF), &scalars(1, 1001, 1126), &[0; 8], None);
+    session.sample(id(TOF), &scalars(2, 1010, 1124), &[0; 8], None);
+    session.advance(at(1144), &masks);
+    assert_eq!(session.status(at(1144)).messages, 3, "two samples and a mask; the frame not before 1145 ms");
+    session.advance(at(1145), &masks);
+    assert_eq!(session.status(at(1145)).messages, 4);
+
+    session.end_at(at(1100));
+    session.end_at(at(1200));
+    // Captured before the end and arriving after it; captured at the end.
+    session.sample(id(TOF), &scalars(3, 1099, 1190), &[0; 8], None);
+    session.sample(id(TOF), &scalars(4, 1100, 1190), &[0; 8], None);
+    assert!(!session.is_over(at(1219)) && session.is_over(at(1220)));
+    let report = session.finish(at(1220), &masks, None);
+    assert_eq!((report.error, report.messages), (None, 7), "one sample and two frames more");
+    assert!((report.seconds - 0.1).abs() < 1e-9);
+
+    let read = read(&report.file);
+    assert_eq!(read.on("/rapid/tof").map(|m| m.1).collect::<Vec<_>>(), [1, 2, 3]);
+    let chosen: Vec<_> = read
+        .on("/rapid/frame")
+        .map(|(.., frame)| {
+            let list = frame.get_field_by_name("modalities").unwrap();
+            let slot = list.as_list().unwrap()[1].as_message().unwrap().clone();
+            (number(&slot, "valid"), number(&slot, "seq"), number(&slot, "age_ns"))
+        })
+        .collect();
+    // Ticks at 1000, 1033.3, 1066.7 ms, and none at 1100, the end. The sample of 1001 ms is nearer to
+    // the first but came too late for it; the second has one in its window, the third holds it.
+    assert_eq!(chosen, [(1, 2, -10_000_000), (1, 2, 23_333_333), (0, 2, 56_666_666)]);
+}
+
+#[test]
+fn losses_are_announced_once_a_second_and_counted_all() {
+    let folder = tempfile::tempdir().unwrap();
+    let board = Arc::new(Board::new(&registry()));
+    let mut events = board.events();
+    let masks = MaskHistory::new();
+    let mut session = session(folder.path(), &board, &masks);
+    for n in 0..200 {
+        let now = 1000 + n * 10;
+        let hole = Hole { after: Stamp((now - 9) * MS), before: Stamp(now * MS), lost: 1, dropped: 2 };
+        session.sample(id(TOF), &scalars(n, now, now), &[0; 8], Some(hole));
+        session.advance(Stamp(now * MS), &masks);
+    }
+    // One more, so that a number of hostile size comes to the others.
+    let hole = Hole { after: Stamp(1500 * MS), before: Stamp(3000 * MS), lost: 0, dropped: u64::MAX };
+    session.sample(id(CAM), &scalars(1, 3000, 3000), &[0; 8], Some(hole));
+    assert_eq!(session.status(Stamp(0)).dropped, u64::MAX);
+    let report = session.finish(Stamp(3001 * MS), &masks, None);
+    assert_eq!((report.error, report.dropped), (None, u64::MAX));
+    let mut said = Vec::new();
+    while let Ok(event) = events.try_recv() {
+        if let What::Log { level: Level::Warn, text } = event.what {
+            said.push(text);
+        }
+    }
+    let lost = |count: u64, name: &str| format!("{name}: {count} samples lost on the way to the file");
+    assert_eq!(said, [lost(2, "tof"), lost(200, "tof"), lost(u64::MAX, "cam_wrist"), lost(196, "tof")]);
+    let tallies = &read(&report.file).metadata["rapid/summary"]["modalities"];
+    let tallies: serde_json::Value = serde_json::from_str(tallies).unwrap();
+    assert_eq!((&tallies["tof"]["samples"], &tallies["tof"]["dropped"]), (&200.into(), &398.into()));
+    // The hole before the first sample lies before the episode.
+    assert_eq!(tallies["tof"]["lost"], 199);
+}
+
+#[test]
+fn of_a_hole_across_the_beginning_or_the_end_only_the_part_within_counts() {
+    let folder = tempfile::tempdir().unwrap();
+    let board = Arc::new(Board::new(&registry()));
+    let masks = MaskHistory::new();
+    let mut session = session(folder.path(), &board, &masks);
+    let hole = |after: u64, before: u64, missing| {
+        Some(Hole { after: Stamp(after * MS), before: Stamp(before * MS), lost: 0, dropped: missing })
+    };
+    // Every 10 ms; the episode begins at 1000 ms: 960 to 990 do not count.
+    session.sample(id(TOF), &scalars(9, 1050, 1050), &[0; 8], hole(950, 1050, 9));
+    assert_eq!(session.status(Stamp(0)).dropped, 5);
+    // As after a disk that stood still beyond the end: what is left is of later moments, and yet 1060
+    // to 1090 ms are lost.
+    session.end_at(Stamp(1100 * MS));
+    session.sample(id(TOF), &scalars(29, 1250, 1250), &[0; 8], hole(1050, 1250, 19));
+    assert_eq!(session.status(Stamp(0)).dropped, 9);
+    // Neither a hole in another time nor one of no length.
+    session.sample(id(TOF), &scalars(40, 1300, 1300), &[0; 8], hole(1250, 1300, 10));
+    session.sample(id(TOF), &scalars(50, 1300, 1300), &[0; 8], hole(1300, 1300, 10));
+    let report = session.finish(Stamp(1300 * MS), &masks, None);
+    assert_eq!((report.error, report.dropped), (None, 9));
+}
