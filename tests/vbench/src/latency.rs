@@ -1,4 +1,4 @@
-//! Delays between what was done to a device and what came of it.
+//! Delays between what was done to a device and what came of it, and between one event and the next.
 //!
 //! Invariant: an effect counts for a cause only before the next cause; what never came is counted, not left out.
 
@@ -24,6 +24,14 @@ impl Delays {
         }
         delays.found.sort_by(f64::total_cmp);
         delays
+    }
+
+    /// The time from each of these moments to the next; ns on one clock, sorted.
+    pub fn apart(moments: &[u64]) -> Self {
+        let gaps = moments.iter().zip(moments.iter().skip(1)).map(|(one, next)| one.abs_diff(*next));
+        let mut found: Vec<f64> = gaps.map(|gap| gap as f64 / 1e6).collect();
+        found.sort_by(f64::total_cmp);
+        Self { found, missing: 0 }
     }
 
     /// The value that this share of the delays does not exceed (nearest rank).
@@ -56,5 +64,12 @@ mod tests {
         let delays = Delays::between(&ms(&[100, 200, 300]), &ms(&[50, 130, 140, 310]));
         assert_eq!(delays.to_string(), "n=2/3 min=10.0 p50=10.0 p95=30.0 max=30.0 ms");
         assert_eq!(Delays::between(&[], &[]).to_string(), "n=0/0 ms");
+    }
+
+    #[test]
+    fn moments_have_one_gap_less_than_there_are_moments() {
+        let gaps = Delays::apart(&[1_000_000, 3_000_000, 4_000_000, 9_000_000]);
+        assert_eq!(gaps.to_string(), "n=3/3 min=1.0 p50=2.0 p95=5.0 max=5.0 ms");
+        assert_eq!(Delays::apart(&[7]).to_string(), "n=0/0 ms");
     }
 }

@@ -1,5 +1,6 @@
 //! `vbench-cycles [N] [OUT_MS] [IN_MS]`: pulls and replugs a camera N times while `rapid` records, and prints how soon the
-//! mask and the data follow. A benchmark: it prints figures and asserts nothing about them.
+//! mask and the data follow, and how evenly the mask is published. A benchmark: it prints figures and asserts nothing
+//! about them.
 
 use std::process::ExitCode;
 use std::time::Duration;
@@ -13,6 +14,7 @@ use vbench::recording::{falls, rises};
 use vbench::scenario::Scenario;
 
 const TOPIC: &str = "/rapid/camera/wrist";
+const MASK: &str = "/rapid/mask";
 const REGISTRY: &str = r#"
 [rig]
 name = "vbench"
@@ -102,6 +104,8 @@ fn report(outcome: &Outcome) -> Result<(), Box<dyn std::error::Error>> {
     let real = |moments: &[Moment]| moments.iter().map(|moment| moment.real_ns).collect::<Vec<_>>();
     let mut samples: Vec<u64> = episode.topic(TOPIC).map(|message| message.log_time).collect();
     samples.sort_unstable();
+    let mut published: Vec<u64> = episode.topic(MASK).map(|message| message.log_time).collect();
+    published.sort_unstable();
 
     let rows = [
         ("unplug -> bit 0, shared memory", Delays::between(&mono(&unplugs), &seen(outcome, false))),
@@ -109,6 +113,7 @@ fn report(outcome: &Outcome) -> Result<(), Box<dyn std::error::Error>> {
         ("plug -> first recorded sample", Delays::between(&real(&plugs), &samples)),
         ("plug -> bit 1, shared memory", Delays::between(&mono(&plugs), &seen(outcome, true))),
         ("plug -> bit 1, mask channel", Delays::between(&real(&plugs), &rises(&edges, 0))),
+        ("mask, one message to the next", Delays::apart(&published)),
     ];
     for (what, delays) in rows {
         println!("{what:<32} {delays}");
