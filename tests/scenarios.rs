@@ -418,7 +418,8 @@ fn metadata(run: &Run) {
         let said = &counted[&device.name];
         let messages = run.messages(device);
         let bytes: usize = messages.iter().map(|message| message.payload().len()).sum();
-        let expected = serde_json::json!({"samples": messages.len(), "bytes": bytes, "dropped": 0, "damaged": 0});
+        let expected =
+            serde_json::json!({"samples": messages.len(), "bytes": bytes, "lost": 0, "dropped": 0, "damaged": 0});
         assert_eq!(*said, expected, "{}", device.name);
     }
     for (key, expected) in [("dropped", 0), ("masks_dropped", 0), ("events_missed", 0)] {

@@ -6,6 +6,7 @@ use super::style::Palette;
 use crate::modality::ModalityId;
 use crate::status::{DeviceStatus, Event, Snapshot, What};
 use crate::text;
+use crate::time::Stamp;
 
 /// An event with its time on the wall clock.
 #[derive(Serialize)]
@@ -24,6 +25,7 @@ pub(super) fn json(event: &Event, wall_ns: u64) -> serde_json::Result<String> {
 #[derive(Serialize)]
 #[serde(tag = "event", rename = "begin")]
 struct Begin<'a> {
+    stamp: Stamp,
     rig: &'a str,
     devices: Vec<BeginDevice<'a>>,
     time: String,
@@ -42,6 +44,7 @@ pub(super) fn begin_json(snapshot: &Snapshot, wall_ns: u64) -> serde_json::Resul
         BeginDevice { device: &device.name, bit: device.id, topic: &device.topic }
     }
     serde_json::to_string(&Begin {
+        stamp: snapshot.taken,
         rig: &snapshot.rig,
         devices: snapshot.devices.iter().map(device).collect(),
         time: crate::time::rfc3339(wall_ns),
