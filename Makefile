@@ -38,7 +38,8 @@ check: setup-build lint ## lints, documentation, licences, bans, sources and kno
 
 bench: setup ## print figures from the virtual bench; nothing passes or fails
 	cargo build --release --locked
-	RAPID_BIN='$(TARGET)/release/rapid' cargo run --release --locked -p vbench --bin vbench-cycles
+	cargo build --release --locked -p vbench --bins
+	RAPID_BIN='$(TARGET)/release/rapid' '$(TARGET)/release/vbench-cycles'
 
 clean: ## remove what was built here (what setup fetched stays)
 	cargo clean
