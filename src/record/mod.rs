@@ -21,10 +21,10 @@ mod session;
 mod source;
 #[cfg(test)]
 mod tests;
-mod walk;
-mod wire;
 
 use std::path::PathBuf;
+
+use crate::episode_format::{walk, wire};
 
 pub use episode::{EpisodeReport, EpisodeRequest};
 pub use file::Sink;
