@@ -19,7 +19,7 @@
 //!
 //!  L1   registry                                 devices.toml, checked
 //!       status                                   the board every stage reports on
-//!       text   outlet                            words and lines for people
+//!       text   outlet   folder                   words and lines for people; files others cannot lead astray
 //!  L0   modality   mask   sample   time          nouns
 //! ```
 //!
@@ -82,6 +82,7 @@ pub mod cli;
 pub mod commands;
 pub mod dispatch;
 pub mod driver;
+pub mod folder;
 pub mod headless;
 pub mod hotplug;
 pub mod logging;
