@@ -22,6 +22,7 @@ use crate::record::{self, EpisodeRequest, RecordError};
 use crate::registry::scenario::Scenario;
 use crate::registry::{Registry, RegistryErrors};
 use crate::rig::presence::{PresenceError, json_path, read_mask};
+use crate::text;
 
 /// Tasks that are left at the end have this long to go.
 const LAST_TASKS: Duration = Duration::from_millis(500);
@@ -100,7 +101,9 @@ pub fn dispatch(cli: Cli) -> ExitCode {
         // Whoever read the output has read enough of it.
         Err(Failure::Output(error)) if error.kind() == io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
         Err(failure) => {
-            let text = failure.to_string();
+            // Paths and what a library says of a file are text of strangers.
+            let text: Vec<_> = failure.to_string().lines().map(|line| text::plain(line).into_owned()).collect();
+            let text = text.join("\n");
             if !text.is_empty() {
                 let _ = writeln!(io::stderr(), "{} {text}", stderr_palette().bad("error:"));
             }
@@ -142,8 +145,7 @@ fn print(global: &Global, before: SimArgs, command: Command) -> Result<(), Failu
         Command::Inspect { file } => {
             let inspection = inspect::inspect(&file)?;
             if format == Format::Json {
-                serde_json::to_writer(&mut *out, &inspection).map_err(io::Error::from)?;
-                return Ok(writeln!(out)?);
+                return Ok(writeln!(out, "{}", text::json(&inspection).map_err(io::Error::from)?)?);
             }
             Ok(out.write_all(inspect::render(&inspection, columns(), paint()).as_bytes())?)
         }

@@ -21,7 +21,7 @@ use super::trust::distrust;
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use device::Draft;
 
-pub(super) use device::{check_serial, is_port};
+pub(super) use device::is_port;
 pub(super) use file::read_file;
 
 /// The registry used when there is no file: the rig `rapid --sim` simulates.
