@@ -225,7 +225,7 @@ impl Printer {
         let tally = std::mem::replace(&mut self.tally, Tally::new(end));
         let summary = tally.summary(end);
         let text = if self.json {
-            serde_json::to_string(&summary)?
+            text::json(&summary)?
         } else {
             summary.text(self.columns.name, self.columns.palette)
         };

@@ -26,7 +26,7 @@ use std::path::PathBuf;
 
 use crate::episode_format::{walk, wire};
 
-pub use episode::{EpisodeReport, EpisodeRequest};
+pub use episode::{EpisodeReport, EpisodeRequest, open_folder};
 pub use file::Sink;
 pub use recorder::{Recorder, RecorderConfig};
 pub use source::Source;
@@ -45,6 +45,9 @@ pub enum RecordError {
         /// What the system says.
         source: std::io::Error,
     },
+    /// The folder lies behind a link of somebody else, or cannot be entered.
+    #[error("{0}; or choose another with --out")]
+    Folder(crate::folder::FolderError),
     /// There is an episode in progress.
     #[error("already recording {}", .0.display())]
     Busy(PathBuf),

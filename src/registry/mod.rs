@@ -13,6 +13,7 @@ pub mod scenario;
 mod scenario_file;
 mod section;
 mod spec;
+pub mod trust;
 mod units;
 mod words;
 

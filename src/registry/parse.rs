@@ -17,10 +17,11 @@ use std::time::Duration;
 use super::diagnostic::{Diagnostic, RegistryErrors};
 use super::section::{At, Problems, Section, file_label, read};
 use super::spec::{Registry, RigSpec};
+use super::trust::distrust;
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use device::Draft;
 
-pub(super) use device::{check_serial, is_port};
+pub(super) use device::is_port;
 pub(super) use file::read_file;
 
 /// The registry used when there is no file: the rig `rapid --sim` simulates.
@@ -50,7 +51,13 @@ impl Registry {
             "`rapid --sim` needs no file; for real devices write one, beginning from the \
                                     devices.toml of the repository, or name another with --config FILE",
         )?;
-        Self::parse(&text, Some(path))
+        let mut loaded = Self::parse(&text, Some(path))?;
+        // As root it would have been refused.
+        if let Ok(Some(reason)) = distrust(path) {
+            let (file, message, fix) = (file_label(Some(path), ""), reason.to_string(), Some(reason.fix()));
+            loaded.warnings.insert(0, Diagnostic { file, line: 0, column: 0, entry: None, message, fix });
+        }
+        Ok(loaded)
     }
 
     /// Reads the text of a `devices.toml`; `path` names it in messages.

@@ -229,7 +229,7 @@ fn serial_number(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<S
 }
 
 /// A serial number ends up in rules and descriptors: it must at least be one line of text.
-pub(crate) fn check_serial(serial: &str) -> Result<(), (String, &'static str)> {
+fn check_serial(serial: &str) -> Result<(), (String, &'static str)> {
     /// A USB string descriptor holds at most 126 UTF-16 units.
     const LONGEST: usize = 126;
     if serial.is_empty() {
