@@ -52,6 +52,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("clap_complete", &["cli", "dispatch", "main", "commands"]),
     ("crossterm", &["tui"]),
     ("futures", &["hotplug", "driver", "bus", "rig", "record", "app", "tui", "headless", "commands"]),
+    ("hdrhistogram", &["record/quality"]),
     ("humantime", &["registry", "cli", "commands"]),
     ("iceoryx2", &["bus"]),
     ("jpeg_encoder", &["driver/sim"]),

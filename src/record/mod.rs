@@ -15,12 +15,14 @@ mod file;
 mod hole;
 pub mod inspect;
 mod metadata;
+mod quality;
 mod recorder;
 pub mod schema;
 mod session;
 mod source;
 #[cfg(test)]
 mod tests;
+mod verdict;
 mod walk;
 mod wire;
 
@@ -28,6 +30,7 @@ use std::path::PathBuf;
 
 pub use episode::{EpisodeReport, EpisodeRequest};
 pub use file::Sink;
+pub use quality::{Quality, Spread};
 pub use recorder::{Recorder, RecorderConfig};
 pub use source::Source;
 
