@@ -15,12 +15,14 @@ mod file;
 mod hole;
 pub mod inspect;
 mod metadata;
+mod quality;
 mod recorder;
 pub mod schema;
 mod session;
 mod source;
 #[cfg(test)]
 mod tests;
+mod verdict;
 
 use std::path::PathBuf;
 
@@ -28,6 +30,7 @@ use crate::episode_format::{walk, wire};
 
 pub use episode::{EpisodeReport, EpisodeRequest, open_folder};
 pub use file::Sink;
+pub use quality::{Quality, Spread};
 pub use recorder::{Recorder, RecorderConfig};
 pub use source::Source;
 

@@ -99,6 +99,11 @@ fn device(bit: u8, name: &str, node: NodeSpec) -> DeviceSpec {
         max_bytes: 1 << 16,
         depth: 64,
         when_stale: WhenStale::Hold,
+        verdict: crate::registry::VerdictSpec::of(
+            crate::modality::ModalityKind::Image,
+            Duration::from_millis(500),
+            Some(30.0),
+        ),
     }
 }
 

@@ -10,6 +10,7 @@ mod budget;
 mod device;
 mod file;
 mod node;
+mod verdict;
 
 use std::path::Path;
 use std::time::Duration;
@@ -20,6 +21,7 @@ use super::spec::{Registry, RigSpec};
 use super::trust::distrust;
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use device::Draft;
+use verdict::Whose;
 
 pub(super) use device::is_port;
 pub(super) use file::read_file;
@@ -70,8 +72,9 @@ impl Registry {
         let document = read(text, &mut problems);
         problems.check()?;
         let root = Section::new(document.get_ref(), 0, String::new());
-        root.allow(&mut problems, &["rig", "device"]);
+        root.allow(&mut problems, &["rig", "verdict", "device"]);
         let rig = rig(&root, &mut problems);
+        let verdict = verdict::read(&root, Whose::Rig, &mut problems);
         let mut drafts = drafts(&root, &mut problems);
         if drafts.is_empty() && problems.is_empty() {
             return Err(nothing_registered(file));
@@ -82,7 +85,7 @@ impl Registry {
         warnings.extend(unused_ports(&drafts, &problems));
         warnings.extend(budget::fit(&mut drafts, rig.memory_budget, root.at_of("rig"), &mut problems));
         problems.check()?;
-        let mut devices: Vec<_> = drafts.into_iter().filter_map(Draft::finish).collect();
+        let mut devices: Vec<_> = drafts.into_iter().filter_map(|draft| draft.finish(&verdict)).collect();
         devices.sort_by_key(|device| device.id);
         let registry = Self { rig, devices, path: path.map(Path::to_path_buf), text: text.to_owned() };
         Ok(Loaded { registry, warnings })

@@ -9,6 +9,7 @@ mod event;
 #[cfg(test)]
 pub(crate) mod literal;
 pub mod rates;
+mod verdict;
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -22,6 +23,7 @@ use crate::time::Stamp;
 
 pub use board::Board;
 pub use event::{Event, What};
+pub use verdict::{Grade, Verdict};
 
 /// What the device of a modality is doing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize)]

@@ -2,7 +2,8 @@
 
 use std::time::Duration;
 
-use super::node;
+use super::verdict::{VerdictTable, Whose};
+use super::{node, verdict};
 use crate::modality::ModalityId;
 use crate::registry::diagnostic::{did_you_mean, nearest};
 use crate::registry::section::{At, Problems, Section};
@@ -14,7 +15,7 @@ const BUILT_IN: [(&str, Kind); 2] = [("camera", Kind::Camera), ("serial", Kind::
 const PLANNED: [&str; 3] = ["can", "lan", "process"];
 /// Keys that only planned kinds of node have.
 const PLANNED_KEYS: [&str; 6] = ["can", "lan", "process", "on_attach", "on_detach", "heartbeat"];
-const KEYS: [&str; 14] = [
+const KEYS: [&str; 15] = [
     "vid",
     "pid",
     "serial",
@@ -29,6 +30,7 @@ const KEYS: [&str; 14] = [
     "depth",
     "when_stale",
     "camera",
+    "verdict",
 ];
 
 /// The mask is 64 bits wide.
@@ -59,16 +61,20 @@ pub(super) struct Draft<'a> {
     /// The depth was written in the file and is not ours to lower.
     pub(super) depth_written: bool,
     when_stale: WhenStale,
+    verdict: VerdictTable,
 }
 
 impl Draft<'_> {
-    /// The entry; `None` only if a problem with it was reported.
-    pub(super) fn finish(self) -> Option<DeviceSpec> {
+    /// The entry, with what `[verdict]` says for all; `None` only if a problem with it was reported.
+    pub(super) fn finish(self, rig: &VerdictTable) -> Option<DeviceSpec> {
+        let node = self.node?;
+        let fps = if let NodeSpec::Camera(camera) = &node { Some(f64::from(camera.fps)) } else { None };
         Some(DeviceSpec {
+            verdict: verdict::spec(node.modality_kind(), self.stall_after, fps, rig, &self.verdict),
             name: self.name,
             id: self.id?,
             identity: self.identity?,
-            node: self.node?,
+            node,
             topic: self.topic,
             mount: self.mount,
             stall_after: self.stall_after,
@@ -127,6 +133,7 @@ pub(super) fn read<'a>(name: &str, section: Section<'a>, problems: &mut Problems
         depth: written.unwrap_or_else(|| node::default_depth(settings.as_ref())),
         depth_written: written.is_some(),
         when_stale,
+        verdict: verdict::read(&section, Whose::Device, problems),
         node: settings,
         section,
     }
