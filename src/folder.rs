@@ -20,7 +20,7 @@ use rustix::io::Errno;
 
 use crate::time::realtime_ns;
 
-/// Links on one way before it is taken for a circle; as in Linux (path_resolution(7)).
+/// Links on one way before it is taken for a circle; as in Linux, see `path_resolution(7)`.
 const MOST_LINKS: usize = 40;
 /// Names tried for a temporary file, should somebody take them before us.
 const TRIES: u32 = 8;

@@ -34,7 +34,12 @@ pub fn check(path: &Path, format: Format, out: &mut dyn Write) -> io::Result<Out
         (Err(errors), Format::Text) => {
             writeln!(out, "{errors}")?;
             let count = errors.diagnostics.len();
-            writeln!(out, "{}: {count} {}", text::plain(&path.display().to_string()), if count == 1 { "problem" } else { "problems" })?;
+            writeln!(
+                out,
+                "{}: {count} {}",
+                text::plain(&path.display().to_string()),
+                if count == 1 { "problem" } else { "problems" }
+            )?;
             Ok(Outcome::BadConfiguration)
         }
         (Err(errors), Format::Json) => {

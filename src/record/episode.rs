@@ -120,12 +120,10 @@ fn next_number(folder: &Folder, stem: &str) -> io::Result<u32> {
     let mut highest = 0;
     for entry in rustix::fs::Dir::read_from(folder.descriptor())? {
         let entry = entry?;
-        let number = entry
-            .file_name()
-            .to_str()
-            .ok()
-            .and_then(|name| name.strip_prefix(stem))
-            .and_then(|rest| rest.strip_suffix(".partial").unwrap_or(rest).strip_suffix(".mcap")?.parse::<u32>().ok());
+        let number =
+            entry.file_name().to_str().ok().and_then(|name| name.strip_prefix(stem)).and_then(|rest| {
+                rest.strip_suffix(".partial").unwrap_or(rest).strip_suffix(".mcap")?.parse::<u32>().ok()
+            });
         highest = highest.max(number.filter(|number| *number < LARGEST).unwrap_or(0));
     }
     Ok(highest + 1)

@@ -15,7 +15,7 @@ mod scenario_file;
 mod section;
 mod spec;
 pub mod trust;
-mod units;
+pub mod units;
 mod words;
 
 pub use attachment::{Attachment, DeviceNode, UsbIdentity};

@@ -19,7 +19,7 @@ use std::io;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Component, Path, PathBuf};
 
-/// Links on one way before it is taken for a circle; as in Linux (path_resolution(7)).
+/// Links on one way before it is taken for a circle; as in Linux, see `path_resolution(7)`.
 const MOST_LINKS: usize = 40;
 
 /// Why what a path leads to cannot be trusted. As text, the reason without the file's own name.

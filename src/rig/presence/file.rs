@@ -133,7 +133,8 @@ fn take(path: &Path) -> Result<File, PresenceError> {
     let io = |error: Errno| PresenceError::Io { path: path.to_owned(), error: error.into() };
     let foreign = |what: &str| PresenceError::Foreign { path: path.to_owned(), what: what.to_owned() };
     for _ in 0..TRIES {
-        let flags = OFlags::RDWR | OFlags::CREATE | OFlags::NOFOLLOW | OFlags::CLOEXEC | OFlags::NONBLOCK | OFlags::NOCTTY;
+        let flags =
+            OFlags::RDWR | OFlags::CREATE | OFlags::NOFOLLOW | OFlags::CLOEXEC | OFlags::NONBLOCK | OFlags::NOCTTY;
         let mode = Mode::RUSR | Mode::WUSR | Mode::RGRP | Mode::ROTH;
         let file = match rustix::fs::open(path, flags, mode) {
             Ok(descriptor) => File::from(descriptor),

@@ -42,7 +42,10 @@ fn a_file_that_may_not_be_opened_is_explained() {
     // Only root can give a file away.
     if std::os::unix::fs::chown(&path, Some(12_345), None).is_ok() {
         let error = file::refused(&path, rustix::io::Errno::ACCESS);
-        assert!(error.to_string().contains("user 12345: another user's rapid left it behind; remove it: rm -r "), "{error}");
+        assert!(
+            error.to_string().contains("user 12345: another user's rapid left it behind; remove it: rm -r "),
+            "{error}"
+        );
     }
     std::fs::remove_file(&path).expect("clean");
     assert!(matches!(file::refused(&path, rustix::io::Errno::ACCESS), PresenceError::Io { .. }));
