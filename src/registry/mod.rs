@@ -21,6 +21,6 @@ pub use diagnostic::{Diagnostic, RegistryErrors};
 pub use identity::{Assigner, Assignment, Detached, Explanation};
 pub use parse::{BUILTIN, Loaded};
 pub use spec::{
-    CameraSpec, DeviceSpec, Framing, IdentitySpec, MAX_BORROWED, MAX_SUBSCRIBERS, Mount, NodeSpec, POOL_SPARE, Parse,
-    PixelFormat, Registry, RigSpec, SerialSpec, WhenStale,
+    CameraSpec, DeviceSpec, Framing, IdentitySpec, MAX_BORROWED, MAX_SUBSCRIBERS, Mount, NodeSpec, Opens, POOL_SPARE,
+    Parse, PixelFormat, ProcessSpec, Registry, RigSpec, SerialSpec, WhenStale,
 };

@@ -10,6 +10,8 @@ mod budget;
 mod device;
 mod file;
 mod node;
+mod process;
+mod program;
 
 use std::path::Path;
 use std::time::Duration;
@@ -19,6 +21,7 @@ use super::section::{At, Problems, Section, file_label, read};
 use super::spec::{Registry, RigSpec};
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use device::Draft;
+use program::Programs;
 
 pub(super) use device::{check_serial, is_port};
 pub(super) use file::read_file;
@@ -53,7 +56,8 @@ impl Registry {
         Self::parse(&text, Some(path))
     }
 
-    /// Reads the text of a `devices.toml`; `path` names it in messages.
+    /// Reads the text of a `devices.toml`; `path` names it in messages, and programs are looked for
+    /// beside it. Without a path they are not looked for: nothing of such a registry will be run.
     ///
     /// # Errors
     /// All that is wrong with the text.
@@ -65,7 +69,8 @@ impl Registry {
         let root = Section::new(document.get_ref(), 0, String::new());
         root.allow(&mut problems, &["rig", "device"]);
         let rig = rig(&root, &mut problems);
-        let mut drafts = drafts(&root, &mut problems);
+        let programs = path.map_or(Programs::Nowhere, Programs::Beside);
+        let mut drafts = drafts(&root, programs, &mut problems);
         if drafts.is_empty() && problems.is_empty() {
             return Err(nothing_registered(file));
         }
@@ -133,7 +138,7 @@ fn rig(root: &Section<'_>, problems: &mut Problems<'_>) -> RigSpec {
 }
 
 /// One draft an entry, in the order of the file.
-fn drafts<'a>(root: &Section<'a>, problems: &mut Problems<'_>) -> Vec<Draft<'a>> {
+fn drafts<'a>(root: &Section<'a>, programs: Programs<'_>, problems: &mut Problems<'_>) -> Vec<Draft<'a>> {
     if let Some((at, _, value)) = root.fields().into_iter().find(|(_, key, _)| *key == "device")
         && value.get_ref().is_array()
     {
@@ -156,7 +161,7 @@ fn drafts<'a>(root: &Section<'a>, problems: &mut Problems<'_>) -> Vec<Draft<'a>>
             continue;
         };
         let section = Section::new(section, at, devices.child(name));
-        drafts.push(device::read(name, section, problems));
+        drafts.push(device::read(name, section, programs, problems));
     }
     drafts
 }
@@ -169,7 +174,7 @@ fn check_identities(drafts: &[Draft<'_>], problems: &mut Problems<'_>) {
         let Some(identity) = &draft.identity else { continue };
         let same_unit = |other: &&Draft<'_>| {
             let Some(earlier) = &other.identity else { return false };
-            let same_model = (earlier.vid, earlier.pid, other.kind) == (identity.vid, identity.pid, draft.kind);
+            let same_model = (earlier.vid, earlier.pid, other.opens()) == (identity.vid, identity.pid, draft.opens());
             let same_place = match (&identity.serial, &earlier.serial) {
                 (Some(serial), Some(earlier)) => serial == earlier,
                 (None, None) => identity.port.is_some() && identity.port == earlier.port,

@@ -50,7 +50,7 @@ pub(crate) fn read_file(path: &Path, when_missing: &str) -> Result<String, Regis
 }
 
 /// As root we run with rights that whoever may write the file would gain.
-fn distrust(mode: u32, owner: u32, euid: u32, label: &str) -> Option<(String, String)> {
+pub(super) fn distrust(mode: u32, owner: u32, euid: u32, label: &str) -> Option<(String, String)> {
     if euid != 0 {
         return None;
     }
