@@ -10,6 +10,8 @@ mod budget;
 mod device;
 mod file;
 mod node;
+mod process;
+mod program;
 mod verdict;
 
 use std::path::Path;
@@ -21,6 +23,7 @@ use super::spec::{Registry, RigSpec};
 use super::trust::distrust;
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use device::Draft;
+use program::Programs;
 use verdict::Whose;
 
 pub(super) use device::is_port;
@@ -62,7 +65,8 @@ impl Registry {
         Ok(loaded)
     }
 
-    /// Reads the text of a `devices.toml`; `path` names it in messages.
+    /// Reads the text of a `devices.toml`; `path` names it in messages, and programs are looked for
+    /// beside it. Without a path they are not looked for: nothing of such a registry will be run.
     ///
     /// # Errors
     /// All that is wrong with the text.
@@ -75,7 +79,8 @@ impl Registry {
         root.allow(&mut problems, &["rig", "verdict", "device"]);
         let rig = rig(&root, &mut problems);
         let verdict = verdict::read(&root, Whose::Rig, &mut problems);
-        let mut drafts = drafts(&root, &mut problems);
+        let programs = path.map_or(Programs::Nowhere, Programs::Beside);
+        let mut drafts = drafts(&root, programs, &mut problems);
         if drafts.is_empty() && problems.is_empty() {
             return Err(nothing_registered(file));
         }
@@ -143,7 +148,7 @@ fn rig(root: &Section<'_>, problems: &mut Problems<'_>) -> RigSpec {
 }
 
 /// One draft an entry, in the order of the file.
-fn drafts<'a>(root: &Section<'a>, problems: &mut Problems<'_>) -> Vec<Draft<'a>> {
+fn drafts<'a>(root: &Section<'a>, programs: Programs<'_>, problems: &mut Problems<'_>) -> Vec<Draft<'a>> {
     if let Some((at, _, value)) = root.fields().into_iter().find(|(_, key, _)| *key == "device")
         && value.get_ref().is_array()
     {
@@ -166,7 +171,7 @@ fn drafts<'a>(root: &Section<'a>, problems: &mut Problems<'_>) -> Vec<Draft<'a>>
             continue;
         };
         let section = Section::new(section, at, devices.child(name));
-        drafts.push(device::read(name, section, problems));
+        drafts.push(device::read(name, section, programs, problems));
     }
     drafts
 }
@@ -179,7 +184,7 @@ fn check_identities(drafts: &[Draft<'_>], problems: &mut Problems<'_>) {
         let Some(identity) = &draft.identity else { continue };
         let same_unit = |other: &&Draft<'_>| {
             let Some(earlier) = &other.identity else { return false };
-            let same_model = (earlier.vid, earlier.pid, other.kind) == (identity.vid, identity.pid, draft.kind);
+            let same_model = (earlier.vid, earlier.pid, other.opens()) == (identity.vid, identity.pid, draft.opens());
             let same_place = match (&identity.serial, &earlier.serial) {
                 (Some(serial), Some(earlier)) => serial == earlier,
                 (None, None) => identity.port.is_some() && identity.port == earlier.port,

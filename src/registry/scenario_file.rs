@@ -116,6 +116,7 @@ fn standing_for(spec: &DeviceSpec, name: &str) -> ScenarioDevice {
         }
         // Raw lines have no channels; something must be sent all the same.
         NodeSpec::Serial(serial) => SimSource::Serial { channels: serial.channels.max(1), hz: SERIAL_HZ, seed },
+        NodeSpec::Process(_) => SimSource::Process,
     };
     let usb = UsbIdentity {
         vid: spec.identity.vid,
@@ -190,7 +191,7 @@ fn device(section: &Section<'_>, registry: &Registry, problems: &mut Problems<'_
             *rate = hz.unwrap_or(*rate);
             *chosen = seed.unwrap_or(*chosen);
         }
-        SimSource::Replay { .. } => {}
+        SimSource::Process | SimSource::Replay { .. } => {}
     }
     device.plugged = section.flag(problems, "plugged").unwrap_or(true);
     device.usb.vid = section.usb_id(problems, "vid").unwrap_or(device.usb.vid);
