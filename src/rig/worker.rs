@@ -117,6 +117,10 @@ impl Worker {
         epoch: Epoch,
     ) -> Result<Self, DriverError> {
         let watch = seat.ingress.watch().map_err(|error| DriverError::Retry(error.to_string()))?;
+        if seat.turn.try_lock().is_err() {
+            let text = format!("{}: waits for its previous process to end", spec.name);
+            seat.workers.board.announce(What::Log { level: Level::Info, text });
+        }
         let wait = timeout(TERM_LIMIT + MARGIN, Arc::clone(&seat.turn).lock_owned());
         let turn = wait.await.map_err(|_| DriverError::Retry("its previous process has not ended".to_owned()))?;
         // What the predecessor left.
