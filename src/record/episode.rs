@@ -12,6 +12,7 @@ use rustix::io::Errno;
 use serde::Serialize;
 
 use super::RecordError;
+use crate::status::Verdict;
 use crate::time;
 
 /// Longest slug of a task in bytes: with date, number and endings a name stays far below the 255
@@ -48,6 +49,9 @@ pub struct EpisodeReport {
     pub dropped: u64,
     /// Why the file is not whole, if it is not.
     pub error: Option<String>,
+    /// What it is worth.
+    #[serde(flatten)]
+    pub verdict: Verdict,
 }
 
 /// The two names of an episode's file.
