@@ -11,6 +11,7 @@ use serde::Serialize;
 
 use super::RecordError;
 use crate::folder::{Folder, FolderError, Links, Missing};
+use crate::status::Verdict;
 use crate::time;
 
 /// Longest slug of a task in bytes: with date, number and endings a name stays far below the 255
@@ -49,6 +50,9 @@ pub struct EpisodeReport {
     pub dropped: u64,
     /// Why the file is not whole, if it is not.
     pub error: Option<String>,
+    /// What it is worth.
+    #[serde(flatten)]
+    pub verdict: Verdict,
 }
 
 /// The folder of an episode's file, held open, and its two names in it.

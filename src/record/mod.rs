@@ -9,11 +9,13 @@
 //! Invariant: a file without `.partial` at its end is finished; one that exists is never replaced.
 //! Invariant: what could not be recorded is counted and said.
 
+mod announce;
 pub mod encode;
 mod episode;
 mod file;
 mod hole;
 pub mod inspect;
+mod masks;
 mod metadata;
 mod quality;
 mod recorder;

@@ -50,6 +50,7 @@ pub(crate) fn snapshot(devices: Vec<DeviceStatus>) -> Snapshot {
         devices,
         recording: None,
         last_episode: None,
+        last_verdict: super::Verdict::default(),
         log: Vec::new(),
     }
 }

@@ -156,6 +156,8 @@ pub struct Snapshot {
     pub recording: Option<RecordingStatus>,
     /// The last file finished.
     pub last_episode: Option<PathBuf>,
+    /// The verdict on it.
+    pub last_verdict: Verdict,
     /// The newest log lines, oldest first.
     pub log: Vec<LogLine>,
 }
