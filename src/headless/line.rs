@@ -4,7 +4,7 @@ use serde::Serialize;
 
 use super::style::Palette;
 use crate::modality::ModalityId;
-use crate::status::{DeviceStatus, Event, Snapshot, What};
+use crate::status::{DeviceStatus, Event, Level, Snapshot, What};
 use crate::text;
 use crate::time::Stamp;
 
@@ -98,11 +98,19 @@ impl Columns {
                 let file = file.display();
                 let figures = format!("{file}  {seconds:.1} s  {messages} messages  {size}  {dropped} dropped");
                 let (word, rest) = match error {
-                    Some(error) => (palette.bad(&pad("not whole")), format!("{figures}  {error}")),
+                    Some(error) => {
+                        let word = if event.what.is_cut_short() { "cut short" } else { "not whole" };
+                        (palette.bad(&pad(word)), format!("{figures}  {error}"))
+                    }
                     None if *dropped > 0 => (palette.warn(&pad("finished")), figures),
                     None => (palette.good(&pad("finished")), figures),
                 };
                 (&"episode".to_owned(), None, word, rest)
+            }
+            What::DiskLow { .. } | What::ClockStep { .. } => {
+                let (level, text) = event.what.sentence().unwrap_or((Level::Warn, String::new()));
+                let subject = if matches!(event.what, What::DiskLow { .. }) { "disk" } else { "clock" };
+                (&subject.to_owned(), None, palette.level(level, &pad(level.word())), text)
             }
             What::Log { level, text } => {
                 let word = palette.level(*level, &pad(level.word()));

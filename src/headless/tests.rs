@@ -5,7 +5,7 @@ use serde_json::Value;
 use super::*;
 use crate::sample::Epoch;
 use crate::status::literal::{WALL_NS, board, every_state, id, recording, three_streaming};
-use crate::status::{Level, SlotState, What};
+use crate::status::{Level, RecordingStatus, SlotState, What};
 
 /// An output that keeps what it is given.
 #[derive(Clone, Default)]
@@ -38,7 +38,7 @@ fn state(device: &str, bit: u8, state: SlotState, detail: &str) -> What {
 
 fn episode(dropped: u64, error: Option<&str>) -> What {
     What::Episode {
-        file: "out/a.mcap".into(),
+        file: if error == Some("disk full") { "out/a.mcap.partial".into() } else { "out/a.mcap".into() },
         seconds: 30.04,
         messages: 1234,
         bytes: 12_345_678,
@@ -63,6 +63,9 @@ fn all_events() -> Vec<What> {
         What::Recording { file: "out/a.mcap".into() },
         episode(0, None),
         episode(3, Some("disk full")),
+        episode(0, Some("disk nearly full")),
+        What::DiskLow { folder: "out".into(), free: 1_500_000_000, seconds: 252 },
+        What::ClockStep { seconds: -3600.0 },
         What::Log { level: Level::Warn, text: "something".to_owned() },
     ]
 }
@@ -79,7 +82,10 @@ fn lines_for_people_have_their_columns() {
     22:13:20.000Z  usb                unregistered  046d:0825  X   no entry has this serial
     22:13:20.000Z  episode            recording     out/a.mcap
     22:13:20.000Z  episode            finished      out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped
-    22:13:20.000Z  episode            not whole     out/a.mcap  30.0 s  1234 messages  12.3 MB  3 dropped  disk full
+    22:13:20.000Z  episode            not whole     out/a.mcap.partial  30.0 s  1234 messages  12.3 MB  3 dropped  disk full
+    22:13:20.000Z  episode            cut short     out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped  disk nearly full
+    22:13:20.000Z  disk               warn          out: disk nearly full, 1.5 GB free: the episode will be closed in about 4 min
+    22:13:20.000Z  clock              warn          the wall clock was set back by 3600.000 s; times of capture stay as they are
     22:13:20.000Z  log                warn          something
     "#);
 }
@@ -132,6 +138,13 @@ fn progress_names_what_counts_first() {
     assert_eq!(object["recording"]["dropped"], 2);
     assert_eq!(object["devices"][3]["state"], "stalled");
     assert!(object.get("duration").is_none());
+    assert!(object["recording"].get("disk_seconds").is_none());
+
+    snapshot.recording = Some(RecordingStatus { room: Some(Duration::from_secs(252)), ..recording(2) });
+    let line = progress::line(&snapshot, &Rates::default(), Duration::from_secs(12), None);
+    assert!(line.contains("2 dropped  disk full in 04:12"), "{line}");
+    let json = progress::json(&snapshot, &Rates::default(), Duration::from_secs(12), None, WALL_NS).unwrap();
+    assert_eq!(serde_json::from_str::<Value>(&json).unwrap()["recording"]["disk_seconds"], 252);
 }
 
 #[test]

@@ -14,6 +14,8 @@ use serde::Serialize;
 use super::RecordError;
 use crate::time;
 
+/// Extension of a file that is not finished.
+pub(super) const PARTIAL: &str = "partial";
 /// Longest slug of a task in bytes: with date, number and endings a name stays far below the 255
 /// bytes a file name may have.
 const SLUG_BYTES: usize = 64;
@@ -46,7 +48,7 @@ pub struct EpisodeReport {
     pub bytes: u64,
     /// Samples lost on the way to the file.
     pub dropped: u64,
-    /// Why the file is not whole, if it is not.
+    /// Why the file, or the episode in it, is not whole, if it is not.
     pub error: Option<String>,
 }
 
@@ -76,7 +78,7 @@ impl EpisodePath {
             if fs::symlink_metadata(&finished).is_ok() {
                 continue;
             }
-            match OpenOptions::new().write(true).create_new(true).open(&partial) {
+            match OpenOptions::new().read(true).write(true).create_new(true).open(&partial) {
                 Ok(file) => return Ok((Self { finished, partial }, file)),
                 Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
                 Err(source) => return Err(RecordError::Io { path: partial, source }),

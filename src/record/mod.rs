@@ -14,11 +14,14 @@ mod episode;
 mod file;
 mod hole;
 pub mod inspect;
+mod keep;
 mod metadata;
 mod recorder;
 pub mod schema;
 mod session;
 mod source;
+mod space;
+mod streams;
 #[cfg(test)]
 mod tests;
 mod walk;
@@ -30,6 +33,9 @@ pub use episode::{EpisodeReport, EpisodeRequest};
 pub use file::Sink;
 pub use recorder::{Recorder, RecorderConfig};
 pub use source::Source;
+pub use space::{Asker, Disk};
+
+use crate::text;
 
 /// Why an episode cannot be recorded.
 #[derive(Debug, thiserror::Error)]
@@ -44,6 +50,20 @@ pub enum RecordError {
         path: PathBuf,
         /// What the system says.
         source: std::io::Error,
+    },
+    /// There is no room for an episode.
+    #[error(
+        "{}: the disk is full: {} free, and {} of it are kept free (disk_reserve under [rig] in devices.toml): remove \
+         or move recordings, choose another folder with --out, or lower disk_reserve",
+        folder.display(), text::size(*free), text::size(*reserve)
+    )]
+    NoRoom {
+        /// The folder.
+        folder: PathBuf,
+        /// What is free on its disk, bytes.
+        free: u64,
+        /// What is to stay free, bytes.
+        reserve: u64,
     },
     /// There is an episode in progress.
     #[error("already recording {}", .0.display())]

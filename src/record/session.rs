@@ -18,6 +18,7 @@
 //! Invariant: every sample a frame names was written to the file before the frame.
 
 use std::collections::{BTreeMap, VecDeque};
+use std::fs::File;
 use std::io;
 use std::sync::Arc;
 use std::time::Duration;
@@ -26,6 +27,7 @@ use super::encode::EventText;
 use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest};
 use super::file::{EpisodeFile, Sink};
 use super::hole::Hole;
+use super::keep;
 use super::metadata::{self, Ending};
 use crate::mask::PhysicalMask;
 use crate::modality::{MAX_MODALITIES, ModalityId};
@@ -97,6 +99,8 @@ pub(super) struct Session {
     board: Arc<Board>,
     path: EpisodePath,
     file: EpisodeFile,
+    /// The open file itself, whatever becomes of its name.
+    handle: File,
     begin: Stamp,
     end: Option<Stamp>,
     grid: Grid,
@@ -118,6 +122,7 @@ pub(super) struct Beginning<'a> {
     pub(super) request: &'a EpisodeRequest,
     pub(super) path: EpisodePath,
     pub(super) sink: Box<dyn Sink>,
+    pub(super) handle: File,
     pub(super) attached: &'a Attached,
     pub(super) clock: WallClock,
     pub(super) begin: Stamp,
@@ -126,7 +131,7 @@ pub(super) struct Beginning<'a> {
 impl Session {
     /// Begins an episode and writes what stands at its beginning.
     pub(super) fn begin(beginning: Beginning<'_>, masks: &MaskHistory) -> io::Result<Self> {
-        let Beginning { registry, board, request, path, sink, attached, clock, begin } = beginning;
+        let Beginning { registry, board, request, path, sink, handle, attached, clock, begin } = beginning;
         let said = metadata::beginning(&registry, request, attached, clock, begin);
         let mut file = EpisodeFile::begin(sink, &registry, clock, begin, said)?;
         if let Some((header, mask, sequence)) = masks.at(begin) {
@@ -149,6 +154,7 @@ impl Session {
             board,
             path,
             file,
+            handle,
             begin,
             next_tick: 0,
             tallies: vec![Tally::default(); MAX_MODALITIES],
@@ -279,13 +285,16 @@ impl Session {
             seen: &self.seen,
         };
         let closed = match self.failed {
-            None => self.file.finish(metadata::end(&self.registry, &ending)).and_then(|()| self.path.publish()),
+            None => {
+                let finished = self.file.finish(metadata::end(&self.registry, &ending));
+                finished.and_then(|()| keep::publish(&self.path, &self.handle))
+            }
             Some(error) => Err(error),
         };
         let (file, error) = match closed {
-            Ok(()) => (self.path.finished, reason),
+            Ok(file) => (file, reason),
             Err(error) => {
-                let file = self.path.partial;
+                let file = keep::partial(&self.path, &self.handle);
                 let text = match reason {
                     Some(reason) => format!("{reason}; {}: {error}", file.display()),
                     None => format!("{}: {error}", file.display()),
@@ -305,6 +314,7 @@ impl Session {
             messages: self.file.messages,
             bytes: self.file.bytes,
             dropped: self.dropped(),
+            room: None,
         }
     }
 
@@ -382,5 +392,8 @@ fn describe(what: &What) -> String {
         What::Recording { file } => format!("recording {}", file.display()),
         What::Episode { file, .. } => format!("finished {}", file.display()),
         What::Log { text, .. } => text.clone(),
+        What::DiskLow { .. } | What::ClockStep { .. } => {
+            what.sentence().map_or_else(String::new, |(_, sentence)| sentence)
+        }
     }
 }
