@@ -112,7 +112,7 @@ pub fn attached(scenario: &Scenario) -> Vec<Attachment> {
 
 /// The attachment of a device that is plugged in now, and its cable.
 fn attachment(device: &ScenarioDevice, begun: Stamp) -> (Attachment, Arc<SimDevice>) {
-    let sim = Arc::new(SimDevice::new(&device.name, device.source.clone(), begun));
+    let sim = Arc::new(SimDevice::new(&device.name, device.source.clone(), begun).with_faults(device.faults));
     let syspath = PathBuf::from("/sim").join(&device.usb.port);
     let (node, usb) = (DeviceNode::Sim(Arc::clone(&sim)), device.usb.clone());
     (Attachment { syspath, node, usb }, sim)

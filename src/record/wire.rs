@@ -85,6 +85,12 @@ impl<'a> Proto<'a> {
         }
     }
 
+    /// A `sint64`.
+    pub(super) fn zigzag(self) -> i64 {
+        let number = self.number();
+        (number >> 1).cast_signed() ^ -(number & 1).cast_signed()
+    }
+
     pub(super) fn bytes(self) -> &'a [u8] {
         match self {
             Self::Number(_) => &[],
