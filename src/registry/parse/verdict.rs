@@ -10,7 +10,6 @@
 use std::time::Duration;
 
 use crate::modality::ModalityKind;
-use crate::registry::diagnostic::did_you_mean;
 use crate::registry::limits::{Limits, VerdictSpec};
 use crate::registry::section::{Problems, Section};
 
@@ -93,12 +92,17 @@ fn limits(section: &Section<'_>, problems: &mut Problems<'_>) -> Written {
         *share = read_share(section, key, problems);
     }
     for ((key, _), time) in TIMES.iter().zip(&mut written.times) {
-        *time = match section.text_if(key) {
+        *time = match text(section, key) {
             Some("off") => Some(None),
             _ => section.duration(problems, key, Duration::from_millis(1)..=Duration::from_hours(1)).map(Some),
         };
     }
     written
+}
+
+/// The text of `key`, if it is one.
+fn text<'a>(section: &Section<'a>, key: &str) -> Option<&'a str> {
+    section.fields().into_iter().find(|(_, name, _)| *name == key)?.2.get_ref().as_str()
 }
 
 /// `"0.1%"`, `"0.1 %"`, or `"off"`.
@@ -107,27 +111,20 @@ fn read_share(section: &Section<'_>, key: &str, problems: &mut Problems<'_>) -> 
     if !section.has(key) {
         return None;
     }
-    let Some(text) = section.text_if(key) else {
+    let Some(written) = text(section, key) else {
         section.report(problems, key, format!("{key} is not a share in percent"), fix);
         return None;
     };
-    if text == "off" {
+    if written == "off" {
         return Some(None);
     }
-    let number = text.strip_suffix('%').map(str::trim);
-    let plain = |number: &&str| number.bytes().all(|byte| byte.is_ascii_digit() || byte == b'.');
-    let percent: Option<f64> = number.filter(plain).and_then(|number| number.parse().ok());
+    let number = written.strip_suffix('%').map(str::trim);
+    let is_plain = |number: &&str| number.bytes().all(|byte| byte.is_ascii_digit() || byte == b'.');
+    let percent: Option<f64> = number.filter(is_plain).and_then(|number| number.parse().ok());
     match percent {
         Some(percent) if (0.0..=100.0).contains(&percent) => return Some(Some(percent / 100.0)),
-        Some(_) => section.report(problems, key, format!("{key} = {text:?} is out of range"), fix),
-        None => {
-            let fix = if did_you_mean(text, &["off"], "").contains("off") && !text.is_empty() && number.is_none() {
-                format!("write \"off\" to switch the check off, or a share, for example {key} = \"0.5%\"")
-            } else {
-                fix
-            };
-            section.report(problems, key, format!("{key} = {text:?} is not a share in percent"), fix);
-        }
+        Some(_) => section.report(problems, key, format!("{key} = {written:?} is out of range"), fix),
+        None => section.report(problems, key, format!("{key} = {written:?} is not a share in percent"), fix),
     }
     None
 }
