@@ -19,7 +19,9 @@
 //!
 //!  L1   registry                                 devices.toml, checked
 //!       status                                   the board every stage reports on
-//!       text   outlet   folder                   words and lines for people; files others cannot lead astray
+//!       text   outlet                            words and lines for people
+//!       folder                                   files others cannot lead astray
+//!       episode_format                           an episode's file, record by record
 //!  L0   modality   mask   sample   time          nouns
 //! ```
 //!
@@ -82,6 +84,7 @@ pub mod cli;
 pub mod commands;
 pub mod dispatch;
 pub mod driver;
+pub mod episode_format;
 pub mod folder;
 pub mod headless;
 pub mod hotplug;

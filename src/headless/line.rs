@@ -4,7 +4,7 @@ use serde::Serialize;
 
 use super::style::Palette;
 use crate::modality::ModalityId;
-use crate::status::{DeviceStatus, Event, Snapshot, What};
+use crate::status::{DeviceStatus, Event, Level, Snapshot, What};
 use crate::text;
 use crate::time::Stamp;
 
@@ -95,16 +95,20 @@ impl Columns {
             What::Recording { file } => {
                 (&"episode".to_owned(), None, palette.good(&pad("recording")), file.display().to_string())
             }
-            What::Episode { file, seconds, messages, bytes, dropped, error } => {
+            What::Episode { file, seconds, messages, bytes, dropped, error, verdict } => {
                 let size = text::size(*bytes);
                 let file = file.display();
-                let figures = format!("{file}  {seconds:.1} s  {messages} messages  {size}  {dropped} dropped");
-                let (word, rest) = match error {
-                    Some(error) => (palette.bad(&pad("not whole")), format!("{figures}  {error}")),
-                    None if *dropped > 0 => (palette.warn(&pad("finished")), figures),
-                    None => (palette.good(&pad("finished")), figures),
-                };
-                (&"episode".to_owned(), None, word, rest)
+                let mut rest = format!("{file}  {seconds:.1} s  {messages} messages  {size}  {dropped} dropped");
+                // Where an error has made a reason, that says it.
+                let why = if verdict.reasons.is_empty() { error.clone().unwrap_or_default() } else { verdict.why() };
+                rest.push_str("  ");
+                rest.push_str(&why);
+                (&"episode".to_owned(), None, palette.grade(verdict.grade, &pad(verdict.grade.word())), rest)
+            }
+            What::DiskLow { .. } | What::ClockStep { .. } => {
+                let (level, text) = event.what.sentence().unwrap_or((Level::Warn, String::new()));
+                let subject = if matches!(event.what, What::DiskLow { .. }) { "disk" } else { "clock" };
+                (&subject.to_owned(), None, palette.level(level, &pad(level.word())), text)
             }
             What::Log { level, text } => {
                 let word = palette.level(*level, &pad(level.word()));
