@@ -7,8 +7,8 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use proptest::prelude::*;
-use rapid::registry::scenario::Scenario;
 use rapid::modality::ModalityKind;
+use rapid::registry::scenario::Scenario;
 use rapid::registry::{BUILTIN, Framing, Loaded, NodeSpec, Opens, POOL_SPARE, Parse, Registry};
 
 fn files(folder: &str) -> Vec<PathBuf> {
