@@ -156,6 +156,11 @@ async fn only_chunks_allocate() {
         max_bytes: BYTES,
         depth: 64,
         when_stale: WhenStale::Hold,
+        verdict: rapid::registry::VerdictSpec::of(
+            rapid::modality::ModalityKind::Image,
+            Duration::from_millis(500),
+            Some(30.0),
+        ),
     };
     let rig = RigSpec {
         name: "rig".to_owned(),

@@ -7,14 +7,16 @@
 //!
 //! Invariant: a writer never waits for a reader. A reader that falls `depth` samples behind loses
 //! the oldest, and sees the hole in `SampleHeader::seq`.
-//! Invariant: payloads lie in pools that are reserved when a topic is opened. For each sample iceoryx2
-//! 0.10 makes one small allocation, the handle of the loan, and takes one lock that nobody else wants;
-//! nothing else allocates or locks (`tests/stream_alloc.rs`).
+//! Invariant: payloads lie in pools that are reserved when a topic is opened, and the handle of a
+//! loan in memory that is used again (`shared`): once a thread has published a sample, no sample
+//! allocates (`tests/stream_alloc.rs`). The locks of a topic's port are its stream's alone.
 //! Invariant: writers live as long as the bus. What a reader has not fetched dies with its writer
 //! (iceoryx2 0.10), so a writer that went with its device would take the last samples along.
 
 mod inbox;
 mod ingress;
+mod service;
+mod shared;
 mod topic;
 mod writer;
 
@@ -28,13 +30,13 @@ use crate::modality::ModalityId;
 use crate::registry::{MAX_BORROWED, MAX_SUBSCRIBERS, NodeSpec, Registry};
 use crate::sample::SampleHeader;
 
+use service::Service;
+
 pub use inbox::Inbox;
 pub use ingress::{Given, Ingress, Watch};
 pub use topic::{MASK_TOPIC, TopicId, TopicSpec};
 pub use writer::Writer;
 
-/// Ports are used from several threads, hence the thread-safe variant.
-type Service = ipc_threadsafe::Service;
 type TopicFactory = iceoryx2::service::port_factory::publish_subscribe::PortFactory<Service, [u8], SampleHeader>;
 
 /// Name of the event service that wakes consumers.

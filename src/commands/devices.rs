@@ -130,13 +130,11 @@ struct Missing<'a> {
 
 fn print_json(plugged: &[Plugged], missing: &[&DeviceSpec], out: &mut dyn Write) -> io::Result<()> {
     for what in plugged {
-        serde_json::to_writer(&mut *out, &Line { plugged: true, what })?;
-        writeln!(out)?;
+        writeln!(out, "{}", text::json(&Line { plugged: true, what })?)?;
     }
     for entry in missing {
         let what = Missing { entry: &entry.name, identity: &entry.identity };
-        serde_json::to_writer(&mut *out, &Line { plugged: false, what })?;
-        writeln!(out)?;
+        writeln!(out, "{}", text::json(&Line { plugged: false, what })?)?;
     }
     Ok(())
 }

@@ -9,25 +9,30 @@
 //! Invariant: a file without `.partial` at its end is finished; one that exists is never replaced.
 //! Invariant: what could not be recorded is counted and said.
 
+mod announce;
 pub mod encode;
 mod episode;
 mod file;
 mod hole;
 pub mod inspect;
+mod masks;
 mod metadata;
+mod quality;
 mod recorder;
 pub mod schema;
 mod session;
 mod source;
 #[cfg(test)]
 mod tests;
-mod walk;
-mod wire;
+mod verdict;
 
 use std::path::PathBuf;
 
-pub use episode::{EpisodeReport, EpisodeRequest};
+use crate::episode_format::{walk, wire};
+
+pub use episode::{EpisodeReport, EpisodeRequest, open_folder};
 pub use file::Sink;
+pub use quality::{Quality, Spread};
 pub use recorder::{Recorder, RecorderConfig};
 pub use source::Source;
 
@@ -45,6 +50,9 @@ pub enum RecordError {
         /// What the system says.
         source: std::io::Error,
     },
+    /// The folder lies behind a link of somebody else, or cannot be entered.
+    #[error("{0}; or choose another with --out")]
+    Folder(crate::folder::FolderError),
     /// There is an episode in progress.
     #[error("already recording {}", .0.display())]
     Busy(PathBuf),

@@ -23,7 +23,8 @@ use super::RecordError;
 use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest};
 use super::file::Sink;
 use super::hole::Last;
-use super::session::{Attached, Beginning, MaskHistory, Session};
+use super::masks::MaskHistory;
+use super::session::{Attached, Beginning, Session};
 use super::source::Source;
 use crate::bus::TopicId;
 use crate::mask::PhysicalMask;
@@ -319,10 +320,10 @@ impl Writer {
         let board = &self.config.board;
         board.set_recording(None);
         if report.error.is_none() {
-            board.set_last_episode(report.file.clone());
+            board.set_last_episode(report.file.clone(), report.verdict.clone());
         }
-        let EpisodeReport { file, seconds, messages, bytes, dropped, error } = report.clone();
-        board.announce(What::Episode { file, seconds, messages, bytes, dropped, error });
+        let EpisodeReport { file, seconds, messages, bytes, dropped, error, verdict } = report.clone();
+        board.announce(What::Episode { file, seconds, messages, bytes, dropped, error, verdict });
         for reply in self.waiting.drain(..) {
             let _ = reply.send(Ok(report.clone()));
         }

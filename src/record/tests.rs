@@ -19,7 +19,7 @@ use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::registry::{
     CameraSpec, DeviceSpec, Framing, IdentitySpec, NodeSpec, Parse, PixelFormat, Registry, RigSpec, SerialSpec,
-    WhenStale,
+    VerdictSpec, WhenStale,
 };
 use crate::sample::{Encoding, FLAG_ERROR, SampleHeader};
 use crate::status::{Board, Level, What};
@@ -88,6 +88,7 @@ fn id(bit: u8) -> ModalityId {
 }
 
 fn device(bit: u8, name: &str, node: NodeSpec) -> DeviceSpec {
+    let verdict = VerdictSpec::of(node.modality_kind(), Duration::from_millis(500), None);
     DeviceSpec {
         name: name.to_owned(),
         id: id(bit),
@@ -99,11 +100,18 @@ fn device(bit: u8, name: &str, node: NodeSpec) -> DeviceSpec {
         max_bytes: 1 << 16,
         depth: 64,
         when_stale: WhenStale::Hold,
+        verdict,
     }
 }
 
 fn camera(format: PixelFormat) -> NodeSpec {
     NodeSpec::Camera(CameraSpec { width: 4, height: 2, fps: 30, format, controls: Vec::new() })
+}
+
+/// What a picture looks like from outside.
+fn picture(number: u64) -> Vec<u8> {
+    let inside = number.to_le_bytes().repeat(100);
+    [&[0xff, 0xd8], inside.as_slice(), &[0xff, 0xd9]].concat()
 }
 
 pub(super) fn registry() -> Registry {
@@ -164,7 +172,7 @@ impl Bench {
     /// A sample of a device that says it lost `lost` ones so far.
     fn sample_after(&self, lost: u64, bit: u8, epoch: u32, seq: u64, capture: u64, flags: u32) {
         let (encoding, payload) = match bit {
-            CAM => (Encoding::Mjpeg, seq.to_le_bytes().repeat(100)),
+            CAM => (Encoding::Mjpeg, picture(seq)),
             TOF => (Encoding::F64, [seq as f64, 0.5].iter().flat_map(|v| v.to_le_bytes()).collect()),
             _ => (Encoding::Grey, vec![seq.to_le_bytes()[0]; 8]),
         };

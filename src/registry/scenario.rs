@@ -48,6 +48,8 @@ pub enum SimSource {
         fps: u32,
         /// Chooses the pictures.
         seed: u64,
+        /// Least size of a picture; what it lacks is filled up. 0: as the encoder makes it.
+        bytes: usize,
     },
     /// Vectors of numbers; values are a function of seed and sequence.
     Serial {

@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use serde::Serialize;
 
+use super::limits::VerdictSpec;
 use crate::modality::{Modality, ModalityId, ModalityKind};
 use crate::sample::SampleHeader;
 
@@ -78,6 +79,8 @@ pub struct DeviceSpec {
     pub depth: usize,
     /// What an observation holds when the device is attached but no sample lies in the window.
     pub when_stale: WhenStale,
+    /// What the verdict on its part of an episode is made of.
+    pub verdict: VerdictSpec,
 }
 
 /// Which USB device an entry means.
@@ -225,15 +228,27 @@ impl DeviceSpec {
     /// What this device adds to an observation.
     #[must_use]
     pub fn modality(&self) -> Modality {
-        let (kind, shape) = match &self.node {
-            NodeSpec::Camera(camera) => (ModalityKind::Image, vec![camera.height, camera.width]),
-            NodeSpec::Serial(serial) if serial.parse == Parse::Raw => (ModalityKind::Bytes, Vec::new()),
-            NodeSpec::Serial(serial) => {
-                (ModalityKind::Scalars, vec![u32::try_from(serial.channels).unwrap_or(u32::MAX)])
-            }
-            NodeSpec::Process(process) => (process.kind, process.shape.clone()),
+        let kind = self.node.modality_kind();
+        let shape = match (&self.node, kind) {
+            (NodeSpec::Camera(camera), _) => vec![camera.height, camera.width],
+            (NodeSpec::Serial(_), ModalityKind::Bytes) => Vec::new(),
+            (NodeSpec::Serial(serial), _) => vec![u32::try_from(serial.channels).unwrap_or(u32::MAX)],
+            (NodeSpec::Process(process), _) => process.shape.clone(),
         };
         Modality { name: self.name.clone(), kind, shape }
+    }
+}
+
+impl NodeSpec {
+    /// What samples of a device that is read like this hold.
+    #[must_use]
+    pub fn modality_kind(&self) -> ModalityKind {
+        match self {
+            Self::Camera(_) => ModalityKind::Image,
+            Self::Serial(serial) if serial.parse == Parse::Raw => ModalityKind::Bytes,
+            Self::Serial(_) => ModalityKind::Scalars,
+            Self::Process(process) => process.kind,
+        }
     }
 }
 

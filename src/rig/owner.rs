@@ -348,9 +348,7 @@ impl Rig {
         };
         let devices: Vec<_> = self.modalities.iter().map(device).collect();
         let sequence = self.board.mask_sequence();
-        if let Err(error) = self.presence.write_json(self.mask, sequence, &devices) {
-            tracing::debug!(%error, "the mask's JSON file is not written");
-        }
+        self.presence.write_json(self.mask, sequence, &devices);
     }
 
     /// Tells every stream to end and gives them a moment to close their devices.

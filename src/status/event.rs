@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
-use super::{Level, SlotState};
+use super::{Grade, Level, SlotState, Verdict};
 use crate::modality::ModalityId;
 use crate::time::Stamp;
 
@@ -83,6 +83,9 @@ pub enum What {
         dropped: u64,
         /// Why the file is not whole, if it is not.
         error: Option<String>,
+        /// What it is worth.
+        #[serde(flatten)]
+        verdict: Verdict,
     },
     /// A line of the log that has no event of its own.
     Log {
@@ -119,12 +122,19 @@ impl What {
             }
             Self::Unregistered { device, reason } => (Level::Info, format!("{device} is not used: {reason}")),
             Self::Recording { file } => (Level::Info, format!("recording {}", file.display())),
-            Self::Episode { file, seconds, error: Some(error), .. } => {
-                (Level::Error, format!("{} is not whole after {seconds:.1} s: {error}", file.display()))
+            Self::Episode { file, seconds, error: Some(error), verdict, .. } => {
+                let (file, word) = (file.display(), verdict.grade.word());
+                (Level::Error, format!("{word} {file} is not whole after {seconds:.1} s: {error}"))
             }
-            Self::Episode { file, seconds, dropped, error: None, .. } => {
-                let level = if *dropped > 0 { Level::Warn } else { Level::Info };
-                (level, format!("{} finished, {seconds:.1} s, {dropped} samples dropped", file.display()))
+            Self::Episode { file, seconds, error: None, verdict, .. } => {
+                let level = match verdict.grade {
+                    Grade::Good => Level::Info,
+                    Grade::Suspect => Level::Warn,
+                    Grade::Bad => Level::Error,
+                };
+                let (file, word) = (file.display(), verdict.grade.word());
+                let why = if verdict.reasons.is_empty() { String::new() } else { format!(": {}", verdict.why()) };
+                (level, format!("{word} {file} finished, {seconds:.1} s{why}"))
             }
             Self::Log { level, text } => (*level, text.clone()),
         })

@@ -150,6 +150,7 @@ mod tests {
                 dropped: 0,
             }),
             last_episode: None,
+            last_verdict: crate::status::Verdict::default(),
             log: Vec::new(),
         }
     }

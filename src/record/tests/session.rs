@@ -2,7 +2,8 @@
 
 use super::super::episode::EpisodePath;
 use super::super::hole::Hole;
-use super::super::session::{Beginning, MaskHistory, Session};
+use super::super::masks::MaskHistory;
+use super::super::session::{Beginning, Session};
 use super::*;
 use crate::time::WallClock;
 

@@ -3,7 +3,8 @@
 use std::time::Duration;
 
 use super::program::Programs;
-use super::{node, process};
+use super::verdict::{VerdictTable, Whose};
+use super::{node, process, verdict};
 use crate::modality::ModalityId;
 use crate::registry::diagnostic::did_you_mean;
 use crate::registry::section::{At, Problems, Section};
@@ -15,7 +16,7 @@ pub(super) const BUILT_IN: [(&str, Kind); 2] = [("camera", Kind::Camera), ("seri
 const PLANNED: [&str; 2] = ["can", "lan"];
 /// Keys that only planned kinds of node have.
 const PLANNED_KEYS: [&str; 4] = ["can", "lan", "on_attach", "on_detach"];
-const KEYS: [&str; 15] = [
+const KEYS: [&str; 16] = [
     "vid",
     "pid",
     "serial",
@@ -31,6 +32,7 @@ const KEYS: [&str; 15] = [
     "when_stale",
     "camera",
     "process",
+    "verdict",
 ];
 
 /// The mask is 64 bits wide.
@@ -62,16 +64,20 @@ pub(super) struct Draft<'a> {
     /// The depth was written in the file and is not ours to lower.
     pub(super) depth_written: bool,
     when_stale: WhenStale,
+    verdict: VerdictTable,
 }
 
 impl Draft<'_> {
-    /// The entry; `None` only if a problem with it was reported.
-    pub(super) fn finish(self) -> Option<DeviceSpec> {
+    /// The entry, with what `[verdict]` says for all; `None` only if a problem with it was reported.
+    pub(super) fn finish(self, rig: &VerdictTable) -> Option<DeviceSpec> {
+        let node = self.node?;
+        let fps = if let NodeSpec::Camera(camera) = &node { Some(f64::from(camera.fps)) } else { None };
         Some(DeviceSpec {
+            verdict: verdict::spec(node.modality_kind(), self.stall_after, fps, rig, &self.verdict),
             name: self.name,
             id: self.id?,
             identity: self.identity?,
-            node: self.node?,
+            node,
             topic: self.topic,
             mount: self.mount,
             stall_after: self.stall_after,
@@ -155,6 +161,7 @@ pub(super) fn read<'a>(
         depth: written.unwrap_or_else(|| node::default_depth(settings.as_ref())),
         depth_written: written.is_some(),
         when_stale,
+        verdict: verdict::read(&section, Whose::Device, problems),
         node: settings,
         section,
     }
@@ -251,7 +258,7 @@ fn serial_number(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<S
 }
 
 /// A serial number ends up in rules and descriptors: it must at least be one line of text.
-pub(crate) fn check_serial(serial: &str) -> Result<(), (String, &'static str)> {
+fn check_serial(serial: &str) -> Result<(), (String, &'static str)> {
     /// A USB string descriptor holds at most 126 UTF-16 units.
     const LONGEST: usize = 126;
     if serial.is_empty() {

@@ -6,12 +6,12 @@
 //! Invariant: as root, a program that others could change is refused.
 
 use std::ffi::OsString;
-use std::os::unix::fs::{MetadataExt, PermissionsExt};
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
-use super::file::distrust;
 use crate::registry::diagnostic::nearest;
 use crate::registry::section::printable;
+use crate::registry::trust::distrust;
 
 /// Files beside the registry that are compared with a name that is not found.
 const MOST_COMPARED: usize = 1000;
@@ -102,24 +102,21 @@ fn check(path: &Path) -> Result<(), Wrong> {
     if rustix::fs::access(path, rustix::fs::Access::EXEC_OK).is_err() {
         return wrong("may not be run by this user", format!("chmod +x {label}"));
     }
-    trusted(path, &label, rustix::process::geteuid().as_raw())
+    trusted(path, &label)
 }
 
 /// Whoever may write the program, or exchange it in its folder, decides what root runs.
-fn trusted(path: &Path, label: &str, euid: u32) -> Result<(), Wrong> {
-    /// In a folder with this bit only its owner may exchange a file.
-    const STICKY: u32 = 0o1000;
-    let folder = path.parent().unwrap_or(path);
-    for (place, folder_label) in [(path, None), (folder, Some(printable(&folder.display().to_string())))] {
-        let Ok(meta) = place.metadata() else { continue };
-        let mode = if folder_label.is_some() && meta.mode() & STICKY != 0 { meta.mode() & !0o022 } else { meta.mode() };
-        let label = folder_label.as_deref().unwrap_or(label);
-        if let Some((message, fix)) = distrust(mode, meta.uid(), euid, label) {
-            let what = if folder_label.is_some() { "the program's folder" } else { "the program" };
-            return Err((format!("{what} {label}: {message}"), fix));
+fn trusted(path: &Path, label: &str) -> Result<(), Wrong> {
+    if !rustix::process::geteuid().is_root() {
+        return Ok(());
+    }
+    match distrust(path) {
+        Ok(None) => Ok(()),
+        Ok(Some(reason)) => Err((format!("the program {label}: {reason}"), reason.fix())),
+        Err(error) => {
+            Err((format!("the program {label}: cannot be looked at: {error}"), "name another program".to_owned()))
         }
     }
-    Ok(())
 }
 
 #[cfg(test)]
@@ -162,19 +159,16 @@ mod tests {
         let program = dir.path().join("p");
         write(&program, "").unwrap();
         allow(&program, 0o755);
-        let owner = program.metadata().unwrap().uid();
-        // The files of a test belong to whoever runs it, which need not be root.
-        let says = |euid| trusted(&program, "p", euid).err().map(|(_, fix)| fix);
-        assert_eq!(says(1), None);
-        let sound = (owner != 0).then(|| "chown root p".to_owned());
-        assert_eq!(says(0), sound);
+        // Anybody else runs what that user may run anyway.
+        let refused = || trusted(&program, "p").is_err();
+        let is_root = rustix::process::geteuid().is_root();
+        assert!(!refused());
         allow(&program, 0o775);
-        assert_eq!(says(0), Some(sound.clone().unwrap_or("chmod go-w p".to_owned())));
+        assert_eq!(refused(), is_root);
         allow(&program, 0o755);
         allow(dir.path(), 0o777);
-        assert!(says(0).is_some());
+        assert_eq!(refused(), is_root);
         allow(dir.path(), 0o1777);
-        assert_eq!(says(0), sound);
-        assert_eq!(says(1), None);
+        assert!(!refused());
     }
 }
