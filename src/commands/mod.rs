@@ -5,6 +5,7 @@ pub mod check;
 pub mod completions;
 pub mod devices;
 pub mod mask;
+pub mod recover;
 
 /// How a listing is written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

@@ -104,6 +104,9 @@ impl Columns {
                 };
                 (&"episode".to_owned(), None, word, rest)
             }
+            What::Recovered { text, .. } => {
+                (&"episode".to_owned(), None, palette.warn(&pad("repaired")), text.clone())
+            }
             What::Log { level, text } => {
                 let word = palette.level(*level, &pad(level.word()));
                 (&"log".to_owned(), None, word, text.clone())

@@ -12,6 +12,7 @@ use rustix::io::Errno;
 use serde::Serialize;
 
 use super::RecordError;
+use super::lock::{self, Lock};
 use crate::time;
 
 /// Longest slug of a task in bytes: with date, number and endings a name stays far below the 255
@@ -50,13 +51,15 @@ pub struct EpisodeReport {
     pub error: Option<String>,
 }
 
-/// The two names of an episode's file.
-#[derive(Debug, Clone, PartialEq, Eq)]
+/// The two names of an episode's file, which is locked until the second one is given.
+#[derive(Debug)]
 pub(super) struct EpisodePath {
     /// Once it is finished.
     pub(super) finished: PathBuf,
     /// While it is written.
     pub(super) partial: PathBuf,
+    /// Holds the lock.
+    _locked: File,
 }
 
 impl EpisodePath {
@@ -77,7 +80,12 @@ impl EpisodePath {
                 continue;
             }
             match OpenOptions::new().write(true).create_new(true).open(&partial) {
-                Ok(file) => return Ok((Self { finished, partial }, file)),
+                Ok(file) => match lock(&file, &partial) {
+                    Ok(Some(locked)) => return Ok((Self { finished, partial, _locked: locked }, file)),
+                    // Somebody took the empty file for one that was left behind.
+                    Ok(None) => {}
+                    Err(source) => return Err(RecordError::Io { path: partial, source }),
+                },
                 Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
                 Err(source) => return Err(RecordError::Io { path: partial, source }),
             }
@@ -85,23 +93,36 @@ impl EpisodePath {
         Err(at(out)(io::Error::new(io::ErrorKind::AlreadyExists, "no free number for this task")))
     }
 
-    /// Gives the finished file its name, and waits for the name to be on the disk where the file
-    /// system can be asked for that.
+    /// Gives the finished file its name.
     pub(super) fn publish(&self) -> io::Result<()> {
-        match renameat_with(CWD, &self.partial, CWD, &self.finished, RenameFlags::NOREPLACE) {
-            Ok(()) => {}
-            // A file system without the flag (NFS, some FUSE): the number was free when it was taken.
-            Err(Errno::INVAL | Errno::NOSYS | Errno::OPNOTSUPP) if fs::symlink_metadata(&self.finished).is_err() => {
-                fs::rename(&self.partial, &self.finished)?;
-            }
-            Err(error) => return Err(error.into()),
+        publish(&self.partial, &self.finished)
+    }
+}
+
+/// Gives a file its final name, which must be free, and waits for the name to be on the disk where
+/// the file system can be asked for that.
+pub(super) fn publish(file: &Path, name: &Path) -> io::Result<()> {
+    match renameat_with(CWD, file, CWD, name, RenameFlags::NOREPLACE) {
+        Ok(()) => {}
+        // A file system without the flag (NFS, some FUSE): the name was free when it was chosen.
+        Err(Errno::INVAL | Errno::NOSYS | Errno::OPNOTSUPP) if fs::symlink_metadata(name).is_err() => {
+            fs::rename(file, name)?;
         }
-        let folder = self.finished.parent().filter(|folder| *folder != Path::new("")).unwrap_or(Path::new("."));
-        // The file has its name: what remains is what a loss of power right now would do to it.
-        if let Err(error) = File::open(folder).and_then(|folder| folder.sync_all()) {
-            tracing::warn!(folder = %folder.display(), %error, "folder not synced");
-        }
-        Ok(())
+        Err(error) => return Err(error.into()),
+    }
+    let folder = name.parent().filter(|folder| *folder != Path::new("")).unwrap_or(Path::new("."));
+    // The file has its name: what remains is what a loss of power right now would do to it.
+    if let Err(error) = File::open(folder).and_then(|folder| folder.sync_all()) {
+        tracing::warn!(folder = %folder.display(), %error, "folder not synced");
+    }
+    Ok(())
+}
+
+/// Locks a partial file just made; a handle that holds the lock, `None` if somebody else has it.
+fn lock(file: &File, partial: &Path) -> io::Result<Option<File>> {
+    match lock::take(file, partial)? {
+        Lock::Ours | Lock::Unknown => file.try_clone().map(Some),
+        Lock::Others | Lock::Gone => Ok(None),
     }
 }
 
@@ -114,7 +135,8 @@ fn make_folder(out: &Path) -> Result<(), RecordError> {
     }
 }
 
-/// One more than the highest number of any file, finished or not, whose name begins with `stem`.
+/// One more than the highest number of any file, finished, repaired or not, whose name begins with
+/// `stem`.
 fn next_number(out: &Path, stem: &str) -> io::Result<u32> {
     let mut highest = 0;
     for entry in fs::read_dir(out)? {
@@ -122,7 +144,7 @@ fn next_number(out: &Path, stem: &str) -> io::Result<u32> {
         let number = name
             .to_str()
             .and_then(|name| name.strip_prefix(stem))
-            .and_then(|rest| rest.strip_suffix(".partial").unwrap_or(rest).strip_suffix(".mcap")?.parse::<u32>().ok());
+            .and_then(|rest| rest.split_once('.')?.0.parse::<u32>().ok());
         highest = highest.max(number.unwrap_or(0));
     }
     Ok(highest.saturating_add(1))
@@ -205,6 +227,11 @@ mod tests {
         fs::write(out.join("20231114_t_nonsense.mcap"), "kept").unwrap();
         let (third, _) = EpisodePath::create(&out, "t", WALL).unwrap();
         assert_eq!(third.finished.file_name().unwrap(), "20231114_t_042.mcap");
+        for (number, ending) in [(50, "partial"), (60, "recovering"), (70, "damaged"), (80, "empty")] {
+            fs::write(out.join(format!("20231114_t_0{number}.mcap.{ending}")), "kept").unwrap();
+            let (next, _) = EpisodePath::create(&out, "t", WALL).unwrap();
+            assert_eq!(next.finished.file_name().unwrap(), format!("20231114_t_0{}.mcap", number + 1).as_str());
+        }
         let (other, _) = EpisodePath::create(&out, "other", WALL).unwrap();
         assert_eq!(other.finished.file_name().unwrap(), "20231114_other_001.mcap");
         // A file that took the name meanwhile stays as it is.

@@ -132,6 +132,8 @@ impl Session {
         if let Some((header, mask, sequence)) = masks.at(begin) {
             file.mask(header, *mask, *sequence)?;
         }
+        // Killed in the next moment, it is an episode all the same, of a known task and rig.
+        file.flush()?;
         let modalities: Vec<SyncModality> = registry
             .devices
             .iter()
@@ -381,6 +383,6 @@ fn describe(what: &What) -> String {
         What::Unregistered { device, reason } => format!("{device} not registered: {reason}"),
         What::Recording { file } => format!("recording {}", file.display()),
         What::Episode { file, .. } => format!("finished {}", file.display()),
-        What::Log { text, .. } => text.clone(),
+        What::Recovered { text, .. } | What::Log { text, .. } => text.clone(),
     }
 }

@@ -84,6 +84,21 @@ pub enum What {
         /// Why the file is not whole, if it is not.
         error: Option<String>,
     },
+    /// An episode that an earlier run did not finish was repaired.
+    Recovered {
+        /// The repaired file.
+        file: PathBuf,
+        /// Length of what was recorded, in seconds.
+        seconds: f64,
+        /// Messages.
+        messages: u64,
+        /// Bytes of the unfinished file that are not in the repaired one.
+        unread_bytes: u64,
+        /// Chunks left out because they are not what was written.
+        damaged_chunks: u64,
+        /// What is there and what is lost, for people.
+        text: String,
+    },
     /// A line of the log that has no event of its own.
     Log {
         /// Severity.
@@ -126,6 +141,8 @@ impl What {
                 let level = if *dropped > 0 { Level::Warn } else { Level::Info };
                 (level, format!("{} finished, {seconds:.1} s, {dropped} samples dropped", file.display()))
             }
+            // Something was lost before this run began.
+            Self::Recovered { text, .. } => (Level::Warn, text.clone()),
             Self::Log { level, text } => (*level, text.clone()),
         })
     }
