@@ -55,7 +55,7 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static COUNTING: Counting = Counting;
 
-const CAMERA: SimSource = SimSource::Camera { width: 64, height: 48, fps: 200, seed: 3 };
+const CAMERA: SimSource = SimSource::Camera { width: 64, height: 48, fps: 200, seed: 3, bytes: 0 };
 const SERIAL: SimSource = SimSource::Serial { channels: 4, hz: 500, seed: 3 };
 
 fn spec(node: NodeSpec) -> DeviceSpec {

@@ -60,6 +60,5 @@ pub fn inspect(
 }
 
 fn write_json(out: &mut impl Write, value: &impl serde::Serialize) -> io::Result<()> {
-    serde_json::to_writer(&mut *out, value)?;
-    writeln!(out)
+    writeln!(out, "{}", crate::text::json(value)?)
 }

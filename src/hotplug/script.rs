@@ -142,7 +142,7 @@ impl Stream for Script {
 mod tests {
     use super::*;
     use crate::registry::UsbIdentity;
-    use crate::registry::scenario::SimSource;
+    use crate::registry::scenario::{SimFaults, SimSource};
     use futures::StreamExt;
 
     fn device(name: &str, port: &str, plugged: bool) -> ScenarioDevice {
@@ -151,6 +151,7 @@ mod tests {
             usb: UsbIdentity { vid: 1, pid: 2, serial: None, port: port.into(), product: None },
             source: SimSource::Serial { channels: 1, hz: 100, seed: 1 },
             plugged,
+            faults: SimFaults::default(),
         }
     }
 

@@ -24,13 +24,19 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Them
 }
 
 fn under_way(recording: &RecordingStatus, area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
-    let mut figures = vec![
-        Span::raw(text::clock(recording.elapsed)),
-        Span::styled("   messages ", theme.faint()),
-        Span::raw(recording.messages.to_string()),
+    let mut figures = vec![Span::raw(text::clock(recording.elapsed))];
+    if let Some(left) = recording.room {
+        // In place of what can wait: the line is full.
+        let left = format!("{} disk full in {}", theme.symbol("▲", "!"), text::clock(left));
+        figures.extend([Span::raw("   "), Span::styled(left, theme.alarm())]);
+    } else {
+        let messages = Span::raw(recording.messages.to_string());
+        figures.extend([Span::styled("   messages ", theme.faint()), messages]);
+    }
+    figures.extend([
         Span::raw(format!("   {}", text::size(recording.bytes))),
         Span::raw(format!("   {:.1} MB/s", model.totals().recorded / 1e6)),
-    ];
+    ]);
     let dropped = format!("dropped {}", recording.dropped);
     figures.push(Span::raw("   "));
     figures.push(if recording.dropped > 0 {

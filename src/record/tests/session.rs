@@ -16,6 +16,7 @@ fn session(folder: &Path, board: &Arc<Board>, masks: &MaskHistory) -> Session {
         board: Arc::clone(board),
         request: &EpisodeRequest::default(),
         path,
+        handle: file.try_clone().unwrap(),
         sink: Box::new(file),
         attached: &BTreeMap::new(),
         clock,
