@@ -20,6 +20,9 @@ pub enum InspectFailure {
 
 /// Tells of the episodes at `paths`. In a list, a file that cannot be read has a line like the others;
 /// then the outcome is not [`Outcome::Done`].
+///
+/// # Errors
+/// When the only file named cannot be read, or nothing can be written to `out`.
 pub fn inspect(
     paths: &[PathBuf],
     format: Format,

@@ -59,8 +59,11 @@ pub fn episodes(paths: &[PathBuf]) -> Result<Vec<PathBuf>, InspectError> {
 }
 
 fn is_episode(path: &Path) -> bool {
-    let name = path.file_name().unwrap_or_default().to_string_lossy();
-    name.strip_suffix(".partial").unwrap_or(&name).ends_with(".mcap")
+    let name = match path.extension() {
+        Some(extension) if extension == "partial" => path.with_extension(""),
+        _ => path.to_owned(),
+    };
+    name.extension().is_some_and(|extension| extension == "mcap")
 }
 
 /// What is said of one episode of a list.

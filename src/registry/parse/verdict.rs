@@ -36,11 +36,14 @@ enum Worse {
     Less,
 }
 
-/// The limits of one grade as they were written: `Some(None)` is "off".
+/// A limit as it was written; `None` is "off".
+type Given<T> = Option<T>;
+
+/// The limits of one grade as they were written, as far as they were.
 #[derive(Debug, Default, Clone, Copy)]
 struct Written {
-    shares: [Option<Option<f64>>; SHARES.len()],
-    times: [Option<Option<Duration>>; TIMES.len()],
+    shares: [Option<Given<f64>>; SHARES.len()],
+    times: [Option<Given<Duration>>; TIMES.len()],
 }
 
 /// A verdict table as it was written.
@@ -106,7 +109,7 @@ fn text<'a>(section: &Section<'a>, key: &str) -> Option<&'a str> {
 }
 
 /// `"0.1%"`, `"0.1 %"`, or `"off"`.
-fn read_share(section: &Section<'_>, key: &str, problems: &mut Problems<'_>) -> Option<Option<f64>> {
+fn read_share(section: &Section<'_>, key: &str, problems: &mut Problems<'_>) -> Option<Given<f64>> {
     let usual = if key == "rate" { "90%" } else { "0.5%" };
     let fix = format!("write 0% to 100%, or \"off\", for example {key} = \"{usual}\"");
     if !section.has(key) {
@@ -197,8 +200,8 @@ pub(super) fn spec(
 fn change<T: PartialOrd + Copy>(
     suspect: &mut Option<T>,
     bad: &mut Option<T>,
-    new_suspect: Option<Option<T>>,
-    new_bad: Option<Option<T>>,
+    new_suspect: Option<Given<T>>,
+    new_bad: Option<Given<T>>,
     whose: Whose,
     worse: Worse,
 ) {
