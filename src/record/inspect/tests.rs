@@ -218,6 +218,38 @@ fn the_report_on_a_screen() {
     insta::assert_snapshot!(render(&said, 60, Paint::Plain));
 }
 
+#[tokio::test]
+async fn a_folder_is_a_line_for_each_of_its_episodes() {
+    let (bench, file) = episode().await;
+    let folder = file.parent().unwrap();
+    std::fs::write(folder.join("20231114_t_001.mcap"), "no").unwrap();
+    std::fs::write(folder.join("notes.txt"), "no episode").unwrap();
+    let whole = std::fs::read(&file).unwrap();
+    std::fs::write(folder.join("99990101_t_001.mcap.partial"), &whole[..whole.len() / 2]).unwrap();
+    let files = episodes(&[folder.to_owned(), file.clone()]).unwrap();
+    let names: Vec<_> = files.iter().map(|file| file.file_name().unwrap().to_str().unwrap()).collect();
+    let name = file.file_name().unwrap().to_str().unwrap();
+    assert_eq!(names, ["20231114_t_001.mcap", name, "99990101_t_001.mcap.partial", name]);
+
+    let lines: Vec<_> = files.iter().map(|file| render_list(&list(file), 30, Paint::Plain)).collect();
+    assert!(
+        lines[0].starts_with("?        20231114_t_001.mcap") && lines[0].ends_with("not an MCAP file"),
+        "{lines:?}"
+    );
+    assert!(lines[1].starts_with(&format!("BAD      {name}")) && lines[1].contains(" 1.0 s "), "{lines:?}");
+    assert!(lines[1].contains("tof: 7 of ") && lines[1].ends_with(" (and 3 more)"), "{lines:?}");
+    assert!(
+        !lines[2].starts_with("GOOD") && lines[2].contains("not whole") || lines[2].starts_with("BAD"),
+        "{lines:?}"
+    );
+    let json = serde_json::to_value(list(&files[1])).unwrap();
+    assert_eq!((&json["verdict"], &json["end"], json.get("error")), (&"BAD".into(), &"finished".into(), None));
+    let json = serde_json::to_value(list(&files[0])).unwrap();
+    assert_eq!((json.get("verdict"), &json["error"]), (None, &"not an MCAP file".into()));
+    assert!(matches!(episodes(&[folder.join("none")]).map(|files| files.len()), Ok(1)), "said when it is read");
+    drop(bench);
+}
+
 /// What was measured of a modality, for a report on a screen.
 fn quality() -> Quality {
     Quality {

@@ -110,7 +110,8 @@ fn text<'a>(section: &Section<'a>, key: &str) -> Option<&'a str> {
 
 /// `"0.1%"`, `"0.1 %"`, or `"off"`.
 fn read_share(section: &Section<'_>, key: &str, problems: &mut Problems<'_>) -> Option<Given<f64>> {
-    let fix = format!("write 0% to 100%, or \"off\", for example {key} = \"0.5%\"");
+    let usual = if key == "rate" { "90%" } else { "0.5%" };
+    let fix = format!("write 0% to 100%, or \"off\", for example {key} = \"{usual}\"");
     if !section.has(key) {
         return None;
     }
