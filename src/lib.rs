@@ -20,6 +20,8 @@
 //!  L1   registry                                 devices.toml, checked
 //!       status                                   the board every stage reports on
 //!       text   outlet                            words and lines for people
+//!       folder                                   files others cannot lead astray
+//!       episode_format                           an episode's file, record by record
 //!  L0   modality   mask   sample   time          nouns
 //! ```
 //!
@@ -82,6 +84,8 @@ pub mod cli;
 pub mod commands;
 pub mod dispatch;
 pub mod driver;
+pub mod episode_format;
+pub mod folder;
 pub mod headless;
 pub mod hotplug;
 pub mod logging;

@@ -70,6 +70,11 @@ fn spec(node: NodeSpec) -> DeviceSpec {
         max_bytes: 1 << 20,
         depth: 4,
         when_stale: WhenStale::Hold,
+        verdict: rapid::registry::VerdictSpec::of(
+            rapid::modality::ModalityKind::Image,
+            Duration::from_millis(500),
+            Some(30.0),
+        ),
     }
 }
 

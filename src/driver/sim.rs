@@ -52,7 +52,7 @@ impl Sim {
     /// Starts the device at the next point of its grid.
     ///
     /// # Errors
-    /// When a picture of these dimensions cannot be made.
+    /// When a picture of these dimensions cannot be made, or the device has no samples of its own.
     pub async fn open(device: Arc<SimDevice>) -> Result<Self, DriverError> {
         let (content, rate, backlog) = match device.source {
             SimSource::Camera { width, height, fps, seed, bytes } => {
@@ -62,8 +62,8 @@ impl Sim {
             SimSource::Serial { channels, hz, seed } => {
                 (Content::Values { channels, seed }, hz, SERIAL_BACKLOG.as_secs() * u64::from(hz.max(1)))
             }
-            SimSource::Replay { .. } => {
-                return Err(DriverError::Fatal(format!("{} is a recording, not a simulated device", device.name)));
+            SimSource::Process | SimSource::Replay { .. } => {
+                return Err(DriverError::Fatal(format!("{} sends no samples made up here", device.name)));
             }
         };
         let capacity = match &content {
@@ -134,7 +134,7 @@ impl Sim {
                 format!("simulated camera, MJPG {width}x{height} at {fps} fps")
             }
             SimSource::Serial { channels, hz, .. } => format!("simulated serial line, {channels} numbers at {hz} Hz"),
-            SimSource::Replay { .. } => String::from("recording"),
+            SimSource::Process | SimSource::Replay { .. } => String::new(),
         }
     }
 }
@@ -159,7 +159,7 @@ pub(super) fn check(spec: &DeviceSpec, device: &SimDevice) -> Result<(), DriverE
         }
         (SimSource::Camera { .. }, NodeSpec::Serial(_)) => (String::from("pictures"), String::from("a serial line")),
         (SimSource::Serial { .. }, NodeSpec::Camera(_)) => (String::from("numbers"), String::from("a camera")),
-        (SimSource::Replay { .. }, _) => return Ok(()),
+        (SimSource::Process | SimSource::Replay { .. }, _) | (_, NodeSpec::Process(_)) => return Ok(()),
     };
     Err(DriverError::Fatal(format!(
         "the scenario's device {} sends {sends}, [device.{}] says {wished}: make them equal",
@@ -167,7 +167,8 @@ pub(super) fn check(spec: &DeviceSpec, device: &SimDevice) -> Result<(), DriverE
     )))
 }
 
-/// The bytes a simulated device sends as number `sequence`, made anew; `None` for a recording.
+/// The bytes a simulated device sends as number `sequence`, made anew; `None` for a recording
+/// or a program.
 #[must_use]
 pub fn frame(source: &SimSource, sequence: u32) -> Option<Vec<u8>> {
     let mut payload = Vec::new();
@@ -178,7 +179,7 @@ pub fn frame(source: &SimSource, sequence: u32) -> Option<Vec<u8>> {
             write_picture(&picture, seed, sequence, &mut payload);
         }
         SimSource::Serial { channels, seed, .. } => write_values(channels, seed, sequence, &mut payload),
-        SimSource::Replay { .. } => return None,
+        SimSource::Process | SimSource::Replay { .. } => return None,
     }
     Some(payload)
 }

@@ -60,6 +60,8 @@ pub enum SimSource {
         /// Chooses the values.
         seed: u64,
     },
+    /// Nothing of its own: the program of the entry runs as it would for a real device.
+    Process,
     /// The samples of one topic of a recorded episode, at their recorded distances in time.
     Replay {
         /// The episode.

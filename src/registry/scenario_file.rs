@@ -37,7 +37,7 @@ use std::time::Duration;
 
 use super::attachment::UsbIdentity;
 use super::diagnostic::{RegistryErrors, did_you_mean};
-use super::parse::{check_serial, is_port, read_file};
+use super::parse::{is_port, read_file};
 use super::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, SimSource};
 use super::section::{Problems, Section, file_label, read};
 use super::spec::{DeviceSpec, NodeSpec, Registry};
@@ -116,6 +116,7 @@ fn standing_for(spec: &DeviceSpec, name: &str) -> ScenarioDevice {
         }
         // Raw lines have no channels; something must be sent all the same.
         NodeSpec::Serial(serial) => SimSource::Serial { channels: serial.channels.max(1), hz: SERIAL_HZ, seed },
+        NodeSpec::Process(_) => SimSource::Process,
     };
     let usb = UsbIdentity {
         vid: spec.identity.vid,
@@ -190,17 +191,14 @@ fn device(section: &Section<'_>, registry: &Registry, problems: &mut Problems<'_
             *rate = hz.unwrap_or(*rate);
             *chosen = seed.unwrap_or(*chosen);
         }
-        SimSource::Replay { .. } => {}
+        SimSource::Process | SimSource::Replay { .. } => {}
     }
     device.plugged = section.flag(problems, "plugged").unwrap_or(true);
     device.usb.vid = section.usb_id(problems, "vid").unwrap_or(device.usb.vid);
     device.usb.pid = section.usb_id(problems, "pid").unwrap_or(device.usb.pid);
     if let Some(serial) = section.text(problems, "serial").map(|serial| serial.value) {
-        match check_serial(serial) {
-            _ if serial.is_empty() => device.usb.serial = None,
-            Ok(()) => device.usb.serial = Some(serial.to_owned()),
-            Err((message, _)) => section.report(problems, "serial", message, "write a serial number of printable text"),
-        }
+        // What a device says of itself is no mistake of the file, whatever it is.
+        device.usb.serial = (!serial.is_empty()).then(|| serial.to_owned());
     }
     if let Some(port) = port(section, problems) {
         device.usb.port = port;

@@ -2,7 +2,8 @@
 
 use super::super::episode::EpisodePath;
 use super::super::hole::Hole;
-use super::super::session::{Beginning, MaskHistory, Session};
+use super::super::masks::MaskHistory;
+use super::super::session::{Beginning, Session};
 use super::*;
 use crate::time::WallClock;
 
@@ -15,6 +16,7 @@ fn session(folder: &Path, board: &Arc<Board>, masks: &MaskHistory) -> Session {
         board: Arc::clone(board),
         request: &EpisodeRequest::default(),
         path,
+        handle: file.try_clone().unwrap(),
         sink: Box::new(file),
         attached: &BTreeMap::new(),
         clock,
