@@ -95,7 +95,7 @@ async fn open_sim(source: SimSource) -> (Driver, Arc<SimDevice>) {
     let spec = match source {
         SimSource::Camera { .. } => camera_spec(),
         SimSource::Serial { channels, .. } => serial_spec(Framing::Line, Parse::Csv, channels),
-        SimSource::Replay { .. } => serial_spec(Framing::Line, Parse::Csv, 1),
+        SimSource::Process | SimSource::Replay { .. } => serial_spec(Framing::Line, Parse::Csv, 1),
     };
     let device = sim_device(source);
     let driver = Driver::open(&spec, &DeviceNode::Sim(Arc::clone(&device))).await.unwrap();

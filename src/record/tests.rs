@@ -23,7 +23,7 @@ use crate::registry::{
     VerdictSpec, WhenStale,
 };
 use crate::sample::{Encoding, FLAG_ERROR, SampleHeader};
-use crate::status::{Board, Level, What};
+use crate::status::{Board, Grade, Level, What};
 use crate::time::Stamp;
 
 const MS: u64 = 1_000_000;
