@@ -7,6 +7,7 @@
 //! Invariant: a missing image or binary is an error that names the remedy, never a skipped test.
 
 pub mod clock;
+pub mod deaf;
 pub mod emu;
 pub mod figure;
 pub mod guest;
