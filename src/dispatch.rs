@@ -13,6 +13,7 @@ use tokio_util::sync::CancellationToken;
 use crate::app::{self, AppError, Devices, Options, Screen, mask_path};
 use crate::cli::{Cli, Command, Global, RunArgs, SimArgs};
 use crate::commands::devices::{Entries, Formats};
+use crate::commands::inspect::InspectFailure;
 use crate::commands::{self, Format, Outcome, mask::MaskOptions};
 use crate::driver::{DriverError, replay};
 use crate::headless::style::{ColourChoice, Palette, Terminal};
@@ -64,6 +65,15 @@ enum Failure {
     Told,
     #[error("output: {0}")]
     Output(#[from] io::Error),
+}
+
+impl From<InspectFailure> for Failure {
+    fn from(failure: InspectFailure) -> Self {
+        match failure {
+            InspectFailure::Episode(error) => Self::Inspect(error),
+            InspectFailure::Output(error) => Self::Output(error),
+        }
+    }
 }
 
 impl Failure {
@@ -142,13 +152,10 @@ fn print(global: &Global, before: SimArgs, command: Command) -> Result<(), Failu
             Ok(commands::artifacts::write(&registry, &to, out)?)
         }
         Command::Mask { watch } => mask(global, watch),
-        Command::Inspect { file } => {
-            let inspection = inspect::inspect(&file)?;
-            if format == Format::Json {
-                return Ok(writeln!(out, "{}", text::json(&inspection).map_err(io::Error::from)?)?);
-            }
-            Ok(out.write_all(inspect::render(&inspection, columns(), paint()).as_bytes())?)
-        }
+        Command::Inspect { paths } => match commands::inspect::inspect(&paths, format, columns(), paint(), out)? {
+            Outcome::Done => Ok(()),
+            Outcome::BadConfiguration => Err(Failure::Told),
+        },
         Command::Completions { shell } => Ok(commands::completions::completions(&mut Cli::command(), shell, out)?),
         Command::Replay { .. } => Ok(()),
     }

@@ -105,7 +105,7 @@ impl Folder {
     /// # Errors
     /// `AlreadyExists` when anything has that name, a link that leads nowhere included.
     pub fn create_new(&self, name: impl AsRef<OsStr>, mode: u32) -> io::Result<File> {
-        let flags = OFlags::WRONLY | OFlags::CREATE | OFlags::EXCL | OFlags::NOFOLLOW | OFlags::CLOEXEC;
+        let flags = OFlags::RDWR | OFlags::CREATE | OFlags::EXCL | OFlags::NOFOLLOW | OFlags::CLOEXEC;
         let file = rustix::fs::openat(&self.open, name.as_ref(), flags, Mode::from_raw_mode(mode))?;
         Ok(File::from(file))
     }

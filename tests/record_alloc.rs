@@ -168,6 +168,7 @@ async fn only_chunks_allocate() {
         sync_window: Duration::from_millis(25),
         cooldown: Duration::from_secs(2),
         memory_budget: 1 << 29,
+        disk_reserve: None,
     };
     let registry = Arc::new(Registry { rig, devices: vec![device], path: None, text: String::new() });
     let board = Arc::new(Board::new(&registry));

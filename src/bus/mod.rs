@@ -15,11 +15,13 @@
 
 mod inbox;
 mod ingress;
+mod place;
 mod service;
 mod shared;
 mod topic;
 mod writer;
 
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use iceoryx2::config::Config;
@@ -68,6 +70,17 @@ pub enum BusError {
     Full {
         /// The topic.
         topic: String,
+    },
+    /// What the bus lives in is another user's.
+    #[error(
+        "shared-memory bus: {}: {what}; end the programs that use it and remove it (`sudo rm -r {}`), or run rapid as \
+         that user", path.display(), path.display()
+    )]
+    Foreign {
+        /// Folder or file.
+        path: PathBuf,
+        /// What is wrong with it.
+        what: String,
     },
     /// The node could not be created.
     #[error("shared-memory bus: {0}")]
@@ -118,12 +131,16 @@ impl Bus {
     /// When a topic is in use with another layout, or shared memory is not to be had.
     pub fn open(registry: &Registry, instance: Option<&str>) -> Result<Self, BusError> {
         let config = config(instance)?;
+        place::check(&PathBuf::from(config.global.root_path().to_string()))?;
         let node = NodeBuilder::new()
             .config(&config)
             // Signals belong to the program, not to a library.
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create::<Service>()
-            .map_err(|error| BusError::Node(error.to_string()))?;
+            .map_err(|error| {
+                let prefix = config.global.prefix.to_string();
+                place::in_the_way(&prefix).unwrap_or_else(|| BusError::Node(error.to_string()))
+            })?;
         let specs = registry.devices.iter().map(TopicSpec::of_device).chain([TopicSpec::mask()]);
         let topics = specs.map(|spec| open_topic(&node, spec)).collect::<Result<Vec<_>, _>>()?;
         let wake = node

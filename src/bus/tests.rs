@@ -12,6 +12,7 @@ fn registry(depth: usize) -> Registry {
             sync_window: Duration::from_millis(25),
             cooldown: Duration::from_secs(2),
             memory_budget: 1 << 20,
+            disk_reserve: None,
         },
         devices: vec![DeviceSpec {
             name: "motor".into(),

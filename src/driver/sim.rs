@@ -18,7 +18,7 @@ use super::{DriverError, Reading, unblock};
 use crate::registry::scenario::{SimDevice, SimSource};
 use crate::registry::{DeviceSpec, NodeSpec};
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
-use crate::time::Stamp;
+use crate::time::{Stamp, nanoseconds};
 
 /// Different pictures a simulated camera has.
 const PICTURES: u32 = 8;
@@ -40,6 +40,10 @@ pub struct Sim {
     next: u64,
     backlog: u64,
     payload: Vec<u8>,
+    /// Losses not told yet.
+    owed: u64,
+    /// The sample in `payload` is to be sent once more, with this stamp.
+    again: Option<Stamp>,
 }
 
 #[derive(Debug)]
@@ -72,7 +76,7 @@ impl Sim {
         };
         let grid = Grid { begun: device.begun, rate: u64::from(rate.max(1)) };
         let next = grid.first_after(stamp_of(Instant::now()));
-        Ok(Self { device, content, grid, next, backlog, payload: Vec::with_capacity(capacity) })
+        Ok(Self { device, content, grid, next, backlog, payload: Vec::with_capacity(capacity), owed: 0, again: None })
     }
 
     /// The next sample.
@@ -80,23 +84,48 @@ impl Sim {
     /// # Errors
     /// [`DriverError::Gone`] once the cable is pulled.
     pub async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
-        let lost = self.next_due().await?;
+        if let Some(captured) = self.again.take() {
+            return Ok(self.reading(captured, 0));
+        }
+        let faults = self.device.faults;
+        let hits = |every: Option<u64>, point: u64| every.is_some_and(|every| point.is_multiple_of(every));
+        loop {
+            self.owed += self.next_due().await?;
+            if !hits(faults.lose_every, self.next) {
+                break;
+            }
+            self.next += 1;
+            self.owed += 1;
+        }
         // Nothing waits from here on: a future that is dropped has taken no sample.
+        let (lost, point) = (std::mem::take(&mut self.owed), self.next);
         let skipped = u32::try_from(lost).unwrap_or(u32::MAX);
         let sequence = self.device.sequence.fetch_add(skipped.wrapping_add(1), Ordering::AcqRel).wrapping_add(skipped);
-        let captured = self.grid.stamp(self.next);
+        let captured = self.grid.stamp(point);
         self.next += 1;
+        let elapsed = captured.since(self.device.begun);
+        if self.payload.is_empty() || faults.freeze_at.is_none_or(|freeze| elapsed < freeze) {
+            match &self.content {
+                Content::Pictures(pictures) => pictures.write(sequence, &mut self.payload),
+                Content::Values { channels, seed } => write_values(*channels, *seed, sequence, &mut self.payload),
+            }
+        }
+        if hits(faults.truncate_every, point) {
+            self.payload.truncate(self.payload.len() / 2);
+        }
+        let error = i128::from(nanoseconds(elapsed)) * i128::from(faults.clock_ppm) / 1_000_000;
+        let captured = Stamp(u64::try_from(i128::from(captured.0) + error).unwrap_or(captured.0));
+        self.again = hits(faults.duplicate_every, point).then_some(captured);
+        Ok(self.reading(captured, lost))
+    }
+
+    /// What is in `payload`.
+    fn reading(&self, captured: Stamp, lost: u64) -> Reading<'_> {
         let (encoding, width, height) = match &self.content {
-            Content::Pictures(pictures) => {
-                pictures.write(sequence, &mut self.payload);
-                (Encoding::Mjpeg, pictures.width, pictures.height)
-            }
-            Content::Values { channels, seed } => {
-                write_values(*channels, *seed, sequence, &mut self.payload);
-                (Encoding::F64, u32::try_from(*channels).unwrap_or(u32::MAX), 0)
-            }
+            Content::Pictures(pictures) => (Encoding::Mjpeg, pictures.width, pictures.height),
+            Content::Values { channels, .. } => (Encoding::F64, u32::try_from(*channels).unwrap_or(u32::MAX), 0),
         };
-        Ok(Reading { bytes: &self.payload, encoding, captured, flags: FLAG_DEVICE_TIME, width, height, lost })
+        Reading { bytes: &self.payload, encoding, captured, flags: FLAG_DEVICE_TIME, width, height, lost }
     }
 
     /// Waits until the next sample is due; tells how many the device had to drop before it because
@@ -115,7 +144,8 @@ impl Sim {
                 continue;
             }
             let due = self.grid.stamp(self.next);
-            let now_stamp = stamp_of(now);
+            // What is on its way for long is to be had as late.
+            let now_stamp = stamp_of(now).before(self.device.faults.delay);
             if due <= now_stamp {
                 let newest = self.grid.first_after(now_stamp).saturating_sub(1);
                 let lost = newest.saturating_sub(self.next).saturating_sub(self.backlog);

@@ -4,7 +4,7 @@ use serde::Serialize;
 
 use super::style::Palette;
 use crate::modality::ModalityId;
-use crate::status::{DeviceStatus, Event, Snapshot, What};
+use crate::status::{DeviceStatus, Event, Level, Snapshot, What};
 use crate::text;
 use crate::time::Stamp;
 
@@ -104,6 +104,11 @@ impl Columns {
                 rest.push_str("  ");
                 rest.push_str(&why);
                 (&"episode".to_owned(), None, palette.grade(verdict.grade, &pad(verdict.grade.word())), rest)
+            }
+            What::DiskLow { .. } | What::ClockStep { .. } => {
+                let (level, text) = event.what.sentence().unwrap_or((Level::Warn, String::new()));
+                let subject = if matches!(event.what, What::DiskLow { .. }) { "disk" } else { "clock" };
+                (&subject.to_owned(), None, palette.level(level, &pad(level.word())), text)
             }
             What::Log { level, text } => {
                 let word = palette.level(*level, &pad(level.word()));

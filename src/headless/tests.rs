@@ -5,7 +5,7 @@ use serde_json::Value;
 use super::*;
 use crate::sample::Epoch;
 use crate::status::literal::{WALL_NS, board, every_state, id, recording, three_streaming};
-use crate::status::{Grade, Level, SlotState, Verdict, What};
+use crate::status::{Grade, Level, RecordingStatus, SlotState, Verdict, What};
 
 /// An output that keeps what it is given.
 #[derive(Clone, Default)]
@@ -38,7 +38,7 @@ fn state(device: &str, bit: u8, state: SlotState, detail: &str) -> What {
 
 fn episode(dropped: u64, error: Option<&str>) -> What {
     What::Episode {
-        file: "out/a.mcap".into(),
+        file: if error == Some("disk full") { "out/a.mcap.partial".into() } else { "out/a.mcap".into() },
         seconds: 30.04,
         messages: 1234,
         bytes: 12_345_678,
@@ -74,6 +74,9 @@ fn all_events() -> Vec<What> {
         episode(0, None),
         episode(3, None),
         episode(3, Some("disk full")),
+        episode(0, Some("disk nearly full")),
+        What::DiskLow { folder: "out".into(), free: 1_500_000_000, seconds: 252 },
+        What::ClockStep { seconds: -3600.0 },
         What::Log { level: Level::Warn, text: "something".to_owned() },
     ]
 }
@@ -91,7 +94,10 @@ fn lines_for_people_have_their_columns() {
     22:13:20.000Z  episode            recording     out/a.mcap
     22:13:20.000Z  episode            GOOD          out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped
     22:13:20.000Z  episode            SUSPECT       out/a.mcap  30.0 s  1234 messages  12.3 MB  3 dropped  cam_wrist: 3 of 900 samples dropped on the way to the file (limit 0 %)
-    22:13:20.000Z  episode            BAD           out/a.mcap  30.0 s  1234 messages  12.3 MB  3 dropped  the file could not be written: disk full
+    22:13:20.000Z  episode            BAD           out/a.mcap.partial  30.0 s  1234 messages  12.3 MB  3 dropped  the file could not be written: disk full
+    22:13:20.000Z  episode            BAD           out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped  the file could not be written: disk nearly full
+    22:13:20.000Z  disk               warn          out: disk nearly full, 1.5 GB free: the episode will be closed in about 4 min
+    22:13:20.000Z  clock              warn          the wall clock was set back by 3600.000 s; times of capture stay as they are
     22:13:20.000Z  log                warn          something
     "#);
 }
@@ -144,6 +150,13 @@ fn progress_names_what_counts_first() {
     assert_eq!(object["recording"]["dropped"], 2);
     assert_eq!(object["devices"][3]["state"], "stalled");
     assert!(object.get("duration").is_none());
+    assert!(object["recording"].get("disk_seconds").is_none());
+
+    snapshot.recording = Some(RecordingStatus { room: Some(Duration::from_secs(252)), ..recording(2) });
+    let line = progress::line(&snapshot, &Rates::default(), Duration::from_secs(12), None);
+    assert!(line.contains("2 dropped  disk full in 04:12"), "{line}");
+    let json = progress::json(&snapshot, &Rates::default(), Duration::from_secs(12), None, WALL_NS).unwrap();
+    assert_eq!(serde_json::from_str::<Value>(&json).unwrap()["recording"]["disk_seconds"], 252);
 }
 
 #[test]

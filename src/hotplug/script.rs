@@ -112,7 +112,7 @@ pub fn attached(scenario: &Scenario) -> Vec<Attachment> {
 
 /// The attachment of a device that is plugged in now, and its cable.
 fn attachment(device: &ScenarioDevice, begun: Stamp) -> (Attachment, Arc<SimDevice>) {
-    let sim = Arc::new(SimDevice::new(&device.name, device.source.clone(), begun));
+    let sim = Arc::new(SimDevice::new(&device.name, device.source.clone(), begun).with_faults(device.faults));
     let syspath = PathBuf::from("/sim").join(&device.usb.port);
     let (node, usb) = (DeviceNode::Sim(Arc::clone(&sim)), device.usb.clone());
     (Attachment { syspath, node, usb }, sim)
@@ -142,7 +142,7 @@ impl Stream for Script {
 mod tests {
     use super::*;
     use crate::registry::UsbIdentity;
-    use crate::registry::scenario::SimSource;
+    use crate::registry::scenario::{SimFaults, SimSource};
     use futures::StreamExt;
 
     fn device(name: &str, port: &str, plugged: bool) -> ScenarioDevice {
@@ -151,6 +151,7 @@ mod tests {
             usb: UsbIdentity { vid: 1, pid: 2, serial: None, port: port.into(), product: None },
             source: SimSource::Serial { channels: 1, hz: 100, seed: 1 },
             plugged,
+            faults: SimFaults::default(),
         }
     }
 

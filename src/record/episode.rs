@@ -14,6 +14,8 @@ use crate::folder::{Folder, FolderError, Links, Missing};
 use crate::status::Verdict;
 use crate::time;
 
+/// Extension of a file that is not finished.
+pub(super) const PARTIAL: &str = "partial";
 /// Longest slug of a task in bytes: with date, number and endings a name stays far below the 255
 /// bytes a file name may have.
 const SLUG_BYTES: usize = 64;
@@ -48,7 +50,7 @@ pub struct EpisodeReport {
     pub bytes: u64,
     /// Samples lost on the way to the file.
     pub dropped: u64,
-    /// Why the file is not whole, if it is not.
+    /// Why the file, or the episode in it, is not whole, if it is not.
     pub error: Option<String>,
     /// What it is worth.
     #[serde(flatten)]
@@ -58,7 +60,7 @@ pub struct EpisodeReport {
 /// The folder of an episode's file, held open, and its two names in it.
 #[derive(Debug)]
 pub(super) struct EpisodePath {
-    folder: Folder,
+    pub(super) folder: Folder,
     /// Once it is finished.
     pub(super) finished: PathBuf,
     /// While it is written.

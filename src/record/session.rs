@@ -18,6 +18,7 @@
 //! Invariant: every sample a frame names was written to the file before the frame.
 
 use std::collections::BTreeMap;
+use std::fs::File;
 use std::io;
 use std::sync::Arc;
 use std::time::Duration;
@@ -27,6 +28,7 @@ use super::encode::EventText;
 use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest};
 use super::file::{EpisodeFile, Sink};
 use super::hole::Hole;
+use super::keep;
 use super::masks::MaskHistory;
 use super::metadata::{self, Ending};
 use super::quality::{Frames, Measured, Measures, Seen};
@@ -57,6 +59,8 @@ pub(super) struct Session {
     board: Arc<Board>,
     path: EpisodePath,
     file: EpisodeFile,
+    /// The open file itself, whatever becomes of its name.
+    handle: File,
     begin: Stamp,
     end: Option<Stamp>,
     grid: Grid,
@@ -79,6 +83,7 @@ pub(super) struct Beginning<'a> {
     pub(super) request: &'a EpisodeRequest,
     pub(super) path: EpisodePath,
     pub(super) sink: Box<dyn Sink>,
+    pub(super) handle: File,
     pub(super) attached: &'a Attached,
     pub(super) clock: WallClock,
     pub(super) begin: Stamp,
@@ -87,7 +92,7 @@ pub(super) struct Beginning<'a> {
 impl Session {
     /// Begins an episode and writes what stands at its beginning.
     pub(super) fn begin(beginning: Beginning<'_>, masks: &MaskHistory) -> io::Result<Self> {
-        let Beginning { registry, board, request, path, sink, attached, clock, begin } = beginning;
+        let Beginning { registry, board, request, path, sink, handle, attached, clock, begin } = beginning;
         let said = metadata::beginning(&registry, request, attached, clock, begin);
         let mut file = EpisodeFile::begin(sink, &registry, clock, begin, said)?;
         let mut measures = Measures::new(&measured(&registry), frames(&registry, begin));
@@ -112,6 +117,7 @@ impl Session {
             board,
             path,
             file,
+            handle,
             begin,
             next_tick: 0,
             measures,
@@ -260,13 +266,16 @@ impl Session {
             seen: &self.seen,
         };
         let closed = match self.failed {
-            None => self.file.finish(metadata::end(&ending)).and_then(|()| self.path.publish()),
+            None => {
+                let finished = self.file.finish(metadata::end(&ending));
+                finished.and_then(|()| keep::publish(&self.path, &self.handle))
+            }
             Some(error) => Err(error),
         };
         let (file, error, verdict) = match closed {
-            Ok(()) => (self.path.finished, reason, ending.verdict),
+            Ok(file) => (file, reason, ending.verdict),
             Err(error) => {
-                let file = self.path.partial;
+                let file = keep::partial(&self.path, &self.handle);
                 let text = match reason {
                     Some(reason) => format!("{reason}; {}: {error}", file.display()),
                     None => format!("{}: {error}", file.display()),
@@ -287,6 +296,7 @@ impl Session {
             messages: self.file.messages,
             bytes: self.file.bytes,
             dropped: self.measures.dropped(),
+            room: None,
         }
     }
 
@@ -362,5 +372,8 @@ fn describe(what: &What) -> String {
         What::Recording { file } => format!("recording {}", file.display()),
         What::Episode { file, .. } => format!("finished {}", file.display()),
         What::Log { text, .. } => text.clone(),
+        What::DiskLow { .. } | What::ClockStep { .. } => {
+            what.sentence().map_or_else(String::new, |(_, sentence)| sentence)
+        }
     }
 }

@@ -2,6 +2,7 @@
 
 mod episode;
 mod faults;
+mod room;
 mod session;
 
 use std::collections::{BTreeMap, VecDeque};
@@ -22,7 +23,7 @@ use crate::registry::{
     VerdictSpec, WhenStale,
 };
 use crate::sample::{Encoding, FLAG_ERROR, SampleHeader};
-use crate::status::{Board, Level, What};
+use crate::status::{Board, Grade, Level, What};
 use crate::time::Stamp;
 
 const MS: u64 = 1_000_000;
@@ -123,6 +124,7 @@ pub(super) fn registry() -> Registry {
             sync_window: Duration::from_millis(25),
             cooldown: Duration::from_secs(2),
             memory_budget: 1 << 29,
+            disk_reserve: None,
         },
         devices: vec![
             device(CAM, "cam_wrist", camera(PixelFormat::Mjpg)),
@@ -148,10 +150,16 @@ impl Bench {
     }
 
     fn with_sink(sink: impl FnMut(File) -> Box<dyn Sink> + Send + 'static) -> Self {
+        Self::with(|config| config.sink = Box::new(sink))
+    }
+
+    /// A bench whose recorder has another disk or clock.
+    fn with(change: impl FnOnce(&mut RecorderConfig)) -> Self {
         let registry = Arc::new(registry());
         let board = Arc::new(Board::new(&registry));
         let script = Script::default();
-        let config = RecorderConfig { sink: Box::new(sink), ..RecorderConfig::new(registry, Arc::clone(&board)) };
+        let mut config = RecorderConfig::new(registry, Arc::clone(&board));
+        change(&mut config);
         let recorder = Recorder::spawn(script.clone(), config).unwrap();
         Self { folder: tempfile::tempdir().unwrap(), board, script, recorder }
     }

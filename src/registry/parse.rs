@@ -122,9 +122,10 @@ fn rig(root: &Section<'_>, problems: &mut Problems<'_>) -> RigSpec {
         sync_window: Duration::from_millis(25),
         cooldown: Duration::from_secs(2),
         memory_budget: 512 << 20,
+        disk_reserve: None,
     };
     let Some(section) = root.table(problems, "rig") else { return rig };
-    section.allow(problems, &["name", "observation_hz", "sync_window", "cooldown", "memory_budget"]);
+    section.allow(problems, &["name", "observation_hz", "sync_window", "cooldown", "memory_budget", "disk_reserve"]);
     if let Some(name) = section.text(problems, "name") {
         // The name becomes part of file names.
         let legal = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
@@ -144,6 +145,7 @@ fn rig(root: &Section<'_>, problems: &mut Problems<'_>) -> RigSpec {
     rig.cooldown = section.duration(problems, "cooldown", cooldown).unwrap_or(rig.cooldown);
     let budget = 1 << 20..=64 << 30;
     rig.memory_budget = section.size(problems, "memory_budget", budget).unwrap_or(rig.memory_budget);
+    rig.disk_reserve = section.size(problems, "disk_reserve", 0..=1 << 40);
     rig
 }
 

@@ -14,6 +14,13 @@
 //! [[device]]
 //! name = "spare"              # any name, with
 //! like = "tactile_tip"        # the entry whose format it takes
+//! [device.fault]              # optional: what the device above does wrong
+//! freeze_at = "3s"            # from then on it sends the same bytes
+//! truncate_every = 10         # one sample in ten is cut in the middle
+//! duplicate_every = 10        # one in ten is sent twice
+//! lose_every = 10             # one in ten is lost, and the device says so
+//! delay = "200ms"             # samples arrive so long after their capture
+//! clock_ppm = 500             # its clock runs fast, or slow if negative
 //!
 //! [[event]]                   # exactly one of plug, unplug, silence, resume
 //! at = "3s"
@@ -38,11 +45,12 @@ use std::time::Duration;
 use super::attachment::UsbIdentity;
 use super::diagnostic::{RegistryErrors, did_you_mean};
 use super::parse::{is_port, read_file};
-use super::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, SimSource};
+use super::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, SimFaults, SimSource};
 use super::section::{Problems, Section, file_label, read};
 use super::spec::{DeviceSpec, NodeSpec, Registry};
 
-const DEVICE_KEYS: [&str; 10] = ["name", "like", "seed", "plugged", "hz", "bytes", "vid", "pid", "serial", "port"];
+const DEVICE_KEYS: [&str; 11] =
+    ["name", "like", "seed", "plugged", "hz", "bytes", "vid", "pid", "serial", "port", "fault"];
 const ACTIONS: [&str; 4] = ["plug", "unplug", "silence", "resume"];
 const EVENT_KEYS: [&str; 6] = ["at", "plug", "unplug", "silence", "resume", "port"];
 /// Rate of a simulated serial line, Hz: that of a usual motor controller's state.
@@ -125,7 +133,7 @@ fn standing_for(spec: &DeviceSpec, name: &str) -> ScenarioDevice {
         port: spec.identity.port.clone().unwrap_or_default(),
         product: Some(format!("simulated {}", spec.name)),
     };
-    ScenarioDevice { name: name.to_owned(), usb, source, plugged: true }
+    ScenarioDevice { name: name.to_owned(), usb, source, plugged: true, faults: SimFaults::default() }
 }
 
 /// Ports of a bus no rig has, for devices whose port nothing says.
@@ -203,7 +211,27 @@ fn device(section: &Section<'_>, registry: &Registry, problems: &mut Problems<'_
     if let Some(port) = port(section, problems) {
         device.usb.port = port;
     }
+    device.faults = faults(section, problems);
     Some(device)
+}
+
+fn faults(section: &Section<'_>, problems: &mut Problems<'_>) -> SimFaults {
+    let Some(table) = section.table(problems, "fault") else { return SimFaults::default() };
+    let every = ["truncate_every", "duplicate_every", "lose_every"];
+    let mut known = every.to_vec();
+    known.extend(["freeze_at", "delay", "clock_ppm"]);
+    table.allow(problems, &known);
+    // At least 2: of a device all of whose samples are lost none ever comes.
+    let [truncate_every, duplicate_every, lose_every] =
+        every.map(|key| u64::try_from(table.integer(problems, key, 2..=1_000_000)?.value).ok());
+    SimFaults {
+        freeze_at: table.duration(problems, "freeze_at", Duration::ZERO..=LONGEST),
+        truncate_every,
+        duplicate_every,
+        lose_every,
+        delay: table.duration(problems, "delay", Duration::ZERO..=Duration::from_secs(10)).unwrap_or_default(),
+        clock_ppm: table.integer(problems, "clock_ppm", -100_000..=100_000).map_or(0, |ppm| ppm.value),
+    }
 }
 
 fn port(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<String> {

@@ -53,6 +53,9 @@ pub struct RigSpec {
     pub cooldown: Duration,
     /// Upper bound of the shared memory all topics may reserve, bytes, default 512 MiB.
     pub memory_budget: u64,
+    /// What recording leaves free on its disk, bytes; `None` is the smaller of 1 GiB and a twentieth
+    /// of the disk.
+    pub disk_reserve: Option<u64>,
 }
 
 /// One `[device.NAME]` table.

@@ -89,6 +89,7 @@ pub(crate) fn recording(dropped: u64) -> RecordingStatus {
         messages: 48_211,
         bytes: 312_400_000,
         dropped,
+        room: None,
     }
 }
 
@@ -137,6 +138,7 @@ pub(crate) fn board(names: &[&str]) -> Board {
             sync_window: Duration::from_millis(25),
             cooldown: Duration::from_secs(2),
             memory_budget: 1 << 29,
+            disk_reserve: None,
         },
         devices: names.iter().enumerate().map(device).collect(),
         path: None,

@@ -97,6 +97,8 @@ pub struct RecordingStatus {
     pub bytes: u64,
     /// Samples the recorder lost because its queue overflowed.
     pub dropped: u64,
+    /// While the disk is nearly full: how long until the episode is closed for want of room.
+    pub room: Option<Duration>,
 }
 
 /// A line of the log.

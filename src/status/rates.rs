@@ -148,6 +148,7 @@ mod tests {
                 messages: 0,
                 bytes,
                 dropped: 0,
+                room: None,
             }),
             last_episode: None,
             last_verdict: crate::status::Verdict::default(),

@@ -24,13 +24,19 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Them
 }
 
 fn under_way(recording: &RecordingStatus, area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
-    let mut figures = vec![
-        Span::raw(text::clock(recording.elapsed)),
-        Span::styled("   messages ", theme.faint()),
-        Span::raw(recording.messages.to_string()),
+    let mut figures = vec![Span::raw(text::clock(recording.elapsed))];
+    if let Some(left) = recording.room {
+        // In place of what can wait: the line is full.
+        let left = format!("{} disk full in {}", theme.symbol("▲", "!"), text::clock(left));
+        figures.extend([Span::raw("   "), Span::styled(left, theme.alarm())]);
+    } else {
+        let messages = Span::raw(recording.messages.to_string());
+        figures.extend([Span::styled("   messages ", theme.faint()), messages]);
+    }
+    figures.extend([
         Span::raw(format!("   {}", text::size(recording.bytes))),
         Span::raw(format!("   {:.1} MB/s", model.totals().recorded / 1e6)),
-    ];
+    ]);
     let dropped = format!("dropped {}", recording.dropped);
     figures.push(Span::raw("   "));
     figures.push(if recording.dropped > 0 {
@@ -67,10 +73,10 @@ fn idle(area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
     }
     // The reasons beside the name as far as there is room; the log has all of them.
     let room = width.saturating_sub(label.width() + word.width());
-    let least = last.file_name().map_or(0, |name| text::width(&name.to_string_lossy()));
+    let name_width = last.file_name().map_or(0, |name| text::width(&name.to_string_lossy()));
     let why = theme.safe(&reasons.join("; "));
-    let room_why = room.saturating_sub(least + 2);
-    let path = file(last, if why.is_empty() { room } else { least.min(room) }, theme);
+    let room_why = room.saturating_sub(name_width + 2);
+    let path = file(last, if why.is_empty() { room } else { name_width.min(room) }, theme);
     let mut line = Line::from(vec![label, word, Span::raw(path)]);
     if !why.is_empty() && room_why > 0 {
         line.push_span(Span::raw("  "));

@@ -4,6 +4,7 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::record::tests::Bench;
+use crate::status::Grade;
 
 fn of(bytes: &[u8]) -> Option<Inspection> {
     inspect_from(&mut &*bytes, bytes.len() as u64, Path::new("x.mcap")).unwrap()
@@ -32,7 +33,13 @@ async fn a_finished_episode_is_told_as_it_was() {
     let [first, second] = cam.present.as_slice() else { panic!("{:?}", cam.present) };
     assert!((second.0 - first.1 - 0.3).abs() < 1e-6 && first.0.abs() < 1e-9 && (second.1 - 1.0).abs() < 1e-9);
     assert!((cam.presence.unwrap() - 0.7).abs() < 1e-6);
-    assert!((0.3..0.4).contains(&cam.topic.longest_gap), "{}", cam.topic.longest_gap);
+    // The absence is neither a gap nor a loss of rate.
+    assert!((0.02..0.1).contains(&cam.topic.longest_gap), "{}", cam.topic.longest_gap);
+    assert!((30.0..36.0).contains(&cam.topic.hz), "{}", cam.topic.hz);
+    assert_eq!(said.recorded_verdict.as_ref(), Some(&said.verdict), "the recorder says the same");
+    assert!(said.verdict.reasons.iter().any(|reason| reason.starts_with("tof: 7 of ")), "{:?}", said.verdict);
+    let frame = said.topics.iter().find(|topic| topic.topic == "/rapid/frame").unwrap();
+    assert_eq!((frame.messages, frame.lateness), (30, None));
     assert_eq!(cam.topic.lateness, Some(Lateness { p50: 5.0, p99: 5.0, max: 5.0 }));
     assert!(cam.frames_valid > 10 && cam.frames_valid + cam.frames_stale < 25);
     assert_eq!((tof.topic.missing, tof.presence), (8, Some(1.0)));
@@ -166,6 +173,11 @@ fn the_report_on_a_screen() {
         file: PathBuf::from("/data/20261121_place-block_001.mcap"),
         bytes: 7_400_000,
         end: FileEnd::Torn,
+        verdict: Verdict {
+            grade: Grade::Suspect,
+            reasons: vec!["the file is not whole: its last record is cut".to_owned()],
+        },
+        recorded_verdict: None,
         unread_bytes: 512,
         damaged_chunks: 0,
         software: "rapid 0.1.0".to_owned(),
@@ -179,6 +191,7 @@ fn the_report_on_a_screen() {
         lost: Some(3),
         damaged: None,
         frames: 300,
+        skew: Some(Spread { p50: 4.0, p95: 11.5, p99: 14.0, max: 15.25 }),
         modalities: vec![
             ModalityReport {
                 name: "cam_wrist".to_owned(),
@@ -188,6 +201,7 @@ fn the_report_on_a_screen() {
                 present: vec![(0.0, 3.2), (6.2, 10.0)],
                 frames_valid: 209,
                 frames_stale: 1,
+                quality: Some(quality()),
             },
             ModalityReport {
                 name: "tof".to_owned(),
@@ -197,6 +211,7 @@ fn the_report_on_a_screen() {
                 present: Vec::new(),
                 frames_valid: 0,
                 frames_stale: 0,
+                quality: None,
             },
         ],
         topics: vec![topic("/rapid/mask", 5000, 0, late)],
@@ -209,4 +224,32 @@ fn the_report_on_a_screen() {
         }],
     };
     insta::assert_snapshot!(render(&said, 60, Paint::Plain));
+}
+
+/// What was measured of a modality, for a report on a screen.
+fn quality() -> Quality {
+    Quality {
+        samples: 200,
+        bytes: 7_000_000,
+        lost: 0,
+        dropped: 3,
+        damaged: 0,
+        truncated: 0,
+        duplicates: 0,
+        repeated: 0,
+        frozen_samples: 0,
+        frozen: 0.0,
+        late: 0,
+        lateness: None,
+        clock_drift: None,
+        clock_ahead: 0.0,
+        offset: None,
+        presence: Some(0.7),
+        present: 7.0,
+        hz: Some(28.6),
+        nominal_hz: Some(30.0),
+        longest_gap: 0.0667,
+        frames_present: 210,
+        frames_valid: 209,
+    }
 }

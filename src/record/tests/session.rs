@@ -16,6 +16,7 @@ fn session(folder: &Path, board: &Arc<Board>, masks: &MaskHistory) -> Session {
         board: Arc::clone(board),
         request: &EpisodeRequest::default(),
         path,
+        handle: file.try_clone().unwrap(),
         sink: Box::new(file),
         attached: &BTreeMap::new(),
         clock,
@@ -102,7 +103,8 @@ fn losses_are_announced_once_a_second_and_counted_all() {
         }
     }
     let lost = |count: u64, name: &str| format!("{name}: {count} samples lost on the way to the file");
-    assert_eq!(said, [lost(2, "tof"), lost(200, "tof"), lost(u64::MAX, "cam_wrist"), lost(196, "tof")]);
+    let both = |count, own| format!("{}, {own} samples lost by the device", lost(count, "tof"));
+    assert_eq!(said, [lost(2, "tof"), both(200, 101), lost(u64::MAX, "cam_wrist"), both(196, 98)]);
     let tallies = &read(&report.file).metadata["rapid/summary"]["modalities"];
     let tallies: serde_json::Value = serde_json::from_str(tallies).unwrap();
     assert_eq!((&tallies["tof"]["samples"], &tallies["tof"]["dropped"]), (&200.into(), &398.into()));

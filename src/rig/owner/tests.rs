@@ -45,6 +45,7 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
             sync_window: Duration::from_millis(25),
             cooldown,
             memory_budget: 1 << 20,
+            disk_reserve: None,
         },
         devices: [(0, "a"), (1, "b")].into_iter().map(device).collect(),
         path: None,

@@ -134,7 +134,11 @@ impl Beat {
     fn run(mut self) {
         match use_fifo() {
             Ok(()) => tracing::debug!("thread mask runs under SCHED_FIFO"),
-            Err(reason) => tracing::debug!(reason, "thread mask runs under the ordinary scheduler"),
+            Err(reason) => tracing::warn!(
+                reason,
+                "the mask has no real-time priority, so that a busy machine may delay it: run rapid as rapid.service does, \
+                 or give the user `rtprio {FIFO_PRIORITY}` in /etc/security/limits.conf"
+            ),
         }
         let mut due = Stamp::now();
         let mut published = None;

@@ -15,7 +15,7 @@ use vbench::emu::spec::{DeviceSpec, PORTS};
 use vbench::probe::{beat, mask, uevent, v4l};
 
 const USAGE: &str = "\
-usage: usbemu SPEC...                    emulate; commands on stdin (plug, unplug, silent, port, sleep, t0, at, say, quit)
+usage: usbemu SPEC...                    emulate; commands on stdin (plug, unplug, hub, silent, port, sleep, t0, at, say, quit)
        usbemu --read NODE FRAMES         read a camera, print what came as one JSON object
        usbemu --first-frames             open each camera that comes, print how soon its first frame came
        usbemu --watch-mask [SECONDS]     print each change of the physical mask as a JSON line
