@@ -74,6 +74,7 @@ fn registry(count: u8) -> Registry {
             max_bytes: 1 << 20,
             depth: 8,
             when_stale: WhenStale::Hold,
+            latency: Duration::ZERO,
         })
     };
     Registry {

@@ -20,7 +20,7 @@
 //!  L1   registry                                 devices.toml, checked
 //!       status                                   the board every stage reports on
 //!       text   outlet                            words and lines for people
-//!  L0   modality   mask   sample   time          nouns
+//!  L0   modality   mask   sample   time   provenance     nouns
 //! ```
 //!
 //! The arrows are the way of the data. Imports point down only; the stages of L3 do not know one
@@ -88,6 +88,7 @@ pub mod logging;
 pub mod mask;
 pub mod modality;
 pub mod outlet;
+pub mod provenance;
 pub mod record;
 pub mod registry;
 pub mod rig;

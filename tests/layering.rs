@@ -20,7 +20,7 @@ use proc_macro2::{Delimiter, TokenStream, TokenTree};
 
 /// Modules by layer, lowest first. A module sees those of lower layers.
 const LAYERS: &[&[&str]] = &[
-    &["modality", "mask", "sample", "time", "action"],
+    &["modality", "mask", "sample", "time", "action", "provenance"],
     &["registry", "status", "text", "outlet"],
     &["hotplug", "driver", "bus", "sync"],
     &["rig", "record", "policy", "control"],

@@ -29,6 +29,7 @@ fn registry(depth: usize) -> Registry {
             max_bytes: 64,
             depth,
             when_stale: WhenStale::Hold,
+            latency: Duration::ZERO,
         }],
         path: None,
         text: String::new(),

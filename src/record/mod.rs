@@ -15,6 +15,7 @@ mod file;
 mod hole;
 pub mod inspect;
 mod metadata;
+mod provenance;
 mod recorder;
 pub mod schema;
 mod session;

@@ -23,7 +23,8 @@ use super::RecordError;
 use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest};
 use super::file::Sink;
 use super::hole::Last;
-use super::session::{Attached, Beginning, MaskHistory, Session};
+use super::provenance::Attached;
+use super::session::{Beginning, MaskHistory, Session};
 use super::source::Source;
 use crate::bus::TopicId;
 use crate::mask::PhysicalMask;
@@ -161,7 +162,7 @@ impl Writer {
             inbox,
             events,
             streams,
-            attached: Attached::new(),
+            attached: Attached::default(),
             session: None,
             waiting: Vec::new(),
             flushed: Stamp::default(),
@@ -214,15 +215,7 @@ impl Writer {
         loop {
             match self.events.try_recv() {
                 Ok(event) => {
-                    match &event.what {
-                        What::Attach { device, serial, .. } => {
-                            self.attached.insert(device.clone(), serial.clone());
-                        }
-                        What::Detach { device, .. } => {
-                            self.attached.remove(device);
-                        }
-                        _ => {}
-                    }
+                    self.attached.take(&event);
                     if let Some(session) = &mut self.session {
                         session.event(&event);
                     }

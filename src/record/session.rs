@@ -2,22 +2,23 @@
 //!
 //! Time, in capture time of the monotonic clock:
 //!
-//! 1. The episode holds what was captured in `begin..end`; `end` is fixed by the duration asked for
-//!    or by the moment of the stop. One mask more is written, captured before `begin`: the one in
-//!    force when the episode began.
+//! 1. The episode holds what was captured from `begin` on and happened before `end`: a modality's
+//!    latency is how long before its capture what a sample shows happened. `end` is fixed by the
+//!    duration asked for or by the moment of the stop. One mask more is written, captured before
+//!    `begin`: the one in force when the episode began.
 //! 2. Tick `k` of the observation grid is `begin + k / observation_hz`; ticks before `end` are
 //!    written.
 //! 3. A tick is evaluated once, of what was received by its deadline, `tick + sync_window +`
-//!    [`SETTLE`], under the mask last published at or before the tick. The deadline is the frame's
+//!    [`SETTLE`] `+` the longest latency of the rig, under the mask last published at or before the tick. The deadline is the frame's
 //!    `publish_time`: whoever reads the file can choose the same samples again.
 //! 4. A sample received after its tick's deadline is in the file and in no frame.
-//! 5. The file is closed [`SETTLE`] `+` [`GRACE`] after `end`. A sample captured before `end` that
+//! 5. The file is closed [`SETTLE`] `+` [`GRACE`] `+` the longest latency after `end`. A sample captured before `end` that
 //!    arrives later than that is lost and not counted: nobody knows of it.
 //! 6. A damaged sample is recorded and counted, and belongs to no frame.
 //!
 //! Invariant: every sample a frame names was written to the file before the frame.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::VecDeque;
 use std::io;
 use std::sync::Arc;
 use std::time::Duration;
@@ -27,6 +28,7 @@ use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest};
 use super::file::{EpisodeFile, Sink};
 use super::hole::Hole;
 use super::metadata::{self, Ending};
+use super::provenance::{Attached, Units};
 use crate::mask::PhysicalMask;
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::registry::Registry;
@@ -47,9 +49,6 @@ const ANNOUNCE_EVERY: Duration = Duration::from_secs(1);
 const RING_SLACK: usize = 1024;
 /// Publications of the mask remembered: 16 s at 500 Hz, more than any queue of it holds.
 const MASKS: usize = 8192;
-
-/// Serial of every device attached, by its modality's name.
-pub(super) type Attached = BTreeMap<String, Option<String>>;
 
 /// Counts of one modality in one episode.
 #[derive(Debug, Clone, Copy, Default)]
@@ -106,7 +105,9 @@ pub(super) struct Session {
     masks_dropped: u64,
     events: u64,
     events_missed: u64,
-    seen: Attached,
+    units: Units,
+    /// How long a tick waits for its samples beside the window.
+    settle: Duration,
     /// The first error of the file: from then on nothing is written.
     failed: Option<io::Error>,
 }
@@ -127,7 +128,8 @@ impl Session {
     /// Begins an episode and writes what stands at its beginning.
     pub(super) fn begin(beginning: Beginning<'_>, masks: &MaskHistory) -> io::Result<Self> {
         let Beginning { registry, board, request, path, sink, attached, clock, begin } = beginning;
-        let said = metadata::beginning(&registry, request, attached, clock, begin);
+        let units = Units::new(attached);
+        let said = metadata::beginning(&registry, request, &units, clock, begin);
         let mut file = EpisodeFile::begin(sink, &registry, clock, begin, said)?;
         if let Some((header, mask, sequence)) = masks.at(begin) {
             file.mask(header, *mask, *sequence)?;
@@ -138,9 +140,11 @@ impl Session {
             .map(|device| SyncModality {
                 id: device.id,
                 when_stale: device.when_stale,
+                latency: device.latency,
                 capacity: device.depth.saturating_add(RING_SLACK),
             })
             .collect();
+        let latency = registry.devices.iter().map(|device| device.latency).max().unwrap_or_default();
         Ok(Self {
             sync: Synchronizer::new(&modalities, registry.rig.sync_window),
             grid: Grid::new(begin, registry.rig.observation_hz),
@@ -155,16 +159,18 @@ impl Session {
             masks_dropped: 0,
             events: 0,
             events_missed: 0,
-            seen: attached.clone(),
+            units,
+            settle: SETTLE + latency,
             failed: None,
         })
     }
 
     /// Takes a sample, and the hole before it.
     pub(super) fn sample(&mut self, id: ModalityId, header: &SampleHeader, payload: &[u8], hole: Option<Hole>) {
+        let latency = self.latency(id);
         if let (Some(hole), None) = (hole, &self.failed) {
             // Also before a sample that lies beyond the end: a part of the hole may not.
-            let (lost, dropped) = (self.share(&hole, hole.lost), self.share(&hole, hole.dropped));
+            let (lost, dropped) = (self.share(&hole, hole.lost, latency), self.share(&hole, hole.dropped, latency));
             if let Some(tally) = self.tallies.get_mut(id.index()) {
                 // Saturating: the numbers come from whoever publishes.
                 tally.lost = tally.lost.saturating_add(lost);
@@ -172,7 +178,7 @@ impl Session {
                 tally.unannounced = tally.unannounced.saturating_add(dropped);
             }
         }
-        if !self.holds(Stamp(header.capture_ns)) || self.failed.is_some() {
+        if !self.holds(Stamp(header.capture_ns), latency) || self.failed.is_some() {
             return;
         }
         if let Err(error) = self.file.sample(id, header, payload) {
@@ -199,9 +205,9 @@ impl Session {
     /// Takes a publication of the mask, and the hole before it.
     pub(super) fn mask(&mut self, header: &SampleHeader, mask: PhysicalMask, sequence: u64, hole: Option<Hole>) {
         if let (Some(hole), None) = (hole, &self.failed) {
-            self.masks_dropped = self.masks_dropped.saturating_add(self.share(&hole, hole.dropped));
+            self.masks_dropped = self.masks_dropped.saturating_add(self.share(&hole, hole.dropped, Duration::ZERO));
         }
-        if !self.holds(Stamp(header.capture_ns)) || self.failed.is_some() {
+        if !self.holds(Stamp(header.capture_ns), Duration::ZERO) || self.failed.is_some() {
             return;
         }
         self.failed = self.file.mask(header, mask, sequence).err();
@@ -209,10 +215,8 @@ impl Session {
 
     /// Takes an event.
     pub(super) fn event(&mut self, event: &Event) {
-        if let What::Attach { device, serial, .. } = &event.what {
-            self.seen.insert(device.clone(), serial.clone());
-        }
-        if !self.holds(event.stamp) || self.failed.is_some() {
+        self.units.take(event);
+        if !self.holds(event.stamp, Duration::ZERO) || self.failed.is_some() {
             return;
         }
         self.failed = self.write_event(event).err();
@@ -242,7 +246,7 @@ impl Session {
 
     /// Is it time to [`Self::finish`]?
     pub(super) fn is_over(&self, now: Stamp) -> bool {
-        self.failed.is_some() || self.end.is_some_and(|end| now >= end.after(SETTLE).after(GRACE))
+        self.failed.is_some() || self.end.is_some_and(|end| now >= end.after(self.settle).after(GRACE))
     }
 
     /// Is the end of the episode fixed by now?
@@ -276,7 +280,8 @@ impl Session {
             events_missed: self.events_missed,
             masks_dropped: self.masks_dropped,
             tallies: &self.tallies,
-            seen: &self.seen,
+            units: &self.units,
+            begin: self.begin,
         };
         let closed = match self.failed {
             None => self.file.finish(metadata::end(&self.registry, &ending)).and_then(|()| self.path.publish()),
@@ -317,18 +322,22 @@ impl Session {
         self.tallies.iter().fold(0, |sum, tally| sum.saturating_add(tally.dropped))
     }
 
-    fn holds(&self, capture: Stamp) -> bool {
-        capture >= self.begin && self.end.is_none_or(|end| capture < end)
+    fn holds(&self, capture: Stamp, latency: Duration) -> bool {
+        capture >= self.begin && self.end.is_none_or(|end| capture.before(latency) < end)
     }
 
-    /// How many of `count` samples missing in `hole` were captured within the episode.
-    fn share(&self, hole: &Hole, count: u64) -> u64 {
-        let until_end = self.end.map_or(count, |end| hole.before(end, count));
+    fn latency(&self, id: ModalityId) -> Duration {
+        self.registry.device(id).map_or(Duration::ZERO, |device| device.latency)
+    }
+
+    /// How many of `count` samples missing in `hole` belong to the episode.
+    fn share(&self, hole: &Hole, count: u64, latency: Duration) -> u64 {
+        let until_end = self.end.map_or(count, |end| hole.before(end.after(latency), count));
         until_end.saturating_sub(hole.before(self.begin, count))
     }
 
     fn deadline(&self, tick: u64) -> Stamp {
-        self.grid.tick(tick).after(self.registry.rig.sync_window).after(SETTLE)
+        self.grid.tick(tick).after(self.registry.rig.sync_window).after(self.settle)
     }
 
     fn write_frame(&mut self, masks: &MaskHistory) {
@@ -369,10 +378,14 @@ impl Session {
 /// An event for people.
 fn describe(what: &What) -> String {
     match what {
-        What::Attach { device, node, port, serial, .. } => match serial {
-            Some(serial) => format!("{device} attached: {node}, port {port}, serial {serial}"),
-            None => format!("{device} attached: {node}, port {port}"),
+        What::Attach { device, node, usb, .. } => match &usb.serial {
+            Some(serial) => format!("{device} attached: {node}, port {}, serial {serial}", usb.port),
+            None => format!("{device} attached: {node}, port {}", usb.port),
         },
+        What::Opened { device, provenance, .. } => {
+            let unit = provenance.usb.serial.as_deref().unwrap_or("without a serial number");
+            format!("{device} opened in epoch {}: unit {unit}", provenance.epoch.0)
+        }
         What::Detach { device, witness, .. } => format!("{device} detached, told by {witness}"),
         What::State { device, state, mask, detail, .. } => {
             let state = format!("{state:?}").to_lowercase();

@@ -17,17 +17,17 @@ use crate::bus::Writer;
 use crate::driver::{Driver, DriverError, Reading};
 use crate::registry::{Attachment, DeviceSpec};
 use crate::sample::{Epoch, SampleHeader};
-use crate::status::Board;
-use crate::time::Stamp;
+use crate::status::{Board, Provenance};
+use crate::time::{Stamp, nanoseconds};
 
 /// A device that does not open within this time is tried again.
 const OPEN_LIMIT: Duration = Duration::from_secs(10);
 
 /// What a stream tells the rig while it runs.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub(super) enum Report {
-    /// The node is open; what was agreed with the device.
-    Opened(String),
+    /// The node is open; what was agreed with the device, for people and for the recording.
+    Opened(String, Box<Provenance>),
     /// The first sample was published.
     Started,
     /// Nothing came for `DeviceSpec::stall_after`.
@@ -65,6 +65,8 @@ impl Numbers {
 pub(super) struct Stream {
     pub(super) spec: Arc<DeviceSpec>,
     pub(super) attachment: Attachment,
+    /// When it was attached.
+    pub(super) attached: Stamp,
     pub(super) epoch: Epoch,
     pub(super) writer: Arc<Writer>,
     pub(super) numbers: Arc<Numbers>,
@@ -92,7 +94,7 @@ impl Stream {
             Ok(Err(error)) => return end(&error),
             Err(_) => return (End::Retry, format!("did not open within {} s", OPEN_LIMIT.as_secs())),
         };
-        self.report(Report::Opened(driver.description())).await;
+        self.report(Report::Opened(driver.description(), Box::new(self.provenance(&driver)))).await;
         let mut pulse = Pulse::Silent;
         let mut refused = false;
         let stall = sleep_until(Instant::now() + self.spec.stall_after);
@@ -133,6 +135,19 @@ impl Stream {
                     stall.as_mut().reset(Instant::now() + self.spec.stall_after);
                 }
             }
+        }
+    }
+
+    fn provenance(&self, driver: &Driver) -> Provenance {
+        let mut negotiated = driver.negotiated();
+        negotiated.driver = negotiated.driver.or_else(|| self.attachment.driver.clone());
+        Provenance {
+            epoch: self.epoch,
+            node: self.attachment.node.label(),
+            attached: self.attached,
+            usb: self.attachment.usb.clone(),
+            negotiated,
+            latency_ns: nanoseconds(self.spec.latency),
         }
     }
 

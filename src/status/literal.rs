@@ -123,6 +123,7 @@ pub(crate) fn board(names: &[&str]) -> Board {
         max_bytes: 1 << 20,
         depth: 8,
         when_stale: WhenStale::Hold,
+        latency: Duration::ZERO,
     };
     Board::new(&Registry {
         rig: RigSpec {

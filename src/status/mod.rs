@@ -21,7 +21,7 @@ use crate::sample::Epoch;
 use crate::time::Stamp;
 
 pub use board::Board;
-pub use event::{Event, What};
+pub use event::{Event, Provenance, What};
 
 /// What the device of a modality is doing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize)]

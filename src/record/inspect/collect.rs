@@ -6,6 +6,7 @@ use std::path::Path;
 use super::super::file::{EVENT_TOPIC, FRAME_TOPIC, MASK_TOPIC};
 use super::super::walk::{Walked, op};
 use super::super::wire::{Fields, protobuf};
+use super::units;
 use super::{EventReport, Inspection, Lateness, MaskEdge, ModalityReport, TopicReport};
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
@@ -28,6 +29,8 @@ pub(super) struct Collected {
     /// Frames in which each bit is valid and stale.
     slots: BTreeMap<u8, (u64, u64)>,
     events: Vec<(u64, EventReport)>,
+    /// Of those, what `opened` says as JSON.
+    opened: Vec<(u64, String)>,
 }
 
 #[derive(Debug, Default)]
@@ -131,6 +134,7 @@ impl Collected {
                 2 => event.kind = value.text(),
                 3 => event.device = value.text(),
                 4 => event.text = value.text(),
+                5 if event.kind == "opened" => self.opened.push((at, value.text())),
                 _ => {}
             }
         }
@@ -147,6 +151,9 @@ impl Collected {
         for (at, event) in &mut events {
             event.at = from(begin_ns, *at);
         }
+        let opened =
+            std::mem::take(&mut self.opened).into_iter().map(|(at, json)| (from(begin_ns, at), json)).collect();
+        let units = units::told(&said(&self.summary, "provenance"), &said(&self.about, "provenance"), opened);
         let (modalities, topics) = self.topics(begin_ns, seconds);
         let count = modalities.len();
         let mask = self
@@ -160,6 +167,9 @@ impl Collected {
             unread_bytes: size.saturating_sub(walked.bytes),
             damaged_chunks: walked.damaged_chunks,
             software: said(&self.about, "software"),
+            commit: said(&self.about, "commit"),
+            host: said(&self.about, "host"),
+            kernel: said(&self.about, "kernel"),
             rig: said(&self.about, "rig"),
             task: said(&self.about, "task"),
             tags: serde_json::from_str(&said(&self.about, "tags")).unwrap_or_default(),
@@ -171,6 +181,7 @@ impl Collected {
             damaged: said(&self.summary, "damaged").parse().ok(),
             frames: self.frames,
             modalities,
+            units,
             topics,
             mask: mask.collect(),
             events: events.into_iter().map(|(_, event)| event).collect(),

@@ -14,7 +14,7 @@ const BUILT_IN: [(&str, Kind); 2] = [("camera", Kind::Camera), ("serial", Kind::
 const PLANNED: [&str; 3] = ["can", "lan", "process"];
 /// Keys that only planned kinds of node have.
 const PLANNED_KEYS: [&str; 6] = ["can", "lan", "process", "on_attach", "on_detach", "heartbeat"];
-const KEYS: [&str; 14] = [
+const KEYS: [&str; 15] = [
     "vid",
     "pid",
     "serial",
@@ -28,11 +28,15 @@ const KEYS: [&str; 14] = [
     "max_bytes",
     "depth",
     "when_stale",
+    "latency",
     "camera",
 ];
 
 /// The mask is 64 bits wide.
 const HIGHEST_BIT: i64 = 63;
+
+/// More than any sensor takes; every frame of an episode waits for the longest latency of the rig.
+const LONGEST_LATENCY: Duration = Duration::from_secs(1);
 
 /// How a device is read, without the settings.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -59,6 +63,7 @@ pub(super) struct Draft<'a> {
     /// The depth was written in the file and is not ours to lower.
     pub(super) depth_written: bool,
     when_stale: WhenStale,
+    latency: Duration,
 }
 
 impl Draft<'_> {
@@ -75,6 +80,7 @@ impl Draft<'_> {
             max_bytes: usize::try_from(self.max_bytes).ok()?,
             depth: usize::try_from(self.depth).ok()?,
             when_stale: self.when_stale,
+            latency: self.latency,
         })
     }
 
@@ -112,6 +118,7 @@ pub(super) fn read<'a>(name: &str, section: Section<'a>, problems: &mut Problems
     let stall = Duration::from_millis(10)..=Duration::from_hours(1);
     let stall_after =
         section.duration(problems, "stall_after", stall).unwrap_or_else(|| node::default_stall(settings.as_ref()));
+    let latency = section.duration(problems, "latency", Duration::ZERO..=LONGEST_LATENCY).unwrap_or_default();
     let max_bytes = node::max_bytes(&section, settings.as_ref(), problems);
     let written = section.integer(problems, "depth", 2..=4096).and_then(|depth| u64::try_from(depth.value).ok());
     Draft {
@@ -127,6 +134,7 @@ pub(super) fn read<'a>(name: &str, section: Section<'a>, problems: &mut Problems
         depth: written.unwrap_or_else(|| node::default_depth(settings.as_ref())),
         depth_written: written.is_some(),
         when_stale,
+        latency,
         node: settings,
         section,
     }
