@@ -17,6 +17,8 @@
 //!                                         memory     v          v
 //!  L3                                                record      one episode, one MCAP file
 //!
+//!  L2   calibration                                how late a sensor is
+//!
 //!  L1   registry                                 devices.toml, checked
 //!       status                                   the board every stage reports on
 //!       text   outlet                            words and lines for people
@@ -78,10 +80,12 @@
 
 pub mod app;
 pub mod bus;
+pub mod calibration;
 pub mod cli;
 pub mod commands;
 pub mod dispatch;
 pub mod driver;
+pub mod flash;
 pub mod headless;
 pub mod hotplug;
 pub mod logging;

@@ -20,9 +20,9 @@ use proc_macro2::{Delimiter, TokenStream, TokenTree};
 
 /// Modules by layer, lowest first. A module sees those of lower layers.
 const LAYERS: &[&[&str]] = &[
-    &["modality", "mask", "sample", "time", "action", "provenance"],
+    &["modality", "mask", "sample", "time", "action", "provenance", "flash"],
     &["registry", "status", "text", "outlet"],
-    &["hotplug", "driver", "bus", "sync"],
+    &["hotplug", "driver", "bus", "sync", "calibration"],
     &["rig", "record", "policy", "control"],
     &["app", "tui", "headless", "logging"],
     &["main", "dispatch", "cli", "commands"],
@@ -75,6 +75,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("unicode_segmentation", &["text"]),
     ("unicode_width", &["text"]),
     ("v4l", &["driver/camera"]),
+    ("zune_jpeg", &["calibration/brightness"]),
 ];
 const ANYWHERE: &str = "*";
 const ABOVE_NOUNS: &str = "layers 1 and up";

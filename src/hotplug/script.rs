@@ -115,7 +115,7 @@ fn attachment(device: &ScenarioDevice, begun: Stamp) -> (Attachment, Arc<SimDevi
     let sim = Arc::new(SimDevice::new(&device.name, device.source.clone(), begun));
     let syspath = PathBuf::from("/sim").join(&device.usb.port);
     let (node, usb) = (DeviceNode::Sim(Arc::clone(&sim)), device.usb.clone());
-    (Attachment { syspath, node, usb, driver: Some(scenario::driver()) }, sim)
+    (Attachment { syspath, node, usb, driver: Some(Box::new(scenario::driver())) }, sim)
 }
 
 impl Stream for Script {

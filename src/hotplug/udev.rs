@@ -185,7 +185,8 @@ fn present(device: &Device) -> Option<Present> {
         manufacturer: text("manufacturer"),
         firmware: text("bcdDevice").map(|release| release_number(&release)),
     };
-    let attachment = Attachment { syspath: device.syspath().to_owned(), node, usb, driver: kernel_driver(device) };
+    let attachment =
+        Attachment { syspath: device.syspath().to_owned(), node, usb, driver: kernel_driver(device).map(Box::new) };
     Some(Present { attachment, device_number: text("devnum") })
 }
 

@@ -60,7 +60,7 @@ pub struct Attachment {
     /// The device it belongs to.
     pub usb: UsbIdentity,
     /// The kernel's driver of it.
-    pub driver: Option<KernelDriver>,
+    pub driver: Option<Box<KernelDriver>>,
 }
 
 impl Attachment {

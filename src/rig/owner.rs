@@ -174,7 +174,7 @@ impl Rig {
             bit: id,
             node: attachment.node.label(),
             usb: attachment.usb.clone(),
-            driver: attachment.driver.clone(),
+            driver: attachment.driver.as_deref().cloned(),
         };
         modality.attached = Stamp::now();
         self.board.announce(what);

@@ -140,7 +140,7 @@ impl Stream {
 
     fn provenance(&self, driver: &Driver) -> Provenance {
         let mut negotiated = driver.negotiated();
-        negotiated.driver = negotiated.driver.or_else(|| self.attachment.driver.clone());
+        negotiated.driver = negotiated.driver.or_else(|| self.attachment.driver.as_deref().cloned());
         Provenance {
             epoch: self.epoch,
             node: self.attachment.node.label(),

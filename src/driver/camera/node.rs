@@ -77,13 +77,13 @@ impl Node {
                 path.display()
             )));
         }
-        // KERNEL_VERSION of linux/version.h: major, minor and patch in a byte each, the major in the rest.
-        let [patch, minor, major, _] = capability.version.to_le_bytes();
+        // KERNEL_VERSION of linux/version.h: major, minor and revision, a byte each.
+        let [revision, minor, major, _] = capability.version.to_le_bytes();
         Ok(Card {
             name: text(&capability.card),
             driver: KernelDriver {
                 name: text(&capability.driver),
-                version: Some(format!("{major}.{minor}.{patch}")).filter(|_| capability.version != 0),
+                version: Some(format!("{major}.{minor}.{revision}")).filter(|_| capability.version != 0),
             },
             bus: text(&capability.bus_info),
         })

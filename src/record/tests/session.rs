@@ -144,9 +144,9 @@ fn a_slow_sensor_makes_its_frame_and_every_frame_waits_for_it() {
     let board = Arc::new(Board::new(&registry()));
     let mut masks = MaskHistory::new();
     masks.push(&scalars(1, 990, 990), PhysicalMask(0b10), 1);
-    let mut slow = registry();
-    slow.devices[usize::from(TOF)].latency = Duration::from_millis(300);
-    let mut session = session_of(slow, folder.path(), &board, &masks);
+    let mut late = registry();
+    late.devices[usize::from(TOF)].latency = Duration::from_millis(300);
+    let mut session = session_of(late, folder.path(), &board, &masks);
     let at = |ms: u64| Stamp(ms * MS);
     session.end_at(at(1010));
     // It stands for tick 0, at 1000 ms; and one, captured as late, for a moment after the end.
