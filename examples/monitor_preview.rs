@@ -84,6 +84,7 @@ fn registry(count: u8) -> Registry {
             sync_window: Duration::from_millis(25),
             cooldown: Duration::from_secs(2),
             memory_budget: 1 << 29,
+            disk_reserve: None,
         },
         devices: (0..count).filter_map(device).collect(),
         path: None,
@@ -149,6 +150,7 @@ async fn pretend(board: Arc<Board>, count: u8, mut commands: mpsc::Receiver<Comm
             messages: *messages,
             bytes: messages * 30_000,
             dropped: messages / 2000,
+            room: None,
         }));
     }
 }

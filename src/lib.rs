@@ -22,7 +22,9 @@
 //!  L1   registry                                 devices.toml, checked
 //!       status                                   the board every stage reports on
 //!       text   outlet                            words and lines for people
-//!  L0   modality   mask   sample   time   provenance     nouns
+//!       folder                                   files others cannot lead astray
+//!       episode_format                           an episode's file, record by record
+//!  L0   modality   mask   sample   time   provenance   flash     nouns
 //! ```
 //!
 //! The arrows are the way of the data. Imports point down only; the stages of L3 do not know one
@@ -85,7 +87,9 @@ pub mod cli;
 pub mod commands;
 pub mod dispatch;
 pub mod driver;
+pub mod episode_format;
 pub mod flash;
+pub mod folder;
 pub mod headless;
 pub mod hotplug;
 pub mod logging;

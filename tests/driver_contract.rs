@@ -55,7 +55,7 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static COUNTING: Counting = Counting;
 
-const CAMERA: SimSource = SimSource::Camera { width: 64, height: 48, fps: 200, seed: 3 };
+const CAMERA: SimSource = SimSource::Camera { width: 64, height: 48, fps: 200, seed: 3, bytes: 0 };
 const SERIAL: SimSource = SimSource::Serial { channels: 4, hz: 500, seed: 3 };
 
 fn spec(node: NodeSpec) -> DeviceSpec {
@@ -71,6 +71,11 @@ fn spec(node: NodeSpec) -> DeviceSpec {
         depth: 4,
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
+        verdict: rapid::registry::VerdictSpec::of(
+            rapid::modality::ModalityKind::Image,
+            Duration::from_millis(500),
+            Some(30.0),
+        ),
     }
 }
 

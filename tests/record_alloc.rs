@@ -157,6 +157,11 @@ async fn only_chunks_allocate() {
         depth: 64,
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
+        verdict: rapid::registry::VerdictSpec::of(
+            rapid::modality::ModalityKind::Image,
+            Duration::from_millis(500),
+            Some(30.0),
+        ),
     };
     let rig = RigSpec {
         name: "rig".to_owned(),
@@ -164,6 +169,7 @@ async fn only_chunks_allocate() {
         sync_window: Duration::from_millis(25),
         cooldown: Duration::from_secs(2),
         memory_budget: 1 << 29,
+        disk_reserve: None,
     };
     let registry = Arc::new(Registry { rig, devices: vec![device], path: None, text: String::new() });
     let board = Arc::new(Board::new(&registry));

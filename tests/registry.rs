@@ -7,8 +7,9 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use proptest::prelude::*;
+use rapid::modality::ModalityKind;
 use rapid::registry::scenario::Scenario;
-use rapid::registry::{BUILTIN, Framing, Loaded, NodeSpec, POOL_SPARE, Parse, Registry};
+use rapid::registry::{BUILTIN, Framing, Loaded, NodeSpec, Opens, POOL_SPARE, Parse, Registry};
 
 fn files(folder: &str) -> Vec<PathBuf> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/registry").join(folder);
@@ -69,6 +70,23 @@ fn defaults_are_those_of_the_documentation() {
         "devices.toml:1:9: [device.cam] no bit given, it gets bit 0: another entry above it would move it\n    \
          fix: pin it with bit = 0; a policy is trained on bit positions"
     );
+}
+
+#[test]
+fn a_program_and_its_settings_arrive() {
+    let Loaded { registry, warnings } = valid("process");
+    assert_eq!(warnings, []);
+    let [_, counter, leds, digit] = registry.devices.as_slice() else { panic!("four devices") };
+    let NodeSpec::Process(process) = &counter.node else { panic!("a program") };
+    assert_eq!((process.program.to_str(), process.args.join(" ")), (Some("/bin/sh"), "-c exec publisher".to_owned()));
+    assert_eq!((process.opens, process.kind, process.shape.as_slice()), (Opens::Tty, ModalityKind::Scalars, &[3][..]));
+    assert_eq!((counter.topic.as_str(), counter.max_bytes, counter.depth), ("/rapid/process/counter", 24, 2048));
+    assert_eq!((counter.stall_after.as_millis(), leds.stall_after.as_millis()), (500, 2000), "the heartbeat");
+    let NodeSpec::Process(process) = &leds.node else { panic!("a program") };
+    assert_eq!((process.opens, process.kind, process.shape.as_slice()), (Opens::Usb, ModalityKind::Bytes, &[][..]));
+    assert_eq!((leds.max_bytes, leds.depth, leds.modality().shape), (64 << 10, 60, vec![]));
+    assert_eq!(digit.modality().shape, [240, 320]);
+    assert_eq!((digit.max_bytes, digit.depth), (320 * 240 * 2, 60));
 }
 
 #[test]

@@ -8,6 +8,7 @@
 //! Invariant: no bytes from a device make a driver panic.
 
 pub mod camera;
+pub mod process;
 pub mod replay;
 pub mod serial;
 pub mod sim;
@@ -80,12 +81,10 @@ impl Driver {
                 Ok(Self::Serial(Box::new(serial::Serial::open(serial, path, spec.max_bytes).await?)))
             }
             (_, DeviceNode::Sim(device)) => Self::open_sim(spec, device).await,
-            (NodeSpec::Camera(_), DeviceNode::Tty(path)) => {
-                Err(wrong_kind(spec, "camera", &path.display().to_string(), "serial line"))
-            }
-            (NodeSpec::Serial(_), DeviceNode::Video(path)) => {
-                Err(wrong_kind(spec, "serial line", &path.display().to_string(), "camera"))
-            }
+            (NodeSpec::Camera(_), node) => Err(wrong_kind(spec, "camera", node)),
+            (NodeSpec::Serial(_), node) => Err(wrong_kind(spec, "serial line", node)),
+            // The rig supervises programs itself: `process` only starts and ends them.
+            (NodeSpec::Process(_), node) => Err(wrong_kind(spec, "program", node)),
         }
     }
 
@@ -135,10 +134,17 @@ impl Driver {
     }
 }
 
-fn wrong_kind(spec: &DeviceSpec, wished: &str, node: &str, is: &str) -> DriverError {
+fn wrong_kind(spec: &DeviceSpec, wished: &str, node: &DeviceNode) -> DriverError {
+    let is = match node {
+        DeviceNode::Video(_) => "a camera",
+        DeviceNode::Tty(_) => "a serial line",
+        DeviceNode::Usb(_) => "a USB device",
+        DeviceNode::Sim(_) => "simulated",
+    };
     DriverError::Fatal(format!(
-        "[device.{}] is a {wished} and {node} is a {is}: correct `node` or the identity of the entry",
-        spec.name
+        "[device.{}] is a {wished} and {} is {is}: correct `node` or the identity of the entry",
+        spec.name,
+        node.label()
     ))
 }
 

@@ -59,6 +59,15 @@ struct Message {
     shape: Shape,
 }
 
+/// The payload of one recorded message of the schema named so, with its width and height.
+#[doc(hidden)]
+#[must_use]
+pub fn decode(schema: &str, message: &[u8]) -> Option<(Vec<u8>, u32, u32)> {
+    let mut payload = Vec::new();
+    let shape = wire::payload(Schema::named(schema)?, message, &mut payload)?;
+    Some((payload, shape.width, shape.height))
+}
+
 impl Replay {
     /// Begins to play the device's topic from the present moment of the scenario.
     ///

@@ -211,6 +211,30 @@ impl Decoder {
     }
 }
 
+/// What a line that delivers `pieces` one after another would be read as: the payloads, and how many
+/// messages were refused.
+#[doc(hidden)]
+pub fn decode<'p>(
+    spec: &SerialSpec,
+    max_bytes: usize,
+    pieces: impl IntoIterator<Item = &'p [u8]>,
+) -> (Vec<Vec<u8>>, u64) {
+    let mut decoder = Decoder::new(spec, max_bytes);
+    let (mut payloads, mut refused) = (Vec::new(), 0);
+    for mut piece in pieces {
+        while !piece.is_empty() {
+            let (taken, outcome) = decoder.feed(piece);
+            piece = piece.get(taken..).unwrap_or_default();
+            match outcome {
+                Decoded::Nothing => {}
+                Decoded::Message => payloads.push(decoder.reading(Stamp::default(), 0).bytes.to_vec()),
+                Decoded::Malformed => refused += 1,
+            }
+        }
+    }
+    (payloads, refused)
+}
+
 fn open_line(path: &Path, baud: u32) -> Result<SerialStream, DriverError> {
     let Some(name) = path.to_str() else {
         return Err(DriverError::Fatal(format!("{}: the path is not UTF-8", path.display())));

@@ -55,18 +55,18 @@ impl Sim {
     /// Starts the device at the next point of its grid.
     ///
     /// # Errors
-    /// When a picture of these dimensions cannot be made.
+    /// When a picture of these dimensions cannot be made, or the device has no samples of its own.
     pub async fn open(device: Arc<SimDevice>) -> Result<Self, DriverError> {
         let (content, rate, backlog) = match device.source {
-            SimSource::Camera { width, height, fps, seed } => {
-                let pictures = unblock(move || Pictures::new(width, height, seed)).await?;
+            SimSource::Camera { width, height, fps, seed, bytes } => {
+                let pictures = unblock(move || Pictures::new(width, height, seed, bytes)).await?;
                 (Content::Pictures(pictures), fps, CAMERA_BACKLOG)
             }
             SimSource::Serial { channels, hz, seed } => {
                 (Content::Values { channels, seed }, hz, SERIAL_BACKLOG.as_secs() * u64::from(hz.max(1)))
             }
-            SimSource::Replay { .. } => {
-                return Err(DriverError::Fatal(format!("{} is a recording, not a simulated device", device.name)));
+            SimSource::Process | SimSource::Replay { .. } => {
+                return Err(DriverError::Fatal(format!("{} sends no samples made up here", device.name)));
             }
         };
         let capacity = match &content {
@@ -147,7 +147,7 @@ impl Sim {
                 format!("simulated camera, MJPG {width}x{height} at {fps} fps")
             }
             SimSource::Serial { channels, hz, .. } => format!("simulated serial line, {channels} numbers at {hz} Hz"),
-            SimSource::Replay { .. } => String::from("recording"),
+            SimSource::Process | SimSource::Replay { .. } => String::new(),
         }
     }
 
@@ -161,7 +161,7 @@ impl Sim {
             SimSource::Serial { channels, hz, .. } => {
                 Some(Format::Messages { baud: None, channels, hz: Some(hz.into()) })
             }
-            SimSource::Replay { .. } => None,
+            SimSource::Replay { .. } | SimSource::Process => None,
         };
         let bus = Some(format!("sim:{}", self.device.name));
         Negotiated { driver: Some(scenario::driver()), card: None, bus, format, controls: self.controls.clone() }
@@ -188,7 +188,7 @@ pub(super) fn check(spec: &DeviceSpec, device: &SimDevice) -> Result<(), DriverE
         }
         (SimSource::Camera { .. }, NodeSpec::Serial(_)) => (String::from("pictures"), String::from("a serial line")),
         (SimSource::Serial { .. }, NodeSpec::Camera(_)) => (String::from("numbers"), String::from("a camera")),
-        (SimSource::Replay { .. }, _) => return Ok(()),
+        (SimSource::Process | SimSource::Replay { .. }, _) | (_, NodeSpec::Process(_)) => return Ok(()),
     };
     Err(DriverError::Fatal(format!(
         "the scenario's device {} sends {sends}, [device.{}] says {wished}: make them equal",
@@ -196,17 +196,18 @@ pub(super) fn check(spec: &DeviceSpec, device: &SimDevice) -> Result<(), DriverE
     )))
 }
 
-/// The bytes a simulated device sends as number `sequence`, made anew; `None` for a recording.
+/// The bytes a simulated device sends as number `sequence`, made anew; `None` for a recording
+/// or a program.
 #[must_use]
 pub fn frame(source: &SimSource, sequence: u32) -> Option<Vec<u8>> {
     let mut payload = Vec::new();
     match *source {
-        SimSource::Camera { width, height, seed, .. } => {
-            let picture = encode(width, height, seed, sequence % PICTURES).ok()?;
+        SimSource::Camera { width, height, seed, bytes, .. } => {
+            let picture = fill(encode(width, height, seed, sequence % PICTURES).ok()?, bytes, seed);
             write_picture(&picture, seed, sequence, &mut payload);
         }
         SimSource::Serial { channels, seed, .. } => write_values(channels, seed, sequence, &mut payload),
-        SimSource::Replay { .. } => return None,
+        SimSource::Process | SimSource::Replay { .. } => return None,
     }
     Some(payload)
 }
@@ -236,8 +237,9 @@ struct Pictures {
 }
 
 impl Pictures {
-    fn new(width: u32, height: u32, seed: u64) -> Result<Self, DriverError> {
-        let encoded = (0..PICTURES).map(|index| encode(width, height, seed, index)).collect::<Result<_, _>>()?;
+    fn new(width: u32, height: u32, seed: u64, bytes: usize) -> Result<Self, DriverError> {
+        let picture = |index| Ok(fill(encode(width, height, seed, index)?, bytes, seed));
+        let encoded = (0..PICTURES).map(picture).collect::<Result<_, DriverError>>()?;
         Ok(Self { width, height, seed, encoded })
     }
 
@@ -268,6 +270,35 @@ fn write_picture(picture: &[u8], seed: u64, sequence: u32, payload: &mut Vec<u8>
         place.copy_from_slice(&length);
     }
     payload.extend_from_slice(rest);
+}
+
+/// The picture with comment segments after its start of image that bring it to `bytes` at least, filled with
+/// noise that does not compress, as the coefficients of a real scene do not.
+fn fill(picture: Vec<u8>, bytes: usize, seed: u64) -> Vec<u8> {
+    // Marker and length beside this many bytes of content.
+    const SEGMENT: usize = 65_533;
+    if picture.len() >= bytes {
+        return picture;
+    }
+    let (start, rest) = picture.split_at(picture.len().min(2));
+    let mut filled = Vec::with_capacity(bytes + SEGMENT);
+    filled.extend_from_slice(start);
+    // xorshift64 (Marsaglia 2003), which needs a seed that is not zero.
+    let mut state = seed | 1 << 63;
+    while filled.len() + rest.len() < bytes {
+        let content = (bytes - filled.len() - rest.len()).saturating_sub(4).clamp(1, SEGMENT);
+        let length = u16::try_from(content + 2).unwrap_or(u16::MAX);
+        filled.extend_from_slice(&[0xff, 0xfe]);
+        filled.extend_from_slice(&length.to_be_bytes());
+        filled.extend((0..content).map(|_| {
+            state ^= state << 13;
+            state ^= state >> 7;
+            state ^= state << 17;
+            state.to_le_bytes()[0]
+        }));
+    }
+    filled.extend_from_slice(rest);
+    filled
 }
 
 /// A gradient tinted by the seed, with a bright square that moves from picture to picture.

@@ -22,7 +22,7 @@ use crate::provenance::KernelDriver;
 use crate::registry::{Attachment, DeviceNode, UsbIdentity};
 use crate::time::Stamp;
 
-/// Subsystems whose nodes are opened.
+/// Subsystems whose nodes are opened, beside the USB devices themselves.
 const NODE_SUBSYSTEMS: [&str; 2] = ["video4linux", "tty"];
 
 /// See the module's comment.
@@ -152,6 +152,7 @@ fn attached() -> Result<Vec<Present>, HotplugError> {
     for subsystem in NODE_SUBSYSTEMS {
         enumerator.match_subsystem(subsystem)?;
     }
+    enumerator.match_subsystem("usb")?;
     enumerator.match_is_initialized()?;
     let mut found: Vec<_> = enumerator.scan_devices()?.filter_map(|device| present(&device)).collect();
     // In the order of ports, so that a start assigns equal units the same way each time.
@@ -168,9 +169,15 @@ fn present(device: &Device) -> Option<Present> {
     let node = match device.subsystem()?.to_str()? {
         "video4linux" if captures(device) => DeviceNode::Video(path),
         "tty" => DeviceNode::Tty(path),
+        // Of this subsystem, only the devices themselves have a node.
+        "usb" => DeviceNode::Usb(path),
         _ => return None,
     };
-    let usb_device = device.parent_with_subsystem_devtype("usb", "usb_device").ok()??;
+    let usb_device = match &node {
+        // Its parent is the hub.
+        DeviceNode::Usb(_) => device.clone(),
+        _ => device.parent_with_subsystem_devtype("usb", "usb_device").ok()??,
+    };
     let text = |name: &str| {
         let value = usb_device.attribute_value(name)?.to_string_lossy().into_owned();
         (!value.is_empty()).then_some(value)

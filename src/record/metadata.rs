@@ -7,9 +7,9 @@ use serde_json::{Map, Value, json};
 
 use super::episode::EpisodeRequest;
 use super::provenance::Units;
-use super::session::Tally;
-use crate::modality::ModalityId;
-use crate::registry::{Registry, WhenStale};
+use super::quality::{Quality, Spread};
+use crate::registry::{DeviceSpec, Registry, WhenStale};
+use crate::status::Verdict;
 use crate::time::{Stamp, WallClock, nanoseconds};
 
 /// The record at the beginning.
@@ -82,8 +82,12 @@ pub(super) struct Ending<'a> {
     pub(super) events_missed: u64,
     /// Publications of the mask lost.
     pub(super) masks_dropped: u64,
-    /// Counts of each modality.
-    pub(super) tallies: &'a [Tally],
+    /// What each modality was like.
+    pub(super) qualities: &'a [(&'a DeviceSpec, Quality)],
+    /// Between the earliest and the latest sample of a frame.
+    pub(super) skew: Option<Spread>,
+    /// The verdict.
+    pub(super) verdict: Verdict,
     /// Everything that was attached or ran at some time.
     pub(super) units: &'a Units,
     /// When the episode began.
@@ -92,32 +96,29 @@ pub(super) struct Ending<'a> {
 
 /// The record at the end.
 ///
-/// JSON: `modalities` `{name: {samples, bytes, lost, dropped, damaged}}` (`lost` by the device,
-/// `dropped` between the driver and the file), `serials` and `provenance` as at the beginning, of
-/// whatever was attached or ran at some time.
-pub(super) fn end(registry: &Registry, ending: &Ending<'_>) -> BTreeMap<String, String> {
-    let tally = |id: ModalityId| ending.tallies.get(id.index()).copied().unwrap_or_default();
-    let modalities: Map<String, Value> = registry
-        .devices
-        .iter()
-        .map(|device| {
-            let Tally { samples, bytes, lost, dropped, damaged, .. } = tally(device.id);
-            let said =
-                json!({"samples": samples, "bytes": bytes, "lost": lost, "dropped": dropped, "damaged": damaged});
-            (device.name.clone(), said)
-        })
-        .collect();
-    let sum = |count: fn(&Tally) -> u64| ending.tallies.iter().map(count).fold(0, u64::saturating_add).to_string();
+/// `verdict` is GOOD, SUSPECT or BAD. JSON: `reasons` `["..."]`, why it is not GOOD; `modalities`
+/// `{name: {samples, bytes, lost, dropped, damaged, ...}}`, the fields of [`Quality`]; `skew_ms` `{p50,
+/// p95, p99, max}` between the earliest and the latest sample of a frame, or null; `serials` and
+/// `provenance` as at the beginning, of whatever was attached or ran at some time.
+pub(super) fn end(ending: &Ending<'_>) -> BTreeMap<String, String> {
+    let modalities: Map<String, Value> =
+        ending.qualities.iter().map(|(device, quality)| (device.name.clone(), json!(quality))).collect();
+    let sum = |count: fn(&Quality) -> u64| {
+        ending.qualities.iter().map(|(_, quality)| count(quality)).fold(0, u64::saturating_add).to_string()
+    };
     text_map([
+        ("verdict", ending.verdict.grade.word().to_owned()),
+        ("reasons", json!(ending.verdict.reasons).to_string()),
         ("duration_s", ending.seconds.to_string()),
         ("messages", ending.messages.to_string()),
         ("frames", ending.frames.to_string()),
-        ("lost", sum(|tally| tally.lost)),
-        ("dropped", sum(|tally| tally.dropped)),
-        ("damaged", sum(|tally| tally.damaged)),
+        ("lost", sum(|quality| quality.lost)),
+        ("dropped", sum(|quality| quality.dropped)),
+        ("damaged", sum(|quality| quality.damaged)),
         ("masks_dropped", ending.masks_dropped.to_string()),
         ("events_missed", ending.events_missed.to_string()),
         ("modalities", Value::Object(modalities).to_string()),
+        ("skew_ms", json!(ending.skew).to_string()),
         ("serials", ending.units.serials().to_string()),
         ("provenance", ending.units.epochs(ending.begin).to_string()),
     ])

@@ -18,24 +18,29 @@
 //!
 //! Invariant: every sample a frame names was written to the file before the frame.
 
-use std::collections::VecDeque;
+use std::fs::File;
 use std::io;
 use std::sync::Arc;
 use std::time::Duration;
 
+use super::announce::Announcer;
 use super::encode::EventText;
 use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest};
 use super::file::{EpisodeFile, Sink};
 use super::hole::Hole;
+use super::keep;
+use super::masks::MaskHistory;
 use super::metadata::{self, Ending};
 use super::provenance::{Attached, Units};
+use super::quality::{Frames, Measured, Measures, Seen};
+use super::verdict::{Facts, FileState, Judged, Losses, judge};
 use crate::mask::PhysicalMask;
-use crate::modality::{MAX_MODALITIES, ModalityId};
-use crate::registry::Registry;
-use crate::sample::{Epoch, FLAG_ERROR, SampleHeader};
-use crate::status::{Board, Event, Level, RecordingStatus, What};
+use crate::modality::ModalityId;
+use crate::registry::{DeviceSpec, Registry};
+use crate::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
+use crate::status::{Board, Event, RecordingStatus, What};
 use crate::sync::{Grid, SyncModality, SyncSample, Synchronizer};
-use crate::time::{Stamp, WallClock};
+use crate::time::{Stamp, WallClock, nanoseconds};
 
 /// How long after its capture a sample may arrive and still belong to its frame. The slowest we
 /// know: a camera at 15 Hz stamps the start of exposure and delivers after exposure, transfer and
@@ -43,52 +48,8 @@ use crate::time::{Stamp, WallClock};
 pub(super) const SETTLE: Duration = Duration::from_millis(100);
 /// What has been received may still lie on the bus for this long.
 pub(super) const GRACE: Duration = Duration::from_millis(20);
-/// How often losses of one modality are announced at most.
-const ANNOUNCE_EVERY: Duration = Duration::from_secs(1);
 /// Samples of a modality that may arrive while those of a whole queue are being written.
 const RING_SLACK: usize = 1024;
-/// Publications of the mask remembered: 16 s at 500 Hz, more than any queue of it holds.
-const MASKS: usize = 8192;
-
-/// Counts of one modality in one episode.
-#[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Tally {
-    /// Samples written.
-    pub(super) samples: u64,
-    /// Payload bytes written.
-    pub(super) bytes: u64,
-    /// Samples that the device lost before we had them.
-    pub(super) lost: u64,
-    /// Samples lost between the driver and the file.
-    pub(super) dropped: u64,
-    /// Samples the driver called damaged.
-    pub(super) damaged: u64,
-    /// Of `dropped`, those not announced yet.
-    unannounced: u64,
-    announced: Option<Stamp>,
-}
-
-/// The last publications of the mask, in the order of publication.
-#[derive(Debug)]
-pub(super) struct MaskHistory(VecDeque<(SampleHeader, PhysicalMask, u64)>);
-
-impl MaskHistory {
-    pub(super) fn new() -> Self {
-        Self(VecDeque::with_capacity(MASKS))
-    }
-
-    pub(super) fn push(&mut self, header: &SampleHeader, mask: PhysicalMask, sequence: u64) {
-        if self.0.len() == MASKS {
-            self.0.pop_front();
-        }
-        self.0.push_back((*header, mask, sequence));
-    }
-
-    /// The publication in force at `stamp`: the last one at or before it.
-    fn at(&self, stamp: Stamp) -> Option<&(SampleHeader, PhysicalMask, u64)> {
-        self.0.iter().rev().find(|(header, ..)| header.capture_ns <= stamp.0)
-    }
-}
 
 /// See the module's comment.
 pub(super) struct Session {
@@ -96,12 +57,15 @@ pub(super) struct Session {
     board: Arc<Board>,
     path: EpisodePath,
     file: EpisodeFile,
+    /// The open file itself, whatever becomes of its name.
+    handle: File,
     begin: Stamp,
     end: Option<Stamp>,
     grid: Grid,
     next_tick: u64,
     sync: Synchronizer<()>,
-    tallies: Vec<Tally>,
+    measures: Measures,
+    announcer: Announcer,
     masks_dropped: u64,
     events: u64,
     events_missed: u64,
@@ -119,6 +83,7 @@ pub(super) struct Beginning<'a> {
     pub(super) request: &'a EpisodeRequest,
     pub(super) path: EpisodePath,
     pub(super) sink: Box<dyn Sink>,
+    pub(super) handle: File,
     pub(super) attached: &'a Attached,
     pub(super) clock: WallClock,
     pub(super) begin: Stamp,
@@ -127,12 +92,15 @@ pub(super) struct Beginning<'a> {
 impl Session {
     /// Begins an episode and writes what stands at its beginning.
     pub(super) fn begin(beginning: Beginning<'_>, masks: &MaskHistory) -> io::Result<Self> {
-        let Beginning { registry, board, request, path, sink, attached, clock, begin } = beginning;
+        let Beginning { registry, board, request, path, sink, handle, attached, clock, begin } = beginning;
         let units = Units::new(attached);
         let said = metadata::beginning(&registry, request, &units, clock, begin);
         let mut file = EpisodeFile::begin(sink, &registry, clock, begin, said)?;
+        let settle = SETTLE + registry.devices.iter().map(|device| device.latency).max().unwrap_or_default();
+        let mut measures = Measures::new(&measured(&registry), frames(&registry, begin, settle));
         if let Some((header, mask, sequence)) = masks.at(begin) {
             file.mask(header, *mask, *sequence)?;
+            measures.mask(header.capture_ns, *mask);
         }
         let modalities: Vec<SyncModality> = registry
             .devices
@@ -144,7 +112,6 @@ impl Session {
                 capacity: device.depth.saturating_add(RING_SLACK),
             })
             .collect();
-        let latency = registry.devices.iter().map(|device| device.latency).max().unwrap_or_default();
         Ok(Self {
             sync: Synchronizer::new(&modalities, registry.rig.sync_window),
             grid: Grid::new(begin, registry.rig.observation_hz),
@@ -153,14 +120,16 @@ impl Session {
             board,
             path,
             file,
+            handle,
             begin,
             next_tick: 0,
-            tallies: vec![Tally::default(); MAX_MODALITIES],
+            measures,
+            announcer: Announcer::new(),
             masks_dropped: 0,
             events: 0,
             events_missed: 0,
             units,
-            settle: SETTLE + latency,
+            settle,
             failed: None,
         })
     }
@@ -171,12 +140,7 @@ impl Session {
         if let (Some(hole), None) = (hole, &self.failed) {
             // Also before a sample that lies beyond the end: a part of the hole may not.
             let (lost, dropped) = (self.share(&hole, hole.lost, latency), self.share(&hole, hole.dropped, latency));
-            if let Some(tally) = self.tallies.get_mut(id.index()) {
-                // Saturating: the numbers come from whoever publishes.
-                tally.lost = tally.lost.saturating_add(lost);
-                tally.dropped = tally.dropped.saturating_add(dropped);
-                tally.unannounced = tally.unannounced.saturating_add(dropped);
-            }
+            self.measures.missing(id, lost, dropped);
         }
         if !self.holds(Stamp(header.capture_ns), latency) || self.failed.is_some() {
             return;
@@ -185,11 +149,17 @@ impl Session {
             self.failed = Some(error);
             return;
         }
-        let Some(tally) = self.tallies.get_mut(id.index()) else { return };
-        tally.samples += 1;
-        tally.bytes += payload.len() as u64;
-        if header.flags & FLAG_ERROR != 0 {
-            tally.damaged += 1;
+        let flagged = header.flags & FLAG_ERROR != 0;
+        let seen = Seen {
+            seq: header.seq,
+            capture_ns: header.capture_ns,
+            recv_ns: header.recv_ns,
+            flagged,
+            jpeg: Encoding::from_raw(header.encoding) == Some(Encoding::Mjpeg),
+            payload,
+        };
+        self.measures.sample(id, &seen);
+        if flagged {
             return;
         }
         let sample = SyncSample {
@@ -211,6 +181,7 @@ impl Session {
             return;
         }
         self.failed = self.file.mask(header, mask, sequence).err();
+        self.measures.mask(header.capture_ns, mask);
     }
 
     /// Takes an event.
@@ -229,13 +200,14 @@ impl Session {
     }
 
     /// Writes the frames whose deadline has passed by `now`, everything received before which was
-    /// taken, and announces losses.
+    /// taken, and announces what goes wrong.
     pub(super) fn advance(&mut self, now: Stamp, masks: &MaskHistory) {
         let ticks = self.end.map_or(u64::MAX, |end| self.grid.ticks_before(end));
         while self.failed.is_none() && self.next_tick < ticks && now >= self.deadline(self.next_tick).after(GRACE) {
             self.write_frame(masks);
         }
-        self.announce_losses(|tally| tally.announced.is_none_or(|at| now.since(at) >= ANNOUNCE_EVERY), now);
+        self.measures.settle();
+        self.announcer.look(&self.measures, &self.registry, &self.board, now);
     }
 
     /// Fixes the end of the episode, if it is not fixed to an earlier moment.
@@ -269,37 +241,55 @@ impl Session {
         while self.failed.is_none() && self.next_tick < ticks {
             self.write_frame(masks);
         }
-        self.announce_losses(|_| true, now);
+        self.announcer.last(&self.measures, &self.registry, &self.board, now);
         let seconds = end.since(self.begin).as_secs_f64();
-        let dropped = self.dropped();
         let messages = self.file.messages;
+        let dropped = self.measures.dropped();
+        let qualities =
+            self.registry.devices.iter().filter_map(|device| Some((device, self.measures.quality(device.id, end.0)?)));
+        let qualities: Vec<_> = qualities.collect();
+        let judged: Vec<Judged<'_>> = qualities
+            .iter()
+            .map(|(device, quality)| Judged { name: &device.name, quality, limits: device.verdict })
+            .collect();
+        let (masks_dropped, events_missed) = (self.masks_dropped, self.events_missed);
+        let verdict = |file: FileState<'_>| {
+            judge(&Facts { modalities: &judged, masks_dropped, events_missed, losses: Losses::Apart, file })
+        };
+        let state = reason.as_deref().map_or(FileState::Whole, FileState::NotWhole);
         let ending = Ending {
             seconds,
             messages,
             frames: self.next_tick,
-            events_missed: self.events_missed,
-            masks_dropped: self.masks_dropped,
-            tallies: &self.tallies,
+            events_missed,
+            masks_dropped,
+            qualities: &qualities,
+            skew: self.measures.skew(),
+            verdict: verdict(state),
             units: &self.units,
             begin: self.begin,
         };
         let closed = match self.failed {
-            None => self.file.finish(metadata::end(&self.registry, &ending)).and_then(|()| self.path.publish()),
+            None => {
+                let finished = self.file.finish(metadata::end(&ending));
+                finished.and_then(|()| keep::publish(&self.path, &self.handle))
+            }
             Some(error) => Err(error),
         };
-        let (file, error) = match closed {
-            Ok(()) => (self.path.finished, reason),
+        let (file, error, verdict) = match closed {
+            Ok(file) => (file, reason, ending.verdict),
             Err(error) => {
-                let file = self.path.partial;
+                let file = keep::partial(&self.path, &self.handle);
                 let text = match reason {
                     Some(reason) => format!("{reason}; {}: {error}", file.display()),
                     None => format!("{}: {error}", file.display()),
                 };
-                (file, Some(text))
+                let verdict = verdict(FileState::Failed(&error.to_string()));
+                (file, Some(text), verdict)
             }
         };
         let bytes = std::fs::metadata(&file).map_or(0, |metadata| metadata.len());
-        EpisodeReport { file, seconds, messages, bytes, dropped, error }
+        EpisodeReport { file, seconds, messages, bytes, dropped, error, verdict }
     }
 
     /// For the screen.
@@ -309,17 +299,14 @@ impl Session {
             elapsed: self.end.unwrap_or(now).min(now).since(self.begin),
             messages: self.file.messages,
             bytes: self.file.bytes,
-            dropped: self.dropped(),
+            dropped: self.measures.dropped(),
+            room: None,
         }
     }
 
     /// The file's name once it is finished.
     pub(super) fn name(&self) -> &std::path::Path {
         &self.path.finished
-    }
-
-    fn dropped(&self) -> u64 {
-        self.tallies.iter().fold(0, |sum, tally| sum.saturating_add(tally.dropped))
     }
 
     fn holds(&self, capture: Stamp, latency: Duration) -> bool {
@@ -346,6 +333,8 @@ impl Session {
         // Before the first publication nothing is known to be present.
         let mask = masks.at(tick).map_or(PhysicalMask::EMPTY, |(_, mask, _)| *mask);
         let observation = self.sync.observe(tick, deadline, mask);
+        let slots = observation.slots.iter();
+        self.measures.frame(slots.map(|slot| (slot.id, slot.present, slot.valid.then_some(slot.age_ns))));
         self.failed = self.file.frame(index, observation, deadline).err();
         self.next_tick += 1;
     }
@@ -361,18 +350,22 @@ impl Session {
         }
         Ok(())
     }
+}
 
-    fn announce_losses(&mut self, due: impl Fn(&Tally) -> bool, now: Stamp) {
-        for device in &self.registry.devices {
-            let Some(tally) = self.tallies.get_mut(device.id.index()) else { continue };
-            if tally.unannounced > 0 && due(tally) {
-                let text = format!("{}: {} samples lost on the way to the file", device.name, tally.unannounced);
-                self.board.announce(What::Log { level: Level::Warn, text });
-                tally.unannounced = 0;
-                tally.announced = Some(now);
-            }
-        }
-    }
+/// What is measured of the devices of a registry.
+fn measured(registry: &Registry) -> Vec<Measured> {
+    let measured = |device: &DeviceSpec| Measured {
+        id: device.id,
+        limits: device.verdict,
+        latency_ns: nanoseconds(device.latency),
+        max_bytes: device.max_bytes,
+    };
+    registry.devices.iter().map(measured).collect()
+}
+
+/// When the frames of an episode are that begins at `begin`.
+fn frames(registry: &Registry, begin: Stamp, settle: Duration) -> Frames {
+    Frames { begin_ns: begin.0, hz: registry.rig.observation_hz, wait: registry.rig.sync_window + settle }
 }
 
 /// An event for people.
@@ -395,5 +388,8 @@ fn describe(what: &What) -> String {
         What::Recording { file } => format!("recording {}", file.display()),
         What::Episode { file, .. } => format!("finished {}", file.display()),
         What::Log { text, .. } => text.clone(),
+        What::DiskLow { .. } | What::ClockStep { .. } => {
+            what.sentence().map_or_else(String::new, |(_, sentence)| sentence)
+        }
     }
 }

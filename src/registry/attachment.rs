@@ -45,6 +45,8 @@ pub enum DeviceNode {
     Video(PathBuf),
     /// A serial line, for example `/dev/ttyACM0`.
     Tty(PathBuf),
+    /// The USB device itself, for example `/dev/bus/usb/001/005`.
+    Usb(PathBuf),
     /// A simulated device.
     Sim(Arc<SimDevice>),
 }
@@ -76,7 +78,7 @@ impl DeviceNode {
     #[must_use]
     pub fn label(&self) -> String {
         match self {
-            Self::Video(path) | Self::Tty(path) => path.display().to_string(),
+            Self::Video(path) | Self::Tty(path) | Self::Usb(path) => path.display().to_string(),
             Self::Sim(device) => format!("sim:{}", device.name),
         }
     }

@@ -49,6 +49,8 @@ pub enum SimSource {
         fps: u32,
         /// Chooses the pictures.
         seed: u64,
+        /// Least size of a picture; what it lacks is filled up. 0: as the encoder makes it.
+        bytes: usize,
     },
     /// Vectors of numbers; values are a function of seed and sequence.
     Serial {
@@ -59,6 +61,8 @@ pub enum SimSource {
         /// Chooses the values.
         seed: u64,
     },
+    /// Nothing of its own: the program of the entry runs as it would for a real device.
+    Process,
     /// The samples of one topic of a recorded episode, at their recorded distances in time.
     Replay {
         /// The episode.

@@ -137,7 +137,7 @@ fn syntax_fix(message: &str, source: &str) -> String {
 }
 
 /// Without control characters.
-fn printable(text: &str) -> String {
+pub(super) fn printable(text: &str) -> String {
     text.chars().flat_map(|c| if c.is_control() { c.escape_default().collect() } else { vec![c] }).collect()
 }
 
@@ -214,6 +214,11 @@ impl<'a> Section<'a> {
             return None;
         };
         Some(At { at: value.span().start, value: text.as_ref() })
+    }
+
+    /// The text of `key`, if it is one.
+    pub(super) fn text_if(&self, key: &str) -> Option<&'a str> {
+        self.field(key)?.get_ref().as_str()
     }
 
     pub(super) fn flag(&self, problems: &mut Problems<'_>, key: &str) -> Option<bool> {

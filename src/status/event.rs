@@ -1,14 +1,16 @@
 //! Events: state changes worth a line on a screen and a message in a recording.
 
 use std::path::PathBuf;
+use std::time::Duration;
 
 use serde::Serialize;
 
-use super::{Level, SlotState};
+use super::{Grade, Level, SlotState, Verdict};
 use crate::modality::ModalityId;
 use crate::provenance::{KernelDriver, Negotiated};
 use crate::registry::UsbIdentity;
 use crate::sample::Epoch;
+use crate::text;
 use crate::time::Stamp;
 
 /// A state change, with its moment. As JSON, one object: `{"event":"state","device":...}`.
@@ -97,6 +99,23 @@ pub enum What {
         dropped: u64,
         /// Why the file is not whole, if it is not.
         error: Option<String>,
+        /// What it is worth.
+        #[serde(flatten)]
+        verdict: Verdict,
+    },
+    /// The disk of the episode in progress is nearly full; told once an episode.
+    DiskLow {
+        /// The folder.
+        folder: PathBuf,
+        /// What is free on its disk, bytes.
+        free: u64,
+        /// Until the episode will be closed, at the rate it is written with.
+        seconds: u64,
+    },
+    /// The wall clock was set. Capture times of an episode in progress go on by the clock it began with.
+    ClockStep {
+        /// By how much, forward; back if negative.
+        seconds: f64,
     },
     /// A line of the log that has no event of its own.
     Log {
@@ -127,8 +146,16 @@ pub struct Provenance {
 }
 
 impl What {
+    /// Did an episode end before its time, with a file that is whole all the same?
+    #[must_use]
+    pub fn is_cut_short(&self) -> bool {
+        let Self::Episode { file, error: Some(_), .. } = self else { return false };
+        file.extension().is_some_and(|extension| extension == "mcap")
+    }
+
     /// The event as a line of the log; `None` where the event that follows says it all.
-    pub(super) fn sentence(&self) -> Option<(Level, String)> {
+    #[must_use]
+    pub fn sentence(&self) -> Option<(Level, String)> {
         Some(match self {
             Self::Attach { device, node, usb, .. } => {
                 let serial = usb.serial.as_deref().map(|serial| format!(", serial {serial}")).unwrap_or_default();
@@ -152,12 +179,35 @@ impl What {
             }
             Self::Unregistered { device, reason } => (Level::Info, format!("{device} is not used: {reason}")),
             Self::Recording { file } => (Level::Info, format!("recording {}", file.display())),
-            Self::Episode { file, seconds, error: Some(error), .. } => {
-                (Level::Error, format!("{} is not whole after {seconds:.1} s: {error}", file.display()))
+            Self::Episode { file, seconds, error: Some(error), verdict, .. } => {
+                let word = if self.is_cut_short() { "cut short" } else { "not whole" };
+                let grade = verdict.grade.word();
+                (Level::Error, format!("{grade} {} is {word} after {seconds:.1} s: {error}", file.display()))
             }
-            Self::Episode { file, seconds, dropped, error: None, .. } => {
-                let level = if *dropped > 0 { Level::Warn } else { Level::Info };
-                (level, format!("{} finished, {seconds:.1} s, {dropped} samples dropped", file.display()))
+            Self::Episode { file, seconds, error: None, verdict, .. } => {
+                let level = match verdict.grade {
+                    Grade::Good => Level::Info,
+                    Grade::Suspect => Level::Warn,
+                    Grade::Bad => Level::Error,
+                };
+                let (file, word) = (file.display(), verdict.grade.word());
+                let why = if verdict.reasons.is_empty() { String::new() } else { format!(": {}", verdict.why()) };
+                (level, format!("{word} {file} finished, {seconds:.1} s{why}"))
+            }
+            Self::DiskLow { folder, free, seconds } => {
+                let (free, left) = (text::size(*free), text::about(Duration::from_secs(*seconds)));
+                let folder = folder.display();
+                let text =
+                    format!("{folder}: disk nearly full, {free} free: the episode will be closed in about {left}");
+                (Level::Warn, text)
+            }
+            Self::ClockStep { seconds } => {
+                let direction = if *seconds < 0.0 { "back" } else { "forward" };
+                let by = seconds.abs();
+                (
+                    Level::Warn,
+                    format!("the wall clock was set {direction} by {by:.3} s; times of capture stay as they are"),
+                )
             }
             Self::Log { level, text } => (*level, text.clone()),
         })

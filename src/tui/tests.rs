@@ -11,7 +11,7 @@ use super::*;
 use crate::status::literal::{
     TAKEN, board, device, every_state, line, recording, sixty_four, snapshot, three_streaming,
 };
-use crate::status::{Level, SlotState, Snapshot};
+use crate::status::{Level, RecordingStatus, SlotState, Snapshot};
 use crate::time::Stamp;
 use theme::{Charset, Colours};
 
@@ -130,6 +130,18 @@ fn an_episode_that_loses_samples_says_so() {
     assert_snapshot!("recording_120x40", draw(&model, (120, 40), THEME));
     assert_eq!(style_of(screen.buffer(), "▲ dropped 17").fg, Some(Color::Red));
     assert_eq!(style_of(screen.buffer(), "● REC").fg, Some(Color::Red));
+}
+
+#[test]
+fn a_disk_that_fills_up_says_how_long_it_takes() {
+    let mut end = three_streaming();
+    end.recording = Some(RecordingStatus { room: Some(Duration::from_secs(252)), ..recording(17) });
+    let model = measured(&end);
+    for (size, theme) in [((80, 24), THEME), ((80, 24), ASCII)] {
+        let screen = draw(&model, size, theme).to_string();
+        assert!(screen.contains("disk full in 04:12") && screen.contains("dropped 17"), "{screen}");
+    }
+    assert_eq!(style_of(draw(&model, (80, 24), THEME).buffer(), "▲ disk full in 04:12").fg, Some(Color::Red));
 }
 
 #[test]

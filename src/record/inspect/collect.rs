@@ -3,11 +3,11 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use super::super::file::{EVENT_TOPIC, FRAME_TOPIC, MASK_TOPIC};
 use super::super::walk::{Walked, op};
 use super::super::wire::{Fields, protobuf};
 use super::units;
 use super::{EventReport, Inspection, Lateness, MaskEdge, ModalityReport, TopicReport};
+use crate::episode_format::{EVENT_TOPIC, FRAME_TOPIC, MASK_TOPIC};
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 

@@ -183,6 +183,14 @@ pub fn inspect(path: &Path) -> Result<Inspection, InspectError> {
     inspect_from(&mut file, size, path).map_err(io)?.ok_or_else(|| InspectError::NotMcap(path.to_owned()))
 }
 
+/// The same for the bytes of a file. `None`: no MCAP file.
+#[doc(hidden)]
+#[must_use]
+pub fn inspect_bytes(mut bytes: &[u8]) -> Option<Inspection> {
+    let size = bytes.len() as u64;
+    inspect_from(&mut bytes, size, Path::new("bytes")).ok()?
+}
+
 /// `None`: no MCAP file.
 fn inspect_from(file: &mut impl Read, size: u64, path: &Path) -> io::Result<Option<Inspection>> {
     let mut collected = Collected::default();

@@ -4,6 +4,7 @@ use std::fmt::Write;
 
 use super::units;
 use super::{FileEnd, Inspection, Lateness, ModalityReport, TopicReport};
+use crate::text;
 
 /// Whether the terminal shows colours.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -199,7 +200,7 @@ fn colour(paint: Paint, code: u8, text: &str) -> String {
 
 /// Text of a file, without what could move the cursor of a terminal.
 fn clean(text: &str) -> String {
-    text.replace(char::is_control, " ")
+    text::plain(text).into_owned()
 }
 
 fn or_dash(text: &str) -> &str {

@@ -7,7 +7,9 @@ async fn an_episode_holds_what_was_captured_and_nothing_else() {
     let bench = Bench::new();
     let mut events = bench.board.events();
     let (finished, t0) = bench.one_second().await;
-    let What::Episode { file, seconds, messages, bytes, dropped, error } = bench.until_closed(&mut events).await else {
+    let What::Episode { file, seconds, messages, bytes, dropped, error, verdict } =
+        bench.until_closed(&mut events).await
+    else {
         unreachable!()
     };
     assert_eq!((file.as_path(), error, seconds), (finished.as_path(), None, 1.0));
@@ -64,7 +66,7 @@ async fn an_episode_holds_what_was_captured_and_nothing_else() {
     assert_eq!(values.as_list().unwrap().iter().map(|v| v.as_f64().unwrap()).collect::<Vec<_>>(), [101.0, 0.5]);
     let cam = read.on("/rapid/cam_wrist").nth(3).unwrap();
     let data = cam.4.get_field_by_name("data").unwrap().as_bytes().unwrap().to_vec();
-    assert_eq!(data, u64::from(cam.1).to_le_bytes().repeat(100));
+    assert_eq!(data, picture(u64::from(cam.1)));
     assert_eq!([text(&cam.4, "format"), text(&cam.4, "frame_id")], ["jpeg", "cam_wrist"]);
 
     // Losses: seven of the device's own and one on the way.

@@ -2,8 +2,9 @@
 
 use super::super::episode::EpisodePath;
 use super::super::hole::Hole;
+use super::super::masks::MaskHistory;
 use super::super::provenance::Attached;
-use super::super::session::{Beginning, MaskHistory, Session};
+use super::super::session::{Beginning, Session};
 use super::*;
 use crate::time::WallClock;
 
@@ -20,6 +21,7 @@ fn session_of(registry: Registry, folder: &Path, board: &Arc<Board>, masks: &Mas
         board: Arc::clone(board),
         request: &EpisodeRequest::default(),
         path,
+        handle: file.try_clone().unwrap(),
         sink: Box::new(file),
         attached: &Attached::default(),
         clock,

@@ -26,7 +26,7 @@ fn without_devices_every_entry_is_plugged() {
             ("motor_state", "MOT00C1", "9-3", true),
         ]
     );
-    assert_eq!(scenario.devices[1].source, SimSource::Camera { width: 320, height: 240, fps: 30, seed: 1 });
+    assert_eq!(scenario.devices[1].source, SimSource::Camera { width: 320, height: 240, fps: 30, seed: 1, bytes: 0 });
     assert_eq!(scenario.devices[2].source, SimSource::Serial { channels: 3, hz: 100, seed: 2 });
 }
 
@@ -86,6 +86,7 @@ fn two_units_of_one_model_without_serial_numbers_can_be_told() {
         port = "1-3"
         seed = 9
         hz = 60
+        bytes = "60kB"
         plugged = false
         [[event]]
         at = "1s"
@@ -96,7 +97,7 @@ fn two_units_of_one_model_without_serial_numbers_can_be_told() {
     let [one, two] = scenario.devices.as_slice() else { panic!("two devices") };
     assert_eq!((one.usb.vid, one.usb.pid, &one.usb.serial), (two.usb.vid, two.usb.pid, &two.usb.serial));
     assert_eq!((one.usb.port.as_str(), two.usb.port.as_str()), ("1-2", "1-3"));
-    assert_eq!(two.source, SimSource::Camera { width: 640, height: 480, fps: 60, seed: 9 });
+    assert_eq!(two.source, SimSource::Camera { width: 640, height: 480, fps: 60, seed: 9, bytes: 60_000 });
     assert!(one.plugged && !two.plugged);
 }
 

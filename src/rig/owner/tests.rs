@@ -33,6 +33,11 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
         depth: 16,
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
+        verdict: crate::registry::VerdictSpec::of(
+            crate::modality::ModalityKind::Image,
+            Duration::from_millis(500),
+            Some(30.0),
+        ),
     };
     Registry {
         rig: RigSpec {
@@ -41,6 +46,7 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
             sync_window: Duration::from_millis(25),
             cooldown,
             memory_budget: 1 << 20,
+            disk_reserve: None,
         },
         devices: [(0, "a"), (1, "b")].into_iter().map(device).collect(),
         path: None,

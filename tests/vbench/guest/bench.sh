@@ -31,6 +31,13 @@ emu_start() {
 # emu COMMAND...: one line to the emulator.
 emu() { echo "$*" >&7; }
 
+# emu_done SECONDS: until the emulator has done all it was told so far.
+emu_done() {
+  emu_asked=$((${emu_asked:-0} + 1))
+  emu "say done-$emu_asked"
+  wait_for "$1" said "$out/emu.jsonl" "\"word\":\"done-$emu_asked\"" || fail "the emulator is not done: $(tail -n 1 "$out/emu.jsonl")"
+}
+
 # emu_quit: what is still plugged is pulled, and the log is complete.
 emu_quit() { emu quit; wait "$emu_pid"; }
 

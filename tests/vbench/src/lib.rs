@@ -8,6 +8,7 @@
 
 pub mod clock;
 pub mod emu;
+pub mod figure;
 pub mod guest;
 pub mod latency;
 pub mod outcome;

@@ -2,10 +2,11 @@
 //!
 //! ```text
 //! plug N..      unplug N..      silent N 0|1      port N P
-//! sleep MS      t0              at MS [COMMAND]   quit
+//! sleep MS      t0              at MS [COMMAND]   say WORD       quit
 //! ```
 //!
-//! `t0` starts the timeline's clock; `at MS` waits until MS after it. The end of the input means `quit`.
+//! `t0` starts the timeline's clock; `at MS` waits until MS after it. `say` logs the word, once everything before it is done.
+//! The end of the input means `quit`.
 //! Invariant: a line that makes no sense is reported and skipped; it never ends the emulator.
 
 use std::io::BufRead;
@@ -39,6 +40,8 @@ pub enum Command {
     Origin,
     /// Wait until this long after the start of the timeline, then do.
     At(Duration, Option<Box<Command>>),
+    /// Log a word.
+    Say(String),
     /// Unplug everything and end.
     Quit,
 }
@@ -78,6 +81,7 @@ fn parse(words: &mut SplitWhitespace<'_>) -> Option<Command> {
             };
             Command::At(when, then)
         }
+        "say" => Command::Say(words.next()?.into()),
         "quit" => Command::Quit,
         _ => return None,
     };
@@ -144,6 +148,7 @@ impl Player<'_> {
                     self.play(*then);
                 }
             }
+            Command::Say(word) => self.log.say("say", Moment::now(), json!({"word": word})),
             Command::Quit => {}
         }
     }
@@ -177,6 +182,7 @@ mod tests {
             ("t0", Command::Origin),
             ("at 5000", Command::At(ms(5000), None)),
             ("  at 300 unplug 1 ", Command::At(ms(300), Some(Box::new(Command::Unplug(vec![1]))))),
+            ("say done", Command::Say("done".into())),
             ("quit", Command::Quit),
         ];
         for (line, command) in cases {
