@@ -79,6 +79,7 @@ fn registry(count: u8) -> Registry {
                 std::time::Duration::from_millis(500),
                 None,
             ),
+            latency: Duration::ZERO,
         })
     };
     Registry {

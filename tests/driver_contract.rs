@@ -70,6 +70,7 @@ fn spec(node: NodeSpec) -> DeviceSpec {
         max_bytes: 1 << 20,
         depth: 4,
         when_stale: WhenStale::Hold,
+        latency: Duration::ZERO,
         verdict: rapid::registry::VerdictSpec::of(
             rapid::modality::ModalityKind::Image,
             Duration::from_millis(500),

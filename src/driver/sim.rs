@@ -6,6 +6,7 @@
 //!
 //! Invariant: the sequence goes on over a replug; a number that is skipped is told in `lost`.
 
+use std::collections::BTreeMap;
 use std::f64::consts::TAU;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, OnceLock};
@@ -15,7 +16,8 @@ use jpeg_encoder::{ColorType, Encoder};
 use tokio::time::Instant;
 
 use super::{DriverError, Reading, unblock};
-use crate::registry::scenario::{SimDevice, SimSource};
+use crate::provenance::{Format, Negotiated};
+use crate::registry::scenario::{self, SimDevice, SimSource};
 use crate::registry::{DeviceSpec, NodeSpec};
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
 use crate::time::{Stamp, nanoseconds};
@@ -44,6 +46,7 @@ pub struct Sim {
     owed: u64,
     /// The sample in `payload` is to be sent once more, with this stamp.
     again: Option<Stamp>,
+    controls: BTreeMap<String, i64>,
 }
 
 #[derive(Debug)]
@@ -76,7 +79,17 @@ impl Sim {
         };
         let grid = Grid { begun: device.begun, rate: u64::from(rate.max(1)) };
         let next = grid.first_after(stamp_of(Instant::now()));
-        Ok(Self { device, content, grid, next, backlog, payload: Vec::with_capacity(capacity), owed: 0, again: None })
+        let (payload, controls) = (Vec::with_capacity(capacity), BTreeMap::new());
+        Ok(Self { device, content, grid, next, backlog, payload, owed: 0, again: None, controls })
+    }
+
+    /// With the controls that `spec` sets: a simulated camera has those and no others.
+    #[must_use]
+    pub(super) fn with_controls(mut self, spec: &NodeSpec) -> Self {
+        if let NodeSpec::Camera(camera) = spec {
+            self.controls = camera.controls.iter().cloned().collect();
+        }
+        self
     }
 
     /// The next sample.
@@ -166,6 +179,22 @@ impl Sim {
             SimSource::Serial { channels, hz, .. } => format!("simulated serial line, {channels} numbers at {hz} Hz"),
             SimSource::Process | SimSource::Replay { .. } => String::new(),
         }
+    }
+
+    /// The same for the recording.
+    #[must_use]
+    pub fn negotiated(&self) -> Negotiated {
+        let format = match self.device.source {
+            SimSource::Camera { width, height, fps, .. } => {
+                Some(Format::Pictures { fourcc: "MJPG".to_owned(), width, height, fps: Some(fps.into()) })
+            }
+            SimSource::Serial { channels, hz, .. } => {
+                Some(Format::Messages { baud: None, channels, hz: Some(hz.into()) })
+            }
+            SimSource::Replay { .. } | SimSource::Process => None,
+        };
+        let bus = Some(format!("sim:{}", self.device.name));
+        Negotiated { driver: Some(scenario::driver()), card: None, bus, format, controls: self.controls.clone() }
     }
 }
 

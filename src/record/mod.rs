@@ -19,6 +19,7 @@ mod keep;
 mod lock;
 mod masks;
 mod metadata;
+mod provenance;
 mod quality;
 mod recorder;
 pub mod recover;

@@ -41,6 +41,8 @@ pub(super) struct Measured {
     pub(super) id: ModalityId,
     /// Its limits say whether payloads are compared, and its nominal rate.
     pub(super) limits: VerdictSpec,
+    /// How long before its capture what a sample shows happened, ns.
+    pub(super) latency_ns: u64,
     /// Largest payload, bytes: reserved where payloads are compared.
     pub(super) max_bytes: usize,
 }
@@ -153,7 +155,9 @@ impl Measures {
 
     /// Takes a sample that belongs to the episode.
     pub(super) fn sample(&mut self, id: ModalityId, seen: &Seen<'_>) {
-        let deadline = self.nearest_tick(seen.capture_ns).saturating_add(self.wait_ns);
+        let Some(Some(lane)) = self.lanes.get(id.index()) else { return };
+        let shown = seen.capture_ns.saturating_sub(lane.measured.latency_ns);
+        let deadline = self.nearest_tick(shown).saturating_add(self.wait_ns);
         let Some(Some(lane)) = self.lanes.get_mut(id.index()) else { return };
         let Some((from, to)) = lane.meter.sample(seen, deadline) else { return };
         if to - from > lane.longest_gap_ns {

@@ -22,7 +22,8 @@ use tokio::sync::oneshot;
 use super::RecordError;
 use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest, PARTIAL};
 use super::file::Sink;
-use super::session::{Attached, Beginning, Session};
+use super::provenance::Attached;
+use super::session::{Beginning, Session};
 use super::source::Source;
 use super::space::{Asker, Disk, Finding, Space};
 use super::streams::Streams;
@@ -167,7 +168,7 @@ impl Writer {
             inbox,
             events,
             streams: Streams::new(),
-            attached: Attached::new(),
+            attached: Attached::default(),
             session: None,
             space: None,
             clock,
@@ -224,15 +225,7 @@ impl Writer {
         loop {
             match self.events.try_recv() {
                 Ok(event) => {
-                    match &event.what {
-                        What::Attach { device, serial, .. } => {
-                            self.attached.insert(device.clone(), serial.clone());
-                        }
-                        What::Detach { device, .. } => {
-                            self.attached.remove(device);
-                        }
-                        _ => {}
-                    }
+                    self.attached.take(&event);
                     if let Some(session) = &mut self.session {
                         session.event(&event);
                     }

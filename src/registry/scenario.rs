@@ -10,6 +10,7 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::Duration;
 
 use super::attachment::UsbIdentity;
+use crate::provenance::KernelDriver;
 
 /// A whole scenario.
 #[derive(Debug, Clone, PartialEq)]
@@ -90,6 +91,12 @@ pub enum SimSource {
         /// Wall time of the episode's beginning as recorded, ns: moment zero of the scenario.
         begin_ns: u64,
     },
+}
+
+/// What stands for the kernel's driver of a simulated device.
+#[must_use]
+pub fn driver() -> KernelDriver {
+    KernelDriver { name: "rapid-sim".to_owned(), version: Some(env!("CARGO_PKG_VERSION").to_owned()) }
 }
 
 /// Something that happens in a scenario.

@@ -9,7 +9,8 @@
 //! hz = 100                    # rate; default: the camera's fps, 100 for a serial line
 //! bytes = "60kB"              # a camera's pictures are filled up to this size, as real scenes fill them
 //! plugged = false             # when the scenario begins; default true
-//! serial = "OTHER"            # also vid, pid, port: what it says it is; serial = "" for none
+//! serial = "OTHER"            # also vid, pid, port, firmware, manufacturer, product: what it says it
+//!                             # is; serial = "" for none
 //!
 //! [[device]]
 //! name = "spare"              # any name, with
@@ -49,8 +50,22 @@ use super::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, S
 use super::section::{Problems, Section, file_label, read};
 use super::spec::{DeviceSpec, NodeSpec, Registry};
 
-const DEVICE_KEYS: [&str; 11] =
-    ["name", "like", "seed", "plugged", "hz", "bytes", "vid", "pid", "serial", "port", "fault"];
+const DEVICE_KEYS: [&str; 14] = [
+    "name",
+    "like",
+    "seed",
+    "plugged",
+    "hz",
+    "bytes",
+    "vid",
+    "pid",
+    "serial",
+    "port",
+    "firmware",
+    "manufacturer",
+    "product",
+    "fault",
+];
 const ACTIONS: [&str; 4] = ["plug", "unplug", "silence", "resume"];
 const EVENT_KEYS: [&str; 6] = ["at", "plug", "unplug", "silence", "resume", "port"];
 /// Rate of a simulated serial line, Hz: that of a usual motor controller's state.
@@ -132,6 +147,8 @@ fn standing_for(spec: &DeviceSpec, name: &str) -> ScenarioDevice {
         serial: Some(spec.identity.serial.clone().unwrap_or_else(|| format!("SIM-{name}"))),
         port: spec.identity.port.clone().unwrap_or_default(),
         product: Some(format!("simulated {}", spec.name)),
+        manufacturer: Some("rapid".to_owned()),
+        firmware: Some("1.00".to_owned()),
     };
     ScenarioDevice { name: name.to_owned(), usb, source, plugged: true, faults: SimFaults::default() }
 }
@@ -212,6 +229,14 @@ fn device(section: &Section<'_>, registry: &Registry, problems: &mut Problems<'_
         device.usb.port = port;
     }
     device.faults = faults(section, problems);
+    let usb = &mut device.usb;
+    for (key, place) in
+        [("firmware", &mut usb.firmware), ("manufacturer", &mut usb.manufacturer), ("product", &mut usb.product)]
+    {
+        if let Some(text) = section.text(problems, key) {
+            *place = (!text.value.is_empty()).then(|| text.value.to_owned());
+        }
+    }
     Some(device)
 }
 

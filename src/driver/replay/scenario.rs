@@ -77,5 +77,6 @@ fn usb_identity(spec: &DeviceSpec) -> UsbIdentity {
         serial: identity.serial.clone(),
         port: identity.port.clone().unwrap_or_else(|| format!("9-{}", spec.id.bit() + 1)),
         product: Some(String::from("replay")),
+        ..UsbIdentity::default()
     }
 }

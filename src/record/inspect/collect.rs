@@ -6,6 +6,7 @@ use std::path::Path;
 use super::super::walk::{Walked, op};
 use super::super::wire::{Fields, protobuf};
 use super::judge::{Ending, Judge, recorded_verdict};
+use super::units;
 use super::{EventReport, Inspection, Lateness, MaskEdge, ModalityReport, TopicReport};
 use crate::episode_format::{EVENT_TOPIC, FRAME_TOPIC, MASK_TOPIC};
 use crate::mask::PhysicalMask;
@@ -31,6 +32,8 @@ pub(super) struct Collected {
     events: Vec<(u64, EventReport)>,
     /// Absent until the file has said that it is an episode of ours.
     judge: Option<Judge>,
+    /// Of those, what `opened` says as JSON.
+    opened: Vec<(u64, String)>,
 }
 
 #[derive(Debug, Default)]
@@ -154,6 +157,7 @@ impl Collected {
                 2 => event.kind = value.text(),
                 3 => event.device = value.text(),
                 4 => event.text = value.text(),
+                5 if event.kind == "opened" => self.opened.push((at, value.text())),
                 _ => {}
             }
         }
@@ -171,6 +175,9 @@ impl Collected {
             event.at = from(begin_ns, *at);
         }
         let judge = self.judge.take();
+        let opened =
+            std::mem::take(&mut self.opened).into_iter().map(|(at, json)| (from(begin_ns, at), json)).collect();
+        let units = units::told(&said(&self.summary, "provenance"), &said(&self.about, "provenance"), opened);
         let (mut modalities, topics) = self.topics(begin_ns, seconds);
         let ending = Ending { file: walked, seconds, summary: &self.summary };
         let verdict = judge.as_ref().map(|judge| judge.judge(&mut modalities, &ending)).unwrap_or_default();
@@ -188,6 +195,9 @@ impl Collected {
             unread_bytes: size.saturating_sub(walked.bytes),
             damaged_chunks: walked.damaged_chunks,
             software: said(&self.about, "software"),
+            commit: said(&self.about, "commit"),
+            host: said(&self.about, "host"),
+            kernel: said(&self.about, "kernel"),
             rig: said(&self.about, "rig"),
             task: said(&self.about, "task"),
             tags: serde_json::from_str(&said(&self.about, "tags")).unwrap_or_default(),
@@ -200,6 +210,7 @@ impl Collected {
             frames: self.frames,
             skew: judge.and_then(|judge| judge.skew()),
             modalities,
+            units,
             topics,
             mask: mask.collect(),
             events: events.into_iter().map(|(_, event)| event).collect(),

@@ -179,8 +179,12 @@ fn registered(about: &BTreeMap<String, String>) -> Option<Vec<Measured>> {
     let text = about.get("registry").filter(|text| text.len() <= LONGEST_REGISTRY)?;
     let registry = Registry::parse(text, None).ok()?.registry;
     // Nothing is reserved: how large payloads are, a file is not believed.
-    let measured =
-        registry.devices.iter().map(|device| Measured { id: device.id, limits: device.verdict, max_bytes: 0 });
+    let measured = registry.devices.iter().map(|device| Measured {
+        id: device.id,
+        limits: device.verdict,
+        max_bytes: 0,
+        latency_ns: crate::time::nanoseconds(device.latency),
+    });
     Some(measured.collect())
 }
 
@@ -190,7 +194,7 @@ fn listed(about: &BTreeMap<String, String>) -> Option<Vec<Measured>> {
     let measured = |entry: &Value| {
         let id = ModalityId::new(u8::try_from(entry.get("bit")?.as_u64()?).ok()?)?;
         let kind: ModalityKind = serde_json::from_value(entry.get("kind")?.clone()).ok()?;
-        Some(Measured { id, limits: VerdictSpec::of(kind, STALL_AFTER, None), max_bytes: 0 })
+        Some(Measured { id, limits: VerdictSpec::of(kind, STALL_AFTER, None), max_bytes: 0, latency_ns: 0 })
     };
     Some(list.iter().filter_map(measured).collect())
 }

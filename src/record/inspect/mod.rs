@@ -11,6 +11,7 @@ mod list;
 mod render;
 #[cfg(test)]
 mod tests;
+mod units;
 
 use std::collections::BTreeMap;
 use std::io::{self, BufReader, Read};
@@ -67,6 +68,12 @@ pub struct Inspection {
     pub damaged_chunks: u64,
     /// The program that wrote it, with its version.
     pub software: String,
+    /// The commit it was built from; empty if that was not known.
+    pub commit: String,
+    /// The computer it ran on.
+    pub host: String,
+    /// Release of that computer's kernel.
+    pub kernel: String,
     /// Name of the rig.
     pub rig: String,
     /// The task in the user's words.
@@ -91,6 +98,8 @@ pub struct Inspection {
     pub skew: Option<Spread>,
     /// The modalities, ascending by bit.
     pub modalities: Vec<ModalityReport>,
+    /// By modality, the unit behind each epoch and what was agreed with it, as recorded.
+    pub units: BTreeMap<String, Vec<serde_json::Value>>,
     /// The other topics.
     pub topics: Vec<TopicReport>,
     /// Values of the mask over time: the first one and every change.

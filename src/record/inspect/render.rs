@@ -2,6 +2,7 @@
 
 use std::fmt::Write;
 
+use super::units;
 use super::{FileEnd, Inspection, Lateness, ModalityReport, TopicReport};
 use crate::record::Spread;
 use crate::status::{Grade, Verdict};
@@ -87,6 +88,18 @@ fn write_all(out: &mut String, inspection: &Inspection, width: usize, paint: Pai
         writeln!(out, "{:column$} {line} {share:>6}", clean(&modality.name))?;
     }
 
+    if !inspection.units.is_empty() {
+        writeln!(out, "\nunits")?;
+    }
+    for (name, epochs) in &inspection.units {
+        let mut name = clean(name);
+        for epoch in epochs {
+            let words: Vec<_> = units::words(epoch).iter().map(|word| clean(word)).collect();
+            out.push_str(&wrapped(&format!("{name:column$} "), &words, width));
+            name.clear();
+        }
+    }
+
     if !inspection.events.is_empty() {
         writeln!(out, "\nevents")?;
         for event in inspection.events.iter().take(EVENTS) {
@@ -117,6 +130,30 @@ fn write_verdict(out: &mut String, inspection: &Inspection, paint: Paint) -> std
         writeln!(out, "  {}", clean(reason))?;
     }
     Ok(())
+}
+
+/// `words` behind `head`, two blanks apart, in lines of at most `width` characters, as far as words
+/// allow; further lines are set in a little more.
+fn wrapped(head: &str, words: &[String], width: usize) -> String {
+    let indent = head.chars().count();
+    let mut text = head.to_owned();
+    let mut used = indent;
+    for (index, word) in words.iter().enumerate() {
+        let length = word.chars().count();
+        let space = if index == 0 {
+            String::new()
+        } else if used + 2 + length > width {
+            used = indent;
+            format!("\n{:indent$}  ", "")
+        } else {
+            "  ".to_owned()
+        };
+        used += if index == 0 { length } else { 2 + length };
+        text.push_str(&space);
+        text.push_str(word);
+    }
+    text.push('\n');
+    text
 }
 
 fn ending(inspection: &Inspection, paint: Paint) -> String {

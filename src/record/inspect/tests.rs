@@ -173,6 +173,9 @@ fn the_report_on_a_screen() {
         unread_bytes: 512,
         damaged_chunks: 0,
         software: "rapid 0.1.0".to_owned(),
+        commit: String::new(),
+        host: "rig-7".to_owned(),
+        kernel: "6.1.0".to_owned(),
         rig: "bench".to_owned(),
         task: "place \x1b[31mblock".to_owned(),
         tags: BTreeMap::from([("finger".to_owned(), "soft".to_owned())]),
@@ -206,6 +209,13 @@ fn the_report_on_a_screen() {
                 quality: None,
             },
         ],
+        units: BTreeMap::from([(
+            "cam_wrist".to_owned(),
+            vec![
+                serde_json::json!({"epoch": 1, "from_s": -2.0, "to_s": 3.2, "vid": "046d", "pid": "0825", "serial": "A\u{1b}7"}),
+                serde_json::json!({"epoch": 2, "from_s": 6.2, "to_s": null, "vid": "046d", "pid": "0825", "serial": "B"}),
+            ],
+        )]),
         topics: vec![topic("/rapid/mask", 5000, 0, late)],
         mask: Vec::new(),
         events: vec![EventReport {

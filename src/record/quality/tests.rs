@@ -17,7 +17,10 @@ fn id(bit: u8) -> ModalityId {
 
 fn measures(kind: ModalityKind) -> Measures {
     let limits = VerdictSpec::of(kind, Duration::from_millis(500), Some(30.0));
-    let measured = [Measured { id: id(0), limits, max_bytes: 64 }, Measured { id: id(3), limits, max_bytes: 64 }];
+    let measured = [
+        Measured { id: id(0), limits, max_bytes: 64, latency_ns: 0 },
+        Measured { id: id(3), limits, max_bytes: 64, latency_ns: 0 },
+    ];
     Measures::new(&measured, Frames { begin_ns: BEGIN, hz: 30.0, wait: Duration::from_millis(125) })
 }
 
