@@ -82,6 +82,7 @@ fn device(arguments: &[String]) -> Result<DeviceSpec, Box<dyn std::error::Error>
         max_bytes: 4 << 20,
         depth: 4,
         when_stale: WhenStale::Hold,
+        latency: Duration::ZERO,
         verdict: rapid::registry::VerdictSpec::of(
             rapid::modality::ModalityKind::Image,
             Duration::from_millis(500),
