@@ -5,6 +5,8 @@
 use std::io::{self, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use clap::CommandFactory;
@@ -54,6 +56,9 @@ enum Failure {
     Artifacts(#[from] commands::artifacts::ArtifactsError),
     #[error(transparent)]
     Mask(#[from] commands::mask::MaskError),
+    /// Not every file was repaired; which and why has been printed.
+    #[error("")]
+    Recover(commands::recover::Outcome),
     /// The episode to play is none.
     #[error(transparent)]
     Replay(DriverError),
@@ -93,6 +98,7 @@ impl Failure {
             {
                 2
             }
+            Self::Recover(outcome) if outcome.is_bad_argument() => 2,
             _ => 1,
         }
     }
@@ -156,6 +162,7 @@ fn print(global: &Global, before: SimArgs, command: Command) -> Result<(), Failu
             Outcome::Done => Ok(()),
             Outcome::BadConfiguration => Err(Failure::Told),
         },
+        Command::Recover { paths } => recover(&paths, format),
         Command::Completions { shell } => Ok(commands::completions::completions(&mut Cli::command(), shell, out)?),
         Command::Replay { .. } => Ok(()),
     }
@@ -222,6 +229,31 @@ fn mask(global: &Global, watch: bool) -> Result<(), Failure> {
         });
         Ok(commands::mask::run(read, names, crate::time::realtime_ns, options, stop, io::stdout()).await?)
     })?
+}
+
+fn recover(paths: &[PathBuf], format: Format) -> Result<(), Failure> {
+    let progress = io::stderr().is_terminal() && format == Format::Text;
+    let stop = Arc::new(AtomicBool::new(false));
+    let asked = Arc::clone(&stop);
+    let paths = paths.to_owned();
+    let told = block_on(async move {
+        let mut work = tokio::task::spawn_blocking(move || {
+            commands::recover::run(&paths, format, progress, &asked, &mut io::stdout(), &mut io::stderr())
+        });
+        let interrupted = tokio::select! {
+            done = &mut work => return Ok(done),
+            interrupted = tokio::signal::ctrl_c() => interrupted,
+        };
+        interrupted?;
+        stop.store(true, Ordering::Relaxed);
+        tokio::select! {
+            done = &mut work => Ok(done),
+            // The disk may take its time; what was repaired is repaired.
+            _ = tokio::signal::ctrl_c() => Err(Failure::App(AppError::InterruptedTwice)),
+        }
+    })??;
+    let outcome = told.map_err(|_| Failure::App(AppError::Panicked("the repair")))??;
+    if outcome.is_done() { Ok(()) } else { Err(Failure::Recover(outcome)) }
 }
 
 /// The rig: on this machine, simulated, or played from an episode.

@@ -204,7 +204,8 @@ pub fn frame(source: &SimSource, sequence: u32) -> Option<Vec<u8>> {
     let mut payload = Vec::new();
     match *source {
         SimSource::Camera { width, height, seed, bytes, .. } => {
-            let picture = fill(encode(width, height, seed, sequence % PICTURES).ok()?, bytes, seed);
+            let picture =
+                fill(encode(width, height, seed, sequence % PICTURES).ok()?, bytes, seed, sequence % PICTURES);
             write_picture(&picture, seed, sequence, &mut payload);
         }
         SimSource::Serial { channels, seed, .. } => write_values(channels, seed, sequence, &mut payload),
@@ -239,7 +240,7 @@ struct Pictures {
 
 impl Pictures {
     fn new(width: u32, height: u32, seed: u64, bytes: usize) -> Result<Self, DriverError> {
-        let picture = |index| Ok(fill(encode(width, height, seed, index)?, bytes, seed));
+        let picture = |index| Ok(fill(encode(width, height, seed, index)?, bytes, seed, index));
         let encoded = (0..PICTURES).map(picture).collect::<Result<_, DriverError>>()?;
         Ok(Self { width, height, seed, encoded })
     }
@@ -275,7 +276,7 @@ fn write_picture(picture: &[u8], seed: u64, sequence: u32, payload: &mut Vec<u8>
 
 /// The picture with comment segments after its start of image that bring it to `bytes` at least, filled with
 /// noise that does not compress, as the coefficients of a real scene do not.
-fn fill(picture: Vec<u8>, bytes: usize, seed: u64) -> Vec<u8> {
+fn fill(picture: Vec<u8>, bytes: usize, seed: u64, index: u32) -> Vec<u8> {
     // Marker and length beside this many bytes of content.
     const SEGMENT: usize = 65_533;
     if picture.len() >= bytes {
@@ -285,7 +286,7 @@ fn fill(picture: Vec<u8>, bytes: usize, seed: u64) -> Vec<u8> {
     let mut filled = Vec::with_capacity(bytes + SEGMENT);
     filled.extend_from_slice(start);
     // xorshift64 (Marsaglia 2003), which needs a seed that is not zero.
-    let mut state = seed | 1 << 63;
+    let mut state = seed.wrapping_mul(u64::from(PICTURES)).wrapping_add(u64::from(index)) | 1 << 63;
     while filled.len() + rest.len() < bytes {
         let content = (bytes - filled.len() - rest.len()).saturating_sub(4).clamp(1, SEGMENT);
         let length = u16::try_from(content + 2).unwrap_or(u16::MAX);

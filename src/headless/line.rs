@@ -110,6 +110,7 @@ impl Columns {
                 let subject = if matches!(event.what, What::DiskLow { .. }) { "disk" } else { "clock" };
                 (&subject.to_owned(), None, palette.level(level, &pad(level.word())), text)
             }
+            What::Recovered { text, .. } => (&"episode".to_owned(), None, palette.warn(&pad("repaired")), text.clone()),
             What::Log { level, text } => {
                 let word = palette.level(*level, &pad(level.word()));
                 (&"log".to_owned(), None, word, text.clone())

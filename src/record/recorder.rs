@@ -32,8 +32,9 @@ use crate::time::{ClockWatch, Stamp, WallClock};
 
 /// Longest wait for samples: what an order, an event or a due frame may have to wait.
 const TURN: Duration = Duration::from_millis(20);
-/// How often what was written is handed to the kernel: what a kill can take.
-const FLUSH_EVERY: Duration = Duration::from_secs(1);
+/// How often what was written is handed to the kernel. A kill may take a second at most: half of it
+/// is for what lies on the bus and for frames that are not due yet.
+const FLUSH_EVERY: Duration = Duration::from_millis(500);
 /// How often the board is told.
 const STATUS_EVERY: Duration = Duration::from_millis(200);
 /// How often it is looked whether the wall clock was set.

@@ -100,6 +100,8 @@ impl Session {
             file.mask(header, *mask, *sequence)?;
             measures.mask(header.capture_ns, *mask);
         }
+        // Killed in the next moment, it is an episode all the same, of a known task and rig.
+        file.flush()?;
         let modalities: Vec<SyncModality> = registry
             .devices
             .iter()
@@ -371,7 +373,7 @@ fn describe(what: &What) -> String {
         What::Unregistered { device, reason } => format!("{device} not registered: {reason}"),
         What::Recording { file } => format!("recording {}", file.display()),
         What::Episode { file, .. } => format!("finished {}", file.display()),
-        What::Log { text, .. } => text.clone(),
+        What::Recovered { text, .. } | What::Log { text, .. } => text.clone(),
         What::DiskLow { .. } | What::ClockStep { .. } => {
             what.sentence().map_or_else(String::new, |(_, sentence)| sentence)
         }

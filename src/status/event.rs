@@ -103,6 +103,21 @@ pub enum What {
         /// By how much, forward; back if negative.
         seconds: f64,
     },
+    /// An episode that an earlier run did not finish was repaired.
+    Recovered {
+        /// The repaired file.
+        file: PathBuf,
+        /// Length of what was recorded, in seconds.
+        seconds: f64,
+        /// Messages.
+        messages: u64,
+        /// Bytes of the unfinished file that are not in the repaired one.
+        unread_bytes: u64,
+        /// Chunks left out because they are not what was written.
+        damaged_chunks: u64,
+        /// What is there and what is lost, for people.
+        text: String,
+    },
     /// A line of the log that has no event of its own.
     Log {
         /// Severity.
@@ -176,6 +191,8 @@ impl What {
                     format!("the wall clock was set {direction} by {by:.3} s; times of capture stay as they are"),
                 )
             }
+            // Something was lost before this run began.
+            Self::Recovered { text, .. } => (Level::Warn, text.clone()),
             Self::Log { level, text } => (*level, text.clone()),
         })
     }

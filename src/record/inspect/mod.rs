@@ -13,7 +13,6 @@ mod render;
 mod tests;
 
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};
 
@@ -21,6 +20,7 @@ use serde::Serialize;
 
 use super::quality::{Quality, Spread};
 use super::walk::walk;
+use crate::episode_format::{self, OpenError};
 use crate::status::Verdict;
 use collect::Collected;
 
@@ -178,24 +178,19 @@ pub struct EventReport {
 /// When it cannot be read or is no MCAP file. An unfinished or damaged one is no error.
 pub fn inspect(path: &Path) -> Result<Inspection, InspectError> {
     let io = |source| InspectError::Io { path: path.to_owned(), source };
-    // Asked before it is opened: opening a pipe would wait for its writer.
-    let metadata = std::fs::metadata(path).map_err(io)?;
-    if !metadata.is_file() {
-        return Err(InspectError::NotFile(path.to_owned()));
-    }
-    let file = File::open(path).map_err(io)?;
-    let size = file.metadata().map_err(io)?.len();
+    let (file, size) = episode_format::open(path).map_err(|error| match error {
+        OpenError::Io { path, source } => InspectError::Io { path, source },
+        OpenError::NotFile(path) => InspectError::NotFile(path),
+    })?;
     // One that grows meanwhile is read as it was.
     let mut file = BufReader::with_capacity(1 << 16, file.take(size));
     inspect_from(&mut file, size, path).map_err(io)?.ok_or_else(|| InspectError::NotMcap(path.to_owned()))
 }
 
-/// The same for the bytes of a file. `None`: no MCAP file.
-#[doc(hidden)]
+/// What a file of these bytes, which may be any, holds; `None` if they are no MCAP file.
 #[must_use]
-pub fn inspect_bytes(mut bytes: &[u8]) -> Option<Inspection> {
-    let size = bytes.len() as u64;
-    inspect_from(&mut bytes, size, Path::new("bytes")).ok()?
+pub fn inspect_bytes(bytes: &[u8]) -> Option<Inspection> {
+    inspect_from(&mut &*bytes, bytes.len() as u64, Path::new("bytes.mcap")).ok()?
 }
 
 /// `None`: no MCAP file.

@@ -3,6 +3,7 @@
 use proptest::prelude::*;
 
 use super::*;
+use crate::episode_format::testing;
 use crate::record::tests::Bench;
 use crate::status::Grade;
 
@@ -90,25 +91,16 @@ async fn a_cut_or_damaged_file_is_read_as_far_as_it_goes() {
     assert!(noticed * 37 > bytes.len() / 2, "{noticed}");
 }
 
-#[tokio::test]
-async fn several_flips_and_hostile_lengths_do_not_panic() {
-    let (_bench, file) = episode().await;
-    let bytes = std::fs::read(&file).unwrap();
+#[test]
+fn whatever_happened_to_a_file_it_is_told_of() {
     let config = ProptestConfig { cases: 300, failure_persistence: None, ..ProptestConfig::default() };
-    let places = proptest::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..12);
-    proptest!(config, |(places in places, word in any::<prop::sample::Index>(), value in any::<u64>())| {
-        let mut bytes = bytes.clone();
-        for (place, value) in places {
-            let at = place.index(bytes.len());
-            bytes[at] = value;
-        }
-        if let Some(field) = bytes.get_mut(word.index(4000)..).and_then(|rest| rest.first_chunk_mut()) {
-            *field = value.to_le_bytes();
-        }
-        if let Some(said) = of(&bytes) {
-            assert!(!render(&said, 80, Paint::Plain).is_empty());
-        }
-    });
+    for bytes in testing::layouts().map(testing::episode) {
+        proptest!(config.clone(), |(mutations in testing::mutations())| {
+            if let Some(said) = inspect_bytes(&testing::mutated(&bytes, &mutations)) {
+                prop_assert!(!render(&said, 80, Paint::Plain).is_empty());
+            }
+        });
+    }
 }
 
 #[test]
