@@ -152,7 +152,7 @@ pub enum Command {
         #[arg(long)]
         watch: bool,
     },
-    /// Tells what an episode holds: its verdict, messages, rates, gaps, lateness, presence over time
+    /// Tells what an episode holds: verdict, rates, gaps, lateness, presence over time
     #[command(after_help = "Of one file a report; of a folder or of several files one line each, GOOD, SUSPECT or \
         BAD.\n\nExamples:\n  rapid inspect episodes/20260101_place-block_001.mcap\n  rapid inspect episodes\n  \
         rapid inspect --json episodes | jq -r 'select(.verdict == \"GOOD\") | .file'")]

@@ -170,8 +170,8 @@ fn mistakes_are_placed_and_all_told() {
              fix: write [[device]] with two brackets",
         ),
         (
-            "[[device]]\nname = \"cam_wrist\"\n[device.fault]\nfreeze = \"1s\"\nlose_every = 1\n",
-            "scenario:4:1: [device 1.fault] unknown key \"freeze\"\n    fix: did you mean \"freeze_at\"?\n\
+            "[[device]]\nname = \"cam_wrist\"\n[device.fault]\nfreez_at = \"1s\"\nlose_every = 1\n",
+            "scenario:4:1: [device 1.fault] unknown key \"freez_at\"\n    fix: did you mean \"freeze_at\"?\n\
              scenario:5:14: [device 1.fault] lose_every = 1 is out of range\n    \
              fix: write a whole number from 2 to 1000000, without quotes",
         ),
