@@ -16,6 +16,8 @@
 //! Options: `--rate HZ`, `--channels N`; and to try what happens when a program misbehaves:
 //! `--ignore-sigterm`, `--crash-after SAMPLES`, `--silent-after SAMPLES`, `--flood-stderr`.
 
+#![expect(clippy::print_stdout, clippy::print_stderr, reason = "what a program prints goes to the log of `rapid`")]
+
 use std::error::Error;
 use std::str::FromStr;
 use std::time::{Duration, Instant};

@@ -159,7 +159,7 @@ mod tests {
         assert_eq!(outcome, Outcome::BadConfiguration);
         assert_eq!(
             text,
-            "devices.toml:4:8: [device.a] unknown node \"camrea\"\n    fix: did you mean \"camera\"?\n\
+            "devices.toml:4:8: [device.a] node \"camrea\" is neither built in nor a program\n    fix: did you mean \"camera\"?\n\
              devices.toml: 1 problem\n"
         );
     }

@@ -216,7 +216,7 @@ impl Leader {
     fn kill(&mut self) {
         self.signal(Signal::KILL);
         // A process that even this does not end is left to the kernel.
-        let _ = self.process.try_wait();
+        self.reaped = matches!(self.process.try_wait(), Ok(Some(_)));
     }
 }
 
