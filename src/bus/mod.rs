@@ -72,6 +72,18 @@ pub enum BusError {
     /// The node could not be created.
     #[error("shared-memory bus: {0}")]
     Node(String),
+    /// Another user's processes have the bus.
+    #[error(
+        "{path}: the shared-memory bus of this machine belongs to another user (uid {uid}), and serves the programs of \
+         one user only: run rapid as that user, or, when none of their programs is left, remove it: \
+         sudo rm -r {path} /dev/shm/iox2_*"
+    )]
+    OtherUser {
+        /// The folder that iceoryx2 makes for its first user.
+        path: String,
+        /// Whose it is.
+        uid: u32,
+    },
     /// A sample is larger than the topic allows.
     #[error("a sample of {size} bytes does not fit topic {topic} (at most {max}); raise max_bytes of the device")]
     TooLarge {
@@ -123,7 +135,7 @@ impl Bus {
             // Signals belong to the program, not to a library.
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create::<Service>()
-            .map_err(|error| BusError::Node(error.to_string()))?;
+            .map_err(|error| node_error(&config, &error))?;
         let specs = registry.devices.iter().map(TopicSpec::of_device).chain([TopicSpec::mask()]);
         let topics = specs.map(|spec| open_topic(&node, spec)).collect::<Result<Vec<_>, _>>()?;
         let wake = node
@@ -204,6 +216,18 @@ impl Membership {
     /// topics. Blocks for as long as files are looked through.
     pub fn sweep(&self) {
         let _ = self.node.try_cleanup_dead_nodes();
+    }
+}
+
+/// iceoryx2 says no more of a folder it may not enter than of any other failure.
+fn node_error(config: &Config, error: &dyn std::fmt::Display) -> BusError {
+    use std::os::unix::fs::MetadataExt as _;
+    let path = config.global.root_path().to_string();
+    match std::fs::symlink_metadata(&path) {
+        Ok(folder) if folder.uid() != rustix::process::geteuid().as_raw() => {
+            BusError::OtherUser { path: path.trim_end_matches('/').to_owned(), uid: folder.uid() }
+        }
+        _ => BusError::Node(error.to_string()),
     }
 }
 
