@@ -26,6 +26,7 @@ use crate::hotplug::udev::UdevMonitor;
 use crate::hotplug::{HotplugError, HotplugStream};
 use crate::logging::{self, LoggingError, Stderr};
 use crate::mask::MASK_PATH;
+use crate::record::recover::Repairs;
 use crate::record::{EpisodeRequest, RecordError, Recorder, RecorderConfig};
 use crate::registry::Registry;
 use crate::registry::scenario::Scenario;
@@ -178,6 +179,12 @@ pub async fn run(options: Options) -> Result<(), AppError> {
         }
     });
     let episode = EpisodeRequest { duration: options.duration, ..options.episode };
+    // In the background: nothing of this run waits for what an earlier one left behind.
+    let may_record = options.record || options.screen == Screen::Monitor;
+    let _repairs = may_record.then(|| {
+        let repairs = Repairs::start(episode.out.clone(), Arc::clone(&board));
+        repairs.inspect_err(|error| tracing::warn!(%error, "unfinished episodes are not repaired")).ok()
+    });
     let mut conductor = Conductor {
         events: board.events(),
         board,

@@ -5,6 +5,8 @@
 use std::io::{self, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use clap::CommandFactory;
@@ -13,6 +15,7 @@ use tokio_util::sync::CancellationToken;
 use crate::app::{self, AppError, Devices, Options, Screen, mask_path};
 use crate::cli::{Cli, Command, Global, RunArgs, SimArgs};
 use crate::commands::devices::{Entries, Formats};
+use crate::commands::inspect::InspectFailure;
 use crate::commands::{self, Format, Outcome, mask::MaskOptions};
 use crate::driver::{DriverError, replay};
 use crate::headless::style::{ColourChoice, Palette, Terminal};
@@ -53,6 +56,9 @@ enum Failure {
     Artifacts(#[from] commands::artifacts::ArtifactsError),
     #[error(transparent)]
     Mask(#[from] commands::mask::MaskError),
+    /// Not every file was repaired; which and why has been printed.
+    #[error("")]
+    Recover(commands::recover::Outcome),
     /// The episode to play is none.
     #[error(transparent)]
     Replay(DriverError),
@@ -64,6 +70,15 @@ enum Failure {
     Told,
     #[error("output: {0}")]
     Output(#[from] io::Error),
+}
+
+impl From<InspectFailure> for Failure {
+    fn from(failure: InspectFailure) -> Self {
+        match failure {
+            InspectFailure::Episode(error) => Self::Inspect(error),
+            InspectFailure::Output(error) => Self::Output(error),
+        }
+    }
 }
 
 impl Failure {
@@ -83,6 +98,7 @@ impl Failure {
             {
                 2
             }
+            Self::Recover(outcome) if outcome.is_bad_argument() => 2,
             _ => 1,
         }
     }
@@ -142,13 +158,11 @@ fn print(global: &Global, before: SimArgs, command: Command) -> Result<(), Failu
             Ok(commands::artifacts::write(&registry, &to, out)?)
         }
         Command::Mask { watch } => mask(global, watch),
-        Command::Inspect { file } => {
-            let inspection = inspect::inspect(&file)?;
-            if format == Format::Json {
-                return Ok(writeln!(out, "{}", text::json(&inspection).map_err(io::Error::from)?)?);
-            }
-            Ok(out.write_all(inspect::render(&inspection, columns(), paint()).as_bytes())?)
-        }
+        Command::Inspect { paths } => match commands::inspect::inspect(&paths, format, columns(), paint(), out)? {
+            Outcome::Done => Ok(()),
+            Outcome::BadConfiguration => Err(Failure::Told),
+        },
+        Command::Recover { paths } => recover(&paths, format),
         Command::Completions { shell } => Ok(commands::completions::completions(&mut Cli::command(), shell, out)?),
         Command::Replay { .. } => Ok(()),
     }
@@ -215,6 +229,31 @@ fn mask(global: &Global, watch: bool) -> Result<(), Failure> {
         });
         Ok(commands::mask::run(read, names, crate::time::realtime_ns, options, stop, io::stdout()).await?)
     })?
+}
+
+fn recover(paths: &[PathBuf], format: Format) -> Result<(), Failure> {
+    let progress = io::stderr().is_terminal() && format == Format::Text;
+    let stop = Arc::new(AtomicBool::new(false));
+    let asked = Arc::clone(&stop);
+    let paths = paths.to_owned();
+    let told = block_on(async move {
+        let mut work = tokio::task::spawn_blocking(move || {
+            commands::recover::run(&paths, format, progress, &asked, &mut io::stdout(), &mut io::stderr())
+        });
+        let interrupted = tokio::select! {
+            done = &mut work => return Ok(done),
+            interrupted = tokio::signal::ctrl_c() => interrupted,
+        };
+        interrupted?;
+        stop.store(true, Ordering::Relaxed);
+        tokio::select! {
+            done = &mut work => Ok(done),
+            // The disk may take its time; what was repaired is repaired.
+            _ = tokio::signal::ctrl_c() => Err(Failure::App(AppError::InterruptedTwice)),
+        }
+    })??;
+    let outcome = told.map_err(|_| Failure::App(AppError::Panicked("the repair")))??;
+    if outcome.is_done() { Ok(()) } else { Err(Failure::Recover(outcome)) }
 }
 
 /// The rig: on this machine, simulated, or played from an episode.

@@ -66,6 +66,15 @@ pub enum FolderError {
     },
 }
 
+impl From<FolderError> for io::Error {
+    fn from(error: FolderError) -> Self {
+        match error {
+            FolderError::Io { error, .. } => error,
+            link @ FolderError::Link { .. } => Self::other(link),
+        }
+    }
+}
+
 fn of(owner: u32) -> String {
     if owner == rustix::process::geteuid().as_raw() { String::new() } else { format!(" of user {owner}") }
 }

@@ -152,6 +152,20 @@ pub fn size(bytes: u64) -> String {
     format!("{value:.1} EB")
 }
 
+/// A number with its thousands apart: `9,312`.
+#[must_use]
+pub fn count(number: u64) -> String {
+    let digits = number.to_string();
+    let mut text = String::with_capacity(digits.len() + digits.len() / 3);
+    for (at, digit) in digits.chars().enumerate() {
+        if at > 0 && (digits.len() - at).is_multiple_of(3) {
+            text.push(',');
+        }
+        text.push(digit);
+    }
+    text
+}
+
 /// Samples per second, with one decimal below 1000.
 #[must_use]
 pub fn hertz(hz: f64) -> String {
@@ -205,6 +219,7 @@ mod tests {
         assert_eq!(size(999_999), "1.0 MB");
         assert_eq!(size(12_345_678), "12.3 MB");
         assert_eq!(size(u64::MAX), "18.4 EB");
+        assert_eq!([0, 999, 1000, 9312, 1_234_567].map(count), ["0", "999", "1,000", "9,312", "1,234,567"]);
         assert_eq!(hertz(29.97), "30.0");
         assert_eq!(hertz(1000.2), "1000");
     }

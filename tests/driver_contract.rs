@@ -70,6 +70,7 @@ fn spec(node: NodeSpec) -> DeviceSpec {
         max_bytes: 1 << 20,
         depth: 4,
         when_stale: WhenStale::Hold,
+        latency: Duration::ZERO,
         verdict: rapid::registry::VerdictSpec::of(
             rapid::modality::ModalityKind::Image,
             Duration::from_millis(500),
@@ -95,7 +96,7 @@ async fn open_sim(source: SimSource) -> (Driver, Arc<SimDevice>) {
     let spec = match source {
         SimSource::Camera { .. } => camera_spec(),
         SimSource::Serial { channels, .. } => serial_spec(Framing::Line, Parse::Csv, channels),
-        SimSource::Replay { .. } => serial_spec(Framing::Line, Parse::Csv, 1),
+        SimSource::Process | SimSource::Replay { .. } => serial_spec(Framing::Line, Parse::Csv, 1),
     };
     let device = sim_device(source);
     let driver = Driver::open(&spec, &DeviceNode::Sim(Arc::clone(&device))).await.unwrap();

@@ -238,6 +238,14 @@ fn two_users_on_one_machine_do_not_write_through_each_other() {
     assert!(said.contains("it belongs to user 0") && said.contains("remove it: rm -r /dev/shm/"), "{said}");
     fs::remove_file(&mask).expect("clean");
 
+    // The bus's folder is root's by now, as it is of whoever comes first.
+    let output = place.run(&["--sim", "--headless", "--duration", "100ms"]);
+    assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+    let output = shared.as_nobody(&run);
+    let said = text(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("/tmp/iceoryx2: belongs to user 0; end the programs that use it and remove it"), "{said}");
+
     // A link of nobody's as the folder of root's episodes.
     let link = place.path("link");
     symlink(&out, &link).expect("link");

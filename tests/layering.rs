@@ -20,9 +20,9 @@ use proc_macro2::{Delimiter, TokenStream, TokenTree};
 
 /// Modules by layer, lowest first. A module sees those of lower layers.
 const LAYERS: &[&[&str]] = &[
-    &["modality", "mask", "sample", "time", "action"],
+    &["modality", "mask", "sample", "time", "action", "provenance", "flash"],
     &["registry", "status", "text", "outlet", "folder", "episode_format"],
-    &["hotplug", "driver", "bus", "sync"],
+    &["hotplug", "driver", "bus", "sync", "calibration"],
     &["rig", "record", "policy", "control"],
     &["app", "tui", "headless", "logging"],
     &["main", "dispatch", "cli", "commands"],
@@ -82,6 +82,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("unicode_width", &["text"]),
     ("v4l", &["driver/camera"]),
     ("zstd", &["episode_format"]),
+    ("zune_jpeg", &["calibration/brightness"]),
 ];
 const ANYWHERE: &str = "*";
 const ABOVE_NOUNS: &str = "layers 1 and up";

@@ -102,7 +102,7 @@ fn a_deaf_program_is_unplugged_at_once_and_killed_later_and_its_successor_waits(
     let output = place.run(&[&sim(&place, scenario)[..], &["--record", "--out", "out", "--duration", "12s"]].concat());
     assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
     let told = events(&String::from_utf8_lossy(&output.stdout));
-    assert_eq!(states(&told), ["opening", "streaming", "absent", "backoff", "opening", "streaming"]);
+    assert_eq!(states(&told), ["opening", "streaming", "absent", "opening", "streaming"]);
 
     // The bit goes with the cable, five seconds before the program does; its successor comes after.
     let absent = find(&told, |event| event["state"] == "absent", "absent");
@@ -195,7 +195,8 @@ fn a_program_that_floods_its_output_is_thinned_and_its_samples_are_whole() {
     let output = place.run(&[&sim(&place, "")[..], &["--record", "--out", "out", "--duration", "7s"]].concat());
     assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
     let told = events(&String::from_utf8_lossy(&output.stdout));
-    let seconds = (stamp(told.last().expect("an end")) - stamp(&told[0])) / 1_000_000_000 + 1;
+    let stamps: Vec<u64> = told.iter().filter_map(|event| event["stamp"].as_u64()).collect();
+    let seconds = (stamps[stamps.len() - 1] - stamps[0]) / 1_000_000_000 + 1;
     let lines = logged(&told, "counter: flood ").len() as u64;
     assert!(lines <= 100 + 20 * seconds, "{lines} lines in {seconds} s");
     assert!(!logged(&told, "lines are left out").is_empty());

@@ -15,11 +15,13 @@
 
 mod inbox;
 mod ingress;
+mod place;
 mod service;
 mod shared;
 mod topic;
 mod writer;
 
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use iceoryx2::config::Config;
@@ -69,21 +71,20 @@ pub enum BusError {
         /// The topic.
         topic: String,
     },
+    /// What the bus lives in is another user's.
+    #[error(
+        "shared-memory bus: {}: {what}; end the programs that use it and remove it (`sudo rm -r {}`), or run rapid as \
+         that user", path.display(), path.display()
+    )]
+    Foreign {
+        /// Folder or file.
+        path: PathBuf,
+        /// What is wrong with it.
+        what: String,
+    },
     /// The node could not be created.
     #[error("shared-memory bus: {0}")]
     Node(String),
-    /// Another user's processes have the bus.
-    #[error(
-        "{path}: the shared-memory bus of this machine belongs to another user (uid {uid}), and serves the programs of \
-         one user only: run rapid as that user, or, when none of their programs is left, remove it: \
-         sudo rm -r {path} /dev/shm/iox2_*"
-    )]
-    OtherUser {
-        /// The folder that iceoryx2 makes for its first user.
-        path: String,
-        /// Whose it is.
-        uid: u32,
-    },
     /// A sample is larger than the topic allows.
     #[error("a sample of {size} bytes does not fit topic {topic} (at most {max}); raise max_bytes of the device")]
     TooLarge {
@@ -130,12 +131,16 @@ impl Bus {
     /// When a topic is in use with another layout, or shared memory is not to be had.
     pub fn open(registry: &Registry, instance: Option<&str>) -> Result<Self, BusError> {
         let config = config(instance)?;
+        place::check(&PathBuf::from(config.global.root_path().to_string()))?;
         let node = NodeBuilder::new()
             .config(&config)
             // Signals belong to the program, not to a library.
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create::<Service>()
-            .map_err(|error| node_error(&config, &error))?;
+            .map_err(|error| {
+                let prefix = config.global.prefix.to_string();
+                place::in_the_way(&prefix).unwrap_or_else(|| BusError::Node(error.to_string()))
+            })?;
         let specs = registry.devices.iter().map(TopicSpec::of_device).chain([TopicSpec::mask()]);
         let topics = specs.map(|spec| open_topic(&node, spec)).collect::<Result<Vec<_>, _>>()?;
         let wake = node
@@ -216,18 +221,6 @@ impl Membership {
     /// topics. Blocks for as long as files are looked through.
     pub fn sweep(&self) {
         let _ = self.node.try_cleanup_dead_nodes();
-    }
-}
-
-/// iceoryx2 says no more of a folder it may not enter than of any other failure.
-fn node_error(config: &Config, error: &dyn std::fmt::Display) -> BusError {
-    use std::os::unix::fs::MetadataExt as _;
-    let path = config.global.root_path().to_string();
-    match std::fs::symlink_metadata(&path) {
-        Ok(folder) if folder.uid() != rustix::process::geteuid().as_raw() => {
-            BusError::OtherUser { path: path.trim_end_matches('/').to_owned(), uid: folder.uid() }
-        }
-        _ => BusError::Node(error.to_string()),
     }
 }
 

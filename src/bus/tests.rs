@@ -30,6 +30,7 @@ fn registry(depth: usize) -> Registry {
             max_bytes: 64,
             depth,
             when_stale: WhenStale::Hold,
+            latency: Duration::ZERO,
             verdict: crate::registry::VerdictSpec::of(
                 crate::modality::ModalityKind::Image,
                 Duration::from_millis(500),

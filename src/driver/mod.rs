@@ -15,6 +15,7 @@ pub mod sim;
 
 use std::sync::Arc;
 
+use crate::provenance::Negotiated;
 use crate::registry::scenario::{SimDevice, SimSource};
 use crate::registry::{DeviceNode, DeviceSpec, NodeSpec};
 use crate::sample::Encoding;
@@ -92,7 +93,8 @@ impl Driver {
             return Ok(Self::Replay(Box::new(replay::Replay::open(Arc::clone(device)).await?)));
         }
         sim::check(spec, device)?;
-        Ok(Self::Sim(Box::new(sim::Sim::open(Arc::clone(device)).await?)))
+        let sim = sim::Sim::open(Arc::clone(device)).await?.with_controls(&spec.node);
+        Ok(Self::Sim(Box::new(sim)))
     }
 
     /// The next sample. Waits as long as the device sends nothing.
@@ -108,7 +110,7 @@ impl Driver {
         }
     }
 
-    /// What was agreed with the device: format, rate, driver, for the log and the recording.
+    /// What was agreed with the device: format, rate, driver, for people.
     #[must_use]
     pub fn description(&self) -> String {
         match self {
@@ -116,6 +118,18 @@ impl Driver {
             Self::Serial(driver) => driver.description().to_owned(),
             Self::Sim(driver) => driver.description(),
             Self::Replay(driver) => driver.description().to_owned(),
+        }
+    }
+
+    /// What was agreed with the device, for the recording. Of the driver only what the open node
+    /// tells: a serial line tells nothing.
+    #[must_use]
+    pub fn negotiated(&self) -> Negotiated {
+        match self {
+            Self::Camera(driver) => driver.negotiated(),
+            Self::Serial(driver) => driver.negotiated(),
+            Self::Sim(driver) => driver.negotiated(),
+            Self::Replay(driver) => driver.negotiated(),
         }
     }
 }

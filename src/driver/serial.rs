@@ -19,6 +19,7 @@ use tokio_serial::{ClearBuffer, SerialPort as _, SerialStream};
 
 use self::framing::{Cut, Framer};
 use super::{DriverError, Reading, unblock};
+use crate::provenance::{Format, Negotiated};
 use crate::registry::{Framing, Parse, SerialSpec};
 use crate::sample::Encoding;
 use crate::time::Stamp;
@@ -43,6 +44,7 @@ pub struct Serial {
     arrived: Stamp,
     lost: u64,
     description: String,
+    format: Format,
 }
 
 impl Serial {
@@ -58,6 +60,8 @@ impl Serial {
         let path = path.to_owned();
         let baud = spec.baud;
         let stream = unblock(move || open_line(&path, baud)).await?;
+        let baud = stream.baud_rate().unwrap_or(baud);
+        let format = Format::Messages { baud: Some(baud), channels: spec.channels, hz: None };
         Ok(Self {
             stream,
             decoder,
@@ -67,6 +71,7 @@ impl Serial {
             arrived: Stamp::default(),
             lost: 0,
             description,
+            format,
         })
     }
 
@@ -108,6 +113,12 @@ impl Serial {
     #[must_use]
     pub fn description(&self) -> &str {
         &self.description
+    }
+
+    /// The same for the recording.
+    #[must_use]
+    pub fn negotiated(&self) -> Negotiated {
+        Negotiated { format: Some(self.format.clone()), ..Negotiated::default() }
     }
 }
 

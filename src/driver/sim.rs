@@ -6,6 +6,7 @@
 //!
 //! Invariant: the sequence goes on over a replug; a number that is skipped is told in `lost`.
 
+use std::collections::BTreeMap;
 use std::f64::consts::TAU;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, OnceLock};
@@ -15,10 +16,11 @@ use jpeg_encoder::{ColorType, Encoder};
 use tokio::time::Instant;
 
 use super::{DriverError, Reading, unblock};
-use crate::registry::scenario::{SimDevice, SimSource};
+use crate::provenance::{Format, Negotiated};
+use crate::registry::scenario::{self, SimDevice, SimSource};
 use crate::registry::{DeviceSpec, NodeSpec};
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
-use crate::time::Stamp;
+use crate::time::{Stamp, nanoseconds};
 
 /// Different pictures a simulated camera has.
 const PICTURES: u32 = 8;
@@ -40,6 +42,11 @@ pub struct Sim {
     next: u64,
     backlog: u64,
     payload: Vec<u8>,
+    /// Losses not told yet.
+    owed: u64,
+    /// The sample in `payload` is to be sent once more, with this stamp.
+    again: Option<Stamp>,
+    controls: BTreeMap<String, i64>,
 }
 
 #[derive(Debug)]
@@ -72,7 +79,17 @@ impl Sim {
         };
         let grid = Grid { begun: device.begun, rate: u64::from(rate.max(1)) };
         let next = grid.first_after(stamp_of(Instant::now()));
-        Ok(Self { device, content, grid, next, backlog, payload: Vec::with_capacity(capacity) })
+        let (payload, controls) = (Vec::with_capacity(capacity), BTreeMap::new());
+        Ok(Self { device, content, grid, next, backlog, payload, owed: 0, again: None, controls })
+    }
+
+    /// With the controls that `spec` sets: a simulated camera has those and no others.
+    #[must_use]
+    pub(super) fn with_controls(mut self, spec: &NodeSpec) -> Self {
+        if let NodeSpec::Camera(camera) = spec {
+            self.controls = camera.controls.iter().cloned().collect();
+        }
+        self
     }
 
     /// The next sample.
@@ -80,23 +97,48 @@ impl Sim {
     /// # Errors
     /// [`DriverError::Gone`] once the cable is pulled.
     pub async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
-        let lost = self.next_due().await?;
+        if let Some(captured) = self.again.take() {
+            return Ok(self.reading(captured, 0));
+        }
+        let faults = self.device.faults;
+        let hits = |every: Option<u64>, point: u64| every.is_some_and(|every| point.is_multiple_of(every));
+        loop {
+            self.owed += self.next_due().await?;
+            if !hits(faults.lose_every, self.next) {
+                break;
+            }
+            self.next += 1;
+            self.owed += 1;
+        }
         // Nothing waits from here on: a future that is dropped has taken no sample.
+        let (lost, point) = (std::mem::take(&mut self.owed), self.next);
         let skipped = u32::try_from(lost).unwrap_or(u32::MAX);
         let sequence = self.device.sequence.fetch_add(skipped.wrapping_add(1), Ordering::AcqRel).wrapping_add(skipped);
-        let captured = self.grid.stamp(self.next);
+        let captured = self.grid.stamp(point);
         self.next += 1;
+        let elapsed = captured.since(self.device.begun);
+        if self.payload.is_empty() || faults.freeze_at.is_none_or(|freeze| elapsed < freeze) {
+            match &self.content {
+                Content::Pictures(pictures) => pictures.write(sequence, &mut self.payload),
+                Content::Values { channels, seed } => write_values(*channels, *seed, sequence, &mut self.payload),
+            }
+        }
+        if hits(faults.truncate_every, point) {
+            self.payload.truncate(self.payload.len() / 2);
+        }
+        let error = i128::from(nanoseconds(elapsed)) * i128::from(faults.clock_ppm) / 1_000_000;
+        let captured = Stamp(u64::try_from(i128::from(captured.0) + error).unwrap_or(captured.0));
+        self.again = hits(faults.duplicate_every, point).then_some(captured);
+        Ok(self.reading(captured, lost))
+    }
+
+    /// What is in `payload`.
+    fn reading(&self, captured: Stamp, lost: u64) -> Reading<'_> {
         let (encoding, width, height) = match &self.content {
-            Content::Pictures(pictures) => {
-                pictures.write(sequence, &mut self.payload);
-                (Encoding::Mjpeg, pictures.width, pictures.height)
-            }
-            Content::Values { channels, seed } => {
-                write_values(*channels, *seed, sequence, &mut self.payload);
-                (Encoding::F64, u32::try_from(*channels).unwrap_or(u32::MAX), 0)
-            }
+            Content::Pictures(pictures) => (Encoding::Mjpeg, pictures.width, pictures.height),
+            Content::Values { channels, .. } => (Encoding::F64, u32::try_from(*channels).unwrap_or(u32::MAX), 0),
         };
-        Ok(Reading { bytes: &self.payload, encoding, captured, flags: FLAG_DEVICE_TIME, width, height, lost })
+        Reading { bytes: &self.payload, encoding, captured, flags: FLAG_DEVICE_TIME, width, height, lost }
     }
 
     /// Waits until the next sample is due; tells how many the device had to drop before it because
@@ -115,7 +157,8 @@ impl Sim {
                 continue;
             }
             let due = self.grid.stamp(self.next);
-            let now_stamp = stamp_of(now);
+            // What is on its way for long is to be had as late.
+            let now_stamp = stamp_of(now).before(self.device.faults.delay);
             if due <= now_stamp {
                 let newest = self.grid.first_after(now_stamp).saturating_sub(1);
                 let lost = newest.saturating_sub(self.next).saturating_sub(self.backlog);
@@ -136,6 +179,22 @@ impl Sim {
             SimSource::Serial { channels, hz, .. } => format!("simulated serial line, {channels} numbers at {hz} Hz"),
             SimSource::Process | SimSource::Replay { .. } => String::new(),
         }
+    }
+
+    /// The same for the recording.
+    #[must_use]
+    pub fn negotiated(&self) -> Negotiated {
+        let format = match self.device.source {
+            SimSource::Camera { width, height, fps, .. } => {
+                Some(Format::Pictures { fourcc: "MJPG".to_owned(), width, height, fps: Some(fps.into()) })
+            }
+            SimSource::Serial { channels, hz, .. } => {
+                Some(Format::Messages { baud: None, channels, hz: Some(hz.into()) })
+            }
+            SimSource::Replay { .. } | SimSource::Process => None,
+        };
+        let bus = Some(format!("sim:{}", self.device.name));
+        Negotiated { driver: Some(scenario::driver()), card: None, bus, format, controls: self.controls.clone() }
     }
 }
 
@@ -174,7 +233,8 @@ pub fn frame(source: &SimSource, sequence: u32) -> Option<Vec<u8>> {
     let mut payload = Vec::new();
     match *source {
         SimSource::Camera { width, height, seed, bytes, .. } => {
-            let picture = fill(encode(width, height, seed, sequence % PICTURES).ok()?, bytes, seed);
+            let picture =
+                fill(encode(width, height, seed, sequence % PICTURES).ok()?, bytes, seed, sequence % PICTURES);
             write_picture(&picture, seed, sequence, &mut payload);
         }
         SimSource::Serial { channels, seed, .. } => write_values(channels, seed, sequence, &mut payload),
@@ -209,7 +269,7 @@ struct Pictures {
 
 impl Pictures {
     fn new(width: u32, height: u32, seed: u64, bytes: usize) -> Result<Self, DriverError> {
-        let picture = |index| Ok(fill(encode(width, height, seed, index)?, bytes, seed));
+        let picture = |index| Ok(fill(encode(width, height, seed, index)?, bytes, seed, index));
         let encoded = (0..PICTURES).map(picture).collect::<Result<_, DriverError>>()?;
         Ok(Self { width, height, seed, encoded })
     }
@@ -245,7 +305,7 @@ fn write_picture(picture: &[u8], seed: u64, sequence: u32, payload: &mut Vec<u8>
 
 /// The picture with comment segments after its start of image that bring it to `bytes` at least, filled with
 /// noise that does not compress, as the coefficients of a real scene do not.
-fn fill(picture: Vec<u8>, bytes: usize, seed: u64) -> Vec<u8> {
+fn fill(picture: Vec<u8>, bytes: usize, seed: u64, index: u32) -> Vec<u8> {
     // Marker and length beside this many bytes of content.
     const SEGMENT: usize = 65_533;
     if picture.len() >= bytes {
@@ -255,7 +315,7 @@ fn fill(picture: Vec<u8>, bytes: usize, seed: u64) -> Vec<u8> {
     let mut filled = Vec::with_capacity(bytes + SEGMENT);
     filled.extend_from_slice(start);
     // xorshift64 (Marsaglia 2003), which needs a seed that is not zero.
-    let mut state = seed | 1 << 63;
+    let mut state = seed.wrapping_mul(u64::from(PICTURES)).wrapping_add(u64::from(index)) | 1 << 63;
     while filled.len() + rest.len() < bytes {
         let content = (bytes - filled.len() - rest.len()).saturating_sub(4).clamp(1, SEGMENT);
         let length = u16::try_from(content + 2).unwrap_or(u16::MAX);

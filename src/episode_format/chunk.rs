@@ -38,20 +38,20 @@ impl Opened {
         };
         if compression.is_empty() {
             let sound = size == count && is_sound(packed, crc);
-            let trust = if sound && fits(packed) { Trust::Sound } else { doubt };
+            let trust = if sound && fits(packed) { Trust::Sound } else { Trust::Damaged };
             return Self { unpacked: false, records: begin..begin + packed.len(), trust };
         }
         unpacked.clear();
         if size > MAX_RECORD || unpack(compression, packed, size, unpacked).is_none() {
             return nothing;
         }
-        let trust = if is_sound(unpacked, crc) && fits(unpacked) { Trust::Sound } else { doubt };
+        let trust = if is_sound(unpacked, crc) && fits(unpacked) { Trust::Sound } else { Trust::Damaged };
         Self { unpacked: true, records: 0..unpacked.len(), trust }
     }
 }
 
-/// A check value of zero says that there is none.
-pub(super) fn is_sound(bytes: &[u8], crc: u32) -> bool {
+/// Are `bytes` as they were written? A check value of zero says that there is none.
+pub(crate) fn is_sound(bytes: &[u8], crc: u32) -> bool {
     crc == 0 || crc32fast::hash(bytes) == crc
 }
 

@@ -6,8 +6,14 @@
 //! Invariant: no bytes make anything here panic, and memory holds one record of a file at a time.
 
 mod chunk;
+#[cfg(test)]
+pub(crate) mod testing;
+#[cfg(test)]
+mod tests;
 pub(crate) mod walk;
 pub(crate) mod wire;
+
+pub(crate) use chunk::is_sound;
 
 use std::fs::File;
 use std::io;

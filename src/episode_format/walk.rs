@@ -103,6 +103,7 @@ pub(crate) struct Walk<R> {
     buffer: Vec<u8>,
     unpacked: Vec<u8>,
     chunk: Option<Opened>,
+    found: Option<Found>,
     /// The chunk is the last, and not whole.
     cut: bool,
 }
@@ -135,6 +136,7 @@ impl<R: Read> Walk<R> {
             buffer: Vec::new(),
             unpacked: Vec::new(),
             chunk: None,
+            found: None,
             cut: false,
         };
         let whole = walk.read(MAGIC.len() as u64)?;
@@ -149,14 +151,25 @@ impl<R: Read> Walk<R> {
     /// The next record that is not one of the container's own, chunks opened up; `None` at the end.
     /// Records of the summary that repeat those of the data are shown too.
     pub(crate) fn next(&mut self) -> io::Result<Option<Record<'_>>> {
-        Ok(match self.find()? {
-            None => None,
-            Some(Found::Buffer(opcode)) => Some(Record { opcode, data: &self.buffer, trust: Trust::Sound }),
+        Ok(if self.advance()? { Some(self.record()) } else { None })
+    }
+
+    /// Goes on to the next record; `false` at the end.
+    pub(crate) fn advance(&mut self) -> io::Result<bool> {
+        self.found = self.find()?;
+        Ok(self.found.is_some())
+    }
+
+    /// The record gone to last; one of no content before the first and after the last.
+    pub(crate) fn record(&self) -> Record<'_> {
+        match &self.found {
+            None => Record { opcode: 0, data: &[], trust: Trust::Sound },
+            Some(Found::Buffer(opcode)) => Record { opcode: *opcode, data: &self.buffer, trust: Trust::Sound },
             Some(Found::Chunk { opcode, unpacked, range, trust }) => {
-                let bytes = if unpacked { &self.unpacked } else { &self.buffer };
-                Some(Record { opcode, data: bytes.get(range).unwrap_or_default(), trust })
+                let bytes = if *unpacked { &self.unpacked } else { &self.buffer };
+                Record { opcode: *opcode, data: bytes.get(range.clone()).unwrap_or_default(), trust: *trust }
             }
-        })
+        }
     }
 
     /// What was found so far; all there is once the last record was read.

@@ -78,9 +78,19 @@ impl Columns {
     pub(super) fn line(self, event: &Event, wall_ns: u64) -> String {
         let palette = self.palette;
         let (subject, bit, word, rest) = match &event.what {
-            What::Attach { device, bit, node, port, serial } => {
-                let serial = serial.as_deref().map(|serial| format!(" serial {serial}")).unwrap_or_default();
-                (device, Some(bit), pad("attached"), format!("{node} port {port}{serial}"))
+            What::Attach { device, bit, node, usb, .. } => {
+                let serial = usb.serial.as_deref().map(|serial| format!(" serial {serial}")).unwrap_or_default();
+                (device, Some(bit), pad("attached"), format!("{node} port {}{serial}", usb.port))
+            }
+            What::Opened { device, bit, provenance } => {
+                let driver = provenance.negotiated.driver.as_ref();
+                let driver = driver.map(|driver| {
+                    format!("  driver {} {}", driver.name, driver.version.as_deref().unwrap_or_default())
+                });
+                let firmware = provenance.usb.firmware.as_deref().map(|firmware| format!("  firmware {firmware}"));
+                let rest =
+                    [Some(format!("epoch {}", provenance.epoch.0)), firmware, driver].into_iter().flatten().collect();
+                (device, Some(bit), pad("opened"), rest)
             }
             What::Detach { device, bit, witness } => {
                 (device, Some(bit), palette.warn(&pad("detached")), format!("told by {witness}"))
@@ -110,6 +120,7 @@ impl Columns {
                 let subject = if matches!(event.what, What::DiskLow { .. }) { "disk" } else { "clock" };
                 (&subject.to_owned(), None, palette.level(level, &pad(level.word())), text)
             }
+            What::Recovered { text, .. } => (&"episode".to_owned(), None, palette.warn(&pad("repaired")), text.clone()),
             What::Log { level, text } => {
                 let word = palette.level(*level, &pad(level.word()));
                 (&"log".to_owned(), None, word, text.clone())

@@ -3,9 +3,11 @@ use std::sync::Mutex;
 use serde_json::Value;
 
 use super::*;
+use crate::provenance::{KernelDriver, Negotiated};
+use crate::registry::UsbIdentity;
 use crate::sample::Epoch;
-use crate::status::literal::{WALL_NS, board, every_state, id, recording, three_streaming};
-use crate::status::{Grade, Level, RecordingStatus, SlotState, Verdict, What};
+use crate::status::literal::{TAKEN, WALL_NS, board, every_state, id, recording, three_streaming};
+use crate::status::{Grade, Level, Provenance, RecordingStatus, SlotState, Verdict, What};
 
 /// An output that keeps what it is given.
 #[derive(Clone, Default)]
@@ -57,14 +59,40 @@ fn episode(dropped: u64, error: Option<&str>) -> What {
     }
 }
 
+fn usb() -> UsbIdentity {
+    UsbIdentity {
+        vid: 0x046d,
+        pid: 0x0825,
+        serial: Some("CAM\x1b[2J00".to_owned()),
+        port: "1-2.3".to_owned(),
+        firmware: Some("4.18".to_owned()),
+        ..UsbIdentity::default()
+    }
+}
+
 fn all_events() -> Vec<What> {
     vec![
         What::Attach {
             device: "cam_wrist".to_owned(),
             bit: id(0),
             node: "/dev/video0".to_owned(),
-            port: "1-2.3".to_owned(),
-            serial: Some("CAM\x1b[2J00".to_owned()),
+            usb: usb(),
+            driver: None,
+        },
+        What::Opened {
+            device: "cam_wrist".to_owned(),
+            bit: id(0),
+            provenance: Box::new(Provenance {
+                epoch: Epoch(3),
+                node: "/dev/video0".to_owned(),
+                attached: TAKEN,
+                usb: usb(),
+                negotiated: Negotiated {
+                    driver: Some(KernelDriver { name: "uvcvideo".to_owned(), version: Some("6.1.0".to_owned()) }),
+                    ..Negotiated::default()
+                },
+                latency_ns: 35_000_000,
+            }),
         },
         state("cam_wrist", 0, SlotState::Streaming, "/dev/video0 MJPG 640x480@30"),
         What::Detach { device: "tof".to_owned(), bit: id(12), witness: "kernel".to_owned() },
@@ -87,6 +115,7 @@ fn lines_for_people_have_their_columns() {
     let lines: Vec<_> = all_events().into_iter().map(|what| columns.line(&event(what), WALL_NS)).collect();
     insta::assert_snapshot!(lines.join("\n"), @r#"
     22:13:20.000Z  cam_wrist  bit 0   attached      /dev/video0 port 1-2.3 serial CAM [2J00
+    22:13:20.000Z  cam_wrist  bit 0   opened        epoch 3  firmware 4.18  driver uvcvideo 6.1.0
     22:13:20.000Z  cam_wrist  bit 0   streaming     mask 0x05  /dev/video0 MJPG 640x480@30
     22:13:20.000Z  tof        bit 12  detached      told by kernel
     22:13:20.000Z  tof        bit 12  absent        mask 0x05

@@ -10,6 +10,7 @@ use std::time::Duration;
 use serde::Serialize;
 
 use super::RecordError;
+use super::lock::{self, Lock};
 use crate::folder::{Folder, FolderError, Links, Missing};
 use crate::status::Verdict;
 use crate::time;
@@ -57,7 +58,8 @@ pub struct EpisodeReport {
     pub verdict: Verdict,
 }
 
-/// The folder of an episode's file, held open, and its two names in it.
+/// The folder of an episode's file, held open, and its two names in it; the file is locked until the
+/// second one is given.
 #[derive(Debug)]
 pub(super) struct EpisodePath {
     pub(super) folder: Folder,
@@ -65,6 +67,9 @@ pub(super) struct EpisodePath {
     pub(super) finished: PathBuf,
     /// While it is written.
     pub(super) partial: PathBuf,
+    /// Holds the lock.
+    #[expect(dead_code, reason = "held for its lock")]
+    pub(super) locked: File,
 }
 
 impl EpisodePath {
@@ -84,7 +89,12 @@ impl EpisodePath {
             match folder.create_new(&partial, 0o666) {
                 Ok(file) => {
                     let (finished, partial) = (out.join(name), out.join(partial));
-                    return Ok((Self { folder, finished, partial }, file));
+                    match lock(&file, &partial) {
+                        Ok(Some(locked)) => return Ok((Self { folder, finished, partial, locked }, file)),
+                        // Somebody took the empty file for one that was left behind.
+                        Ok(None) => {}
+                        Err(source) => return Err(RecordError::Io { path: partial, source }),
+                    }
                 }
                 Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
                 Err(source) => return Err(RecordError::Io { path: out.join(partial), source }),
@@ -93,16 +103,34 @@ impl EpisodePath {
         Err(refused(io::Error::new(io::ErrorKind::AlreadyExists, "no free number for this task")))
     }
 
-    /// Gives the finished file its name, and waits for the name to be on the disk where the file
-    /// system can be asked for that.
+    /// Gives the finished file its name.
     pub(super) fn publish(&self) -> io::Result<()> {
-        let name = |path: &'_ Path| path.file_name().unwrap_or_default().to_owned();
-        self.folder.rename_new(&name(&self.partial), &name(&self.finished))?;
-        // The file has its name: what remains is what a loss of power right now would do to it.
-        if let Err(error) = self.folder.sync() {
-            tracing::warn!(folder = %self.folder.path().display(), %error, "folder not synced");
-        }
-        Ok(())
+        rename(&self.folder, &self.partial, &self.finished)
+    }
+}
+
+/// Gives a file its final name, in the same folder, which must be free, and waits for the name to be
+/// on the disk where the file system can be asked for that.
+pub(super) fn publish(file: &Path, name: &Path) -> io::Result<()> {
+    let folder = Folder::open(name.parent().unwrap_or(Path::new("")), Links::Own, Missing::Refused);
+    rename(&folder.map_err(io::Error::from)?, file, name)
+}
+
+fn rename(folder: &Folder, file: &Path, name: &Path) -> io::Result<()> {
+    let part = |path: &'_ Path| path.file_name().unwrap_or_default().to_owned();
+    folder.rename_new(&part(file), &part(name))?;
+    // The file has its name: what remains is what a loss of power right now would do to it.
+    if let Err(error) = folder.sync() {
+        tracing::warn!(folder = %folder.path().display(), %error, "folder not synced");
+    }
+    Ok(())
+}
+
+/// Locks a partial file just made; a handle that holds the lock, `None` if somebody else has it.
+pub(super) fn lock(file: &File, partial: &Path) -> io::Result<Option<File>> {
+    match lock::take(file, partial)? {
+        Lock::Ours | Lock::Unknown => file.try_clone().map(Some),
+        Lock::Others | Lock::Gone => Ok(None),
     }
 }
 
@@ -119,17 +147,16 @@ pub fn open_folder(out: &Path) -> Result<Folder, RecordError> {
     })
 }
 
-/// One more than the highest number of any file, finished or not, whose name begins with `stem`.
+/// One more than the highest number of any file, finished, repaired or not, whose name begins with
+/// `stem`.
 ///
 /// A number that no count of ours reaches does not count: somebody else made that name.
 fn next_number(folder: &Folder, stem: &str) -> io::Result<u32> {
     let mut highest = 0;
     for entry in rustix::fs::Dir::read_from(folder.descriptor())? {
         let entry = entry?;
-        let number =
-            entry.file_name().to_str().ok().and_then(|name| name.strip_prefix(stem)).and_then(|rest| {
-                rest.strip_suffix(".partial").unwrap_or(rest).strip_suffix(".mcap")?.parse::<u32>().ok()
-            });
+        let name = entry.file_name().to_str().ok().and_then(|name| name.strip_prefix(stem));
+        let number = name.and_then(|rest| rest.split_once('.')?.0.parse::<u32>().ok());
         highest = highest.max(number.filter(|number| *number < LARGEST).unwrap_or(0));
     }
     Ok(highest + 1)
@@ -215,6 +242,11 @@ mod tests {
         fs::write(out.join("20231114_t_nonsense.mcap"), "kept").unwrap();
         let (third, _) = EpisodePath::create(&out, "t", WALL).unwrap();
         assert_eq!(third.finished.file_name().unwrap(), "20231114_t_042.mcap");
+        for (number, ending) in [(50, "partial"), (60, "recovering"), (70, "damaged"), (80, "empty")] {
+            fs::write(out.join(format!("20231114_t_0{number}.mcap.{ending}")), "kept").unwrap();
+            let (next, _) = EpisodePath::create(&out, "t", WALL).unwrap();
+            assert_eq!(next.finished.file_name().unwrap(), format!("20231114_t_0{}.mcap", number + 1).as_str());
+        }
         let (other, _) = EpisodePath::create(&out, "other", WALL).unwrap();
         assert_eq!(other.finished.file_name().unwrap(), "20231114_other_001.mcap");
         // A file that took the name meanwhile stays as it is.

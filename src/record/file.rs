@@ -38,6 +38,12 @@ pub trait Sink: Write + Send {
     fn sync(&mut self) -> io::Result<()>;
 }
 
+impl Sink for Box<dyn Sink> {
+    fn sync(&mut self) -> io::Result<()> {
+        (**self).sync()
+    }
+}
+
 impl Sink for File {
     fn sync(&mut self) -> io::Result<()> {
         self.sync_all()
@@ -77,16 +83,7 @@ impl EpisodeFile {
         begin: Stamp,
         metadata: BTreeMap<String, String>,
     ) -> io::Result<Self> {
-        // JPEG does not compress and raw frames are rare: no codec, so that the thread's time goes
-        // into the disk and every reader can read. Without seeking the writer keeps a chunk in
-        // memory until it is whole.
-        let options = WriteOptions::new()
-            .compression(None)
-            .chunk_size(Some(CHUNK_BYTES))
-            .disable_seeking(true)
-            .library(concat!("rapid/", env!("CARGO_PKG_VERSION")));
-        let sink = NoSeek::new(BufWriter::with_capacity(BUFFER_BYTES, sink));
-        let mut writer = Writer::with_options(sink, options).map_err(io_error)?;
+        let mut writer = writer(sink)?;
         writer.write_metadata(&Metadata { name: ABOUT.to_owned(), metadata }).map_err(io_error)?;
         let wall_ns = clock.wall_ns(begin);
         writer
@@ -192,6 +189,19 @@ impl EpisodeFile {
     }
 }
 
+/// The writer of an episode's file.
+pub(super) fn writer<S: Sink>(sink: S) -> io::Result<Writer<NoSeek<BufWriter<S>>>> {
+    // JPEG does not compress and raw frames are rare: no codec, so that the thread's time goes
+    // into the disk and every reader can read. Without seeking the writer keeps a chunk in
+    // memory until it is whole.
+    let options = WriteOptions::new()
+        .compression(None)
+        .chunk_size(Some(CHUNK_BYTES))
+        .disable_seeking(true)
+        .library(concat!("rapid/", env!("CARGO_PKG_VERSION")));
+    Writer::with_options(NoSeek::new(BufWriter::with_capacity(BUFFER_BYTES, sink)), options).map_err(io_error)
+}
+
 impl Track {
     fn channel(
         &mut self,
@@ -220,7 +230,7 @@ fn add_channel(
 }
 
 /// The system's own error where there is one: it says more than the writer's.
-fn io_error(error: McapError) -> io::Error {
+pub(super) fn io_error(error: McapError) -> io::Error {
     match error {
         McapError::Io(error) => error,
         other => io::Error::other(other),

@@ -11,8 +11,8 @@ use std::os::fd::AsRawFd;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use super::episode::{EpisodePath, PARTIAL};
-use crate::folder::{Folder, FolderError, Links, Missing};
+use super::episode::{EpisodePath, PARTIAL, lock};
+use crate::folder::{Folder, Links, Missing};
 
 /// Names tried for a file that is written again, while others have taken them.
 const ATTEMPTS: u32 = 100;
@@ -35,7 +35,8 @@ pub(super) fn publish(path: &EpisodePath, file: &File) -> io::Result<PathBuf> {
                 return Ok(partial);
             }
             let folder = open(partial.parent().unwrap_or(Path::new("")), Missing::Refused)?;
-            let moved = EpisodePath { folder, finished: partial.with_extension(""), partial };
+            let moved =
+                EpisodePath { folder, finished: partial.with_extension(""), partial, locked: file.try_clone()? };
             moved.publish()?;
             Ok(moved.finished)
         }
@@ -132,7 +133,8 @@ fn write_into(out: &Path, stem: &str, content: Content, file: &File) -> io::Resu
         if content == Content::Partial {
             return Ok(partial);
         }
-        let path = EpisodePath { folder, finished, partial };
+        let Some(locked) = lock(&copy, &partial)? else { continue };
+        let path = EpisodePath { folder, finished, partial, locked };
         path.publish()?;
         return Ok(path.finished);
     }
@@ -140,8 +142,5 @@ fn write_into(out: &Path, stem: &str, content: Content, file: &File) -> io::Resu
 }
 
 fn open(folder: &Path, missing: Missing) -> io::Result<Folder> {
-    Folder::open(folder, Links::Own, missing).map_err(|error| match error {
-        FolderError::Io { error, .. } => error,
-        link @ FolderError::Link { .. } => io::Error::other(link),
-    })
+    Folder::open(folder, Links::Own, missing).map_err(io::Error::from)
 }

@@ -6,21 +6,24 @@ use std::collections::BTreeMap;
 use serde_json::{Map, Value, json};
 
 use super::episode::EpisodeRequest;
+use super::provenance::Units;
 use super::quality::{Quality, Spread};
-use super::session::Attached;
 use crate::registry::{DeviceSpec, Registry, WhenStale};
 use crate::status::Verdict;
-use crate::time::{Stamp, WallClock};
+use crate::time::{Stamp, WallClock, nanoseconds};
 
 /// The record at the beginning.
 ///
-/// JSON: `layout` `{name: bit}`, `modalities` `[{name, bit, topic, kind, shape, when_stale}]`,
-/// `serials` `{name: serial or null}` of what was attached when the episode began, `tags`
-/// `{key: value}`.
+/// JSON: `layout` `{name: bit}`, `modalities` `[{name, bit, topic, kind, shape, when_stale,
+/// latency_ns}]`, `serials` `{name: serial or null}` of what was attached when the episode began,
+/// `provenance` (see [`Units::epochs`]) of what ran then, `tags` `{key: value}`.
+///
+/// A message's `log_time` is its capture time as the kernel gave it. The latency is taken off when
+/// a frame's samples are chosen: a sample stands for the moment `log_time - latency_ns`.
 pub(super) fn beginning(
     registry: &Registry,
     request: &EpisodeRequest,
-    attached: &Attached,
+    units: &Units,
     clock: WallClock,
     begin: Stamp,
 ) -> BTreeMap<String, String> {
@@ -38,11 +41,13 @@ pub(super) fn beginning(
             json!({
                 "name": device.name, "bit": device.id.bit(), "topic": device.topic,
                 "kind": modality.kind, "shape": modality.shape, "when_stale": when_stale,
+                "latency_ns": nanoseconds(device.latency),
             })
         })
         .collect();
     let tags: Map<String, Value> =
         request.tags.iter().map(|(key, value)| (key.clone(), value.clone().into())).collect();
+    let host = rustix::system::uname();
     text_map([
         ("software", concat!("rapid ", env!("CARGO_PKG_VERSION")).to_owned()),
         ("rig", registry.rig.name.clone()),
@@ -50,7 +55,11 @@ pub(super) fn beginning(
         ("tags", Value::Object(tags).to_string()),
         ("layout", Value::Object(layout).to_string()),
         ("modalities", Value::Array(modalities).to_string()),
-        ("serials", json!(attached).to_string()),
+        ("serials", units.serials().to_string()),
+        ("provenance", units.epochs(begin).to_string()),
+        ("commit", option_env!("RAPID_COMMIT").unwrap_or_default().to_owned()),
+        ("kernel", host.release().to_string_lossy().into_owned()),
+        ("host", host.nodename().to_string_lossy().into_owned()),
         ("registry", registry.text.clone()),
         ("observation_hz", registry.rig.observation_hz.to_string()),
         ("sync_window_ns", registry.rig.sync_window.as_nanos().to_string()),
@@ -79,16 +88,18 @@ pub(super) struct Ending<'a> {
     pub(super) skew: Option<Spread>,
     /// The verdict.
     pub(super) verdict: Verdict,
-    /// Serials of everything that was attached at some time.
-    pub(super) seen: &'a Attached,
+    /// Everything that was attached or ran at some time.
+    pub(super) units: &'a Units,
+    /// When the episode began.
+    pub(super) begin: Stamp,
 }
 
 /// The record at the end.
 ///
 /// `verdict` is GOOD, SUSPECT or BAD. JSON: `reasons` `["..."]`, why it is not GOOD; `modalities`
 /// `{name: {samples, bytes, lost, dropped, damaged, ...}}`, the fields of [`Quality`]; `skew_ms` `{p50,
-/// p95, p99, max}` between the earliest and the latest sample of a frame, or null; `serials` as at the
-/// beginning, of whatever was attached at some time.
+/// p95, p99, max}` between the earliest and the latest sample of a frame, or null; `serials` and
+/// `provenance` as at the beginning, of whatever was attached or ran at some time.
 pub(super) fn end(ending: &Ending<'_>) -> BTreeMap<String, String> {
     let modalities: Map<String, Value> =
         ending.qualities.iter().map(|(device, quality)| (device.name.clone(), json!(quality))).collect();
@@ -108,7 +119,8 @@ pub(super) fn end(ending: &Ending<'_>) -> BTreeMap<String, String> {
         ("events_missed", ending.events_missed.to_string()),
         ("modalities", Value::Object(modalities).to_string()),
         ("skew_ms", json!(ending.skew).to_string()),
-        ("serials", json!(ending.seen).to_string()),
+        ("serials", ending.units.serials().to_string()),
+        ("provenance", ending.units.epochs(ending.begin).to_string()),
     ])
 }
 

@@ -4,7 +4,8 @@
 //! use the same code: of one file both say the same, as far as the file holds what they count.
 //!
 //! Invariant: pure: no clock, no input or output; times are ns on whatever clock the caller uses.
-//! Invariant: taking a sample, a mask that has not changed or a frame allocates nothing.
+//! Invariant: taking a sample, a mask that has not changed or a frame allocates nothing, unless the
+//! caller is far behind.
 
 mod drift;
 mod jpeg;
@@ -29,7 +30,8 @@ use tally::Tally;
 pub(super) use meter::{Counts, Meter, Seen};
 pub use tally::Spread;
 
-/// Intervals without a sample kept until the mask of their time is known.
+/// Room for intervals without a sample until the mask of their time is known; a reader that is further
+/// behind has a disk that stands still, and may allocate.
 const PENDING: usize = 32;
 
 /// A modality as it is to be measured.
@@ -39,6 +41,8 @@ pub(super) struct Measured {
     pub(super) id: ModalityId,
     /// Its limits say whether payloads are compared, and its nominal rate.
     pub(super) limits: VerdictSpec,
+    /// How long before its capture what a sample shows happened, ns.
+    pub(super) latency_ns: u64,
     /// Largest payload, bytes: reserved where payloads are compared.
     pub(super) max_bytes: usize,
 }
@@ -151,13 +155,12 @@ impl Measures {
 
     /// Takes a sample that belongs to the episode.
     pub(super) fn sample(&mut self, id: ModalityId, seen: &Seen<'_>) {
-        let deadline = self.nearest_tick(seen.capture_ns).saturating_add(self.wait_ns);
+        let Some(Some(lane)) = self.lanes.get(id.index()) else { return };
+        let shown = seen.capture_ns.saturating_sub(lane.measured.latency_ns);
+        let deadline = self.nearest_tick(shown).saturating_add(self.wait_ns);
         let Some(Some(lane)) = self.lanes.get_mut(id.index()) else { return };
         let Some((from, to)) = lane.meter.sample(seen, deadline) else { return };
         if to - from > lane.longest_gap_ns {
-            if lane.pending.len() == PENDING {
-                lane.settle(&self.presence);
-            }
             lane.pending.push((from, to));
         }
     }
@@ -246,17 +249,13 @@ impl Measures {
             offset: meter.offset.spread(),
             presence: (known && length > 0.0).then(|| (present / length).clamp(0.0, 1.0)),
             present,
-            hz: (present > 0.0).then(|| samples as f64 / present),
+            // To three decimals, which is all a mean over seconds can say.
+            hz: (present > 0.0).then(|| (samples as f64 / present * 1e3).round() / 1e3),
             nominal_hz: measured.limits.hz,
             longest_gap: longest_gap_ns as f64 / 1e9,
             frames_present: meter.frames_present,
             frames_valid: meter.frames_valid,
         })
-    }
-
-    /// When a modality was present: begin and end, ns, up to `end_ns`.
-    pub(super) fn present(&self, id: ModalityId, end_ns: u64) -> impl Iterator<Item = (u64, u64)> {
-        self.presence.spans(id, self.begin_ns, end_ns)
     }
 
     fn nearest_tick(&self, at_ns: u64) -> u64 {

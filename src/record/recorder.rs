@@ -22,7 +22,8 @@ use tokio::sync::oneshot;
 use super::RecordError;
 use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest, PARTIAL};
 use super::file::Sink;
-use super::session::{Attached, Beginning, Session};
+use super::provenance::Attached;
+use super::session::{Beginning, Session};
 use super::source::Source;
 use super::space::{Asker, Disk, Finding, Space};
 use super::streams::Streams;
@@ -32,8 +33,9 @@ use crate::time::{ClockWatch, Stamp, WallClock};
 
 /// Longest wait for samples: what an order, an event or a due frame may have to wait.
 const TURN: Duration = Duration::from_millis(20);
-/// How often what was written is handed to the kernel: what a kill can take.
-const FLUSH_EVERY: Duration = Duration::from_secs(1);
+/// How often what was written is handed to the kernel. A kill may take a second at most: half of it
+/// is for what lies on the bus and for frames that are not due yet.
+const FLUSH_EVERY: Duration = Duration::from_millis(500);
 /// How often the board is told.
 const STATUS_EVERY: Duration = Duration::from_millis(200);
 /// How often it is looked whether the wall clock was set.
@@ -166,7 +168,7 @@ impl Writer {
             inbox,
             events,
             streams: Streams::new(),
-            attached: Attached::new(),
+            attached: Attached::default(),
             session: None,
             space: None,
             clock,
@@ -223,15 +225,7 @@ impl Writer {
         loop {
             match self.events.try_recv() {
                 Ok(event) => {
-                    match &event.what {
-                        What::Attach { device, serial, .. } => {
-                            self.attached.insert(device.clone(), serial.clone());
-                        }
-                        What::Detach { device, .. } => {
-                            self.attached.remove(device);
-                        }
-                        _ => {}
-                    }
+                    self.attached.take(&event);
                     if let Some(session) = &mut self.session {
                         session.event(&event);
                     }

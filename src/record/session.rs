@@ -2,22 +2,22 @@
 //!
 //! Time, in capture time of the monotonic clock:
 //!
-//! 1. The episode holds what was captured in `begin..end`; `end` is fixed by the duration asked for
-//!    or by the moment of the stop. One mask more is written, captured before `begin`: the one in
-//!    force when the episode began.
+//! 1. The episode holds what was captured from `begin` on and happened before `end`: a modality's
+//!    latency is how long before its capture what a sample shows happened. `end` is fixed by the
+//!    duration asked for or by the moment of the stop. One mask more is written, captured before
+//!    `begin`: the one in force when the episode began.
 //! 2. Tick `k` of the observation grid is `begin + k / observation_hz`; ticks before `end` are
 //!    written.
 //! 3. A tick is evaluated once, of what was received by its deadline, `tick + sync_window +`
-//!    [`SETTLE`], under the mask last published at or before the tick. The deadline is the frame's
+//!    [`SETTLE`] `+` the longest latency of the rig, under the mask last published at or before the tick. The deadline is the frame's
 //!    `publish_time`: whoever reads the file can choose the same samples again.
 //! 4. A sample received after its tick's deadline is in the file and in no frame.
-//! 5. The file is closed [`SETTLE`] `+` [`GRACE`] after `end`. A sample captured before `end` that
+//! 5. The file is closed [`SETTLE`] `+` [`GRACE`] `+` the longest latency after `end`. A sample captured before `end` that
 //!    arrives later than that is lost and not counted: nobody knows of it.
 //! 6. A damaged sample is recorded and counted, and belongs to no frame.
 //!
 //! Invariant: every sample a frame names was written to the file before the frame.
 
-use std::collections::BTreeMap;
 use std::fs::File;
 use std::io;
 use std::sync::Arc;
@@ -31,6 +31,7 @@ use super::hole::Hole;
 use super::keep;
 use super::masks::MaskHistory;
 use super::metadata::{self, Ending};
+use super::provenance::{Attached, Units};
 use super::quality::{Frames, Measured, Measures, Seen};
 use super::verdict::{Facts, FileState, Judged, Losses, judge};
 use crate::mask::PhysicalMask;
@@ -39,7 +40,7 @@ use crate::registry::{DeviceSpec, Registry};
 use crate::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
 use crate::status::{Board, Event, RecordingStatus, What};
 use crate::sync::{Grid, SyncModality, SyncSample, Synchronizer};
-use crate::time::{Stamp, WallClock};
+use crate::time::{Stamp, WallClock, nanoseconds};
 
 /// How long after its capture a sample may arrive and still belong to its frame. The slowest we
 /// know: a camera at 15 Hz stamps the start of exposure and delivers after exposure, transfer and
@@ -49,9 +50,6 @@ pub(super) const SETTLE: Duration = Duration::from_millis(100);
 pub(super) const GRACE: Duration = Duration::from_millis(20);
 /// Samples of a modality that may arrive while those of a whole queue are being written.
 const RING_SLACK: usize = 1024;
-
-/// Serial of every device attached, by its modality's name.
-pub(super) type Attached = BTreeMap<String, Option<String>>;
 
 /// See the module's comment.
 pub(super) struct Session {
@@ -71,7 +69,9 @@ pub(super) struct Session {
     masks_dropped: u64,
     events: u64,
     events_missed: u64,
-    seen: Attached,
+    units: Units,
+    /// How long a tick waits for its samples beside the window.
+    settle: Duration,
     /// The first error of the file: from then on nothing is written.
     failed: Option<io::Error>,
 }
@@ -93,19 +93,24 @@ impl Session {
     /// Begins an episode and writes what stands at its beginning.
     pub(super) fn begin(beginning: Beginning<'_>, masks: &MaskHistory) -> io::Result<Self> {
         let Beginning { registry, board, request, path, sink, handle, attached, clock, begin } = beginning;
-        let said = metadata::beginning(&registry, request, attached, clock, begin);
+        let units = Units::new(attached);
+        let said = metadata::beginning(&registry, request, &units, clock, begin);
         let mut file = EpisodeFile::begin(sink, &registry, clock, begin, said)?;
-        let mut measures = Measures::new(&measured(&registry), frames(&registry, begin));
+        let settle = SETTLE + registry.devices.iter().map(|device| device.latency).max().unwrap_or_default();
+        let mut measures = Measures::new(&measured(&registry), frames(&registry, begin, settle));
         if let Some((header, mask, sequence)) = masks.at(begin) {
             file.mask(header, *mask, *sequence)?;
             measures.mask(header.capture_ns, *mask);
         }
+        // Killed in the next moment, it is an episode all the same, of a known task and rig.
+        file.flush()?;
         let modalities: Vec<SyncModality> = registry
             .devices
             .iter()
             .map(|device| SyncModality {
                 id: device.id,
                 when_stale: device.when_stale,
+                latency: device.latency,
                 capacity: device.depth.saturating_add(RING_SLACK),
             })
             .collect();
@@ -125,19 +130,21 @@ impl Session {
             masks_dropped: 0,
             events: 0,
             events_missed: 0,
-            seen: attached.clone(),
+            units,
+            settle,
             failed: None,
         })
     }
 
     /// Takes a sample, and the hole before it.
     pub(super) fn sample(&mut self, id: ModalityId, header: &SampleHeader, payload: &[u8], hole: Option<Hole>) {
+        let latency = self.latency(id);
         if let (Some(hole), None) = (hole, &self.failed) {
             // Also before a sample that lies beyond the end: a part of the hole may not.
-            let (lost, dropped) = (self.share(&hole, hole.lost), self.share(&hole, hole.dropped));
+            let (lost, dropped) = (self.share(&hole, hole.lost, latency), self.share(&hole, hole.dropped, latency));
             self.measures.missing(id, lost, dropped);
         }
-        if !self.holds(Stamp(header.capture_ns)) || self.failed.is_some() {
+        if !self.holds(Stamp(header.capture_ns), latency) || self.failed.is_some() {
             return;
         }
         if let Err(error) = self.file.sample(id, header, payload) {
@@ -170,9 +177,9 @@ impl Session {
     /// Takes a publication of the mask, and the hole before it.
     pub(super) fn mask(&mut self, header: &SampleHeader, mask: PhysicalMask, sequence: u64, hole: Option<Hole>) {
         if let (Some(hole), None) = (hole, &self.failed) {
-            self.masks_dropped = self.masks_dropped.saturating_add(self.share(&hole, hole.dropped));
+            self.masks_dropped = self.masks_dropped.saturating_add(self.share(&hole, hole.dropped, Duration::ZERO));
         }
-        if !self.holds(Stamp(header.capture_ns)) || self.failed.is_some() {
+        if !self.holds(Stamp(header.capture_ns), Duration::ZERO) || self.failed.is_some() {
             return;
         }
         self.failed = self.file.mask(header, mask, sequence).err();
@@ -181,10 +188,8 @@ impl Session {
 
     /// Takes an event.
     pub(super) fn event(&mut self, event: &Event) {
-        if let What::Attach { device, serial, .. } = &event.what {
-            self.seen.insert(device.clone(), serial.clone());
-        }
-        if !self.holds(event.stamp) || self.failed.is_some() {
+        self.units.take(event);
+        if !self.holds(event.stamp, Duration::ZERO) || self.failed.is_some() {
             return;
         }
         self.failed = self.write_event(event).err();
@@ -215,7 +220,7 @@ impl Session {
 
     /// Is it time to [`Self::finish`]?
     pub(super) fn is_over(&self, now: Stamp) -> bool {
-        self.failed.is_some() || self.end.is_some_and(|end| now >= end.after(SETTLE).after(GRACE))
+        self.failed.is_some() || self.end.is_some_and(|end| now >= end.after(self.settle).after(GRACE))
     }
 
     /// Is the end of the episode fixed by now?
@@ -263,7 +268,8 @@ impl Session {
             qualities: &qualities,
             skew: self.measures.skew(),
             verdict: verdict(state),
-            seen: &self.seen,
+            units: &self.units,
+            begin: self.begin,
         };
         let closed = match self.failed {
             None => {
@@ -305,18 +311,22 @@ impl Session {
         &self.path.finished
     }
 
-    fn holds(&self, capture: Stamp) -> bool {
-        capture >= self.begin && self.end.is_none_or(|end| capture < end)
+    fn holds(&self, capture: Stamp, latency: Duration) -> bool {
+        capture >= self.begin && self.end.is_none_or(|end| capture.before(latency) < end)
     }
 
-    /// How many of `count` samples missing in `hole` were captured within the episode.
-    fn share(&self, hole: &Hole, count: u64) -> u64 {
-        let until_end = self.end.map_or(count, |end| hole.before(end, count));
+    fn latency(&self, id: ModalityId) -> Duration {
+        self.registry.device(id).map_or(Duration::ZERO, |device| device.latency)
+    }
+
+    /// How many of `count` samples missing in `hole` belong to the episode.
+    fn share(&self, hole: &Hole, count: u64, latency: Duration) -> u64 {
+        let until_end = self.end.map_or(count, |end| hole.before(end.after(latency), count));
         until_end.saturating_sub(hole.before(self.begin, count))
     }
 
     fn deadline(&self, tick: u64) -> Stamp {
-        self.grid.tick(tick).after(self.registry.rig.sync_window).after(SETTLE)
+        self.grid.tick(tick).after(self.registry.rig.sync_window).after(self.settle)
     }
 
     fn write_frame(&mut self, masks: &MaskHistory) {
@@ -346,23 +356,31 @@ impl Session {
 
 /// What is measured of the devices of a registry.
 fn measured(registry: &Registry) -> Vec<Measured> {
-    let measured =
-        |device: &DeviceSpec| Measured { id: device.id, limits: device.verdict, max_bytes: device.max_bytes };
+    let measured = |device: &DeviceSpec| Measured {
+        id: device.id,
+        limits: device.verdict,
+        latency_ns: nanoseconds(device.latency),
+        max_bytes: device.max_bytes,
+    };
     registry.devices.iter().map(measured).collect()
 }
 
 /// When the frames of an episode are that begins at `begin`.
-fn frames(registry: &Registry, begin: Stamp) -> Frames {
-    Frames { begin_ns: begin.0, hz: registry.rig.observation_hz, wait: registry.rig.sync_window + SETTLE }
+fn frames(registry: &Registry, begin: Stamp, settle: Duration) -> Frames {
+    Frames { begin_ns: begin.0, hz: registry.rig.observation_hz, wait: registry.rig.sync_window + settle }
 }
 
 /// An event for people.
 fn describe(what: &What) -> String {
     match what {
-        What::Attach { device, node, port, serial, .. } => match serial {
-            Some(serial) => format!("{device} attached: {node}, port {port}, serial {serial}"),
-            None => format!("{device} attached: {node}, port {port}"),
+        What::Attach { device, node, usb, .. } => match &usb.serial {
+            Some(serial) => format!("{device} attached: {node}, port {}, serial {serial}", usb.port),
+            None => format!("{device} attached: {node}, port {}", usb.port),
         },
+        What::Opened { device, provenance, .. } => {
+            let unit = provenance.usb.serial.as_deref().unwrap_or("without a serial number");
+            format!("{device} opened in epoch {}: unit {unit}", provenance.epoch.0)
+        }
         What::Detach { device, witness, .. } => format!("{device} detached, told by {witness}"),
         What::State { device, state, mask, detail, .. } => {
             let state = format!("{state:?}").to_lowercase();
@@ -371,7 +389,7 @@ fn describe(what: &What) -> String {
         What::Unregistered { device, reason } => format!("{device} not registered: {reason}"),
         What::Recording { file } => format!("recording {}", file.display()),
         What::Episode { file, .. } => format!("finished {}", file.display()),
-        What::Log { text, .. } => text.clone(),
+        What::Recovered { text, .. } | What::Log { text, .. } => text.clone(),
         What::DiskLow { .. } | What::ClockStep { .. } => {
             what.sentence().map_or_else(String::new, |(_, sentence)| sentence)
         }

@@ -20,10 +20,10 @@ use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::registry::{
     CameraSpec, DeviceSpec, Framing, IdentitySpec, NodeSpec, Parse, PixelFormat, Registry, RigSpec, SerialSpec,
-    VerdictSpec, WhenStale,
+    UsbIdentity, VerdictSpec, WhenStale,
 };
 use crate::sample::{Encoding, FLAG_ERROR, SampleHeader};
-use crate::status::{Board, Level, What};
+use crate::status::{Board, Grade, Level, What};
 use crate::time::Stamp;
 
 const MS: u64 = 1_000_000;
@@ -101,6 +101,7 @@ fn device(bit: u8, name: &str, node: NodeSpec) -> DeviceSpec {
         max_bytes: 1 << 16,
         depth: 64,
         when_stale: WhenStale::Hold,
+        latency: Duration::ZERO,
         verdict,
     }
 }
@@ -224,8 +225,8 @@ impl Bench {
             device: "raw".to_owned(),
             bit: id(RAW),
             node: "/dev/video7".to_owned(),
-            port: "1-2".to_owned(),
-            serial: Some("S7".to_owned()),
+            usb: UsbIdentity { port: "1-2".to_owned(), serial: Some("S7".to_owned()), ..UsbIdentity::default() },
+            driver: None,
         };
         self.board.announce(attach);
         self.board.announce(What::Log { level: Level::Info, text: "hello".to_owned() });

@@ -9,11 +9,19 @@
 //! hz = 100                    # rate; default: the camera's fps, 100 for a serial line
 //! bytes = "60kB"              # a camera's pictures are filled up to this size, as real scenes fill them
 //! plugged = false             # when the scenario begins; default true
-//! serial = "OTHER"            # also vid, pid, port: what it says it is; serial = "" for none
+//! serial = "OTHER"            # also vid, pid, port, firmware, manufacturer, product: what it says it
+//!                             # is; serial = "" for none
 //!
 //! [[device]]
 //! name = "spare"              # any name, with
 //! like = "tactile_tip"        # the entry whose format it takes
+//! [device.fault]              # optional: what the device above does wrong
+//! freeze_at = "3s"            # from then on it sends the same bytes
+//! truncate_every = 10         # one sample in ten is cut in the middle
+//! duplicate_every = 10        # one in ten is sent twice
+//! lose_every = 10             # one in ten is lost, and the device says so
+//! delay = "200ms"             # samples arrive so long after their capture
+//! clock_ppm = 500             # its clock runs fast, or slow if negative
 //!
 //! [[event]]                   # exactly one of plug, unplug, silence, resume
 //! at = "3s"
@@ -38,11 +46,26 @@ use std::time::Duration;
 use super::attachment::UsbIdentity;
 use super::diagnostic::{RegistryErrors, did_you_mean};
 use super::parse::{is_port, read_file};
-use super::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, SimSource};
+use super::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, SimFaults, SimSource};
 use super::section::{Problems, Section, file_label, read};
 use super::spec::{DeviceSpec, NodeSpec, Registry};
 
-const DEVICE_KEYS: [&str; 10] = ["name", "like", "seed", "plugged", "hz", "bytes", "vid", "pid", "serial", "port"];
+const DEVICE_KEYS: [&str; 14] = [
+    "name",
+    "like",
+    "seed",
+    "plugged",
+    "hz",
+    "bytes",
+    "vid",
+    "pid",
+    "serial",
+    "port",
+    "firmware",
+    "manufacturer",
+    "product",
+    "fault",
+];
 const ACTIONS: [&str; 4] = ["plug", "unplug", "silence", "resume"];
 const EVENT_KEYS: [&str; 6] = ["at", "plug", "unplug", "silence", "resume", "port"];
 /// Rate of a simulated serial line, Hz: that of a usual motor controller's state.
@@ -124,8 +147,10 @@ fn standing_for(spec: &DeviceSpec, name: &str) -> ScenarioDevice {
         serial: Some(spec.identity.serial.clone().unwrap_or_else(|| format!("SIM-{name}"))),
         port: spec.identity.port.clone().unwrap_or_default(),
         product: Some(format!("simulated {}", spec.name)),
+        manufacturer: Some("rapid".to_owned()),
+        firmware: Some("1.00".to_owned()),
     };
-    ScenarioDevice { name: name.to_owned(), usb, source, plugged: true }
+    ScenarioDevice { name: name.to_owned(), usb, source, plugged: true, faults: SimFaults::default() }
 }
 
 /// Ports of a bus no rig has, for devices whose port nothing says.
@@ -203,7 +228,35 @@ fn device(section: &Section<'_>, registry: &Registry, problems: &mut Problems<'_
     if let Some(port) = port(section, problems) {
         device.usb.port = port;
     }
+    device.faults = faults(section, problems);
+    let usb = &mut device.usb;
+    for (key, place) in
+        [("firmware", &mut usb.firmware), ("manufacturer", &mut usb.manufacturer), ("product", &mut usb.product)]
+    {
+        if let Some(text) = section.text(problems, key) {
+            *place = (!text.value.is_empty()).then(|| text.value.to_owned());
+        }
+    }
     Some(device)
+}
+
+fn faults(section: &Section<'_>, problems: &mut Problems<'_>) -> SimFaults {
+    let Some(table) = section.table(problems, "fault") else { return SimFaults::default() };
+    let every = ["truncate_every", "duplicate_every", "lose_every"];
+    let mut known = every.to_vec();
+    known.extend(["freeze_at", "delay", "clock_ppm"]);
+    table.allow(problems, &known);
+    // At least 2: of a device all of whose samples are lost none ever comes.
+    let [truncate_every, duplicate_every, lose_every] =
+        every.map(|key| u64::try_from(table.integer(problems, key, 2..=1_000_000)?.value).ok());
+    SimFaults {
+        freeze_at: table.duration(problems, "freeze_at", Duration::ZERO..=LONGEST),
+        truncate_every,
+        duplicate_every,
+        lose_every,
+        delay: table.duration(problems, "delay", Duration::ZERO..=Duration::from_secs(10)).unwrap_or_default(),
+        clock_ppm: table.integer(problems, "clock_ppm", -100_000..=100_000).map_or(0, |ppm| ppm.value),
+    }
 }
 
 fn port(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<String> {

@@ -216,11 +216,6 @@ impl<'a> Section<'a> {
         Some(At { at: value.span().start, value: text.as_ref() })
     }
 
-    /// The text of `key`, if it is one.
-    pub(super) fn text_if(&self, key: &str) -> Option<&'a str> {
-        self.field(key)?.get_ref().as_str()
-    }
-
     pub(super) fn flag(&self, problems: &mut Problems<'_>, key: &str) -> Option<bool> {
         let DeValue::Boolean(flag) = self.field(key)?.get_ref() else {
             self.wrong_type(problems, key, "true or false", "write true or false without quotes");

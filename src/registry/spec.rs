@@ -82,6 +82,9 @@ pub struct DeviceSpec {
     pub depth: usize,
     /// What an observation holds when the device is attached but no sample lies in the window.
     pub when_stale: WhenStale,
+    /// What a sample captured at `t` shows happened at `t - latency`; up to 1 s, default 0. Taken
+    /// off when samples are aligned, and there alone.
+    pub latency: Duration,
     /// What the verdict on its part of an episode is made of.
     pub verdict: VerdictSpec,
 }
@@ -90,8 +93,10 @@ pub struct DeviceSpec {
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize)]
 pub struct IdentitySpec {
     /// USB vendor id.
+    #[serde(serialize_with = "super::attachment::usb_id")]
     pub vid: u16,
     /// USB product id.
+    #[serde(serialize_with = "super::attachment::usb_id")]
     pub pid: u16,
     /// Serial number as the device reports it. Takes precedence over `port`.
     pub serial: Option<String>,

@@ -68,6 +68,8 @@ struct Modality {
     slot: Slot<Attachment>,
     writer: Arc<Writer>,
     numbers: Arc<Numbers>,
+    /// When the newest device was attached.
+    attached: Stamp,
     /// Tells the running stream to end.
     stop: CancellationToken,
     /// Where its program works, if it has one.
@@ -88,6 +90,7 @@ impl Rig {
                 slot: Slot::new(registry.rig.cooldown),
                 writer,
                 numbers: Arc::default(),
+                attached: Stamp::default(),
                 stop: CancellationToken::new(),
                 seat: workers.as_ref().and_then(|workers| workers.seat(spec, bus)),
                 detail: String::new(),
@@ -191,9 +194,10 @@ impl Rig {
             device: modality.spec.name.clone(),
             bit: id,
             node: attachment.node.label(),
-            port: attachment.usb.port.clone(),
-            serial: attachment.usb.serial.clone(),
+            usb: attachment.usb.clone(),
+            driver: attachment.driver.as_deref().cloned(),
         };
+        modality.attached = Stamp::now();
         self.board.announce(what);
         self.apply(id, Input::Attached(attachment));
     }
@@ -241,9 +245,11 @@ impl Rig {
         // A report may arrive after the end of its stream, whose reason must stay.
         let Some(modality) = self.modality(id).filter(|modality| modality.slot.is_current(epoch)) else { return };
         match report {
-            Report::Opened(description) => {
+            Report::Opened(description, provenance) => {
                 modality.detail = description;
+                let device = modality.spec.name.clone();
                 self.show(id);
+                self.board.announce(What::Opened { device, bit: id, provenance });
             }
             Report::Started => self.apply(id, Input::Started(epoch)),
             Report::Stalled => self.apply(id, Input::Stalled(epoch)),
@@ -313,6 +319,7 @@ impl Rig {
         let stream = Stream {
             spec: Arc::clone(&modality.spec),
             attachment,
+            attached: modality.attached,
             epoch,
             writer: Arc::clone(&modality.writer),
             numbers: Arc::clone(&modality.numbers),

@@ -16,20 +16,21 @@ use super::slot::End;
 use super::worker::{MOST_SILENT_BEATS, Seat, Worker};
 use crate::bus::Writer;
 use crate::driver::{Driver, DriverError, Reading};
+use crate::provenance::Negotiated;
 use crate::registry::scenario::SimSource;
 use crate::registry::{Attachment, DeviceNode, DeviceSpec, NodeSpec};
 use crate::sample::{Epoch, SampleHeader};
-use crate::status::Board;
-use crate::time::Stamp;
+use crate::status::{Board, Provenance};
+use crate::time::{Stamp, nanoseconds};
 
 /// A device that does not open within this time is tried again.
 const OPEN_LIMIT: Duration = Duration::from_secs(10);
 
 /// What a stream tells the rig while it runs.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub(super) enum Report {
-    /// The node is open; what was agreed with the device.
-    Opened(String),
+    /// The node is open; what was agreed with the device, for people and for the recording.
+    Opened(String, Box<Provenance>),
     /// The first sample was published.
     Started,
     /// Nothing came for `DeviceSpec::stall_after`.
@@ -67,6 +68,8 @@ impl Numbers {
 pub(super) struct Stream {
     pub(super) spec: Arc<DeviceSpec>,
     pub(super) attachment: Attachment,
+    /// When it was attached.
+    pub(super) attached: Stamp,
     pub(super) epoch: Epoch,
     pub(super) writer: Arc<Writer>,
     pub(super) numbers: Arc<Numbers>,
@@ -110,6 +113,14 @@ impl Source {
         }
     }
 
+    fn negotiated(&self) -> Negotiated {
+        match self {
+            Self::Driver(driver) => driver.negotiated(),
+            // What a program agrees with its device, only the program knows.
+            Self::Worker(worker) => Negotiated { card: Some(worker.description()), ..Negotiated::default() },
+        }
+    }
+
     /// A source that is silent for this long is opened anew.
     fn patience(&self, stall_after: Duration) -> Option<Duration> {
         match self {
@@ -142,7 +153,7 @@ impl Stream {
             Ok(Err(error)) => return end(&error),
             Err(_) => return (End::Retry, format!("did not open within {} s", OPEN_LIMIT.as_secs())),
         };
-        self.report(Report::Opened(source.description())).await;
+        self.report(Report::Opened(source.description(), Box::new(self.provenance(&source)))).await;
         let patience = source.patience(self.spec.stall_after);
         let mut pulse = Pulse::Silent;
         let mut refused = false;
@@ -187,6 +198,19 @@ impl Stream {
                     stall.as_mut().reset(Instant::now() + self.spec.stall_after);
                 }
             }
+        }
+    }
+
+    fn provenance(&self, source: &Source) -> Provenance {
+        let mut negotiated = source.negotiated();
+        negotiated.driver = negotiated.driver.or_else(|| self.attachment.driver.as_deref().cloned());
+        Provenance {
+            epoch: self.epoch,
+            node: self.attachment.node.label(),
+            attached: self.attached,
+            usb: self.attachment.usb.clone(),
+            negotiated,
+            latency_ns: nanoseconds(self.spec.latency),
         }
     }
 

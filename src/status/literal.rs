@@ -125,6 +125,7 @@ pub(crate) fn board(names: &[&str]) -> Board {
         max_bytes: 1 << 20,
         depth: 8,
         when_stale: WhenStale::Hold,
+        latency: Duration::ZERO,
         verdict: crate::registry::VerdictSpec::of(
             crate::modality::ModalityKind::Image,
             Duration::from_millis(500),

@@ -22,7 +22,7 @@ use crate::sample::Epoch;
 use crate::time::Stamp;
 
 pub use board::Board;
-pub use event::{Event, What};
+pub use event::{Event, Provenance, What};
 pub use verdict::{Grade, Verdict};
 
 /// What the device of a modality is doing.

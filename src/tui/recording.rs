@@ -73,10 +73,10 @@ fn idle(area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
     }
     // The reasons beside the name as far as there is room; the log has all of them.
     let room = width.saturating_sub(label.width() + word.width());
-    let least = last.file_name().map_or(0, |name| text::width(&name.to_string_lossy()));
+    let name_width = last.file_name().map_or(0, |name| text::width(&name.to_string_lossy()));
     let why = theme.safe(&reasons.join("; "));
-    let room_why = room.saturating_sub(least + 2);
-    let path = file(last, if why.is_empty() { room } else { least.min(room) }, theme);
+    let room_why = room.saturating_sub(name_width + 2);
+    let path = file(last, if why.is_empty() { room } else { name_width.min(room) }, theme);
     let mut line = Line::from(vec![label, word, Span::raw(path)]);
     if !why.is_empty() && room_why > 0 {
         line.push_span(Span::raw("  "));

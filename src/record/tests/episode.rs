@@ -13,6 +13,13 @@ async fn an_episode_holds_what_was_captured_and_nothing_else() {
         unreachable!()
     };
     assert_eq!((file.as_path(), error, seconds), (finished.as_path(), None, 1.0));
+    // The camera was away and the mask says so; what else happened is told.
+    let reasons = ["tof: 1 of 1", "tof: 7 of 1", "raw: 1 of 2 samples damaged (limit 5 %)", "raw: no sample for "];
+    assert_eq!(verdict.grade, Grade::Bad);
+    for reason in reasons {
+        assert!(verdict.reasons.iter().any(|said| said.starts_with(reason)), "{reason:?} in {:?}", verdict.reasons);
+    }
+    assert_eq!(verdict.reasons.len(), reasons.len(), "{:?}", verdict.reasons);
     assert_eq!(bytes, std::fs::metadata(&finished).unwrap().len());
     assert!(!finished.with_extension("mcap.partial").exists());
     let snapshot = bench.board.snapshot();

@@ -16,7 +16,7 @@ pub(super) const BUILT_IN: [(&str, Kind); 2] = [("camera", Kind::Camera), ("seri
 const PLANNED: [&str; 2] = ["can", "lan"];
 /// Keys that only planned kinds of node have.
 const PLANNED_KEYS: [&str; 4] = ["can", "lan", "on_attach", "on_detach"];
-const KEYS: [&str; 16] = [
+const KEYS: [&str; 17] = [
     "vid",
     "pid",
     "serial",
@@ -30,6 +30,7 @@ const KEYS: [&str; 16] = [
     "max_bytes",
     "depth",
     "when_stale",
+    "latency",
     "camera",
     "process",
     "verdict",
@@ -37,6 +38,9 @@ const KEYS: [&str; 16] = [
 
 /// The mask is 64 bits wide.
 const HIGHEST_BIT: i64 = 63;
+
+/// More than any sensor takes; every frame of an episode waits for the longest latency of the rig.
+const LONGEST_LATENCY: Duration = Duration::from_secs(1);
 
 /// How a device is read, without the settings.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -64,6 +68,7 @@ pub(super) struct Draft<'a> {
     /// The depth was written in the file and is not ours to lower.
     pub(super) depth_written: bool,
     when_stale: WhenStale,
+    latency: Duration,
     verdict: VerdictTable,
 }
 
@@ -84,6 +89,7 @@ impl Draft<'_> {
             max_bytes: usize::try_from(self.max_bytes).ok()?,
             depth: usize::try_from(self.depth).ok()?,
             when_stale: self.when_stale,
+            latency: self.latency,
         })
     }
 
@@ -146,6 +152,7 @@ pub(super) fn read<'a>(
     let stall_after = heartbeat
         .or_else(|| section.duration(problems, "stall_after", stall))
         .unwrap_or_else(|| node::default_stall(settings.as_ref()));
+    let latency = section.duration(problems, "latency", Duration::ZERO..=LONGEST_LATENCY).unwrap_or_default();
     let max_bytes = node::max_bytes(&section, settings.as_ref(), problems);
     let written = section.integer(problems, "depth", 2..=4096).and_then(|depth| u64::try_from(depth.value).ok());
     Draft {
@@ -161,6 +168,7 @@ pub(super) fn read<'a>(
         depth: written.unwrap_or_else(|| node::default_depth(settings.as_ref())),
         depth_written: written.is_some(),
         when_stale,
+        latency,
         verdict: verdict::read(&section, Whose::Device, problems),
         node: settings,
         section,

@@ -56,7 +56,7 @@ fn args(table: &Section<'_>, problems: &mut Problems<'_>) -> Vec<String> {
         return Vec::new();
     };
     let mut args = Vec::new();
-    for item in items.iter() {
+    for item in items {
         match item.get_ref() {
             DeValue::String(text) if !text.contains('\0') => args.push(text.clone().into_owned()),
             DeValue::String(_) => {
@@ -64,7 +64,7 @@ fn args(table: &Section<'_>, problems: &mut Problems<'_>) -> Vec<String> {
                 problems.report(item.span().start, &table.entry, message, "leave it out");
             }
             _ => {
-                problems.report(item.span().start, &table.entry, "an argument must be text", "put it in double quotes")
+                problems.report(item.span().start, &table.entry, "an argument must be text", "put it in double quotes");
             }
         }
     }

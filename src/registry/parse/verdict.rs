@@ -10,7 +10,6 @@
 use std::time::Duration;
 
 use crate::modality::ModalityKind;
-use crate::registry::diagnostic::did_you_mean;
 use crate::registry::limits::{Limits, VerdictSpec};
 use crate::registry::section::{Problems, Section};
 
@@ -37,11 +36,14 @@ enum Worse {
     Less,
 }
 
-/// The limits of one grade as they were written: `Some(None)` is "off".
+/// A limit as it was written; `None` is "off".
+type Given<T> = Option<T>;
+
+/// The limits of one grade as they were written, as far as they were.
 #[derive(Debug, Default, Clone, Copy)]
 struct Written {
-    shares: [Option<Option<f64>>; SHARES.len()],
-    times: [Option<Option<Duration>>; TIMES.len()],
+    shares: [Option<Given<f64>>; SHARES.len()],
+    times: [Option<Given<Duration>>; TIMES.len()],
 }
 
 /// A verdict table as it was written.
@@ -93,7 +95,7 @@ fn limits(section: &Section<'_>, problems: &mut Problems<'_>) -> Written {
         *share = read_share(section, key, problems);
     }
     for ((key, _), time) in TIMES.iter().zip(&mut written.times) {
-        *time = match section.text_if(key) {
+        *time = match text(section, key) {
             Some("off") => Some(None),
             _ => section.duration(problems, key, Duration::from_millis(1)..=Duration::from_hours(1)).map(Some),
         };
@@ -101,33 +103,32 @@ fn limits(section: &Section<'_>, problems: &mut Problems<'_>) -> Written {
     written
 }
 
+/// The text of `key`, if it is one.
+fn text<'a>(section: &Section<'a>, key: &str) -> Option<&'a str> {
+    section.fields().into_iter().find(|(_, name, _)| *name == key)?.2.get_ref().as_str()
+}
+
 /// `"0.1%"`, `"0.1 %"`, or `"off"`.
-fn read_share(section: &Section<'_>, key: &str, problems: &mut Problems<'_>) -> Option<Option<f64>> {
-    let fix = format!("write 0% to 100%, or \"off\", for example {key} = \"0.5%\"");
+fn read_share(section: &Section<'_>, key: &str, problems: &mut Problems<'_>) -> Option<Given<f64>> {
+    let usual = if key == "rate" { "90%" } else { "0.5%" };
+    let fix = format!("write 0% to 100%, or \"off\", for example {key} = \"{usual}\"");
     if !section.has(key) {
         return None;
     }
-    let Some(text) = section.text_if(key) else {
+    let Some(written) = text(section, key) else {
         section.report(problems, key, format!("{key} is not a share in percent"), fix);
         return None;
     };
-    if text == "off" {
+    if written == "off" {
         return Some(None);
     }
-    let number = text.strip_suffix('%').map(str::trim);
-    let plain = |number: &&str| number.bytes().all(|byte| byte.is_ascii_digit() || byte == b'.');
-    let percent: Option<f64> = number.filter(plain).and_then(|number| number.parse().ok());
+    let number = written.strip_suffix('%').map(str::trim);
+    let is_plain = |number: &&str| number.bytes().all(|byte| byte.is_ascii_digit() || byte == b'.');
+    let percent: Option<f64> = number.filter(is_plain).and_then(|number| number.parse().ok());
     match percent {
         Some(percent) if (0.0..=100.0).contains(&percent) => return Some(Some(percent / 100.0)),
-        Some(_) => section.report(problems, key, format!("{key} = {text:?} is out of range"), fix),
-        None => {
-            let fix = if did_you_mean(text, &["off"], "").contains("off") && !text.is_empty() && number.is_none() {
-                format!("write \"off\" to switch the check off, or a share, for example {key} = \"0.5%\"")
-            } else {
-                fix
-            };
-            section.report(problems, key, format!("{key} = {text:?} is not a share in percent"), fix);
-        }
+        Some(_) => section.report(problems, key, format!("{key} = {written:?} is out of range"), fix),
+        None => section.report(problems, key, format!("{key} = {written:?} is not a share in percent"), fix),
     }
     None
 }
@@ -199,8 +200,8 @@ pub(super) fn spec(
 fn change<T: PartialOrd + Copy>(
     suspect: &mut Option<T>,
     bad: &mut Option<T>,
-    new_suspect: Option<Option<T>>,
-    new_bad: Option<Option<T>>,
+    new_suspect: Option<Given<T>>,
+    new_bad: Option<Given<T>>,
     whose: Whose,
     worse: Worse,
 ) {

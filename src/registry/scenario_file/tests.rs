@@ -102,6 +102,31 @@ fn two_units_of_one_model_without_serial_numbers_can_be_told() {
 }
 
 #[test]
+fn faults_are_those_of_the_device_above() {
+    let scenario = parse(
+        r#"
+        [[device]]
+        name = "cam_wrist"
+        [device.fault]
+        freeze_at = "3s"
+        truncate_every = 10
+        clock_ppm = -20
+        [[device]]
+        name = "motor_state"
+        "#,
+    )
+    .unwrap();
+    let expected = SimFaults {
+        freeze_at: Some(Duration::from_secs(3)),
+        truncate_every: Some(10),
+        clock_ppm: -20,
+        ..SimFaults::default()
+    };
+    assert_eq!(scenario.devices[0].faults, expected);
+    assert_eq!(scenario.devices[1].faults, SimFaults::default());
+}
+
+#[test]
 fn mistakes_are_placed_and_all_told() {
     for (text, expected) in [
         (
@@ -143,6 +168,12 @@ fn mistakes_are_placed_and_all_told() {
             "[device]\nname = \"cam_wrist\"\nspeed = 1\n",
             "scenario:1:1: device must be a list of tables, but is a table\n    \
              fix: write [[device]] with two brackets",
+        ),
+        (
+            "[[device]]\nname = \"cam_wrist\"\n[device.fault]\nfreeze = \"1s\"\nlose_every = 1\n",
+            "scenario:4:1: [device 1.fault] unknown key \"freeze\"\n    fix: did you mean \"freeze_at\"?\n\
+             scenario:5:14: [device 1.fault] lose_every = 1 is out of range\n    \
+             fix: write a whole number from 2 to 1000000, without quotes",
         ),
     ] {
         assert_eq!(parse(text).unwrap_err(), expected);

@@ -13,14 +13,34 @@ use thread_priority::unix::{
 };
 use thread_priority::{ThreadPriority, ThreadPriorityValue};
 
+use crate::child::thread_cpu_s;
+
 /// The priority of `rapid`'s mask thread.
 const FIFO_PRIORITY: u8 = 40;
+
+/// What a beat was like.
+#[derive(Debug, Default)]
+pub(crate) struct Beaten {
+    /// `CLOCK_REALTIME` of every beat, ns.
+    stamps: Vec<u64>,
+    /// It ran under `SCHED_FIFO`.
+    pub(crate) fifo: bool,
+    /// Share of a core it took, %.
+    pub(crate) cpu: f64,
+}
+
+impl Beaten {
+    /// From one beat to the next, ms.
+    pub(crate) fn intervals(&self) -> impl Iterator<Item = f64> {
+        self.stamps.windows(2).map(|pair| pair[1].saturating_sub(pair[0]) as f64 / 1e6)
+    }
+}
 
 /// A running beat.
 #[derive(Debug)]
 pub(crate) struct Beat {
     stop: Arc<AtomicBool>,
-    thread: JoinHandle<(Vec<u64>, bool)>,
+    thread: JoinHandle<Beaten>,
 }
 
 impl Beat {
@@ -32,23 +52,24 @@ impl Beat {
             move || {
                 let fifo = use_fifo();
                 let mut stamps = Vec::with_capacity(1 << 16);
-                let mut due = Stamp::now();
+                let (begun, cpu) = (Stamp::now(), thread_cpu_s());
+                let mut due = begun;
                 while !stop.load(Ordering::Relaxed) {
                     due = due.after(PERIOD);
                     sleep_until(due);
                     stamps.push(realtime_ns());
                 }
-                (stamps, fifo)
+                let cpu = 100.0 * (thread_cpu_s() - cpu) / Stamp::now().since(begun).as_secs_f64().max(0.001);
+                Beaten { stamps, fifo, cpu }
             }
         });
         Self { stop, thread }
     }
 
-    /// Ends it: intervals in ms, and whether it ran under `SCHED_FIFO`.
-    pub(crate) fn end(self) -> (Vec<f64>, bool) {
+    /// Ends it.
+    pub(crate) fn end(self) -> Beaten {
         self.stop.store(true, Ordering::Relaxed);
-        let (stamps, fifo) = self.thread.join().unwrap_or_default();
-        (stamps.windows(2).map(|pair| (pair[1].saturating_sub(pair[0])) as f64 / 1e6).collect(), fifo)
+        self.thread.join().unwrap_or_default()
     }
 }
 

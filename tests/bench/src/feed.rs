@@ -65,7 +65,9 @@ impl Feed {
             let (encoding, hz, width, height) = match device.source {
                 SimSource::Camera { width, height, fps, .. } => (Encoding::Mjpeg, fps, width, height),
                 SimSource::Serial { channels, hz, .. } => (Encoding::F64, hz, u32::try_from(channels)?, 0),
-                SimSource::Replay { .. } => return Err("the load replays nothing".into()),
+                SimSource::Replay { .. } | SimSource::Process => {
+                    return Err("the load is made of cameras and serial lines".into());
+                }
             };
             let payloads: Vec<Vec<u8>> =
                 (0..PAYLOADS).filter_map(|number| sim::frame(&device.source, number)).collect();

@@ -31,6 +31,8 @@ pub(crate) struct Seen {
     unseen: u64,
     baseline: Sorted,
     baseline_fifo: bool,
+    /// Share of a core that the bare thread took, %.
+    pub(crate) baseline_cpu: f64,
     /// The mask's thread runs under FIFO.
     fifo: bool,
 }
@@ -72,9 +74,10 @@ impl Watch {
         self.stop.store(true, Ordering::Relaxed);
         let numbered = self.reader.join().unwrap_or_default();
         let (intervals, unseen) = steps(&numbered);
-        let (baseline, baseline_fifo) = self.beat.end();
         let intervals = Sorted::new(intervals.into_iter().map(|ns| ns as f64 / 1e6));
-        Seen { intervals, unseen, baseline: Sorted::new(baseline), baseline_fifo, fifo: false }
+        let beaten = self.beat.end();
+        let baseline = Sorted::new(beaten.intervals());
+        Seen { intervals, unseen, baseline, baseline_fifo: beaten.fifo, baseline_cpu: beaten.cpu, fifo: false }
     }
 }
 

@@ -196,7 +196,10 @@ pub fn strings(bytes: &[u8]) {
     let device = |serial: &str| Attachment {
         syspath: PathBuf::from("/sys/devices/1-1/1-1:1.0/video4linux/video0"),
         node: DeviceNode::Video(PathBuf::from("/dev/video0")),
+        driver: None,
         usb: UsbIdentity {
+            firmware: None,
+            manufacturer: None,
             vid: 1,
             pid: 1,
             serial: Some(serial.to_owned()),

@@ -8,6 +8,7 @@
 
 pub mod check;
 pub mod clock;
+pub mod deaf;
 pub mod emu;
 pub mod entries;
 pub mod figure;

@@ -104,7 +104,7 @@ fn listing(outcome: &Outcome) {
         assert!(!text.contains(moves), "{name} moves the cursor: {text:?}");
     }
     let objects: Vec<serde_json::Value> =
-        outcome.file("devices.jsonl").lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+        outcome.file("devices.jsonl").lines().map(|line| serde_json::from_str(line).expect("JSON")).collect();
     for (serial, entry) in [(GLOBS, "globs"), (RULE, "rule"), (LINES, "lines"), (FOREIGN, "foreign")] {
         let object = objects.iter().find(|object| object["serial"] == serial);
         let object = object.unwrap_or_else(|| panic!("{serial:?} not in {objects:?}"));
@@ -160,13 +160,13 @@ fn recorded(outcome: &Outcome) {
         println!("{topic}: {count} samples of {entry:?}");
         assert!(count > 10, "{topic}: {count} samples in 5 s");
     }
-    let bytes = std::fs::read(&episode.path).unwrap();
-    let summary = mcap::Summary::read(&bytes).unwrap().expect("a finished file has a summary");
+    let bytes = std::fs::read(&episode.path).expect("the episode");
+    let summary = mcap::Summary::read(&bytes).expect("an index").expect("a finished file has a summary");
     let metadata: Vec<_> =
-        summary.metadata_indexes.iter().map(|index| mcap::read::metadata(&bytes, index).unwrap()).collect();
+        summary.metadata_indexes.iter().map(|index| mcap::read::metadata(&bytes, index).expect("metadata")).collect();
     let serials =
         metadata.iter().rev().find_map(|record| record.metadata.get("serials")).expect("serials are recorded");
-    let serials: serde_json::Value = serde_json::from_str(serials).unwrap();
+    let serials: serde_json::Value = serde_json::from_str(serials).expect("JSON");
     for (entry, serial) in [("globs", GLOBS), ("rule", RULE), ("lines", LINES), ("foreign", FOREIGN)] {
         assert_eq!(serials[entry], serial, "{serials}");
     }

@@ -177,7 +177,7 @@ fn stranger(outcome: &Outcome) {
     let mask: serde_json::Value = serde_json::from_str(&outcome.file("mask.json")).expect("the mask");
     assert_eq!(mask["stale"], false, "{mask}");
     for (file, words) in [
-        ("bus", "belongs to another user (uid "),
+        ("bus", "/tmp/iceoryx2: belongs to user "),
         ("second", "another rapid (pid "),
         ("foreign", "another user's rapid left it behind; remove it: rm "),
     ] {

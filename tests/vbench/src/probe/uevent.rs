@@ -91,7 +91,7 @@ impl Listener {
     }
 
     /// Waits for the next message, with the moment it came.
-    pub fn next(&mut self) -> Result<(Uevent, Moment), Errno> {
+    pub fn receive(&mut self) -> Result<(Uevent, Moment), Errno> {
         loop {
             let (length, _) = recv(&self.socket, &mut self.room[..], RecvFlags::empty())?;
             let moment = Moment::now();
@@ -106,7 +106,7 @@ impl Listener {
 pub fn watch(log: &Log) -> Result<(), Errno> {
     let mut listener = Listener::open()?;
     loop {
-        let (event, moment) = listener.next()?;
+        let (event, moment) = listener.receive()?;
         if matches!(event.get("SUBSYSTEM"), "usb" | "video4linux" | "tty") {
             log.say("uevent", moment, event.describe());
         }

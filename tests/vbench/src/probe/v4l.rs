@@ -97,7 +97,7 @@ pub fn first_frames(log: &Log) -> Result<(), ReadError> {
     let heard = |error| ReadError::Call("recv from udev", error);
     let mut listener = Listener::open().map_err(heard)?;
     loop {
-        let (event, told) = listener.next().map_err(heard)?;
+        let (event, told) = listener.receive().map_err(heard)?;
         let Some(node) = event.camera_added() else { continue };
         match first_frame(Path::new(&node)) {
             Ok((streaming, came)) => {
