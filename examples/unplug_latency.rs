@@ -2,7 +2,7 @@
 //! the bytes in the mask's file, over simulated unplugs. What the kernel takes before that is measured
 //! on the virtual bench.
 //!
-//! `cargo run --release --example unplug_latency [UNPLUGS]`
+//! `cargo run --release --example unplug_latency [UNPLUGS] [--json]`
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -50,7 +50,13 @@ impl Stream for Tap {
 }
 
 fn main() -> Result<(), Failure> {
-    let unplugs: usize = std::env::args().nth(1).map_or(Ok(200), |number| number.parse())?;
+    let (flags, numbers): (Vec<String>, Vec<String>) = std::env::args().skip(1).partition(|word| word.starts_with('-'));
+    let json = match &flags[..] {
+        [] => false,
+        [flag] if flag == "--json" => true,
+        _ => return Err("usage: unplug_latency [UNPLUGS] [--json]".into()),
+    };
+    let unplugs: usize = numbers.first().map_or(Ok(200), |number| number.parse())?;
     let mut registry = Registry::builtin();
     registry.rig.cooldown = Duration::ZERO;
     let mut scenario = Scenario::demo(&registry);
@@ -108,6 +114,18 @@ fn main() -> Result<(), Failure> {
     runtime.block_on(running)??;
     taken.sort_unstable();
     let at = |percent: usize| taken.get((taken.len() - 1) * percent / 100).copied().unwrap_or_default();
+    if json {
+        let note = format!("first witness received -> bytes in the mask's file, {} simulated unplugs", taken.len());
+        for (name, percent) in [("p50", 50), ("p99", 99), ("max", 100)] {
+            let micros = at(percent).as_secs_f64() * 1e6;
+            let figure = serde_json::json!({
+                "name": format!("own_unplug_to_bit_{name}"), "unit": "us", "value": (micros * 10.0).round() / 10.0,
+                "baseline": null, "target": null, "note": note,
+            });
+            writeln!(std::io::stdout(), "{figure}")?;
+        }
+        return Ok(());
+    }
     writeln!(
         std::io::stdout(),
         "witness -> mask file over {} unplugs ({skipped} more were seen by the stream first): p50 {:?}  p99 {:?}  max {:?}",

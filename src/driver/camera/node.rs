@@ -94,16 +94,27 @@ impl Node {
         self.capability().is_err_and(|error| is_gone(&error))
     }
 
-    /// Sets format and rate as wished and reads back what the driver made of them.
+    /// Sets format and rate as wished and reads back what the driver made of them. What is as wished
+    /// already is left alone: to set it again costs a USB camera half a dozen control transfers, and
+    /// all of them lie between a replug and its first picture.
     pub(super) fn negotiate(&self, spec: &CameraSpec) -> io::Result<Agreed> {
-        let mut wished = v4l2_format { type_: CAPTURE, ..v4l2_format::zeroed() };
-        wished.fmt.pix.width = spec.width;
-        wished.fmt.pix.height = spec.height;
-        wished.fmt.pix.pixelformat = u32::from_le_bytes(fourcc(spec.format));
-        wished.fmt.pix.field = v4l2_field_V4L2_FIELD_NONE;
-        self.ioctl(vidioc::VIDIOC_S_FMT, &mut wished)?;
-        // SAFETY: for the capture type the driver fills `pix`, and any bits are valid integers.
-        let pix = unsafe { wished.fmt.pix };
+        let code = u32::from_le_bytes(fourcc(spec.format));
+        let mut format = v4l2_format { type_: CAPTURE, ..v4l2_format::zeroed() };
+        let current = self.ioctl(vidioc::VIDIOC_G_FMT, &mut format).is_ok() && {
+            // SAFETY: for the capture type the driver fills `pix`, and any bits are valid integers.
+            let pix = unsafe { format.fmt.pix };
+            (pix.width, pix.height, pix.pixelformat) == (spec.width, spec.height, code)
+        };
+        if !current {
+            format = v4l2_format { type_: CAPTURE, ..v4l2_format::zeroed() };
+            format.fmt.pix.width = spec.width;
+            format.fmt.pix.height = spec.height;
+            format.fmt.pix.pixelformat = code;
+            format.fmt.pix.field = v4l2_field_V4L2_FIELD_NONE;
+            self.ioctl(vidioc::VIDIOC_S_FMT, &mut format)?;
+        }
+        // SAFETY: as above.
+        let pix = unsafe { format.fmt.pix };
         Ok(Agreed {
             fourcc: pix.pixelformat.to_le_bytes(),
             width: pix.width,
@@ -122,6 +133,11 @@ impl Node {
         // SAFETY: for the capture type the driver fills `capture`, and any bits are valid integers.
         if unsafe { parameters.parm.capture.capability } & V4L2_CAP_TIMEPERFRAME == 0 {
             return Ok(None);
+        }
+        // SAFETY: as above.
+        let interval = unsafe { parameters.parm.capture.timeperframe };
+        if interval.numerator > 0 && u64::from(interval.numerator) * u64::from(fps) == u64::from(interval.denominator) {
+            return Ok(Some(Rate::of_interval(interval.numerator, interval.denominator)));
         }
         parameters.parm.capture.timeperframe.numerator = 1;
         parameters.parm.capture.timeperframe.denominator = fps;

@@ -30,13 +30,15 @@ pub fn episode(outcome: &Outcome) -> Recording {
     outcome.episode().unwrap_or_else(|error| panic!("{error}"))
 }
 
-/// Frames in this span are there, whole, and without a hole in their numbers.
+/// Frames in this span are there, whole, and each number once, without a hole. `uvcvideo` copies pictures on several threads and
+/// on a busy machine hands out two of them in the other order; what counts is that none is missing.
 pub fn assert_whole(episode: &Recording, topic: &str, span: impl RangeBounds<u64> + Clone) {
     let frames = episode.frames(topic);
     let damaged =
         frames.iter().filter(|frame| span.contains(&frame.log_time)).filter(|frame| frame.id.is_none() || !frame.whole);
     assert_eq!(damaged.count(), 0, "{topic}: damaged frames");
-    let numbers = episode.numbers(topic, span);
+    let mut numbers = episode.numbers(topic, span);
+    numbers.sort_unstable();
     println!("{topic}: {} frames", numbers.len());
     assert!(numbers.len() > 10, "{topic}: only {} frames", numbers.len());
     assert_eq!(holes(numbers), [], "{topic}: a hole in the frame numbers");

@@ -18,6 +18,8 @@ program=("${rapid[@]}")
 # be USER: from here on rapid is run by this user, in the user's groups, without any capability.
 be() { rapid=(env HOME=/tmp setpriv --reuid="$1" --regid="$1" --init-groups --inh-caps=-all --bounding-set=-all "${program[@]}"); }
 mine() { mkdir -p $out/$1; chown $1: $out/$1; }
+# The bus is one user's; what it leaves is in the next one's way.
+bus_gone() { rm -rf /tmp/iceoryx2 /dev/shm/iox2_*; }
 linked() { [ -e /dev/rapid/cam_wrist ] && [ -e /dev/rapid/tof ]; }
 kept() { cp $out/rapid.jsonl $out/$1.jsonl; cp $out/rapid.log $out/$1.log; cp $out/rapid.rc $out/$1.rc; }
 
@@ -57,10 +59,15 @@ echo $? >$out/second.rc
 rapid_wait
 kept keeper
 
-# A user of none of these groups.
+# A user of none of these groups, first while the bus is the other user's.
+"${rapid[@]}" --headless --duration 1s --config $config >$out/bus.txt 2>&1
+echo $? >$out/bus.rc
+bus_gone
 rapid_start --headless --duration 3s --config $config --json
 rapid_wait
 kept stranger
+
+bus_gone
 
 # What root's rapid left behind when it was killed is not this user's to remove.
 rapid=("${program[@]}")
@@ -72,6 +79,7 @@ be keeper
 "${rapid[@]}" --headless --duration 1s --config $config >$out/foreign.txt 2>&1
 echo $? >$out/foreign.rc
 rm -f /dev/shm/rapid_hardware_mask*
+bus_gone
 
 # The unit, as far as there is no systemd here: its user, groups, limits, read-only system, command line and stop signal.
 unit=/etc/systemd/system/rapid.service
@@ -168,9 +176,11 @@ fn ordinary_user(outcome: &Outcome) {
 fn stranger(outcome: &Outcome) {
     let mask: serde_json::Value = serde_json::from_str(&outcome.file("mask.json")).expect("the mask");
     assert_eq!(mask["stale"], false, "{mask}");
-    for (file, words) in
-        [("second", "another rapid (pid "), ("foreign", "left behind by another user's rapid; remove it: rm ")]
-    {
+    for (file, words) in [
+        ("bus", "/tmp/iceoryx2: belongs to user "),
+        ("second", "another rapid (pid "),
+        ("foreign", "another user's rapid left it behind; remove it: rm "),
+    ] {
         let text = outcome.file(&format!("{file}.txt"));
         println!("{text}");
         assert_eq!(outcome.file(&format!("{file}.rc")).trim(), "1", "{text}");
