@@ -18,6 +18,7 @@ use crate::mask::PhysicalMask;
 use crate::modality::{MAX_MODALITIES, ModalityId, ModalityKind};
 use crate::registry::{Registry, VerdictSpec};
 use crate::status::{Grade, Verdict};
+use crate::time::nanoseconds;
 
 /// No registry is longer; the text of a hostile file may be.
 const LONGEST_REGISTRY: usize = 1 << 20;
@@ -51,8 +52,10 @@ impl Judge {
         let number = |key: &str| about.get(key)?.parse::<u64>().ok();
         let begin_ns = number("begin_wall_ns")?;
         let hz = about.get("observation_hz")?.parse().ok()?;
-        let wait = Duration::from_nanos(number("sync_window_ns")?).saturating_add(SETTLE);
         let modalities = registered(about).or_else(|| listed(about))?;
+        let latency = Duration::from_nanos(modalities.iter().map(|measured| measured.latency_ns).max().unwrap_or(0));
+        let window = Duration::from_nanos(number("sync_window_ns")?);
+        let wait = window.saturating_add(SETTLE).saturating_add(latency);
         let mut limits = vec![None; MAX_MODALITIES];
         for measured in &modalities {
             if let Some(place) = limits.get_mut(measured.id.index()) {
@@ -182,8 +185,8 @@ fn registered(about: &BTreeMap<String, String>) -> Option<Vec<Measured>> {
     let measured = registry.devices.iter().map(|device| Measured {
         id: device.id,
         limits: device.verdict,
+        latency_ns: nanoseconds(device.latency),
         max_bytes: 0,
-        latency_ns: crate::time::nanoseconds(device.latency),
     });
     Some(measured.collect())
 }
@@ -194,7 +197,9 @@ fn listed(about: &BTreeMap<String, String>) -> Option<Vec<Measured>> {
     let measured = |entry: &Value| {
         let id = ModalityId::new(u8::try_from(entry.get("bit")?.as_u64()?).ok()?)?;
         let kind: ModalityKind = serde_json::from_value(entry.get("kind")?.clone()).ok()?;
-        Some(Measured { id, limits: VerdictSpec::of(kind, STALL_AFTER, None), max_bytes: 0, latency_ns: 0 })
+        // Files of earlier versions have no latencies.
+        let latency_ns = entry.get("latency_ns").and_then(Value::as_u64).unwrap_or(0);
+        Some(Measured { id, limits: VerdictSpec::of(kind, STALL_AFTER, None), latency_ns, max_bytes: 0 })
     };
     Some(list.iter().filter_map(measured).collect())
 }

@@ -1,0 +1,112 @@
+//! The pictures of a simulated camera: made once, stamped with their number when they are sent.
+
+use jpeg_encoder::{ColorType, Encoder};
+
+use super::super::DriverError;
+
+/// Different pictures a simulated camera has.
+pub(super) const PICTURES: u32 = 8;
+const JPEG_QUALITY: u8 = 80;
+
+/// Pictures encoded once, when the device is opened.
+#[derive(Debug)]
+pub(super) struct Pictures {
+    pub(super) width: u32,
+    pub(super) height: u32,
+    seed: u64,
+    encoded: Vec<Vec<u8>>,
+}
+
+impl Pictures {
+    pub(super) fn new(width: u32, height: u32, seed: u64, bytes: usize) -> Result<Self, DriverError> {
+        let picture = |index| Ok(fill(encode(width, height, seed, index)?, bytes, seed, index));
+        let encoded = (0..PICTURES).map(picture).collect::<Result<_, DriverError>>()?;
+        Ok(Self { width, height, seed, encoded })
+    }
+
+    pub(super) fn largest(&self) -> usize {
+        // 64 bytes hold the comment at its longest.
+        self.encoded.iter().map(Vec::len).max().unwrap_or(0) + 64
+    }
+
+    pub(super) fn write(&self, sequence: u32, payload: &mut Vec<u8>) {
+        let picture = self.encoded.get((sequence % PICTURES) as usize).map_or(&[][..], Vec::as_slice);
+        write_picture(picture, self.seed, sequence, payload);
+    }
+}
+
+/// The picture with a comment segment after its start of image (JPEG, ITU-T T.81 B.2.4.5: marker
+/// FFFE, length of what follows it as big-endian u16 with its own two bytes).
+pub(super) fn write_picture(picture: &[u8], seed: u64, sequence: u32, payload: &mut Vec<u8>) {
+    use std::io::Write as _;
+    let (start, rest) = picture.split_at(picture.len().min(2));
+    payload.clear();
+    payload.extend_from_slice(start);
+    payload.extend_from_slice(&[0xff, 0xfe, 0, 0]);
+    let at = payload.len();
+    // A Vec takes every write.
+    let _ = write!(payload, "rapid-sim {seed} {sequence}");
+    let length = u16::try_from(payload.len() - at + 2).unwrap_or(u16::MAX).to_be_bytes();
+    if let Some(place) = payload.get_mut(at - 2..at) {
+        place.copy_from_slice(&length);
+    }
+    payload.extend_from_slice(rest);
+}
+
+/// The picture with comment segments after its start of image that bring it to `bytes` at least, filled with
+/// noise that does not compress, as the coefficients of a real scene do not.
+pub(super) fn fill(picture: Vec<u8>, bytes: usize, seed: u64, index: u32) -> Vec<u8> {
+    // Marker and length beside this many bytes of content.
+    const SEGMENT: usize = 65_533;
+    if picture.len() >= bytes {
+        return picture;
+    }
+    let (start, rest) = picture.split_at(picture.len().min(2));
+    let mut filled = Vec::with_capacity(bytes + SEGMENT);
+    filled.extend_from_slice(start);
+    // xorshift64 (Marsaglia 2003), which needs a seed that is not zero.
+    let mut state = seed.wrapping_mul(u64::from(PICTURES)).wrapping_add(u64::from(index)) | 1 << 63;
+    while filled.len() + rest.len() < bytes {
+        let content = (bytes - filled.len() - rest.len()).saturating_sub(4).clamp(1, SEGMENT);
+        let length = u16::try_from(content + 2).unwrap_or(u16::MAX);
+        filled.extend_from_slice(&[0xff, 0xfe]);
+        filled.extend_from_slice(&length.to_be_bytes());
+        filled.extend((0..content).map(|_| {
+            state ^= state << 13;
+            state ^= state >> 7;
+            state ^= state << 17;
+            state.to_le_bytes()[0]
+        }));
+    }
+    filled.extend_from_slice(rest);
+    filled
+}
+
+/// A gradient tinted by the seed, with a bright square that moves from picture to picture.
+pub(super) fn encode(width: u32, height: u32, seed: u64, index: u32) -> Result<Vec<u8>, DriverError> {
+    let unmade = || DriverError::Fatal(format!("a simulated picture cannot be {width}x{height}: use 1..=8192 pixels"));
+    let (Ok(narrow_width), Ok(narrow_height)) = (u16::try_from(width), u16::try_from(height)) else {
+        return Err(unmade());
+    };
+    if !(1..=8192).contains(&width) || !(1..=8192).contains(&height) {
+        return Err(unmade());
+    }
+    let side = (width.min(height) / 4).max(1);
+    let left = (width - side.min(width)) * index / PICTURES;
+    let top = height / 3;
+    let tint = seed.to_le_bytes()[0];
+    let mut pixels = Vec::with_capacity((width * height * 3) as usize);
+    for y in 0..height {
+        let down = (y * 255 / height).to_le_bytes()[0];
+        for x in 0..width {
+            let inside = (left..left + side).contains(&x) && (top..top + side).contains(&y);
+            let across = (x * 255 / width).to_le_bytes()[0];
+            pixels.extend_from_slice(&if inside { [255, 240, 32] } else { [across, down, tint] });
+        }
+    }
+    let mut encoded = Vec::new();
+    Encoder::new(&mut encoded, JPEG_QUALITY)
+        .encode(&pixels, narrow_width, narrow_height, ColorType::Rgb)
+        .map_err(|_| unmade())?;
+    Ok(encoded)
+}
