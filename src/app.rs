@@ -1,7 +1,7 @@
 //! The program: puts the stages together, runs them, and takes them down in order.
 //!
-//! Taking down: the episode ends and streams stop, the recorder finishes its file, the mask says 0
-//! and its files go, the screen says what was recorded and gives the terminal back.
+//! Taking down: the episode ends and streams stop, the recorder finishes its file, the programs of
+//! devices are waited for, the mask says 0 and its files go, the screen says what was recorded and gives the terminal back.
 //!
 //! Invariant: only this module sees every stage.
 //! Invariant: whatever ends the run, an episode in progress is finished first.
@@ -168,6 +168,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     let (rig_commands, rig_asked) = mpsc::channel(16);
     let mut rig = Rig::new(&registry, &bus, presence, Arc::clone(&board));
     let rig_ended = CancellationToken::new();
+    let hurry = rig.hurry();
     let rig = tokio::spawn({
         let (stop, ended) = (rig_stop.clone(), rig_ended.clone().drop_guard());
         async move {
@@ -194,7 +195,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
         duration: options.duration,
         recording: false,
     };
-    let mut running = Running { rig, rig_ended, rig_stop, screen, screen_stop, signals, asked };
+    let mut running = Running { rig, rig_ended, rig_stop, hurry, screen, screen_stop, signals, asked };
     let outcome = conductor.conduct(&mut running).await;
     finish(running, conductor, outcome).await
 }
@@ -231,6 +232,7 @@ struct Running {
     rig: JoinHandle<(Rig, Result<(), RigError>)>,
     rig_ended: CancellationToken,
     rig_stop: CancellationToken,
+    hurry: CancellationToken,
     screen: ScreenTask,
     screen_stop: CancellationToken,
     signals: Signals,
@@ -254,6 +256,9 @@ async fn finish(
             None
         };
         keep_first(&mut outcome, conductor.finish_episode().await);
+        if let Some(rig) = &rig {
+            rig.programs_ended().await;
+        }
         // Dropping joins threads: the writer's, which has nothing left to write, and the mask's.
         let dropped = tokio::task::spawn_blocking(move || {
             drop(conductor);
@@ -269,6 +274,7 @@ async fn finish(
     };
     if twice {
         // The recorder's finish is the one thing that is never skipped.
+        running.hurry.cancel();
         take_down.as_mut().await;
     }
     drop(take_down);

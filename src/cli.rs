@@ -152,11 +152,14 @@ pub enum Command {
         #[arg(long)]
         watch: bool,
     },
-    /// Tells what an episode holds: messages, rates, gaps, lateness, presence over time
+    /// Tells what an episode holds: its verdict, messages, rates, gaps, lateness, presence over time
+    #[command(after_help = "Of one file a report; of a folder or of several files one line each, GOOD, SUSPECT or \
+        BAD.\n\nExamples:\n  rapid inspect episodes/20260101_place-block_001.mcap\n  rapid inspect episodes\n  \
+        rapid inspect --json episodes | jq -r 'select(.verdict == \"GOOD\") | .file'")]
     Inspect {
-        /// Episode, finished or .partial
-        #[arg(value_hint = ValueHint::FilePath)]
-        file: PathBuf,
+        /// Episodes, finished or .partial, or folders of them
+        #[arg(value_hint = ValueHint::AnyPath, value_name = "FILE|DIR", required = true)]
+        paths: Vec<PathBuf>,
     },
     /// Makes whole episodes of those that were not finished: after a kill, a loss of power, a full disk
     #[command(after_help = RECOVER)]

@@ -15,18 +15,22 @@ use tokio_util::sync::CancellationToken;
 use crate::app::{self, AppError, Devices, Options, Screen, mask_path};
 use crate::cli::{Cli, Command, Global, RunArgs, SimArgs};
 use crate::commands::devices::{Entries, Formats};
+use crate::commands::inspect::InspectFailure;
 use crate::commands::{self, Format, Outcome, mask::MaskOptions};
 use crate::driver::{DriverError, replay};
 use crate::headless::style::{ColourChoice, Palette, Terminal};
 use crate::hotplug::udev;
 use crate::record::inspect::{self, InspectError};
-use crate::record::{EpisodeRequest, RecordError};
+use crate::record::{self, EpisodeRequest, RecordError};
 use crate::registry::scenario::Scenario;
 use crate::registry::{Registry, RegistryErrors};
 use crate::rig::presence::{PresenceError, json_path, read_mask};
+use crate::text;
 
 /// Tasks that are left at the end have this long to go.
 const LAST_TASKS: Duration = Duration::from_millis(500);
+/// The mask's JSON file holds 64 devices at most; anything larger is not it.
+const LARGEST_JSON: u64 = 1 << 20;
 
 /// Why a command ended without having done what it was asked.
 #[derive(Debug, thiserror::Error)]
@@ -68,6 +72,15 @@ enum Failure {
     Output(#[from] io::Error),
 }
 
+impl From<InspectFailure> for Failure {
+    fn from(failure: InspectFailure) -> Self {
+        match failure {
+            InspectFailure::Episode(error) => Self::Inspect(error),
+            InspectFailure::Output(error) => Self::Output(error),
+        }
+    }
+}
+
 impl Failure {
     /// Exit codes: 1 failed while running, 2 bad configuration or arguments, 130 interrupted twice.
     fn code(&self) -> u8 {
@@ -104,7 +117,9 @@ pub fn dispatch(cli: Cli) -> ExitCode {
         // Whoever read the output has read enough of it.
         Err(Failure::Output(error)) if error.kind() == io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
         Err(failure) => {
-            let text = failure.to_string();
+            // Paths and what a library says of a file are text of strangers.
+            let text: Vec<_> = failure.to_string().lines().map(|line| text::plain(line).into_owned()).collect();
+            let text = text.join("\n");
             if !text.is_empty() {
                 let _ = writeln!(io::stderr(), "{} {text}", stderr_palette().bad("error:"));
             }
@@ -143,14 +158,10 @@ fn print(global: &Global, before: SimArgs, command: Command) -> Result<(), Failu
             Ok(commands::artifacts::write(&registry, &to, out)?)
         }
         Command::Mask { watch } => mask(global, watch),
-        Command::Inspect { file } => {
-            let inspection = inspect::inspect(&file)?;
-            if format == Format::Json {
-                serde_json::to_writer(&mut *out, &inspection).map_err(io::Error::from)?;
-                return Ok(writeln!(out)?);
-            }
-            Ok(out.write_all(inspect::render(&inspection, columns(), paint()).as_bytes())?)
-        }
+        Command::Inspect { paths } => match commands::inspect::inspect(&paths, format, columns(), paint(), out)? {
+            Outcome::Done => Ok(()),
+            Outcome::BadConfiguration => Err(Failure::Told),
+        },
         Command::Recover { paths } => recover(&paths, format),
         Command::Completions { shell } => Ok(commands::completions::completions(&mut Cli::command(), shell, out)?),
         Command::Replay { .. } => Ok(()),
@@ -205,7 +216,7 @@ fn devices(
 fn mask(global: &Global, watch: bool) -> Result<(), Failure> {
     let path = mask_path(global.instance.as_deref());
     let json = json_path(&path);
-    let names = || commands::mask::layout(&std::fs::read_to_string(&json).ok()?);
+    let names = || commands::mask::layout(&crate::folder::read_text(&json, LARGEST_JSON).ok()?);
     let read = || read_mask(&path).map_err(|error| error.to_string());
     let options = MaskOptions { watch, json: global.json, palette: palette() };
     let stop = CancellationToken::new();
@@ -293,14 +304,7 @@ fn run(global: &Global, args: &RunArgs, source: Source) -> Result<(), Failure> {
 /// The folder an episode is to be written to at once: better refused before the devices are started.
 fn prepare(out: &Path) -> Result<(), RecordError> {
     let refused = |source| RecordError::Io { path: out.to_owned(), source };
-    match std::fs::create_dir(out) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => return Err(RecordError::NoFolder(out.to_owned())),
-        Err(error) if error.kind() != io::ErrorKind::AlreadyExists => return Err(refused(error)),
-        _ => {}
-    }
-    if !out.is_dir() {
-        return Err(refused(io::Error::new(io::ErrorKind::NotADirectory, "not a folder; choose another with --out")));
-    }
+    record::open_folder(out)?;
     let enter_and_write = rustix::fs::Access::WRITE_OK | rustix::fs::Access::EXEC_OK;
     rustix::fs::access(out, enter_and_write).map_err(|error| refused(error.into()))
 }

@@ -12,6 +12,7 @@ fn registry(depth: usize) -> Registry {
             sync_window: Duration::from_millis(25),
             cooldown: Duration::from_secs(2),
             memory_budget: 1 << 20,
+            disk_reserve: None,
         },
         devices: vec![DeviceSpec {
             name: "motor".into(),
@@ -29,6 +30,12 @@ fn registry(depth: usize) -> Registry {
             max_bytes: 64,
             depth,
             when_stale: WhenStale::Hold,
+            latency: Duration::ZERO,
+            verdict: crate::registry::VerdictSpec::of(
+                crate::modality::ModalityKind::Image,
+                Duration::from_millis(500),
+                Some(30.0),
+            ),
         }],
         path: None,
         text: String::new(),

@@ -4,6 +4,7 @@ pub mod artifacts;
 pub mod check;
 pub mod completions;
 pub mod devices;
+pub mod inspect;
 pub mod mask;
 pub mod recover;
 

@@ -28,6 +28,7 @@ pub use self::scenario::{Replayed, scenario};
 use self::wire::Shape;
 use super::sim::stamp_of;
 use super::{DriverError, Reading, unblock};
+use crate::provenance::{KernelDriver, Negotiated};
 use crate::registry::scenario::{SimDevice, SimSource};
 use crate::sample::FLAG_DEVICE_TIME;
 use crate::time::{Stamp, nanoseconds};
@@ -59,6 +60,15 @@ struct Message {
     after: Duration,
     payload: Vec<u8>,
     shape: Shape,
+}
+
+/// The payload of one recorded message of the schema named so, with its width and height.
+#[doc(hidden)]
+#[must_use]
+pub fn decode(schema: &str, message: &[u8]) -> Option<(Vec<u8>, u32, u32)> {
+    let mut payload = Vec::new();
+    let shape = wire::payload(wire::Schema::named(schema)?, message, &mut payload)?;
+    Some((payload, shape.width, shape.height))
 }
 
 impl Replay {
@@ -101,6 +111,14 @@ impl Replay {
     #[must_use]
     pub fn description(&self) -> &str {
         &self.description
+    }
+
+    /// The same for a recording of the replay: the file takes the place of the device.
+    #[must_use]
+    pub fn negotiated(&self) -> Negotiated {
+        let version = Some(env!("CARGO_PKG_VERSION").to_owned());
+        let driver = Some(KernelDriver { name: "rapid-replay".to_owned(), version });
+        Negotiated { driver, bus: Some(self.description.clone()), ..Negotiated::default() }
     }
 
     /// Waits until the message at `next` is due.

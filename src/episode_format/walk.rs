@@ -198,8 +198,7 @@ impl<R: Read> Walk<R> {
                 Next::End(end) => {
                     self.ended = true;
                     self.walked.end = end;
-                    self.walked.sound =
-                        self.checked && end == FileEnd::Finished && self.walked.bytes == self.size;
+                    self.walked.sound = self.checked && end == FileEnd::Finished && self.walked.bytes == self.size;
                 }
             }
         }

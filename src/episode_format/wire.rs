@@ -90,6 +90,12 @@ impl<'a> Proto<'a> {
         }
     }
 
+    /// A `sint64`.
+    pub(crate) fn zigzag(self) -> i64 {
+        let number = self.number();
+        (number >> 1).cast_signed() ^ -(number & 1).cast_signed()
+    }
+
     pub(crate) fn bytes(self) -> &'a [u8] {
         match self {
             Self::Bytes(bytes) => bytes,

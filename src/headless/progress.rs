@@ -22,6 +22,7 @@ pub(super) fn line(snapshot: &Snapshot, rates: &Rates, elapsed: Duration, durati
             rates.recorded() / 1e6
         ));
         parts.push(format!("{} dropped", recording.dropped));
+        parts.extend(recording.room.map(|left| format!("disk full in {}", text::clock(left))));
     }
     let running = snapshot.devices.iter().filter(|device| snapshot.mask.contains(device.id));
     parts.extend(running.map(|device| {
@@ -61,6 +62,9 @@ struct RecordingProgress {
     messages: u64,
     bytes: u64,
     dropped: u64,
+    /// While the disk is nearly full: seconds until the episode is closed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    disk_seconds: Option<u64>,
 }
 
 /// Progress as one JSON object, without a line end.
@@ -71,7 +75,7 @@ pub(super) fn json(
     duration: Option<Duration>,
     wall_ns: u64,
 ) -> serde_json::Result<String> {
-    serde_json::to_string(&Progress {
+    text::json(&Progress {
         time: crate::time::rfc3339(wall_ns),
         elapsed: elapsed.as_secs_f64(),
         duration: duration.map(|duration| duration.as_secs_f64()),
@@ -93,6 +97,7 @@ pub(super) fn json(
             messages: recording.messages,
             bytes: recording.bytes,
             dropped: recording.dropped,
+            disk_seconds: recording.room.map(|left| left.as_secs()),
         }),
     })
 }

@@ -9,29 +9,41 @@
 //! Invariant: a file without `.partial` at its end is finished; one that exists is never replaced.
 //! Invariant: what could not be recorded is counted and said.
 
+mod announce;
 pub mod encode;
 mod episode;
 mod file;
 mod hole;
 pub mod inspect;
+mod keep;
 mod lock;
+mod masks;
 mod metadata;
+mod provenance;
+mod quality;
 mod recorder;
 pub mod recover;
 pub mod schema;
 mod session;
 mod source;
+mod space;
+mod streams;
 #[cfg(test)]
 mod tests;
+mod verdict;
 
 use std::path::PathBuf;
 
 use crate::episode_format::{walk, wire};
 
-pub use episode::{EpisodeReport, EpisodeRequest};
+pub use episode::{EpisodeReport, EpisodeRequest, open_folder};
 pub use file::Sink;
+pub use quality::{Quality, Spread};
 pub use recorder::{Recorder, RecorderConfig};
 pub use source::Source;
+pub use space::{Asker, Disk};
+
+use crate::text;
 
 /// Why an episode cannot be recorded.
 #[derive(Debug, thiserror::Error)]
@@ -46,6 +58,23 @@ pub enum RecordError {
         path: PathBuf,
         /// What the system says.
         source: std::io::Error,
+    },
+    /// The folder lies behind a link of somebody else, or cannot be entered.
+    #[error("{0}; or choose another with --out")]
+    Folder(crate::folder::FolderError),
+    /// There is no room for an episode.
+    #[error(
+        "{}: the disk is full: {} free, and {} of it are kept free (disk_reserve under [rig] in devices.toml): remove \
+         or move recordings, choose another folder with --out, or lower disk_reserve",
+        folder.display(), text::size(*free), text::size(*reserve)
+    )]
+    NoRoom {
+        /// The folder.
+        folder: PathBuf,
+        /// What is free on its disk, bytes.
+        free: u64,
+        /// What is to stay free, bytes.
+        reserve: u64,
     },
     /// There is an episode in progress.
     #[error("already recording {}", .0.display())]

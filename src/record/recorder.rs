@@ -10,7 +10,7 @@ use std::any::Any;
 use std::fs::File;
 use std::io;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::mpsc::{self, Receiver, Sender, TryRecvError};
 use std::thread::JoinHandle;
@@ -20,18 +20,16 @@ use tokio::sync::broadcast::{self, error::TryRecvError as EventError};
 use tokio::sync::oneshot;
 
 use super::RecordError;
-use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest};
+use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest, PARTIAL};
 use super::file::Sink;
-use super::hole::Last;
-use super::session::{Attached, Beginning, MaskHistory, Session};
+use super::provenance::Attached;
+use super::session::{Beginning, Session};
 use super::source::Source;
-use crate::bus::TopicId;
-use crate::mask::PhysicalMask;
-use crate::modality::MAX_MODALITIES;
+use super::space::{Asker, Disk, Finding, Space};
+use super::streams::Streams;
 use crate::registry::Registry;
-use crate::sample::SampleHeader;
-use crate::status::{Board, Event, Level, What};
-use crate::time::{Stamp, WallClock};
+use crate::status::{Board, Event, Level, RecordingStatus, What};
+use crate::time::{ClockWatch, Stamp, WallClock};
 
 /// Longest wait for samples: what an order, an event or a due frame may have to wait.
 const TURN: Duration = Duration::from_millis(20);
@@ -40,6 +38,8 @@ const TURN: Duration = Duration::from_millis(20);
 const FLUSH_EVERY: Duration = Duration::from_millis(500);
 /// How often the board is told.
 const STATUS_EVERY: Duration = Duration::from_millis(200);
+/// How often it is looked whether the wall clock was set.
+const CLOCK_EVERY: Duration = Duration::from_millis(100);
 /// Least distance of two complaints about the bus.
 const COMPLAIN_EVERY: Duration = Duration::from_secs(5);
 
@@ -55,13 +55,23 @@ pub struct RecorderConfig {
     /// Makes the sink of an episode of the file opened for it; the file itself unless a test wants
     /// the disk to fail.
     pub sink: Opener,
+    /// Says what is free on the disk of an episode's file.
+    pub disk: Asker,
+    /// Reads the clocks.
+    pub clock: Box<dyn FnMut() -> WallClock + Send>,
 }
 
 impl RecorderConfig {
     /// Episodes of `registry`, reported on `board`, written to their files.
     #[must_use]
     pub fn new(registry: Arc<Registry>, board: Arc<Board>) -> Self {
-        Self { registry, board, sink: Box::new(|file| Box::new(file)) }
+        Self {
+            registry,
+            board,
+            sink: Box::new(|file| Box::new(file)),
+            disk: Box::new(Disk::of),
+            clock: Box::new(WallClock::now),
+        }
     }
 }
 
@@ -135,18 +145,14 @@ struct Writer {
     streams: Streams,
     attached: Attached,
     session: Option<Session>,
+    /// Room for the session's file.
+    space: Option<Space>,
+    clock: ClockWatch,
+    clock_looked: Stamp,
     waiting: Vec<Reply<EpisodeReport>>,
     flushed: Stamp,
     reported: Stamp,
     complained: Option<Stamp>,
-}
-
-/// What is kept of the samples that pass, recording or not.
-struct Streams {
-    masks: MaskHistory,
-    /// The last sample of each modality.
-    last: [Option<Last>; MAX_MODALITIES],
-    last_mask: Option<Last>,
 }
 
 enum Turn {
@@ -155,15 +161,18 @@ enum Turn {
 }
 
 impl Writer {
-    fn new(config: RecorderConfig, inbox: Receiver<Order>, events: broadcast::Receiver<Event>) -> Self {
-        let streams = Streams { masks: MaskHistory::new(), last: [None; MAX_MODALITIES], last_mask: None };
+    fn new(mut config: RecorderConfig, inbox: Receiver<Order>, events: broadcast::Receiver<Event>) -> Self {
+        let clock = ClockWatch::new((config.clock)());
         Self {
             config,
             inbox,
             events,
-            streams,
-            attached: Attached::new(),
+            streams: Streams::new(),
+            attached: Attached::default(),
             session: None,
+            space: None,
+            clock,
+            clock_looked: Stamp::default(),
             waiting: Vec::new(),
             flushed: Stamp::default(),
             reported: Stamp::default(),
@@ -204,6 +213,7 @@ impl Writer {
         }
         self.take_events();
         let open = self.take_orders();
+        self.watch_clock(now);
         self.advance(now);
         match (open, &self.session) {
             (false, None) => Turn::Last,
@@ -215,15 +225,7 @@ impl Writer {
         loop {
             match self.events.try_recv() {
                 Ok(event) => {
-                    match &event.what {
-                        What::Attach { device, serial, .. } => {
-                            self.attached.insert(device.clone(), serial.clone());
-                        }
-                        What::Detach { device, .. } => {
-                            self.attached.remove(device);
-                        }
-                        _ => {}
-                    }
+                    self.attached.take(&event);
                     if let Some(session) = &mut self.session {
                         session.event(&event);
                     }
@@ -271,28 +273,35 @@ impl Writer {
         if let Some(session) = &self.session {
             return Err(RecordError::Busy(session.name().to_owned()));
         }
-        let clock = WallClock::now();
+        let clock = (self.config.clock)();
         let begin = Stamp::now();
         let (path, file) = EpisodePath::create(&request.out, &request.task, clock.wall_ns(begin))?;
         let (finished, partial) = (path.finished.clone(), path.partial.clone());
+        // Nothing was recorded into it, and it was made a moment ago.
+        let refuse = |error| {
+            let _ = std::fs::remove_file(&partial);
+            error
+        };
+        let failed = |source| refuse(RecordError::Io { path: partial.clone(), source });
+        let (handle, watched) = (file.try_clone().map_err(failed)?, file.try_clone().map_err(failed)?);
+        let reserve = self.config.registry.rig.disk_reserve;
+        let space = Space::begin(watched, &request.out, reserve, begin, &mut self.config.disk).map_err(refuse)?;
         let beginning = Beginning {
             registry: Arc::clone(&self.config.registry),
             board: Arc::clone(&self.config.board),
             request,
             path,
             sink: (self.config.sink)(file),
+            handle,
             attached: &self.attached,
             clock,
             begin,
         };
-        let session = Session::begin(beginning, &self.streams.masks).map_err(|source| {
-            // Nothing was recorded into it, and it was made a moment ago.
-            let _ = std::fs::remove_file(&partial);
-            RecordError::Io { path: partial, source }
-        })?;
+        let session = Session::begin(beginning, &self.streams.masks).map_err(failed)?;
         self.config.board.set_recording(Some(session.status(begin)));
         self.config.board.announce(What::Recording { file: finished.clone() });
         self.session = Some(session);
+        self.space = Some(space);
         (self.flushed, self.reported) = (begin, begin);
         Ok(finished)
     }
@@ -309,21 +318,55 @@ impl Writer {
             return;
         }
         if now.since(self.reported) >= STATUS_EVERY && !session.is_ending(now) {
-            self.config.board.set_recording(Some(session.status(now)));
+            let room = self.space.as_ref().and_then(Space::left);
+            self.config.board.set_recording(Some(RecordingStatus { room, ..session.status(now) }));
             self.reported = now;
+        }
+        self.watch_space(now);
+    }
+
+    fn watch_space(&mut self, now: Stamp) {
+        let found = self.space.as_mut().and_then(|space| space.look(now, &mut self.config.disk));
+        let Some((found, session)) = found.zip(self.session.as_ref()) else { return };
+        match found {
+            Finding::Low { free, left } => {
+                let folder = session.name().parent().map(Path::to_owned).unwrap_or_default();
+                self.config.board.announce(What::DiskLow { folder, free, seconds: left.as_secs() });
+            }
+            Finding::Removed => {
+                let file = session.name().display();
+                let text =
+                    format!("{file}: removed while it is recorded; it will be written again when the episode ends");
+                self.complain(Level::Error, text);
+            }
+            // Without waiting for what may still be on its way: it would need room.
+            Finding::Spent(reason) => self.finish(now, Some(reason)),
+        }
+    }
+
+    fn watch_clock(&mut self, now: Stamp) {
+        if now.since(self.clock_looked) < CLOCK_EVERY {
+            return;
+        }
+        self.clock_looked = now;
+        if let Some(step_ns) = self.clock.look((self.config.clock)()) {
+            self.config.board.announce(What::ClockStep { seconds: step_ns as f64 / 1e9 });
         }
     }
 
     fn finish(&mut self, now: Stamp, reason: Option<String>) {
         let Some(session) = self.session.take() else { return };
         let report = session.finish(now, &self.streams.masks, reason);
+        if let Some(space) = self.space.take() {
+            space.release();
+        }
         let board = &self.config.board;
         board.set_recording(None);
-        if report.error.is_none() {
-            board.set_last_episode(report.file.clone());
+        if report.file.extension().is_none_or(|extension| extension != PARTIAL) {
+            board.set_last_episode(report.file.clone(), report.verdict.clone());
         }
-        let EpisodeReport { file, seconds, messages, bytes, dropped, error } = report.clone();
-        board.announce(What::Episode { file, seconds, messages, bytes, dropped, error });
+        let EpisodeReport { file, seconds, messages, bytes, dropped, error, verdict } = report.clone();
+        board.announce(What::Episode { file, seconds, messages, bytes, dropped, error, verdict });
         for reply in self.waiting.drain(..) {
             let _ = reply.send(Ok(report.clone()));
         }
@@ -340,35 +383,6 @@ impl Writer {
     fn complain(&self, level: Level, text: String) {
         self.config.board.announce(What::Log { level, text });
     }
-}
-
-impl Streams {
-    fn take(&mut self, session: Option<&mut Session>, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
-        match topic {
-            TopicId::Modality(id) => {
-                let now = Last { seq: header.seq, lost: header.lost, captured: Stamp(header.capture_ns) };
-                let hole = self.last.get_mut(id.index()).and_then(|last| last.replace(now)?.hole(now));
-                if let Some(session) = session {
-                    session.sample(id, header, payload, hole);
-                }
-            }
-            TopicId::Mask => {
-                let Some((mask, sequence)) = read_mask(payload) else { return };
-                let now = Last { seq: sequence, lost: 0, captured: Stamp(header.capture_ns) };
-                let hole = self.last_mask.replace(now).and_then(|last| last.hole(now));
-                self.masks.push(header, mask, sequence);
-                if let Some(session) = session {
-                    session.mask(header, mask, sequence, hole);
-                }
-            }
-        }
-    }
-}
-
-fn read_mask(payload: &[u8]) -> Option<(PhysicalMask, u64)> {
-    let (mask, rest) = payload.split_first_chunk()?;
-    let (sequence, _) = rest.split_first_chunk()?;
-    Some((PhysicalMask(u64::from_le_bytes(*mask)), u64::from_le_bytes(*sequence)))
 }
 
 fn panic_text(panic: &(dyn Any + Send)) -> &str {

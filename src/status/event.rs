@@ -1,11 +1,16 @@
 //! Events: state changes worth a line on a screen and a message in a recording.
 
 use std::path::PathBuf;
+use std::time::Duration;
 
 use serde::Serialize;
 
-use super::{Level, SlotState};
+use super::{Grade, Level, SlotState, Verdict};
 use crate::modality::ModalityId;
+use crate::provenance::{KernelDriver, Negotiated};
+use crate::registry::UsbIdentity;
+use crate::sample::Epoch;
+use crate::text;
 use crate::time::Stamp;
 
 /// A state change, with its moment. As JSON, one object: `{"event":"state","device":...}`.
@@ -30,10 +35,21 @@ pub enum What {
         bit: ModalityId,
         /// Node, for example `/dev/video0`.
         node: String,
-        /// Port path.
-        port: String,
-        /// Serial, if it has one.
-        serial: Option<String>,
+        /// The unit.
+        #[serde(flatten)]
+        usb: UsbIdentity,
+        /// The kernel's driver of it.
+        driver: Option<KernelDriver>,
+    },
+    /// A registered device was opened, in a new epoch: its samples come from this unit.
+    Opened {
+        /// Modality.
+        device: String,
+        /// Its bit.
+        bit: ModalityId,
+        /// Where its samples come from.
+        #[serde(flatten)]
+        provenance: Box<Provenance>,
     },
     /// A registered device was pulled out.
     Detach {
@@ -83,6 +99,23 @@ pub enum What {
         dropped: u64,
         /// Why the file is not whole, if it is not.
         error: Option<String>,
+        /// What it is worth.
+        #[serde(flatten)]
+        verdict: Verdict,
+    },
+    /// The disk of the episode in progress is nearly full; told once an episode.
+    DiskLow {
+        /// The folder.
+        folder: PathBuf,
+        /// What is free on its disk, bytes.
+        free: u64,
+        /// Until the episode will be closed, at the rate it is written with.
+        seconds: u64,
+    },
+    /// The wall clock was set. Capture times of an episode in progress go on by the clock it began with.
+    ClockStep {
+        /// By how much, forward; back if negative.
+        seconds: f64,
     },
     /// An episode that an earlier run did not finish was repaired.
     Recovered {
@@ -108,16 +141,43 @@ pub enum What {
     },
 }
 
+/// Where the samples of one epoch of a modality come from.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Provenance {
+    /// The incarnation; every sample's header names it.
+    pub epoch: Epoch,
+    /// Node, for example `/dev/video0`.
+    pub node: String,
+    /// When the unit was attached: one that was started again is still the same attachment.
+    pub attached: Stamp,
+    /// The unit.
+    #[serde(flatten)]
+    pub usb: UsbIdentity,
+    /// What was agreed with it. The driver is hot-plug's where the open node names none.
+    #[serde(flatten)]
+    pub negotiated: Negotiated,
+    /// `latency` of the registry's entry, ns.
+    pub latency_ns: u64,
+}
+
 impl What {
+    /// Did an episode end before its time, with a file that is whole all the same?
+    #[must_use]
+    pub fn is_cut_short(&self) -> bool {
+        let Self::Episode { file, error: Some(_), .. } = self else { return false };
+        file.extension().is_some_and(|extension| extension == "mcap")
+    }
+
     /// The event as a line of the log; `None` where the event that follows says it all.
-    pub(super) fn sentence(&self) -> Option<(Level, String)> {
+    #[must_use]
+    pub fn sentence(&self) -> Option<(Level, String)> {
         Some(match self {
-            Self::Attach { device, node, port, serial, .. } => {
-                let serial = serial.as_deref().map(|serial| format!(", serial {serial}")).unwrap_or_default();
-                (Level::Info, format!("{device} attached ({node} at port {port}{serial})"))
+            Self::Attach { device, node, usb, .. } => {
+                let serial = usb.serial.as_deref().map(|serial| format!(", serial {serial}")).unwrap_or_default();
+                (Level::Info, format!("{device} attached ({node} at port {}{serial})", usb.port))
             }
-            // The slot's state changes with it and names the witness.
-            Self::Detach { .. } => return None,
+            // The slot's state changes with it and names the witness, or what was agreed.
+            Self::Detach { .. } | Self::Opened { .. } => return None,
             Self::State { device, state, detail, .. } => {
                 let level = match state {
                     SlotState::Failed => Level::Error,
@@ -134,12 +194,35 @@ impl What {
             }
             Self::Unregistered { device, reason } => (Level::Info, format!("{device} is not used: {reason}")),
             Self::Recording { file } => (Level::Info, format!("recording {}", file.display())),
-            Self::Episode { file, seconds, error: Some(error), .. } => {
-                (Level::Error, format!("{} is not whole after {seconds:.1} s: {error}", file.display()))
+            Self::Episode { file, seconds, error: Some(error), verdict, .. } => {
+                let word = if self.is_cut_short() { "cut short" } else { "not whole" };
+                let grade = verdict.grade.word();
+                (Level::Error, format!("{grade} {} is {word} after {seconds:.1} s: {error}", file.display()))
             }
-            Self::Episode { file, seconds, dropped, error: None, .. } => {
-                let level = if *dropped > 0 { Level::Warn } else { Level::Info };
-                (level, format!("{} finished, {seconds:.1} s, {dropped} samples dropped", file.display()))
+            Self::Episode { file, seconds, error: None, verdict, .. } => {
+                let level = match verdict.grade {
+                    Grade::Good => Level::Info,
+                    Grade::Suspect => Level::Warn,
+                    Grade::Bad => Level::Error,
+                };
+                let (file, word) = (file.display(), verdict.grade.word());
+                let why = if verdict.reasons.is_empty() { String::new() } else { format!(": {}", verdict.why()) };
+                (level, format!("{word} {file} finished, {seconds:.1} s{why}"))
+            }
+            Self::DiskLow { folder, free, seconds } => {
+                let (free, left) = (text::size(*free), text::about(Duration::from_secs(*seconds)));
+                let folder = folder.display();
+                let text =
+                    format!("{folder}: disk nearly full, {free} free: the episode will be closed in about {left}");
+                (Level::Warn, text)
+            }
+            Self::ClockStep { seconds } => {
+                let direction = if *seconds < 0.0 { "back" } else { "forward" };
+                let by = seconds.abs();
+                (
+                    Level::Warn,
+                    format!("the wall clock was set {direction} by {by:.3} s; times of capture stay as they are"),
+                )
             }
             // Something was lost before this run began.
             Self::Recovered { text, .. } => (Level::Warn, text.clone()),

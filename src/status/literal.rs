@@ -50,6 +50,7 @@ pub(crate) fn snapshot(devices: Vec<DeviceStatus>) -> Snapshot {
         devices,
         recording: None,
         last_episode: None,
+        last_verdict: super::Verdict::default(),
         log: Vec::new(),
     }
 }
@@ -88,6 +89,7 @@ pub(crate) fn recording(dropped: u64) -> RecordingStatus {
         messages: 48_211,
         bytes: 312_400_000,
         dropped,
+        room: None,
     }
 }
 
@@ -123,6 +125,12 @@ pub(crate) fn board(names: &[&str]) -> Board {
         max_bytes: 1 << 20,
         depth: 8,
         when_stale: WhenStale::Hold,
+        latency: Duration::ZERO,
+        verdict: crate::registry::VerdictSpec::of(
+            crate::modality::ModalityKind::Image,
+            Duration::from_millis(500),
+            Some(30.0),
+        ),
     };
     Board::new(&Registry {
         rig: RigSpec {
@@ -131,6 +139,7 @@ pub(crate) fn board(names: &[&str]) -> Board {
             sync_window: Duration::from_millis(25),
             cooldown: Duration::from_secs(2),
             memory_budget: 1 << 29,
+            disk_reserve: None,
         },
         devices: names.iter().enumerate().map(device).collect(),
         path: None,

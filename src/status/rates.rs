@@ -148,8 +148,10 @@ mod tests {
                 messages: 0,
                 bytes,
                 dropped: 0,
+                room: None,
             }),
             last_episode: None,
+            last_verdict: crate::status::Verdict::default(),
             log: Vec::new(),
         }
     }

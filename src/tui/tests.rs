@@ -11,7 +11,7 @@ use super::*;
 use crate::status::literal::{
     TAKEN, board, device, every_state, line, recording, sixty_four, snapshot, three_streaming,
 };
-use crate::status::{Level, SlotState, Snapshot};
+use crate::status::{Grade, Level, RecordingStatus, SlotState, Snapshot, Verdict};
 use crate::time::Stamp;
 use theme::{Charset, Colours};
 
@@ -78,6 +78,26 @@ fn three_devices_stream() {
 }
 
 #[test]
+fn the_last_verdict_stands_beside_its_file_with_as_many_reasons_as_there_is_room_for() {
+    let mut end = three_streaming();
+    end.last_episode = Some("episodes/2023-11-14_place-block_006.mcap".into());
+    for (grade, colour) in [(Grade::Suspect, Color::Yellow), (Grade::Bad, Color::Red)] {
+        end.last_verdict = Verdict {
+            grade,
+            reasons: vec![
+                "cam_wrist: frozen for 5.0 s: 151 samples byte for byte the same (limit 2.0 s)".to_owned(),
+                "tof: 3 of 213 samples lost by the device (limit 1 %)".to_owned(),
+            ],
+        };
+        let screen = draw(&measured(&end), (80, 24), THEME);
+        assert_eq!(style_of(screen.buffer(), grade.word()).fg, Some(colour));
+        assert_eq!(style_of(screen.buffer(), "cam_wrist: fro").fg, Some(colour));
+    }
+    assert_snapshot!("verdict_80x24", draw(&measured(&end), (80, 24), ASCII));
+    assert_snapshot!("verdict_60x12", draw(&measured(&end), (60, 12), THEME));
+}
+
+#[test]
 fn every_state_has_its_word_symbol_and_colour() {
     let model = measured(&every_state());
     let screen = draw(&model, (80, 24), THEME);
@@ -130,6 +150,18 @@ fn an_episode_that_loses_samples_says_so() {
     assert_snapshot!("recording_120x40", draw(&model, (120, 40), THEME));
     assert_eq!(style_of(screen.buffer(), "▲ dropped 17").fg, Some(Color::Red));
     assert_eq!(style_of(screen.buffer(), "● REC").fg, Some(Color::Red));
+}
+
+#[test]
+fn a_disk_that_fills_up_says_how_long_it_takes() {
+    let mut end = three_streaming();
+    end.recording = Some(RecordingStatus { room: Some(Duration::from_secs(252)), ..recording(17) });
+    let model = measured(&end);
+    for (size, theme) in [((80, 24), THEME), ((80, 24), ASCII)] {
+        let screen = draw(&model, size, theme).to_string();
+        assert!(screen.contains("disk full in 04:12") && screen.contains("dropped 17"), "{screen}");
+    }
+    assert_eq!(style_of(draw(&model, (80, 24), THEME).buffer(), "▲ disk full in 04:12").fg, Some(Color::Red));
 }
 
 #[test]

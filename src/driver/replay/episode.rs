@@ -276,7 +276,14 @@ impl Collected {
         self.mask.sort_by_key(|(at, _)| *at);
         let (begin_ns, end_ns) = self.times.unwrap_or_default();
         let registry = self.about.remove("registry").unwrap_or_default();
-        Ok(EpisodeDescription { begin_ns, end_ns, topics: topics.into_values().collect(), layout, registry, mask: self.mask })
+        Ok(EpisodeDescription {
+            begin_ns,
+            end_ns,
+            topics: topics.into_values().collect(),
+            layout,
+            registry,
+            mask: self.mask,
+        })
     }
 }
 

@@ -182,7 +182,8 @@ impl<'a, S: Sink> Copy<'a, S> {
                 self.summary.record(opcode, data);
                 Ok(())
             }
-            None | Some(Err(
+            None
+            | Some(Err(
                 McapError::ConflictingSchemas(_)
                 | McapError::ConflictingChannels(_)
                 | McapError::InvalidSchemaId

@@ -101,7 +101,10 @@ fn repair_all(folder: &Path, begun: SystemTime, board: &Board, stop: &AtomicBool
             let (size, free) = (text::size(size), text::size(free));
             log(
                 Level::Warn,
-                format!("{}: not repaired: it takes {size} and {free} are free; make room and run `rapid recover`", path.display()),
+                format!(
+                    "{}: not repaired: it takes {size} and {free} are free; make room and run `rapid recover`",
+                    path.display()
+                ),
             );
             continue;
         }

@@ -40,11 +40,11 @@ use crate::episode_format::{self, OpenError};
 use crate::time;
 
 pub use self::copy::recover_bytes;
-pub use self::folder::{Repairs, left_behind};
-pub use super::walk::FileEnd;
 use self::copy::{Copied, Damage};
+pub use self::folder::{Repairs, left_behind};
 use self::names::{Names, set_aside};
 use self::summary::Summary;
+pub use super::walk::FileEnd;
 
 /// Why a file was not repaired. It is as it was.
 #[derive(Debug, thiserror::Error)]
@@ -210,7 +210,8 @@ impl Source<'_> {
         }
         let path = self.path;
         let aside = |ending| {
-            set_aside(path, &names.finished, ending).map_err(|source| RecoverError::Io { path: path.to_owned(), source })
+            set_aside(path, &names.finished, ending)
+                .map_err(|source| RecoverError::Io { path: path.to_owned(), source })
         };
         let Some(copied) = self.copy(&names.recovering, &known, watch)? else {
             return Ok(Outcome::Unreadable { kept: aside("damaged")? });

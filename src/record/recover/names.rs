@@ -100,7 +100,10 @@ mod tests {
         assert_eq!(names.finished, Path::new("out/20261121_t_003.mcap"));
         assert_eq!(names.recovering, Path::new("out/20261121_t_003.mcap.recovering"));
         let candidates: Vec<_> = names.candidates().take(3).collect();
-        assert_eq!(candidates[1..], ["out/20261121_t_003.recovered.mcap", "out/20261121_t_003.recovered-2.mcap"].map(PathBuf::from));
+        assert_eq!(
+            candidates[1..],
+            ["out/20261121_t_003.recovered.mcap", "out/20261121_t_003.recovered-2.mcap"].map(PathBuf::from)
+        );
         for (file, first, second) in [
             ("a.mcap", "a.recovered.mcap", "a.recovered-2.mcap"),
             ("a.b.mcap", "a.b.recovered.mcap", "a.b.recovered-2.mcap"),

@@ -1,0 +1,332 @@
+//! Room on the disk for the episode in progress.
+//!
+//! Twice guarded: an episode ends before less than the reserve is free, and what closing it takes is
+//! set aside in the file system beforehand, behind the end of the file, so that it can be closed
+//! even when something else takes the last byte.
+//!
+//! | free, above the reserve                     | then                                       |
+//! |---------------------------------------------|--------------------------------------------|
+//! | for [`WARN_LEFT`], and another reserve      |                                            |
+//! | less, at the rate it is written with        | said once, and shown with the time left    |
+//! | nothing                                     | the episode is closed, no other begins     |
+//!
+//! Invariant: free is what other programs may still take, and what is set aside for the file.
+
+use std::collections::VecDeque;
+use std::fs::File;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use rustix::fs::{FallocateFlags, fallocate, fstat, fstatvfs, ftruncate};
+use rustix::io::Errno;
+
+use super::RecordError;
+use crate::text;
+use crate::time::Stamp;
+
+/// The reserve unless the registry says another: this, or [`SHARE`] of a smaller disk.
+const RESERVE: u64 = 1 << 30;
+/// Part of a disk, as its divisor.
+const SHARE: u64 = 20;
+/// With less time than this left, it is said.
+const WARN_LEFT: Duration = Duration::from_mins(5);
+/// How often it is looked whether more must be set aside: at 300 MB/s half of [`ASIDE_MOST`] is
+/// written in that time.
+const LOOK_EVERY: Duration = Duration::from_millis(100);
+/// How often the disk is asked.
+const ASK_EVERY: Duration = Duration::from_secs(1);
+/// What is set aside at most: a chunk, what is written between two looks, and the summary, which
+/// takes some 200 bytes for each MiB of the episode.
+const ASIDE_MOST: u64 = 64 << 20;
+/// What is set aside at least.
+const ASIDE_LEAST: u64 = 4 << 20;
+/// The rate is the mean over this long.
+const RATE_OVER: Duration = Duration::from_secs(10);
+/// No rate is told of less than this.
+const RATE_LEAST: Duration = Duration::from_secs(2);
+/// Times longer than this are no forecast.
+const LEFT_MOST: Duration = Duration::from_hours(100);
+
+/// Asks for the room on the disk of a file; only a test has another answer than the file system's.
+pub type Asker = Box<dyn FnMut(&File) -> io::Result<Disk> + Send>;
+
+/// A disk, in bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Disk {
+    /// What an ordinary user may still write.
+    pub free: u64,
+    /// Its size; 0 where the file system does not say.
+    pub size: u64,
+}
+
+impl Disk {
+    /// The disk that holds `file`.
+    ///
+    /// # Errors
+    /// When the file system does not answer.
+    pub fn of(file: &File) -> io::Result<Self> {
+        let said = fstatvfs(file)?;
+        Ok(Self {
+            free: said.f_bavail.saturating_mul(said.f_frsize),
+            size: said.f_blocks.saturating_mul(said.f_frsize),
+        })
+    }
+
+    fn reserve(self, wanted: Option<u64>) -> u64 {
+        wanted.unwrap_or_else(|| RESERVE.min(self.size / SHARE))
+    }
+}
+
+/// What is known of the room an episode has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Room {
+    Ample,
+    /// Until the reserve is reached.
+    Low(Duration),
+    Spent,
+}
+
+/// The decision of the module's table; `rate` in bytes a second.
+fn room(free: u64, reserve: u64, rate: f64) -> Room {
+    let Some(above) = free.checked_sub(reserve) else { return Room::Spent };
+    let seconds = above as f64 / rate.max(1.0);
+    let left = Duration::try_from_secs_f64(seconds).map_or(LEFT_MOST, |left| left.min(LEFT_MOST));
+    if left >= WARN_LEFT && above >= reserve { Room::Ample } else { Room::Low(left) }
+}
+
+/// What is to be told.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Finding {
+    /// Nearly full; told once an episode.
+    Low {
+        /// What is free, bytes.
+        free: u64,
+        /// Until the episode will be closed.
+        left: Duration,
+    },
+    /// The episode is to be closed now; why.
+    Spent(String),
+    /// The file has no name any more; told once.
+    Removed,
+}
+
+/// The room of one episode.
+pub(super) struct Space {
+    file: File,
+    folder: PathBuf,
+    reserve: u64,
+    /// How much is set aside ahead of the end of the file; none where the file system cannot.
+    aside: Option<u64>,
+    /// Where what is set aside ends.
+    allocated: u64,
+    looked: Stamp,
+    asked: Stamp,
+    sizes: VecDeque<(Stamp, u64)>,
+    left: Option<Duration>,
+    told_low: bool,
+    told_removed: bool,
+}
+
+impl Space {
+    /// Begins to watch over `file`, which lies in `folder`, of a disk of which `reserve` stays free.
+    ///
+    /// # Errors
+    /// When there is no room for an episode.
+    pub(super) fn begin(
+        file: File,
+        folder: &Path,
+        reserve: Option<u64>,
+        now: Stamp,
+        ask: &mut Asker,
+    ) -> Result<Self, RecordError> {
+        // A disk that does not say is tried.
+        let disk = ask(&file).unwrap_or(Disk { free: u64::MAX, size: 0 });
+        let reserve = disk.reserve(reserve);
+        let mut space = Self {
+            file,
+            folder: folder.to_owned(),
+            reserve,
+            aside: Some((reserve / 2).clamp(ASIDE_LEAST, ASIDE_MOST)),
+            allocated: 0,
+            looked: now,
+            asked: now,
+            sizes: VecDeque::from([(now, 0)]),
+            left: None,
+            told_low: false,
+            told_removed: false,
+        };
+        let full = |free| RecordError::NoRoom { folder: folder.to_owned(), free, reserve };
+        if disk.size > 0 && room(disk.free, reserve, 0.0) == Room::Spent {
+            return Err(full(disk.free));
+        }
+        match space.set_aside(0) {
+            Ok(()) => Ok(space),
+            Err(_) => Err(full(disk.free)),
+        }
+    }
+
+    /// Looks, at most every [`LOOK_EVERY`].
+    pub(super) fn look(&mut self, now: Stamp, ask: &mut Asker) -> Option<Finding> {
+        if now.since(self.looked) < LOOK_EVERY {
+            return None;
+        }
+        self.looked = now;
+        let stat = fstat(&self.file).ok()?;
+        let size = u64::try_from(stat.st_size).unwrap_or(0);
+        if let Err(error) = self.set_aside(size) {
+            let folder = self.folder.display();
+            return Some(Finding::Spent(format!(
+                "{folder}: {}, and the episode was closed with what had been set aside for that; remove or move \
+                 recordings, or choose another folder with --out",
+                io::Error::from(error)
+            )));
+        }
+        if now.since(self.asked) < ASK_EVERY {
+            return None;
+        }
+        self.asked = now;
+        let rate = self.rate(now, size);
+        if let Ok(disk) = ask(&self.file)
+            && disk.size > 0
+        {
+            let free = disk.free.saturating_add(self.allocated.saturating_sub(size));
+            let room = room(free, self.reserve, rate);
+            self.left = if let Room::Low(left) = room { Some(left) } else { None };
+            match room {
+                Room::Spent => return Some(Finding::Spent(self.spent(free))),
+                Room::Low(left) if !std::mem::replace(&mut self.told_low, true) => {
+                    return Some(Finding::Low { free, left });
+                }
+                Room::Low(_) | Room::Ample => {}
+            }
+        }
+        (stat.st_nlink == 0 && !std::mem::replace(&mut self.told_removed, true)).then_some(Finding::Removed)
+    }
+
+    /// Time left while the disk is nearly full.
+    pub(super) fn left(&self) -> Option<Duration> {
+        self.left
+    }
+
+    /// Gives back what is set aside and was not needed.
+    pub(super) fn release(self) {
+        let size = fstat(&self.file).map(|stat| u64::try_from(stat.st_size).unwrap_or(0));
+        if let Ok(size) = size.map_err(|error| tracing::debug!(%error, "no size"))
+            && self.allocated > size
+            && let Err(error) = ftruncate(&self.file, size)
+        {
+            tracing::warn!(folder = %self.folder.display(), %error, "what was set aside is not given back");
+        }
+    }
+
+    fn spent(&self, free: u64) -> String {
+        format!(
+            "{}: the disk is nearly full, {} free: the episode was closed to keep {} free (disk_reserve); remove or \
+             move recordings, or choose another folder with --out",
+            self.folder.display(),
+            text::size(free),
+            text::size(self.reserve)
+        )
+    }
+
+    /// Sees to it that at least half of `aside` is set aside behind `size`.
+    fn set_aside(&mut self, size: u64) -> Result<(), Errno> {
+        let Some(aside) = self.aside else { return Ok(()) };
+        if self.allocated >= size.saturating_add(aside / 2) && self.allocated > 0 {
+            return Ok(());
+        }
+        let end = size.saturating_add(aside);
+        match fallocate(&self.file, FallocateFlags::KEEP_SIZE, self.allocated, end - self.allocated) {
+            Ok(()) => self.allocated = end,
+            Err(full @ (Errno::NOSPC | Errno::DQUOT)) => return Err(full),
+            // Tried again at the next look.
+            Err(Errno::INTR) => {}
+            Err(error) => {
+                tracing::debug!(%error, "nothing can be set aside on this file system");
+                self.aside = None;
+            }
+        }
+        Ok(())
+    }
+
+    /// Bytes a second, of late.
+    fn rate(&mut self, now: Stamp, size: u64) -> f64 {
+        while self.sizes.get(1).is_some_and(|(at, _)| now.since(*at) >= RATE_OVER) {
+            self.sizes.pop_front();
+        }
+        self.sizes.push_back((now, size));
+        let Some((first, before)) = self.sizes.front() else { return 0.0 };
+        let over = now.since(*first);
+        if over < RATE_LEAST { 0.0 } else { size.saturating_sub(*before) as f64 / over.as_secs_f64() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    const GIB: u64 = 1 << 30;
+
+    #[test]
+    fn the_room_is_judged_by_reserve_and_rate() {
+        let low = |seconds| Room::Low(Duration::from_secs(seconds));
+        for (free, reserve, rate, expected) in [
+            (100 * GIB, GIB, 0.0, Room::Ample),
+            // 99 GiB last an hour at 28 MiB/s and four minutes at 422 MiB/s.
+            (100 * GIB, GIB, 28.0 * 1_048_576.0, Room::Ample),
+            (241 * 1_000_000 + GIB, GIB, 1e6, low(241)),
+            (2 * GIB, GIB, 0.0, Room::Ample),
+            (2 * GIB - 1, GIB, 0.0, Room::Low(LEFT_MOST)),
+            (GIB + 30_000_000, GIB, 30e6, low(1)),
+            (GIB, GIB, 30e6, low(0)),
+            (GIB - 1, GIB, 0.0, Room::Spent),
+            (0, 0, 1e6, low(0)),
+            (u64::MAX, 0, 0.0, Room::Ample),
+        ] {
+            assert_eq!(room(free, reserve, rate), expected, "{free} {reserve} {rate}");
+        }
+    }
+
+    #[test]
+    fn a_small_disk_keeps_a_twentieth_unless_told_otherwise() {
+        let disk = |size| Disk { free: 0, size };
+        assert_eq!(disk(200 * GIB).reserve(None), GIB);
+        assert_eq!(disk(64 << 20).reserve(None), (64 << 20) / 20);
+        assert_eq!(disk(64 << 20).reserve(Some(5)), 5);
+    }
+
+    proptest! {
+        /// More room is never judged worse, and a higher rate never better.
+        #[test]
+        fn the_judgement_is_monotonic(
+            free in 0..8 * GIB, more in 0..8 * GIB, reserve in 0..4 * GIB, rate in 0.0..1e9, faster in 0.0..1e9
+        ) {
+            let order = |room| match room {
+                Room::Spent => Duration::ZERO,
+                Room::Low(left) => left + Duration::from_nanos(1),
+                Room::Ample => Duration::MAX,
+            };
+            prop_assert!(order(room(free + more, reserve, rate)) >= order(room(free, reserve, rate)));
+            prop_assert!(order(room(free, reserve, rate + faster)) <= order(room(free, reserve, rate)));
+        }
+    }
+
+    #[test]
+    fn what_is_set_aside_lies_behind_the_end_and_is_given_back() {
+        let file = tempfile::tempfile().unwrap();
+        let mut ask: Asker = Box::new(Disk::of);
+        let blocks = |file: &File| fstat(file).unwrap().st_blocks;
+        let space = Space::begin(file.try_clone().unwrap(), Path::new("."), Some(0), Stamp(0), &mut ask).unwrap();
+        assert_eq!(fstat(&file).unwrap().st_size, 0);
+        if space.aside.is_none() {
+            // A file system that cannot: nothing to be given back.
+            return;
+        }
+        assert!(blocks(&file) * 512 >= i64::try_from(ASIDE_LEAST).unwrap());
+        space.release();
+        assert_eq!(blocks(&file), 0);
+    }
+}

@@ -1,0 +1,176 @@
+//! Disks that fill up, folders that go away, clocks that are set.
+
+use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
+
+use super::*;
+use crate::status::Event;
+use crate::time::WallClock;
+
+const GIB: u64 = 1 << 30;
+
+/// A recorder on a disk of 100 GiB of which `free` bytes are free.
+fn on_disk(free: &Arc<AtomicU64>) -> Bench {
+    let free = Arc::clone(free);
+    Bench::with(|config| {
+        config.disk = Box::new(move |_| Ok(Disk { free: free.load(Ordering::Relaxed), size: 100 * GIB }));
+    })
+}
+
+async fn until(events: &mut tokio::sync::broadcast::Receiver<Event>, wanted: impl Fn(&What) -> bool) -> What {
+    loop {
+        let event = events.recv().await.unwrap();
+        if wanted(&event.what) {
+            return event.what;
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_disk_that_fills_up_is_told_once_and_ends_the_episode_with_a_whole_file() {
+    let free = Arc::new(AtomicU64::new(50 * GIB));
+    let bench = on_disk(&free);
+    let mut events = bench.board.events();
+    let finished = bench.recorder.start(bench.request(None)).await.unwrap();
+    bench.sample(TOF, 1, 0, Stamp::now().0, 0);
+    free.store(GIB + (GIB >> 1), Ordering::Relaxed);
+    let low = until(&mut events, |what| matches!(what, What::DiskLow { .. })).await;
+    let What::DiskLow { folder, free: told, seconds } = low else { unreachable!() };
+    assert_eq!(folder, finished.parent().unwrap());
+    // What is set aside for the file counts as free.
+    assert!((GIB + (GIB >> 1)..2 * GIB).contains(&told) && seconds > 0, "{told} {seconds}");
+    while bench.board.snapshot().recording.is_none_or(|status| status.room.is_none()) {
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    free.store(GIB - (128 << 20), Ordering::Relaxed);
+    let closed = until(&mut events, |what| {
+        assert!(!matches!(what, What::DiskLow { .. }), "told twice");
+        matches!(what, What::Episode { .. })
+    });
+    let What::Episode { file, error, .. } = closed.await else { unreachable!() };
+    assert_eq!(file, finished);
+    let error = error.unwrap();
+    assert!(error.contains("nearly full") && error.contains("disk_reserve") && error.contains("--out"), "{error}");
+    let read = read(&finished);
+    assert_eq!(read.on("/rapid/tof").count(), 1);
+    assert_eq!(read.on("/rapid/event").filter(|message| text(&message.4, "kind") == "disk_low").count(), 1);
+    assert_eq!(bench.board.snapshot().last_episode, Some(finished));
+
+    let error = bench.recorder.start(bench.request(None)).await.unwrap_err();
+    assert!(matches!(error, RecordError::NoRoom { reserve: GIB, .. }), "{error}");
+    let said = error.to_string();
+    assert!(said.contains("/out: ") && said.contains("939.5 MB free") && said.contains("1.1 GB"), "{said}");
+    assert!(said.contains("disk_reserve under [rig]") && said.contains("--out"), "{said}");
+    assert_eq!(std::fs::read_dir(bench.folder.path().join("out")).unwrap().count(), 1, "nothing was left");
+
+    // Room again.
+    free.store(50 * GIB, Ordering::Relaxed);
+    bench.recorder.start(bench.request(None)).await.unwrap();
+    assert_eq!(bench.recorder.stop().await.unwrap().error, None);
+}
+
+#[tokio::test]
+async fn a_disk_that_does_not_answer_is_written_to() {
+    let bench = Bench::with(|config| config.disk = Box::new(|_| Err(io::ErrorKind::Unsupported.into())));
+    bench.recorder.start(bench.request(None)).await.unwrap();
+    assert_eq!(bench.recorder.stop().await.unwrap().error, None);
+}
+
+#[tokio::test]
+async fn what_was_set_aside_is_given_back() {
+    use std::os::unix::fs::MetadataExt;
+    let bench = Bench::new();
+    let finished = bench.recorder.start(bench.request(None)).await.unwrap();
+    assert_eq!(bench.recorder.stop().await.unwrap().error, None);
+    let metadata = std::fs::metadata(&finished).unwrap();
+    assert!(metadata.blocks() * 512 < metadata.len() + (1 << 20), "{} blocks", metadata.blocks());
+}
+
+#[tokio::test]
+async fn a_folder_that_is_removed_comes_back_with_the_episode() {
+    let bench = Bench::new();
+    let finished = bench.recorder.start(bench.request(None)).await.unwrap();
+    bench.sample(TOF, 1, 0, Stamp::now().0, 0);
+    std::fs::remove_dir_all(finished.parent().unwrap()).unwrap();
+    bench.sample(TOF, 1, 1, Stamp::now().0, 0);
+    bench.script.taken().await;
+    let report = bench.recorder.stop().await.unwrap();
+    assert_eq!((report.error, report.file.as_path()), (None, finished.as_path()));
+    assert_eq!(read(&finished).on("/rapid/tof").count(), 2);
+    assert_eq!(std::fs::read_dir(finished.parent().unwrap()).unwrap().count(), 1);
+}
+
+#[tokio::test]
+async fn a_removed_file_is_said_while_it_is_recorded_and_takes_nobodys_name() {
+    let bench = Bench::new();
+    let mut events = bench.board.events();
+    let finished = bench.recorder.start(bench.request(None)).await.unwrap();
+    std::fs::remove_file(finished.with_extension("mcap.partial")).unwrap();
+    until(&mut events, |what| matches!(what, What::Log { text, .. } if text.contains("removed while"))).await;
+    std::fs::write(&finished, "of somebody else").unwrap();
+    let report = bench.recorder.stop().await.unwrap();
+    assert_eq!(
+        report.file.file_name().unwrap().to_str().unwrap(),
+        format!("{}-2.mcap", finished.file_stem().unwrap().to_str().unwrap())
+    );
+    read(&report.file);
+    assert_eq!(std::fs::read_to_string(&finished).unwrap(), "of somebody else");
+}
+
+#[tokio::test]
+async fn a_folder_that_is_moved_and_replaced_is_followed() {
+    let bench = Bench::new();
+    let finished = bench.recorder.start(bench.request(None)).await.unwrap();
+    let (out, elsewhere) = (finished.parent().unwrap(), bench.folder.path().join("elsewhere"));
+    std::fs::rename(out, &elsewhere).unwrap();
+    std::fs::create_dir(out).unwrap();
+    std::fs::write(finished.with_extension("mcap.partial"), "of somebody else").unwrap();
+    let report = bench.recorder.stop().await.unwrap();
+    assert_eq!((report.error, &report.file), (None, &elsewhere.join(finished.file_name().unwrap())));
+    read(&report.file);
+    assert_eq!(std::fs::read_dir(&elsewhere).unwrap().count(), 1);
+    assert_eq!(std::fs::read_to_string(finished.with_extension("mcap.partial")).unwrap(), "of somebody else");
+}
+
+#[tokio::test]
+async fn a_clock_that_is_set_is_an_event_and_no_time_goes_back() {
+    let set = Arc::new(AtomicI64::new(0));
+    let bench = Bench::with(|config| {
+        let set = Arc::clone(&set);
+        let offset = i128::from(1_700_000_000 * 1000 * MS);
+        config.clock = Box::new(move || WallClock::with_offset(offset + i128::from(set.load(Ordering::Relaxed))));
+    });
+    let mut events = bench.board.events();
+    let finished = bench.recorder.start(bench.request(None)).await.unwrap();
+    let mut sample = 0;
+    for by in [3600_i64 * 1000, -7200 * 1000] {
+        bench.sample(TOF, 1, sample, Stamp::now().0, 0);
+        sample += 1;
+        set.fetch_add(by * MS.cast_signed(), Ordering::Relaxed);
+        let step = until(&mut events, |what| matches!(what, What::ClockStep { .. })).await;
+        assert_eq!(step, What::ClockStep { seconds: by as f64 / 1000.0 });
+    }
+    bench.sample(TOF, 1, sample, Stamp::now().0, 0);
+    bench.script.taken().await;
+    let report = bench.recorder.stop().await.unwrap();
+    assert_eq!((report.error, report.file.as_path()), (None, finished.as_path()));
+    let read = read(&finished);
+    let told: Vec<_> = read.on("/rapid/event").filter(|message| text(&message.4, "kind") == "clock_step").collect();
+    assert_eq!(told.len(), 2);
+    assert!(text(&told[0].4, "text").contains("forward by 3600.000 s"), "{}", text(&told[0].4, "text"));
+    assert!(text(&told[1].4, "text").contains("back by 7200.000 s"), "{}", text(&told[1].4, "text"));
+    for topic in ["/rapid/tof", "/rapid/event", "/rapid/frame"] {
+        let times: Vec<u64> = read.on(topic).map(|message| message.2).collect();
+        assert!(times.len() > 1 && times.is_sorted_by(|a, b| a < b), "{topic}: {times:?}");
+    }
+    let begin: u64 = read.metadata["rapid"]["begin_wall_ns"].parse().unwrap();
+    assert!(read.messages.iter().all(|message| message.2.abs_diff(begin) < 600 * 1000 * MS));
+    // The next one begins by the clock as it is now.
+    let next = bench.recorder.start(bench.request(None)).await.unwrap();
+    bench.recorder.stop().await.unwrap();
+    let next: u64 = read_begin(&next);
+    assert!(next.abs_diff(begin - 3600 * 1000 * MS) < 600 * 1000 * MS);
+}
+
+fn read_begin(file: &Path) -> u64 {
+    read(file).metadata["rapid"]["begin_wall_ns"].parse().unwrap()
+}
