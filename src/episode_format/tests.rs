@@ -76,7 +76,7 @@ fn a_record_longer_than_its_chunk_is_damage_however_the_chunk_is_packed() {
 fn lengths_that_are_no_lengths_take_no_memory() {
     let huge = [u64::MAX, 1 << 63, 1 << 40, 1 << 28];
     for length in huge {
-        for opcode in 0..=u8::MAX {
+        for opcode in (0..=0x10).chain([0x7f, 0x80, 0xff]) {
             let bytes = [&MAGIC[..], &[opcode], &length.to_le_bytes(), b"little"].concat();
             let (records, found) = walked(&bytes).unwrap();
             assert!(records.is_empty() && found.end != FileEnd::Finished);

@@ -75,7 +75,7 @@ pub(crate) enum Trust {
     Sound,
     /// It lies in a chunk that the end of the file cuts, before the cut: nothing checks it.
     Torn,
-    /// It lies in a chunk whose check value is not right.
+    /// It lies in a chunk whose check value is not right, or where such a record has no place.
     Damaged,
 }
 
@@ -104,6 +104,8 @@ pub(crate) struct Walk<R> {
     unpacked: Vec<u8>,
     chunk: Option<Opened>,
     found: Option<Found>,
+    /// There was a chunk.
+    chunked: bool,
     /// The chunk is the last, and not whole.
     cut: bool,
 }
@@ -117,7 +119,7 @@ enum Next {
 
 /// Where a record that is shown lies.
 enum Found {
-    Buffer(u8),
+    Buffer(u8, Trust),
     Chunk { opcode: u8, unpacked: bool, range: Range<usize>, trust: Trust },
 }
 
@@ -137,6 +139,7 @@ impl<R: Read> Walk<R> {
             unpacked: Vec::new(),
             chunk: None,
             found: None,
+            chunked: false,
             cut: false,
         };
         let whole = walk.read(MAGIC.len() as u64)?;
@@ -164,7 +167,7 @@ impl<R: Read> Walk<R> {
     pub(crate) fn record(&self) -> Record<'_> {
         match &self.found {
             None => Record { opcode: 0, data: &[], trust: Trust::Sound },
-            Some(Found::Buffer(opcode)) => Record { opcode: *opcode, data: &self.buffer, trust: Trust::Sound },
+            Some(Found::Buffer(opcode, trust)) => Record { opcode: *opcode, data: &self.buffer, trust: *trust },
             Some(Found::Chunk { opcode, unpacked, range, trust }) => {
                 let bytes = if *unpacked { &self.unpacked } else { &self.buffer };
                 Record { opcode: *opcode, data: bytes.get(range.clone()).unwrap_or_default(), trust: *trust }
@@ -186,7 +189,11 @@ impl<R: Read> Walk<R> {
                 return Ok(None);
             }
             match self.next_in_file()? {
-                Next::Show(opcode) => return Ok(Some(Found::Buffer(opcode))),
+                Next::Show(opcode) => {
+                    // No writer mixes them: it is the index of a chunk's messages, one bit of it changed.
+                    let stray = self.chunked && opcode == op::MESSAGE;
+                    return Ok(Some(Found::Buffer(opcode, if stray { Trust::Damaged } else { Trust::Sound })));
+                }
                 Next::Again => {}
                 Next::End(end) => {
                     self.ended = true;
@@ -270,7 +277,7 @@ impl<R: Read> Walk<R> {
         self.walked.damaged_chunks += u64::from(damaged);
         self.checked &= !damaged;
         self.chunk = Some(opened);
-        self.cut = !whole;
+        (self.chunked, self.cut) = (true, !whole);
         Ok(Next::Again)
     }
 

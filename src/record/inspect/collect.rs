@@ -8,7 +8,7 @@ use super::super::wire::{Fields, protobuf};
 use super::judge::{Ending, Judge, recorded_verdict};
 use super::units;
 use super::{EventReport, Inspection, Lateness, MaskEdge, ModalityReport, TopicReport};
-use crate::episode_format::{EVENT_TOPIC, FRAME_TOPIC, MASK_TOPIC};
+use crate::episode_format::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, MASK_TOPIC, RECOVERED, SUMMARY};
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 
@@ -21,6 +21,7 @@ pub(super) struct Collected {
     channels: BTreeMap<u16, Channel>,
     about: BTreeMap<String, String>,
     summary: BTreeMap<String, String>,
+    repaired: bool,
     messages: u64,
     first: Option<u64>,
     last: u64,
@@ -85,11 +86,12 @@ impl Collected {
         let name = fields.string()?;
         let map = fields.map()?;
         match name {
-            "rapid" => {
+            ABOUT => {
                 self.judge = Judge::of(&map);
                 self.about = map;
             }
-            "rapid/summary" => self.summary = map,
+            SUMMARY => self.summary = map,
+            RECOVERED => self.repaired = true,
             _ => {}
         }
         Some(())
@@ -179,7 +181,7 @@ impl Collected {
             std::mem::take(&mut self.opened).into_iter().map(|(at, json)| (from(begin_ns, at), json)).collect();
         let units = units::told(&said(&self.summary, "provenance"), &said(&self.about, "provenance"), opened);
         let (mut modalities, topics) = self.topics(begin_ns, seconds);
-        let ending = Ending { file: walked, seconds, summary: &self.summary };
+        let ending = Ending { file: walked, seconds, summary: &self.summary, repaired: self.repaired };
         let verdict = judge.as_ref().map(|judge| judge.judge(&mut modalities, &ending)).unwrap_or_default();
         let count = modalities.len();
         let mask = self

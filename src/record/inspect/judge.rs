@@ -34,6 +34,8 @@ pub(super) struct Ending<'a> {
     pub(super) seconds: f64,
     /// The recorder's summary; empty without one.
     pub(super) summary: &'a BTreeMap<String, String>,
+    /// It was made of one that was not whole.
+    pub(super) repaired: bool,
 }
 
 /// Measures an episode while its file is read.
@@ -152,15 +154,17 @@ impl Judge {
             modalities: &judged,
             masks_dropped: said("masks_dropped"),
             events_missed: said("events_missed"),
-            losses: if counted.is_some() { Losses::Apart } else { Losses::Together },
-            file: file_state(ending.file),
+            // A repaired file's summary counts what is there.
+            losses: if counted.is_some() && ending.summary.contains_key("lost") { Losses::Apart } else { Losses::Together },
+            file: file_state(ending.file, ending.repaired),
         };
         judge(&facts)
     }
 }
 
-fn file_state(walked: Walked) -> FileState<'static> {
+fn file_state(walked: Walked, repaired: bool) -> FileState<'static> {
     match walked.end {
+        FileEnd::Finished if repaired => FileState::NotWhole("it was repaired, and what came last may be missing"),
         FileEnd::Finished if walked.damaged_chunks == 0 => FileState::Whole,
         FileEnd::Finished => FileState::NotWhole("parts of it are damaged"),
         FileEnd::Unfinished => FileState::NotWhole("the recorder has not finished it"),

@@ -1,12 +1,9 @@
 //! How the files of a repair are called.
 
 use std::ffi::OsString;
-use std::fs::File;
+use std::fs::{self, File};
 use std::io;
-use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
-
-use rustix::fs::OFlags;
 
 use super::super::episode::publish;
 
@@ -68,11 +65,14 @@ fn with_ending(path: &Path, ending: &str) -> PathBuf {
     path.with_file_name(name)
 }
 
-/// Creates the file a repair writes, or begins it anew. Only who holds the original's lock does.
+/// Creates the file a repair writes; what an ended one left of it goes. Only who holds the original's
+/// lock does.
 pub(super) fn create(recovering: &Path) -> io::Result<File> {
-    let flags = OFlags::NOFOLLOW.bits().cast_signed();
-    let file = File::options().write(true).create(true).truncate(true).custom_flags(flags).open(recovering)?;
-    if file.metadata()?.is_file() { Ok(file) } else { Err(io::Error::other("not a file: move it away")) }
+    match fs::remove_file(recovering) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
+        // Never one that is there: it may have another name elsewhere.
+        _ => File::create_new(recovering),
+    }
 }
 
 /// Renames `path` to its finished name and `.ending`, or `.ending-2` and so on: returns the name.

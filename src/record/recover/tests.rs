@@ -12,7 +12,7 @@ use super::*;
 use crate::episode_format::testing::{self, Message, metadata, mutated, mutations, strictly};
 use crate::record::Sink;
 use crate::record::tests::{Bench, registry};
-use crate::status::{Board, Level, What};
+use crate::status::{Board, Grade, Level, What};
 
 fn go_on(_: u64, _: u64) -> ControlFlow<()> {
     ControlFlow::Continue(())
@@ -100,6 +100,9 @@ async fn a_torn_episode_becomes_a_whole_one_with_all_that_was_in_it() {
     let inspected = crate::record::inspect::inspect(&repaired.to).unwrap();
     assert_eq!((inspected.end, inspected.messages), (FileEnd::Finished, messages.len() as u64));
     assert!((inspected.seconds - seconds).abs() < 1e-9 && inspected.dropped.is_none());
+    assert_eq!(inspected.verdict.grade, Grade::Bad, "a modality of the test never delivers");
+    let reason = "the file is not whole: it was repaired, and what came last may be missing";
+    assert!(inspected.verdict.reasons.iter().any(|said| said == reason), "{:?}", inspected.verdict);
 }
 
 #[tokio::test]
@@ -107,7 +110,7 @@ async fn cut_at_any_byte_what_comes_before_the_cut_is_kept() {
     let (_folder, bytes) = recorded().await;
     let original = strictly(&bytes);
     let mut before = 0;
-    for cut in (0..bytes.len()).step_by(97) {
+    for cut in (0..bytes.len()).step_by(397) {
         let Some(whole) = recover_bytes(&bytes[..cut]) else {
             assert!(cut < MAGIC.len());
             continue;
@@ -127,7 +130,7 @@ fn a_flipped_bit_costs_messages_and_never_makes_any() {
         let is_checked = layout < 3;
         let original: BTreeSet<Message> = strictly(&bytes).into_iter().collect();
         assert_eq!(original.len(), 200);
-        for at in 0..bytes.len() {
+        for at in (0..bytes.len()).step_by(3) {
             let mut flipped = bytes.clone();
             flipped[at] ^= 1 << (at % 8);
             let Some(whole) = recover_bytes(&flipped) else { continue };
@@ -141,7 +144,7 @@ fn a_flipped_bit_costs_messages_and_never_makes_any() {
 
 #[test]
 fn whatever_happened_to_a_file_the_repaired_one_is_whole() {
-    let config = ProptestConfig { cases: 300, failure_persistence: None, ..ProptestConfig::default() };
+    let config = ProptestConfig { cases: 100, failure_persistence: None, ..ProptestConfig::default() };
     for bytes in testing::layouts().map(testing::episode) {
         proptest!(config.clone(), |(mutations in mutations())| {
             if let Some(whole) = recover_bytes(&mutated(&bytes, &mutations)) {
@@ -339,14 +342,16 @@ fn what_is_no_file_is_said_and_not_touched() {
     fs::remove_file(at("text.mcap")).unwrap();
     fs::remove_file(at("bare.mcap")).unwrap();
     assert_eq!(names(folder.path()), before);
-    // A link in the place of the file to be written is not followed.
+    // A link in the place of the file to be written is not followed, nor what it means written to.
     let partial = at("a.mcap.partial");
     let bytes = testing::episode(testing::options());
     fs::write(&partial, &bytes[..bytes.len() / 2]).unwrap();
     std::os::unix::fs::symlink(at("target"), at("a.mcap.recovering")).unwrap();
-    assert!(matches!(recover(&partial, &mut go_on), Err(RecoverError::Io { .. })));
+    repaired(&partial);
+    fs::write(&partial, &bytes[..bytes.len() / 2 + 1]).unwrap();
+    fs::hard_link(at("target"), at("a.mcap.recovering")).unwrap();
+    repaired(&partial);
     assert_eq!(fs::read(at("target")).unwrap(), bytes);
-    assert!(partial.exists());
 }
 
 #[tokio::test]

@@ -30,6 +30,7 @@ pub const TARGETS: &[Target] = &[
     Target { name: "serial", run: targets::serial, seeds: seeds::serial },
     Target { name: "message", run: targets::message, seeds: seeds::messages },
     Target { name: "inspect", run: targets::inspect, seeds: seeds::episodes },
+    Target { name: "recover", run: targets::recover, seeds: seeds::episodes },
     Target { name: "replay", run: targets::replay, seeds: seeds::episodes },
     Target { name: "mask", run: targets::mask, seeds: seeds::masks },
     Target { name: "layout", run: targets::layout, seeds: seeds::layouts },

@@ -12,6 +12,7 @@ use rapid::driver;
 use rapid::headless::style::Palette;
 use rapid::mask::{MaskRecord, RECORD_LEN};
 use rapid::record::inspect as inspection;
+use rapid::record::recover::recover_bytes;
 use rapid::registry::artifacts::{ArtifactKind, artifacts};
 use rapid::registry::scenario::Scenario;
 use rapid::registry::units::{parse_duration, parse_size, show_duration, show_size};
@@ -122,12 +123,20 @@ pub fn inspect(bytes: &[u8]) {
     assert!(report.seconds.is_finite() && report.seconds >= 0.0, "{} s", report.seconds);
 }
 
+/// A file as `rapid recover` reads it: what is made of it needs no second repair.
+pub fn recover(bytes: &[u8]) {
+    let Some(whole) = short(bytes).and_then(recover_bytes) else { return };
+    let report = inspection::inspect_bytes(&whole).expect("a repaired file is an MCAP file");
+    assert_eq!((report.end, report.damaged_chunks, report.unread_bytes), (inspection::FileEnd::Finished, 0, 0));
+}
+
 /// A file as `rapid replay` reads it. It reads files, so one is written.
 pub fn replay(bytes: &[u8]) {
     thread_local! {
         static FILE: RefCell<Option<Scratch>> = const { RefCell::new(None) };
     }
     let Some(bytes) = short(bytes) else { return };
+    driver::replay::read_bytes(bytes);
     FILE.with_borrow_mut(|file| {
         let file = file.get_or_insert_with(Scratch::new);
         file.fill(bytes);
