@@ -82,6 +82,7 @@ pub mod cli;
 pub mod commands;
 pub mod dispatch;
 pub mod driver;
+pub mod fault;
 pub mod headless;
 pub mod hotplug;
 pub mod logging;

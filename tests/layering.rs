@@ -21,7 +21,7 @@ use proc_macro2::{Delimiter, TokenStream, TokenTree};
 /// Modules by layer, lowest first. A module sees those of lower layers.
 const LAYERS: &[&[&str]] = &[
     &["modality", "mask", "sample", "time", "action"],
-    &["registry", "status", "text", "outlet"],
+    &["registry", "status", "text", "outlet", "fault"],
     &["hotplug", "driver", "bus", "sync"],
     &["rig", "record", "policy", "control"],
     &["app", "tui", "headless", "logging"],

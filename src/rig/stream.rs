@@ -15,6 +15,7 @@ use tokio_util::sync::CancellationToken;
 use super::slot::End;
 use crate::bus::Writer;
 use crate::driver::{Driver, DriverError, Reading};
+use crate::fault;
 use crate::registry::{Attachment, DeviceSpec};
 use crate::sample::{Epoch, SampleHeader};
 use crate::status::Board;
@@ -138,6 +139,7 @@ impl Stream {
 
     /// One copy, from the driver's buffer into shared memory.
     fn publish(&self, reading: &Reading<'_>) -> Result<(), String> {
+        fault::point("stream");
         let (seq, lost) = self.numbers.take(reading.lost);
         let header = SampleHeader {
             seq,
