@@ -204,6 +204,9 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     finish(running, conductor, outcome).await
 }
 
+/// The screen has limits of its own for a reader that does not read. This one is for a screen that is
+/// stuck: crossterm 0.29 reads without end from a terminal that was hung up at the wrong moment.
+const LAST_OUTPUT: Duration = Duration::from_secs(10);
 /// After a second signal, what is still to be shown has this long: enough for a terminal to be given
 /// back.
 const LAST_OUTPUT_IN_A_HURRY: Duration = Duration::from_secs(1);
@@ -221,7 +224,14 @@ fn start_screen(
     if screen == Screen::Monitor {
         return tokio::spawn(async move {
             tokio::select! {
-                outcome = tui::run(board, commands, stop) => Ok(outcome?),
+                outcome = tui::run(board, commands, stop) => match outcome {
+                    // As good as SIGHUP, which comes with it or a little later.
+                    Err(error @ TuiError::Gone(_)) => {
+                        tracing::warn!(%error, "the run ends");
+                        Ok(())
+                    }
+                    outcome => Ok(outcome?),
+                },
                 never = fault::strike("screen") => never,
             }
         });
@@ -309,8 +319,7 @@ async fn finish(
     drop(take_down);
     running.screen_stop.cancel();
     if running.screen.is_some() {
-        let limit = if twice { LAST_OUTPUT_IN_A_HURRY } else { Duration::MAX };
-        // The screen has limits of its own for a reader that does not read.
+        let limit = if twice { LAST_OUTPUT_IN_A_HURRY } else { LAST_OUTPUT };
         if let Ok(ended) = timeout(limit, screen_ended(&mut running.screen)).await {
             keep_first(&mut outcome, ended);
         }
