@@ -3,7 +3,7 @@ SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup setup-build demo test lint check bench clean
+.PHONY: help setup setup-build demo test lint check bench fuzz clean
 
 # A toolchain just installed by rustup is not on the PATH of a shell that was open before.
 export PATH := $(PATH):$(HOME)/.cargo/bin
@@ -36,10 +36,15 @@ check: setup-build lint ## lints, documentation, licences, bans, sources and kno
 	RUSTDOCFLAGS='-D warnings' cargo doc --locked --workspace --no-deps
 	scripts/deny.sh
 
-bench: setup ## print figures from the virtual bench; nothing passes or fails
-	cargo build --release --locked
-	cargo build --release --locked -p vbench --bins
-	RAPID_BIN='$(TARGET)/release/rapid' '$(TARGET)/release/vbench-cycles'
+bench: setup ## print figures beside their baselines (JSON=1; BENCH="--quick --only sync"); nothing passes or fails
+	cargo build --release --locked --bin rapid --example unplug_latency
+	cargo build --release --locked -p vbench -p rapid-bench --bins
+	RAPID_BIN='$(TARGET)/release/rapid' '$(TARGET)/release/rapid-bench' $(if $(JSON),--json) $(BENCH)
+
+# The compiler for C++ is for libFuzzer alone.
+fuzz: ## feed every reader of strangers' bytes with made-up ones, each for FUZZ_SECONDS=60
+	@scripts/setup.sh build fuzz
+	scripts/fuzz.sh
 
 clean: ## remove what was built here (what setup fetched stays)
 	cargo clean

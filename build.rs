@@ -3,7 +3,8 @@
 //! hand.
 
 use std::error::Error;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::process::Command;
 
 const PROTO: &str = "src/record/proto";
 const SCHEMAS: [&str; 8] = [
@@ -23,6 +24,7 @@ const LIBRARY: &str = "libonnxruntime.so.";
 
 fn main() -> Result<(), Box<dyn Error>> {
     onnxruntime()?;
+    commit();
     println!("cargo::rerun-if-changed={PROTO}");
     println!("cargo::rerun-if-changed=build.rs");
     let out = PathBuf::from(std::env::var("OUT_DIR")?);
@@ -33,6 +35,26 @@ fn main() -> Result<(), Box<dyn Error>> {
         std::fs::write(out.join(format!("{}.bin", schema.replace('/', "."))), set)?;
     }
     Ok(())
+}
+
+/// Names the commit a release is built from. A source archive has none. Builds for development have
+/// none either: each commit would build them anew.
+fn commit() {
+    // Asked for here and not found by git itself: the archive may lie in somebody else's repository.
+    if std::env::var("PROFILE").as_deref() != Ok("release") || !Path::new(".git").exists() {
+        return;
+    }
+    let ask = |arguments: &[&str]| {
+        let output = Command::new("git").args(arguments).output().ok().filter(|output| output.status.success())?;
+        Some(String::from_utf8(output.stdout).ok()?.trim().to_owned())
+    };
+    // It grows whenever another commit is checked out or made.
+    if let Some(log) = ask(&["rev-parse", "--git-path", "logs/HEAD"]).filter(|log| Path::new(log).exists()) {
+        println!("cargo::rerun-if-changed={log}");
+    }
+    if let Some(commit) = ask(&["rev-parse", "HEAD"]) {
+        println!("cargo::rustc-env=RAPID_COMMIT={commit}");
+    }
 }
 
 /// This version runs no policy and embeds nothing: it says what a build leaves out, so that nobody

@@ -82,5 +82,10 @@ fn device(arguments: &[String]) -> Result<DeviceSpec, Box<dyn std::error::Error>
         max_bytes: 4 << 20,
         depth: 4,
         when_stale: WhenStale::Hold,
+        verdict: rapid::registry::VerdictSpec::of(
+            rapid::modality::ModalityKind::Image,
+            Duration::from_millis(500),
+            None,
+        ),
     })
 }

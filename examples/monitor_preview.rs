@@ -74,6 +74,12 @@ fn registry(count: u8) -> Registry {
             max_bytes: 1 << 20,
             depth: 8,
             when_stale: WhenStale::Hold,
+            verdict: rapid::registry::VerdictSpec::of(
+                rapid::modality::ModalityKind::Image,
+                std::time::Duration::from_millis(500),
+                None,
+            ),
+            latency: Duration::ZERO,
         })
     };
     Registry {
@@ -105,7 +111,7 @@ async fn pretend(board: Arc<Board>, count: u8, mut commands: mpsc::Receiver<Comm
                 Command::ToggleRecording => match episode.take() {
                     Some((_, file, _)) => {
                         say(&board, Level::Info, format!("episode {} finished", file.display()));
-                        board.set_last_episode(file);
+                        board.set_last_episode(file, rapid::status::Verdict::default());
                     }
                     None => episode = Some((Stamp::now(), "episodes/2026-01-01_place-block_001.mcap".into(), 0)),
                 },

@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
 # Brings a Debian or Ubuntu machine that has git, make and a Rust toolchain to where `rapid` builds, runs and is tested.
 #
-#     setup.sh [build] [test]
+#     setup.sh [build] [test] [fuzz]
 #
 # build: what building and running need. test: the rest - lint tools, the Python that reads episodes and topics from
-# outside, the pinned onnxruntime library, the virtual bench with its guest image.
+# outside, the pinned onnxruntime library, the virtual bench with its guest image. fuzz: what libFuzzer is built with.
 #
 # Every step looks first and does nothing when it is done already. Whatever is fetched lies outside the tree in
 # ${XDG_CACHE_HOME:-~/.cache}/rapid, is checked against the hashes pinned in the tree, and gets its final name last:
@@ -19,6 +19,7 @@ readonly VENV="$CACHE/venv"
 # pkg-config, libudev-dev: crate udev. libclang-dev: the V4L2 bindings. libstdc++6: onnxruntime at run time.
 readonly BUILD_PACKAGES=(gcc libc6-dev pkg-config libudev-dev libclang-dev libstdc++6)
 readonly TEST_PACKAGES=(python3 python3-venv)
+readonly FUZZ_PACKAGES=(g++)
 
 changed=0
 
@@ -40,7 +41,8 @@ main() {
         case "$part" in
             build) wanted+=("${BUILD_PACKAGES[@]}") ;;
             test) mapfile -t -O "${#wanted[@]}" wanted < <(test_packages) ;;
-            *) die "unknown part '$part': build or test" ;;
+            fuzz) wanted+=("${FUZZ_PACKAGES[@]}") ;;
+            *) die "unknown part '$part': build, test or fuzz" ;;
         esac
     done
     toolchain

@@ -1,7 +1,7 @@
 //! The program: puts the stages together, runs them, and takes them down in order.
 //!
-//! Taking down: the episode ends and streams stop, the recorder finishes its file, the mask says 0
-//! and its files go, the screen says what was recorded and gives the terminal back.
+//! Taking down: the episode ends and streams stop, the recorder finishes its file, the programs of
+//! devices are waited for, the mask says 0 and its files go, the screen says what was recorded and gives the terminal back.
 //!
 //! Invariant: only this module sees every stage.
 //! Invariant: whatever ends the run, an episode in progress is finished first.
@@ -30,6 +30,7 @@ use crate::hotplug::udev::UdevMonitor;
 use crate::hotplug::{HotplugError, HotplugStream};
 use crate::logging::{self, LoggingError, Stderr};
 use crate::mask::MASK_PATH;
+use crate::record::recover::Repairs;
 use crate::record::{EpisodeRequest, RecordError, Recorder, RecorderConfig};
 use crate::registry::Registry;
 use crate::registry::scenario::Scenario;
@@ -172,6 +173,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     let (rig_commands, rig_asked) = mpsc::channel(16);
     let mut rig = Rig::new(&registry, &bus, presence, Arc::clone(&board));
     let rig_ended = CancellationToken::new();
+    let hurry = rig.hurry();
     let rig = tokio::spawn({
         let (stop, ended) = (rig_stop.clone(), rig_ended.clone().drop_guard());
         async move {
@@ -185,6 +187,12 @@ pub async fn run(options: Options) -> Result<(), AppError> {
         }
     });
     let episode = EpisodeRequest { duration: options.duration, ..options.episode };
+    // In the background: nothing of this run waits for what an earlier one left behind.
+    let may_record = options.record || options.screen == Screen::Monitor;
+    let _repairs = may_record.then(|| {
+        let repairs = Repairs::start(episode.out.clone(), Arc::clone(&board));
+        repairs.inspect_err(|error| tracing::warn!(%error, "unfinished episodes are not repaired")).ok()
+    });
     let mut conductor = Conductor {
         events: board.events(),
         board,
@@ -197,7 +205,8 @@ pub async fn run(options: Options) -> Result<(), AppError> {
         recording: false,
     };
     let (kind, screen) = (options.screen, Some(screen));
-    let mut running = Running { rig, rig_ended, rig_stop, mask_ended, kind, screen, screen_stop, signals, asked };
+    let mut running =
+        Running { rig, rig_ended, rig_stop, hurry, mask_ended, kind, screen, screen_stop, signals, asked };
     // A panic here ends the run like any other: what it leaves is taken down in order.
     let conducted = AssertUnwindSafe(conductor.conduct(&mut running)).catch_unwind().await;
     let outcome = conducted.unwrap_or(Err(AppError::Panicked("the main task")));
@@ -258,6 +267,7 @@ struct Running {
     rig: JoinHandle<(Rig, Result<(), RigError>)>,
     rig_ended: CancellationToken,
     rig_stop: CancellationToken,
+    hurry: CancellationToken,
     mask_ended: CancellationToken,
     kind: Screen,
     /// Until its outcome was taken.
@@ -282,22 +292,19 @@ async fn finish(
     mut outcome: Result<(), AppError>,
 ) -> Result<(), AppError> {
     running.rig_stop.cancel();
-    let hurry = running.rig.abort_handle();
-    let rig = &mut running.rig;
+    let rig = running.rig;
     let take_down = async {
-        let rig = match rig.await {
-            Ok((rig, ended)) => {
-                keep_first(&mut outcome, ended.map_err(AppError::from));
-                Some(rig)
-            }
-            Err(ended) if ended.is_panic() => {
-                keep_first(&mut outcome, Err(AppError::Panicked("the rig")));
-                None
-            }
-            // Not waited for.
-            Err(_) => None,
+        let rig = if let Ok((rig, ended)) = rig.await {
+            keep_first(&mut outcome, ended.map_err(AppError::from));
+            Some(rig)
+        } else {
+            keep_first(&mut outcome, Err(AppError::Panicked("the rig")));
+            None
         };
         keep_first(&mut outcome, conductor.finish_episode().await);
+        if let Some(rig) = &rig {
+            rig.programs_ended().await;
+        }
         // Dropping joins threads: the writer's, which has nothing left to write, and the mask's.
         let dropped = tokio::task::spawn_blocking(move || {
             drop(conductor);
@@ -313,7 +320,7 @@ async fn finish(
     };
     if twice {
         // What the rig waits for is skipped, the recorder's finish never.
-        hurry.abort();
+        running.hurry.cancel();
         take_down.as_mut().await;
     }
     drop(take_down);

@@ -45,9 +45,20 @@ Examples:
   rapid                                 the monitor on the real rig
   rapid --headless --record --duration 30s --task \"place block\" --tag finger=soft
   rapid inspect episodes/20260101_place-block_001.mcap
+  rapid recover episodes                after a crash: makes the unfinished episodes whole
 
 Exit codes: 0 done, 1 failed while running, 2 bad configuration or arguments,
             130 interrupted twice";
+
+const RECOVER: &str = "\
+A run that may record does this by itself, in the background, for what it finds in its --out folder.
+
+X.mcap.partial becomes X.mcap, and is kept as X.mcap.damaged if not all of it could be read. Of a cut or
+damaged X.mcap a whole X.recovered.mcap is made beside it. A file being written is left alone.
+
+Examples:
+  rapid recover episodes
+  rapid recover copied/20260101_place-block_001.mcap";
 
 const RUN: &str = "Options of a run";
 const GENERAL: &str = "General options";
@@ -141,11 +152,21 @@ pub enum Command {
         #[arg(long)]
         watch: bool,
     },
-    /// Tells what an episode holds: messages, rates, gaps, lateness, presence over time
+    /// Tells what an episode holds: its verdict, messages, rates, gaps, lateness, presence over time
+    #[command(after_help = "Of one file a report; of a folder or of several files one line each, GOOD, SUSPECT or \
+        BAD.\n\nExamples:\n  rapid inspect episodes/20260101_place-block_001.mcap\n  rapid inspect episodes\n  \
+        rapid inspect --json episodes | jq -r 'select(.verdict == \"GOOD\") | .file'")]
     Inspect {
-        /// Episode, finished or .partial
-        #[arg(value_hint = ValueHint::FilePath)]
-        file: PathBuf,
+        /// Episodes, finished or .partial, or folders of them
+        #[arg(value_hint = ValueHint::AnyPath, value_name = "FILE|DIR", required = true)]
+        paths: Vec<PathBuf>,
+    },
+    /// Makes whole episodes of those that were not finished: after a kill, a loss of power, a full disk
+    #[command(after_help = RECOVER)]
+    Recover {
+        /// Episodes, or folders: of a folder every .partial is repaired
+        #[arg(required = true, value_name = "FILE|DIR", value_hint = ValueHint::AnyPath)]
+        paths: Vec<PathBuf>,
     },
     /// Plays an episode as if its devices were plugged in
     #[command(after_help = "The registry is the one in the episode; --config is not looked at.")]

@@ -6,6 +6,8 @@ use std::io::{self, IsTerminal, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use clap::CommandFactory;
@@ -14,18 +16,22 @@ use tokio_util::sync::CancellationToken;
 use crate::app::{self, AppError, Devices, Options, Screen, mask_path};
 use crate::cli::{Cli, Command, Global, RunArgs, SimArgs};
 use crate::commands::devices::{Entries, Formats};
+use crate::commands::inspect::InspectFailure;
 use crate::commands::{self, Format, Outcome, mask::MaskOptions};
 use crate::driver::{DriverError, replay};
 use crate::headless::style::{ColourChoice, Palette, Terminal};
 use crate::hotplug::udev;
 use crate::record::inspect::{self, InspectError};
-use crate::record::{EpisodeRequest, RecordError};
+use crate::record::{self, EpisodeRequest, RecordError};
 use crate::registry::scenario::Scenario;
 use crate::registry::{Registry, RegistryErrors};
 use crate::rig::presence::{PresenceError, json_path, read_mask};
+use crate::text;
 
 /// Tasks that are left at the end have this long to go.
 const LAST_TASKS: Duration = Duration::from_millis(500);
+/// The mask's JSON file holds 64 devices at most; anything larger is not it.
+const LARGEST_JSON: u64 = 1 << 20;
 
 /// Why a command ended without having done what it was asked.
 #[derive(Debug, thiserror::Error)]
@@ -51,6 +57,9 @@ enum Failure {
     Artifacts(#[from] commands::artifacts::ArtifactsError),
     #[error(transparent)]
     Mask(#[from] commands::mask::MaskError),
+    /// Not every file was repaired; which and why has been printed.
+    #[error("")]
+    Recover(commands::recover::Outcome),
     /// The episode to play is none.
     #[error(transparent)]
     Replay(DriverError),
@@ -65,6 +74,15 @@ enum Failure {
     /// Whatever was done has been undone on the way here.
     #[error("rapid panicked; please report this")]
     Panicked,
+}
+
+impl From<InspectFailure> for Failure {
+    fn from(failure: InspectFailure) -> Self {
+        match failure {
+            InspectFailure::Episode(error) => Self::Inspect(error),
+            InspectFailure::Output(error) => Self::Output(error),
+        }
+    }
 }
 
 impl Failure {
@@ -84,6 +102,7 @@ impl Failure {
             {
                 2
             }
+            Self::Recover(outcome) if outcome.is_bad_argument() => 2,
             _ => 1,
         }
     }
@@ -102,7 +121,9 @@ pub fn dispatch(cli: Cli) -> ExitCode {
         // Whoever read the output has read enough of it.
         Err(Failure::Output(error)) if error.kind() == io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
         Err(failure) => {
-            let text = failure.to_string();
+            // Paths and what a library says of a file are text of strangers.
+            let text: Vec<_> = failure.to_string().lines().map(|line| text::plain(line).into_owned()).collect();
+            let text = text.join("\n");
             if !text.is_empty() {
                 let _ = writeln!(io::stderr(), "{} {text}", stderr_palette().bad("error:"));
             }
@@ -141,14 +162,11 @@ fn print(global: &Global, before: SimArgs, command: Command) -> Result<(), Failu
             Ok(commands::artifacts::write(&registry, &to, out)?)
         }
         Command::Mask { watch } => mask(global, watch),
-        Command::Inspect { file } => {
-            let inspection = inspect::inspect(&file)?;
-            if format == Format::Json {
-                serde_json::to_writer(&mut *out, &inspection).map_err(io::Error::from)?;
-                return Ok(writeln!(out)?);
-            }
-            Ok(out.write_all(inspect::render(&inspection, columns(), paint()).as_bytes())?)
-        }
+        Command::Inspect { paths } => match commands::inspect::inspect(&paths, format, columns(), paint(), out)? {
+            Outcome::Done => Ok(()),
+            Outcome::BadConfiguration => Err(Failure::Told),
+        },
+        Command::Recover { paths } => recover(&paths, format),
         Command::Completions { shell } => Ok(commands::completions::completions(&mut Cli::command(), shell, out)?),
         Command::Replay { .. } => Ok(()),
     }
@@ -202,7 +220,7 @@ fn devices(
 fn mask(global: &Global, watch: bool) -> Result<(), Failure> {
     let path = mask_path(global.instance.as_deref());
     let json = json_path(&path);
-    let names = || commands::mask::layout(&std::fs::read_to_string(&json).ok()?);
+    let names = || commands::mask::layout(&crate::folder::read_text(&json, LARGEST_JSON).ok()?);
     let read = || read_mask(&path).map_err(|error| error.to_string());
     let options = MaskOptions { watch, json: global.json, palette: palette() };
     let stop = CancellationToken::new();
@@ -215,6 +233,31 @@ fn mask(global: &Global, watch: bool) -> Result<(), Failure> {
         });
         Ok(commands::mask::run(read, names, crate::time::realtime_ns, options, stop, io::stdout()).await?)
     })?
+}
+
+fn recover(paths: &[PathBuf], format: Format) -> Result<(), Failure> {
+    let progress = io::stderr().is_terminal() && format == Format::Text;
+    let stop = Arc::new(AtomicBool::new(false));
+    let asked = Arc::clone(&stop);
+    let paths = paths.to_owned();
+    let told = block_on(async move {
+        let mut work = tokio::task::spawn_blocking(move || {
+            commands::recover::run(&paths, format, progress, &asked, &mut io::stdout(), &mut io::stderr())
+        });
+        let interrupted = tokio::select! {
+            done = &mut work => return Ok(done),
+            interrupted = tokio::signal::ctrl_c() => interrupted,
+        };
+        interrupted?;
+        stop.store(true, Ordering::Relaxed);
+        tokio::select! {
+            done = &mut work => Ok(done),
+            // The disk may take its time; what was repaired is repaired.
+            _ = tokio::signal::ctrl_c() => Err(Failure::App(AppError::InterruptedTwice)),
+        }
+    })??;
+    let outcome = told.map_err(|_| Failure::App(AppError::Panicked("the repair")))??;
+    if outcome.is_done() { Ok(()) } else { Err(Failure::Recover(outcome)) }
 }
 
 /// The rig: on this machine, simulated, or played from an episode.
@@ -265,14 +308,7 @@ fn run(global: &Global, args: &RunArgs, source: Source) -> Result<(), Failure> {
 /// The folder an episode is to be written to at once: better refused before the devices are started.
 fn prepare(out: &Path) -> Result<(), RecordError> {
     let refused = |source| RecordError::Io { path: out.to_owned(), source };
-    match std::fs::create_dir(out) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => return Err(RecordError::NoFolder(out.to_owned())),
-        Err(error) if error.kind() != io::ErrorKind::AlreadyExists => return Err(refused(error)),
-        _ => {}
-    }
-    if !out.is_dir() {
-        return Err(refused(io::Error::new(io::ErrorKind::NotADirectory, "not a folder; choose another with --out")));
-    }
+    record::open_folder(out)?;
     let enter_and_write = rustix::fs::Access::WRITE_OK | rustix::fs::Access::EXEC_OK;
     rustix::fs::access(out, enter_and_write).map_err(|error| refused(error.into()))
 }

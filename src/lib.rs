@@ -17,10 +17,14 @@
 //!                                         memory     v          v
 //!  L3                                                record      one episode, one MCAP file
 //!
+//!  L2   calibration                                how late a sensor is
+//!
 //!  L1   registry                                 devices.toml, checked
 //!       status                                   the board every stage reports on
 //!       text   outlet                            words and lines for people
-//!  L0   modality   mask   sample   time          nouns
+//!       folder                                   files others cannot lead astray
+//!       episode_format                           an episode's file, record by record
+//!  L0   modality   mask   sample   time   provenance   flash     nouns
 //! ```
 //!
 //! The arrows are the way of the data. Imports point down only; the stages of L3 do not know one
@@ -78,17 +82,22 @@
 
 pub mod app;
 pub mod bus;
+pub mod calibration;
 pub mod cli;
 pub mod commands;
 pub mod dispatch;
 pub mod driver;
+pub mod episode_format;
 pub mod fault;
+pub mod flash;
+pub mod folder;
 pub mod headless;
 pub mod hotplug;
 pub mod logging;
 pub mod mask;
 pub mod modality;
 pub mod outlet;
+pub mod provenance;
 pub mod record;
 pub mod registry;
 pub mod rig;

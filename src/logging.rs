@@ -157,7 +157,7 @@ impl StderrSink {
         if self.form == Stderr::Json {
             let time = crate::time::rfc3339(line.wall_ns);
             let object = serde_json::json!({ "event": "log", "level": line.level, "text": line.text, "time": time });
-            return format!("{object}\n");
+            return format!("{}\n", text::json(&object).unwrap_or_default());
         }
         let time = self.palette.faint(&crate::time::time_of_day(line.wall_ns));
         let level = format!("{:5}", line.level.word());

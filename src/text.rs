@@ -4,11 +4,14 @@
 //! terminal, not bytes or characters.
 //!
 //! Invariant: no text is cut within a character, and nothing that moves a cursor or turns the
-//! direction of writing leaves [`plain`].
+//! direction of writing leaves [`plain`] or [`json`].
 
 use std::borrow::Cow;
+use std::io;
 use std::time::Duration;
 
+use serde::Serialize;
+use serde_json::ser::Formatter;
 use unicode_segmentation::UnicodeSegmentation;
 use unicode_width::UnicodeWidthStr;
 
@@ -24,6 +27,36 @@ pub fn width(text: &str) -> usize {
 #[must_use]
 pub fn plain(text: &str) -> Cow<'_, str> {
     if text.contains(is_unsafe) { Cow::Owned(text.replace(is_unsafe, " ")) } else { Cow::Borrowed(text) }
+}
+
+/// `value` as one line of JSON, without a line end, in which what [`plain`] takes out of a text is
+/// written as `\u` escapes: the same value to a program, harmless to a terminal.
+///
+/// # Errors
+/// When `value` has no form in JSON: a map whose keys are no texts.
+pub fn json(value: &impl Serialize) -> serde_json::Result<String> {
+    let mut line = Vec::new();
+    value.serialize(&mut serde_json::Serializer::with_formatter(&mut line, Escaped))?;
+    Ok(String::from_utf8_lossy(&line).into_owned())
+}
+
+struct Escaped;
+
+impl Formatter for Escaped {
+    /// A part of a text without what JSON escapes itself.
+    fn write_string_fragment<W: io::Write + ?Sized>(&mut self, out: &mut W, fragment: &str) -> io::Result<()> {
+        let mut rest = fragment;
+        while let Some(at) = rest.find(is_unsafe) {
+            let (before, from) = rest.split_at(at);
+            out.write_all(before.as_bytes())?;
+            let mut after = from.chars();
+            for unit in after.next().into_iter().flat_map(|c| c.encode_utf16(&mut [0; 2]).to_vec()) {
+                write!(out, "\\u{unit:04x}")?;
+            }
+            rest = after.as_str();
+        }
+        out.write_all(rest.as_bytes())
+    }
 }
 
 fn is_unsafe(c: char) -> bool {
@@ -119,6 +152,20 @@ pub fn size(bytes: u64) -> String {
     format!("{value:.1} EB")
 }
 
+/// A number with its thousands apart: `9,312`.
+#[must_use]
+pub fn count(number: u64) -> String {
+    let digits = number.to_string();
+    let mut text = String::with_capacity(digits.len() + digits.len() / 3);
+    for (at, digit) in digits.chars().enumerate() {
+        if at > 0 && (digits.len() - at).is_multiple_of(3) {
+            text.push(',');
+        }
+        text.push(digit);
+    }
+    text
+}
+
 /// Samples per second, with one decimal below 1000.
 #[must_use]
 pub fn hertz(hz: f64) -> String {
@@ -150,6 +197,15 @@ mod tests {
     }
 
     #[test]
+    fn json_is_harmless_to_a_terminal_and_the_same_to_a_program() {
+        let hostile = "a\u{9b}2J\u{7f}\u{202e}b\"\\\n\0ü\u{feff}";
+        let line = json(&serde_json::json!({ "serial": hostile })).unwrap();
+        assert_eq!(line, r#"{"serial":"a\u009b2J\u007f\u202eb\"\\\n\u0000ü\ufeff"}"#);
+        let read: serde_json::Value = serde_json::from_str(&line).unwrap();
+        assert_eq!(read["serial"], hostile);
+    }
+
+    #[test]
     fn quantities_are_short() {
         assert_eq!(clock(Duration::from_secs(123)), "02:03");
         assert_eq!(clock(Duration::from_secs(3723)), "1:02:03");
@@ -163,6 +219,7 @@ mod tests {
         assert_eq!(size(999_999), "1.0 MB");
         assert_eq!(size(12_345_678), "12.3 MB");
         assert_eq!(size(u64::MAX), "18.4 EB");
+        assert_eq!([0, 999, 1000, 9312, 1_234_567].map(count), ["0", "999", "1,000", "9,312", "1,234,567"]);
         assert_eq!(hertz(29.97), "30.0");
         assert_eq!(hertz(1000.2), "1000");
     }
@@ -174,6 +231,13 @@ mod tests {
             prop_assert_eq!(width(&left(&text, columns, "~")), columns.max(width(&cut(&text, columns, "~"))));
             prop_assert!(width(&cut(&text, columns, "…")) <= columns);
             prop_assert!(!plain(&text).contains(char::is_control));
+        }
+
+        #[test]
+        fn json_of_any_text_is_read_back_and_holds_nothing_unsafe(text in any::<String>()) {
+            let line = json(&text).unwrap();
+            prop_assert!(!line.contains(is_unsafe));
+            prop_assert_eq!(serde_json::from_str::<String>(&line).unwrap(), text);
         }
     }
 }

@@ -55,7 +55,7 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static COUNTING: Counting = Counting;
 
-const CAMERA: SimSource = SimSource::Camera { width: 64, height: 48, fps: 200, seed: 3 };
+const CAMERA: SimSource = SimSource::Camera { width: 64, height: 48, fps: 200, seed: 3, bytes: 0 };
 const SERIAL: SimSource = SimSource::Serial { channels: 4, hz: 500, seed: 3 };
 
 fn spec(node: NodeSpec) -> DeviceSpec {
@@ -70,6 +70,12 @@ fn spec(node: NodeSpec) -> DeviceSpec {
         max_bytes: 1 << 20,
         depth: 4,
         when_stale: WhenStale::Hold,
+        latency: Duration::ZERO,
+        verdict: rapid::registry::VerdictSpec::of(
+            rapid::modality::ModalityKind::Image,
+            Duration::from_millis(500),
+            Some(30.0),
+        ),
     }
 }
 
@@ -90,7 +96,7 @@ async fn open_sim(source: SimSource) -> (Driver, Arc<SimDevice>) {
     let spec = match source {
         SimSource::Camera { .. } => camera_spec(),
         SimSource::Serial { channels, .. } => serial_spec(Framing::Line, Parse::Csv, channels),
-        SimSource::Replay { .. } => serial_spec(Framing::Line, Parse::Csv, 1),
+        SimSource::Process | SimSource::Replay { .. } => serial_spec(Framing::Line, Parse::Csv, 1),
     };
     let device = sim_device(source);
     let driver = Driver::open(&spec, &DeviceNode::Sim(Arc::clone(&device))).await.unwrap();

@@ -20,9 +20,9 @@ use proc_macro2::{Delimiter, TokenStream, TokenTree};
 
 /// Modules by layer, lowest first. A module sees those of lower layers.
 const LAYERS: &[&[&str]] = &[
-    &["modality", "mask", "sample", "time", "action"],
-    &["registry", "status", "text", "outlet", "fault"],
-    &["hotplug", "driver", "bus", "sync"],
+    &["modality", "mask", "sample", "time", "action", "provenance", "flash"],
+    &["registry", "status", "text", "outlet", "folder", "episode_format", "fault"],
+    &["hotplug", "driver", "bus", "sync", "calibration"],
     &["rig", "record", "policy", "control"],
     &["app", "tui", "headless", "logging"],
     &["main", "dispatch", "cli", "commands"],
@@ -50,14 +50,20 @@ const NARROW: &[(&str, &[&str], &str)] = &[
 const HOMES: &[(&str, &[&str])] = &[
     ("clap", &["cli", "dispatch", "main", "commands"]),
     ("clap_complete", &["cli", "dispatch", "main", "commands"]),
+    ("crc32fast", &["episode_format"]),
     ("crossterm", &["tui"]),
     ("futures", &["hotplug", "driver", "bus", "rig", "record", "app", "tui", "headless", "commands"]),
+    ("hdrhistogram", &["record/quality"]),
     ("humantime", &["registry", "cli", "commands"]),
     ("iceoryx2", &["bus"]),
+    ("iceoryx2_bb_elementary_traits", &["bus"]),
+    ("iceoryx2_cal", &["bus"]),
     ("jpeg_encoder", &["driver/sim"]),
     ("libc", &["registry", "hotplug", "driver", "rig", "app"]),
-    ("mcap", &["record", "driver/replay"]),
+    ("lz4", &["episode_format"]),
+    ("mcap", &["record"]),
     ("nokhwa", &["driver/camera"]),
+    ("parking_lot", &["bus/shared"]),
     ("ratatui", &["tui"]),
     ("rustix", &["time", ABOVE_NOUNS]),
     ("serde", &[ANYWHERE]),
@@ -75,6 +81,8 @@ const HOMES: &[(&str, &[&str])] = &[
     ("unicode_segmentation", &["text"]),
     ("unicode_width", &["text"]),
     ("v4l", &["driver/camera"]),
+    ("zstd", &["episode_format"]),
+    ("zune_jpeg", &["calibration/brightness"]),
 ];
 const ANYWHERE: &str = "*";
 const ABOVE_NOUNS: &str = "layers 1 and up";

@@ -75,7 +75,7 @@ const ID: ModalityId = match ModalityId::new(0) {
 
 #[test]
 fn encoding_and_synchronising_do_not_allocate() {
-    let modality = SyncModality { id: ID, when_stale: WhenStale::Hold, capacity: 100 };
+    let modality = SyncModality { id: ID, when_stale: WhenStale::Hold, latency: Duration::ZERO, capacity: 100 };
     let mut sync = Synchronizer::new(&[modality], Duration::from_millis(25));
     let mut out = Vec::new();
     let payload = vec![7; 60_000];
@@ -156,6 +156,12 @@ async fn only_chunks_allocate() {
         max_bytes: BYTES,
         depth: 64,
         when_stale: WhenStale::Hold,
+        latency: Duration::ZERO,
+        verdict: rapid::registry::VerdictSpec::of(
+            rapid::modality::ModalityKind::Image,
+            Duration::from_millis(500),
+            Some(30.0),
+        ),
     };
     let rig = RigSpec {
         name: "rig".to_owned(),

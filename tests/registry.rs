@@ -7,8 +7,9 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use proptest::prelude::*;
+use rapid::modality::ModalityKind;
 use rapid::registry::scenario::Scenario;
-use rapid::registry::{BUILTIN, Framing, Loaded, NodeSpec, POOL_SPARE, Parse, Registry};
+use rapid::registry::{BUILTIN, Framing, Loaded, NodeSpec, Opens, POOL_SPARE, Parse, Registry, VerdictSpec};
 
 fn files(folder: &str) -> Vec<PathBuf> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/registry").join(folder);
@@ -61,6 +62,7 @@ fn defaults_are_those_of_the_documentation() {
     let device = &registry.devices[0];
     assert_eq!((device.topic.as_str(), device.depth, device.max_bytes), ("/rapid/camera/cam", 60, 640 * 480 * 2));
     assert_eq!(device.stall_after.as_millis(), 500);
+    assert_eq!(device.verdict, VerdictSpec::of(ModalityKind::Image, device.stall_after, Some(30.0)));
     assert_eq!((registry.rig.name.as_str(), registry.rig.observation_hz), ("rig", 30.0));
     assert_eq!(registry.rig.sync_window.as_millis(), 25);
     assert_eq!((registry.rig.cooldown.as_secs(), registry.rig.memory_budget), (2, 512 << 20));
@@ -72,11 +74,29 @@ fn defaults_are_those_of_the_documentation() {
 }
 
 #[test]
+fn a_program_and_its_settings_arrive() {
+    let Loaded { registry, warnings } = valid("process");
+    assert_eq!(warnings, []);
+    let [_, counter, leds, digit] = registry.devices.as_slice() else { panic!("four devices") };
+    let NodeSpec::Process(process) = &counter.node else { panic!("a program") };
+    assert_eq!((process.program.to_str(), process.args.join(" ")), (Some("/bin/sh"), "-c exec publisher".to_owned()));
+    assert_eq!((process.opens, process.kind, process.shape.as_slice()), (Opens::Tty, ModalityKind::Scalars, &[3][..]));
+    assert_eq!((counter.topic.as_str(), counter.max_bytes, counter.depth), ("/rapid/process/counter", 24, 2048));
+    assert_eq!((counter.stall_after.as_millis(), leds.stall_after.as_millis()), (500, 2000), "the heartbeat");
+    let NodeSpec::Process(process) = &leds.node else { panic!("a program") };
+    assert_eq!((process.opens, process.kind, process.shape.as_slice()), (Opens::Usb, ModalityKind::Bytes, &[][..]));
+    assert_eq!((leds.max_bytes, leds.depth, leds.modality().shape), (64 << 10, 60, vec![]));
+    assert_eq!(digit.modality().shape, [240, 320]);
+    assert_eq!((digit.max_bytes, digit.depth), (320 * 240 * 2, 60));
+}
+
+#[test]
 fn every_key_arrives() {
     let Loaded { registry, warnings } = valid("every_key");
     assert_eq!(warnings[0].message, "port has no effect beside a serial number: the unit is recognised in every port");
     let [tof, cam] = registry.devices.as_slice() else { panic!("two devices") };
     assert_eq!((cam.id.bit(), cam.topic.as_str(), cam.depth, cam.max_bytes), (63, "/a/b-c_d", 100, 1 << 20));
+    assert_eq!((cam.latency.as_micros(), tof.latency.as_micros()), (36_500, 0));
     assert_eq!(cam.identity.serial.as_deref(), Some("with \"quotes\" and spaces"));
     assert_eq!(cam.identity.port.as_deref(), Some("1-2.3"));
     let NodeSpec::Camera(camera) = &cam.node else { panic!("a camera") };
@@ -86,6 +106,27 @@ fn every_key_arrives() {
     assert_eq!((serial.baud, serial.framing, serial.parse, serial.channels), (9600, Framing::Cobs, Parse::Raw, 0));
     assert_eq!((tof.max_bytes, tof.depth), (4096, 2048));
     assert_eq!(registry.rig.sync_window.as_micros(), 12_500);
+}
+
+#[test]
+fn limits_of_the_verdict_are_the_defaults_then_the_rigs_then_the_devices() {
+    let registry = valid("verdict").registry;
+    let of = |name: &str| registry.named(name).unwrap().verdict;
+    let ms = |ms| Some(std::time::Duration::from_millis(ms));
+    let (cam, screen, imu) = (of("cam"), of("static_screen"), of("imu"));
+    // The device's own limit for SUSPECT moved the one for BAD along.
+    assert_eq!((cam.suspect.lost, cam.bad.lost), (Some(0.1), Some(0.1)));
+    assert_eq!((screen.suspect.lost, screen.bad.lost), (Some(0.02), Some(0.05)));
+    assert_eq!((cam.suspect.late, cam.bad.late), (Some(0.03), None));
+    assert_eq!((screen.suspect.late, screen.bad.late), (None, None));
+    assert_eq!((cam.suspect.dropped, cam.bad.dropped), (Some(0.0), Some(0.01)));
+    assert_eq!((cam.suspect.gap, cam.bad.gap, cam.hz), (ms(700), ms(7000), Some(15.0)));
+    assert_eq!((screen.suspect.gap, screen.bad.gap, screen.hz), (ms(2000), ms(5000), Some(30.0)));
+    assert_eq!((cam.suspect.frozen, cam.bad.frozen, cam.compares()), (ms(1000), ms(2000), true));
+    assert_eq!((screen.suspect.frozen, screen.bad.frozen, screen.compares()), (None, None, false));
+    // Equal numbers are no fault unless the device's own table says so.
+    assert_eq!((imu.suspect.frozen, imu.bad.frozen, imu.compares()), (None, ms(5000), true));
+    assert_eq!((imu.suspect.rate, imu.bad.rate, imu.hz), (Some(0.9), Some(0.8), Some(200.0)));
 }
 
 #[test]

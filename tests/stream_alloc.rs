@@ -1,22 +1,15 @@
-//! How often the path of a sample allocates once it has warmed up: exactly once, 1 allocation a sample
-//! published, and that one is iceoryx2's.
-//!
-//! iceoryx2 0.10 puts the state that a loaned sample shares with its publisher into an `Arc` of its
-//! own (`ChunkMut`'s shared state, `arc_sync_policy::ArcSyncPolicy::new`), whatever the service
-//! variant: `Publisher::loan_slice_uninit` cannot be had without it. It is small, of one size, and
-//! freed by `send`. Nothing of `rapid`, of tokio and of the receiving side allocates.
+//! The path of a sample does not allocate once it has warmed up.
 //!
 //! Seen twice, because `rig::stream` is private:
 //!
 //! 1. On one thread, by public parts: `Driver::read` of a simulated device, header, `Writer::publish`
 //!    (loan, one copy, send, notify), `Inbox::wait` and `Inbox::drain`. That is what a stream does
-//!    between two samples, without its `select!`, timer and counters. Exactly one allocation a sample,
-//!    all of one size.
+//!    between two samples, without its `select!`, timer and counters. No allocation.
 //! 2. The rig as it is: `Rig::run` on a multi-thread runtime, the `mask` thread at 500 Hz, and an
-//!    inbox as the recorder has. Every thread of the process counts; allocations of the size found
-//!    above are left out. Beside the samples the rig writes the mask's JSON file once a second, which
-//!    allocates. So samples are counted in stretches much shorter than a second: a stretch without a
-//!    JSON file has none.
+//!    inbox as the recorder has. Every thread of the process counts. Beside the samples the rig writes
+//!    the mask's JSON file once a second, which allocates, and each thread keeps the memory of its
+//!    first loan. So samples are counted in stretches much shorter than a second: a stretch without
+//!    a JSON file and without a thread's first sample has none.
 //!
 //! One test, so that no other thread of this process works meanwhile.
 
@@ -24,7 +17,7 @@
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
 use rapid::bus::{Bus, Inbox, TopicId};
@@ -44,17 +37,12 @@ struct Counting;
 
 static COUNTING: AtomicBool = AtomicBool::new(false);
 static COUNT: AtomicU64 = AtomicU64::new(0);
-/// Smallest and largest allocation counted, bytes.
-static LEAST: AtomicUsize = AtomicUsize::new(usize::MAX);
-static MOST: AtomicUsize = AtomicUsize::new(0);
-/// Allocations of this size are not counted.
-static LEFT_OUT: AtomicUsize = AtomicUsize::new(usize::MAX);
 
 // SAFETY: every call is handed to the system's allocator as it came; counting is atomic and does not
 // allocate.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        note(layout.size());
+        note();
         // SAFETY: the caller's promise, passed on.
         unsafe { System.alloc(layout) }
     }
@@ -65,7 +53,7 @@ unsafe impl GlobalAlloc for Counting {
     }
 
     unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        note(size);
+        note();
         // SAFETY: the caller's promise, passed on.
         unsafe { System.realloc(pointer, layout, size) }
     }
@@ -74,11 +62,9 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-fn note(size: usize) {
-    if COUNTING.load(Ordering::Relaxed) && size != LEFT_OUT.load(Ordering::Relaxed) {
+fn note() {
+    if COUNTING.load(Ordering::Relaxed) {
         COUNT.fetch_add(1, Ordering::Relaxed);
-        LEAST.fetch_min(size, Ordering::Relaxed);
-        MOST.fetch_max(size, Ordering::Relaxed);
     }
 }
 
@@ -115,6 +101,8 @@ name = "state"
 hz = 1000
 "#;
 
+/// Threads of the rig's runtime.
+const WORKERS: usize = 2;
 const WARM_UP: usize = 200;
 const SAMPLES: usize = 1000;
 /// Samples of a stretch: at 1,500 a second, some 30 ms.
@@ -123,16 +111,12 @@ const STRETCH: usize = 50;
 const JSON_PERIOD: Duration = Duration::from_secs(1);
 
 #[test]
-fn a_sample_costs_the_one_allocation_of_its_loan_and_no_other() {
+fn a_sample_costs_no_allocation() {
     let registry = Registry::parse(REGISTRY, None).unwrap().registry;
     let scenario = Scenario::parse(SCENARIO, None, &registry).unwrap();
     for device in 0..registry.devices.len() {
         one_thread(&registry, &scenario, device);
     }
-    let (least, most) = (LEAST.load(Ordering::Relaxed), MOST.load(Ordering::Relaxed));
-    assert_eq!(least, most, "they are all the one that iceoryx2 makes for a loan");
-    assert!(least <= 256, "{least} bytes");
-    LEFT_OUT.store(least, Ordering::Relaxed);
     whole_rig(&registry, scenario);
 }
 
@@ -184,7 +168,7 @@ fn one_thread(registry: &Registry, scenario: &Scenario, device: usize) {
         assert!(bytes > SAMPLES * 8);
         COUNT.load(Ordering::Relaxed)
     });
-    assert_eq!(allocated, SAMPLES as u64, "{}: allocations for {SAMPLES} samples", spec.name);
+    assert_eq!(allocated, 0, "{}: allocations for {SAMPLES} samples", spec.name);
     drop((inbox, writer, bus));
     remove_leftovers(&instance);
 }
@@ -198,7 +182,7 @@ fn whole_rig(registry: &Registry, scenario: Scenario) {
     let presence = Presence::start(claim, bus.writer(TopicId::Mask).unwrap(), Arc::clone(&board)).unwrap();
     let inbox = bus.inbox().unwrap();
     let mut rig = Rig::new(registry, &bus, presence, board);
-    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(WORKERS).enable_all().build().unwrap();
     let stop = CancellationToken::new();
     let (commands, asked) = mpsc::channel(1);
     let task = runtime.spawn({
@@ -232,9 +216,12 @@ fn whole_rig(registry: &Registry, scenario: Scenario) {
     drop((commands, inbox, bus));
     remove_leftovers(&instance);
 
-    // A file may fall between two stretches or be cut by their border.
+    // A file may fall between two stretches or be cut by their border, and a worker may have had no
+    // sample while it was warming up.
     let files = elapsed.as_secs() / JSON_PERIOD.as_secs() + 1;
-    assert!(noisy <= 2 * files, "{noisy} of {stretches} stretches allocated, {files} JSON files in {elapsed:?}");
+    let allowed = 2 * files + WORKERS as u64;
+    assert!(noisy <= allowed, "{noisy} of {stretches} stretches allocated, {files} JSON files in {elapsed:?}");
+    assert!(stretches > 2 * allowed, "{stretches} stretches in {elapsed:?} are too few to tell");
     assert!(counts[2] > 0, "no mask came");
 }
 

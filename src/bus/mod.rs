@@ -7,31 +7,38 @@
 //!
 //! Invariant: a writer never waits for a reader. A reader that falls `depth` samples behind loses
 //! the oldest, and sees the hole in `SampleHeader::seq`.
-//! Invariant: payloads lie in pools that are reserved when a topic is opened. For each sample iceoryx2
-//! 0.10 makes one small allocation, the handle of the loan, and takes one lock that nobody else wants;
-//! nothing else allocates or locks (`tests/stream_alloc.rs`).
+//! Invariant: payloads lie in pools that are reserved when a topic is opened, and the handle of a
+//! loan in memory that is used again (`shared`): once a thread has published a sample, no sample
+//! allocates (`tests/stream_alloc.rs`). The locks of a topic's port are its stream's alone.
 //! Invariant: writers live as long as the bus. What a reader has not fetched dies with its writer
 //! (iceoryx2 0.10), so a writer that went with its device would take the last samples along.
 
 mod inbox;
+mod ingress;
+mod place;
+mod service;
+mod shared;
 mod topic;
 mod writer;
 
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use iceoryx2::config::Config;
 use iceoryx2::prelude::*;
 use iceoryx2::service::port_factory::event::PortFactory as EventFactory;
 
-use crate::registry::{MAX_BORROWED, MAX_SUBSCRIBERS, Registry};
+use crate::modality::ModalityId;
+use crate::registry::{MAX_BORROWED, MAX_SUBSCRIBERS, NodeSpec, Registry};
 use crate::sample::SampleHeader;
 
+use service::Service;
+
 pub use inbox::Inbox;
+pub use ingress::{Given, Ingress, Watch};
 pub use topic::{MASK_TOPIC, TopicId, TopicSpec};
 pub use writer::Writer;
 
-/// Ports are used from several threads, hence the thread-safe variant.
-type Service = ipc_threadsafe::Service;
 type TopicFactory = iceoryx2::service::port_factory::publish_subscribe::PortFactory<Service, [u8], SampleHeader>;
 
 /// Name of the event service that wakes consumers.
@@ -64,6 +71,17 @@ pub enum BusError {
         /// The topic.
         topic: String,
     },
+    /// What the bus lives in is another user's.
+    #[error(
+        "shared-memory bus: {}: {what}; end the programs that use it and remove it (`sudo rm -r {}`), or run rapid as \
+         that user", path.display(), path.display()
+    )]
+    Foreign {
+        /// Folder or file.
+        path: PathBuf,
+        /// What is wrong with it.
+        what: String,
+    },
     /// The node could not be created.
     #[error("shared-memory bus: {0}")]
     Node(String),
@@ -93,7 +111,8 @@ pub struct Bus {
     writers: Vec<(TopicId, Arc<Writer>)>,
     topics: Vec<(TopicSpec, TopicFactory)>,
     wake: EventFactory<Service>,
-    _node: Node<Service>,
+    ingresses: Vec<(ModalityId, Arc<Ingress>)>,
+    node: Arc<Node<Service>>,
 }
 
 impl std::fmt::Debug for Bus {
@@ -112,12 +131,16 @@ impl Bus {
     /// When a topic is in use with another layout, or shared memory is not to be had.
     pub fn open(registry: &Registry, instance: Option<&str>) -> Result<Self, BusError> {
         let config = config(instance)?;
+        place::check(&PathBuf::from(config.global.root_path().to_string()))?;
         let node = NodeBuilder::new()
             .config(&config)
             // Signals belong to the program, not to a library.
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create::<Service>()
-            .map_err(|error| BusError::Node(error.to_string()))?;
+            .map_err(|error| {
+                let prefix = config.global.prefix.to_string();
+                place::in_the_way(&prefix).unwrap_or_else(|| BusError::Node(error.to_string()))
+            })?;
         let specs = registry.devices.iter().map(TopicSpec::of_device).chain([TopicSpec::mask()]);
         let topics = specs.map(|spec| open_topic(&node, spec)).collect::<Result<Vec<_>, _>>()?;
         let wake = node
@@ -133,7 +156,25 @@ impl Bus {
             .iter()
             .map(|(spec, factory)| Ok((spec.id, Arc::new(Writer::open(spec, factory, &wake)?))))
             .collect::<Result<Vec<_>, BusError>>()?;
-        Ok(Self { writers, topics, wake, _node: node })
+        let ingresses = registry
+            .devices
+            .iter()
+            .filter(|device| matches!(device.node, NodeSpec::Process(_)))
+            .map(|device| Ok((device.id, Arc::new(Ingress::open(&node, device)?))))
+            .collect::<Result<Vec<_>, BusError>>()?;
+        Ok(Self { writers, topics, wake, ingresses, node: Arc::new(node) })
+    }
+
+    /// Where the program that reads modality `id` publishes; `None` if no program does.
+    #[must_use]
+    pub fn ingress(&self, id: ModalityId) -> Option<Arc<Ingress>> {
+        self.ingresses.iter().find(|(modality, _)| *modality == id).map(|(_, ingress)| Arc::clone(ingress))
+    }
+
+    /// What programs need to know to take part in this bus.
+    #[must_use]
+    pub fn membership(&self) -> Membership {
+        Membership { node: Arc::clone(&self.node) }
     }
 
     /// The one writer of a topic; `None` if the registry has no such topic.
@@ -154,6 +195,32 @@ impl Bus {
     #[must_use]
     pub fn reserved_bytes(&self) -> u64 {
         self.topics.iter().map(|(spec, _)| spec.pool_bytes()).sum()
+    }
+}
+
+/// Who takes part in the bus.
+#[derive(Clone)]
+pub struct Membership {
+    node: Arc<Node<Service>>,
+}
+
+impl std::fmt::Debug for Membership {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Membership").field("prefix", &self.prefix()).finish()
+    }
+}
+
+impl Membership {
+    /// iceoryx2's `global.prefix` of this bus: a program with another one is on another bus.
+    #[must_use]
+    pub fn prefix(&self) -> String {
+        self.node.config().global.prefix.to_string()
+    }
+
+    /// Gives back what programs that were killed held of the bus: shared memory, their places at
+    /// topics. Blocks for as long as files are looked through.
+    pub fn sweep(&self) {
+        let _ = self.node.try_cleanup_dead_nodes();
     }
 }
 

@@ -30,6 +30,12 @@ fn registry(depth: usize) -> Registry {
             max_bytes: 64,
             depth,
             when_stale: WhenStale::Hold,
+            latency: Duration::ZERO,
+            verdict: crate::registry::VerdictSpec::of(
+                crate::modality::ModalityKind::Image,
+                Duration::from_millis(500),
+                Some(30.0),
+            ),
         }],
         path: None,
         text: String::new(),

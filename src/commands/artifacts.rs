@@ -4,19 +4,14 @@
 //! whole, by rename.
 //! Invariant: other programs are started with argument vectors, never through a shell.
 
-use std::fs::File;
 use std::io::{self, Read, Write};
-use std::os::fd::OwnedFd;
-use std::path::{Component, Path, PathBuf};
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use rustix::fs::{AtFlags, Mode, OFlags};
-use rustix::io::Errno;
-
 use super::Format;
+use crate::folder::{Folder, FolderError, Links, Missing, Sync};
 use crate::registry::Registry;
 use crate::registry::artifacts::{Artifact, ArtifactKind, DESCRIPTORS, HEADER, SYSTEM_REGISTRY, artifacts};
-use crate::time::realtime_ns;
 
 /// Why the artifacts could not be written or installed.
 #[derive(Debug, thiserror::Error)]
@@ -24,12 +19,9 @@ pub enum ArtifactsError {
     /// Only root may write where udev and systemd read.
     #[error("installing needs root: run `sudo rapid artifacts --install`")]
     NotRoot,
-    /// A part of the path is a symbolic link and we are root.
-    #[error("{path}: a part of this path is a symbolic link, which is not followed as root; name the real folder")]
-    Link {
-        /// Where.
-        path: PathBuf,
-    },
+    /// The folder cannot be used.
+    #[error(transparent)]
+    Folder(#[from] FolderError),
     /// A file could not be written.
     #[error("{path}: {error}")]
     Write {
@@ -75,7 +67,7 @@ pub fn list(registry: &Registry, format: Format, out: &mut dyn Write) -> io::Res
 /// # Errors
 /// When a file cannot be written.
 pub fn write(registry: &Registry, folder: &Path, out: &mut dyn Write) -> Result<(), ArtifactsError> {
-    let links = Links::for_this_user();
+    let links = links_for_this_user();
     let all = artifacts(registry);
     for artifact in &all {
         write_file(&folder.join(&artifact.path), artifact, links)?;
@@ -125,109 +117,43 @@ fn install_below(registry: &Registry, root: &Path, out: &mut dyn Write) -> Resul
     remove_stale(&descriptors, &all, Links::Refused, out)
 }
 
-/// May folders on the way be symbolic links?
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Links {
-    Followed,
-    Refused,
-}
-
-impl Links {
-    /// A link planted in a folder others may write to would lead root's writing elsewhere.
-    fn for_this_user() -> Self {
-        if rustix::process::geteuid().is_root() { Self::Refused } else { Self::Followed }
-    }
+/// A link planted in a folder others may write to would lead root's writing elsewhere.
+fn links_for_this_user() -> Links {
+    if rustix::process::geteuid().is_root() { Links::Refused } else { Links::Own }
 }
 
 fn write_file(path: &Path, artifact: &Artifact, links: Links) -> Result<(), ArtifactsError> {
-    let explain = |errno: Errno| explain(path, errno, links);
-    let folder = open_folder(path.parent().unwrap_or(Path::new(".")), links).map_err(explain)?;
+    let folder = Folder::open(path.parent().unwrap_or(Path::new(".")), links, Missing::All)?;
     let name = path.file_name().unwrap_or_default();
-    let temporary = format!(".{}.{}.{}", name.to_string_lossy(), std::process::id(), realtime_ns());
-    let flags = OFlags::WRONLY | OFlags::CREATE | OFlags::EXCL | OFlags::NOFOLLOW | OFlags::CLOEXEC;
-    let mode = Mode::from_raw_mode(artifact.mode);
-    let file = rustix::fs::openat(&folder, &temporary, flags, mode).map_err(explain)?;
-    let written = fill(file, artifact, mode)
-        .and_then(|()| rustix::fs::renameat(&folder, &temporary, &folder, name).map_err(io::Error::from));
-    written.map_err(|error| {
-        // What was begun is of no use to anyone; the first error is the one to tell.
-        let _ = rustix::fs::unlinkat(&folder, &temporary, AtFlags::empty());
-        ArtifactsError::Write { path: path.to_path_buf(), error }
-    })
-}
-
-fn fill(file: OwnedFd, artifact: &Artifact, mode: Mode) -> io::Result<()> {
-    let mut file = File::from(file);
-    file.write_all(artifact.contents.as_bytes())?;
-    // The umask may have taken bits away.
-    rustix::fs::fchmod(&file, mode)?;
-    file.sync_all()
-}
-
-/// Opens a folder, making what is missing of it.
-fn open_folder(path: &Path, links: Links) -> Result<OwnedFd, Errno> {
-    let mut flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::CLOEXEC;
-    let start = if path.is_absolute() { "/" } else { "." };
-    let mut folder = rustix::fs::open(start, flags, Mode::empty())?;
-    if links == Links::Refused {
-        flags |= OFlags::NOFOLLOW;
-    }
-    for component in path.components() {
-        let name = match component {
-            Component::Normal(name) => name,
-            Component::ParentDir => "..".as_ref(),
-            _ => continue,
-        };
-        folder = match rustix::fs::openat(&folder, name, flags, Mode::empty()) {
-            Err(Errno::NOENT) => {
-                match rustix::fs::mkdirat(&folder, name, Mode::from_raw_mode(0o755)) {
-                    Ok(()) | Err(Errno::EXIST) => {}
-                    Err(error) => return Err(error),
-                }
-                rustix::fs::openat(&folder, name, flags, Mode::empty())?
-            }
-            opened => opened?,
-        };
-    }
-    Ok(folder)
-}
-
-fn explain(path: &Path, errno: Errno, links: Links) -> ArtifactsError {
-    // O_DIRECTORY with O_NOFOLLOW answers a link with either.
-    let is_link = links == Links::Refused && matches!(errno, Errno::LOOP | Errno::NOTDIR);
-    let linked = path.ancestors().skip(1).find(|part| part.is_symlink());
-    match linked.filter(|_| is_link) {
-        Some(part) => ArtifactsError::Link { path: part.to_path_buf() },
-        None => ArtifactsError::Write { path: path.to_path_buf(), error: errno.into() },
-    }
+    let written = folder.replace(name, artifact.contents.as_bytes(), artifact.mode, Sync::Wait);
+    written.map_err(|error| ArtifactsError::Write { path: path.to_path_buf(), error })
 }
 
 /// Removes descriptors that we wrote for entries that are no more.
-fn remove_stale(folder: &Path, all: &[Artifact], links: Links, out: &mut dyn Write) -> Result<(), ArtifactsError> {
-    let explain = |errno: Errno| explain(folder, errno, links);
-    let opened = open_folder(folder, links).map_err(explain)?;
-    let entries = rustix::fs::Dir::read_from(&opened).map_err(explain)?;
+fn remove_stale(path: &Path, all: &[Artifact], links: Links, out: &mut dyn Write) -> Result<(), ArtifactsError> {
+    let explain = |error: io::Error| ArtifactsError::Write { path: path.to_path_buf(), error };
+    let folder = Folder::open(path, links, Missing::All)?;
+    let entries = rustix::fs::Dir::read_from(folder.descriptor()).map_err(|errno| explain(errno.into()))?;
     for entry in entries {
-        let entry = entry.map_err(explain)?;
+        let entry = entry.map_err(|errno| explain(errno.into()))?;
         let name = entry.file_name().to_string_lossy().into_owned();
         let current = all.iter().any(|artifact| artifact.path.file_name().is_some_and(|file| *file == *name));
         if current
             || Path::new(&name).extension().is_none_or(|extension| extension != "yaml")
-            || !is_ours(&opened, &name)
+            || !is_ours(&folder, &name)
         {
             continue;
         }
-        rustix::fs::unlinkat(&opened, &name, AtFlags::empty()).map_err(explain)?;
-        writeln!(out, "removed {}: no such entry any more", folder.join(name.escape_debug().to_string()).display())?;
+        folder.remove(&name).map_err(explain)?;
+        writeln!(out, "removed {}: no such entry any more", path.join(name.escape_debug().to_string()).display())?;
     }
     Ok(())
 }
 
-fn is_ours(folder: &OwnedFd, name: &str) -> bool {
-    let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
-    let Ok(file) = rustix::fs::openat(folder, name, flags, Mode::empty()) else { return false };
+fn is_ours(folder: &Folder, name: &str) -> bool {
+    let Ok(file) = folder.open_file(name) else { return false };
     let mut begin = Vec::new();
-    let read = File::from(file).take(HEADER.len() as u64).read_to_end(&mut begin);
+    let read = file.take(HEADER.len() as u64).read_to_end(&mut begin);
     read.is_ok() && begin == HEADER.as_bytes()
 }
 

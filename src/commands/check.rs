@@ -7,6 +7,7 @@ use serde::Serialize;
 
 use super::{Format, Outcome};
 use crate::registry::{DeviceSpec, Diagnostic, IdentitySpec, Loaded, Mount, Registry};
+use crate::text;
 
 /// Reads the registry at `path` and writes its entries, or every problem, to `out`.
 ///
@@ -18,7 +19,7 @@ pub fn check(path: &Path, format: Format, out: &mut dyn Write) -> io::Result<Out
             table(&loaded, out)?;
             let count = loaded.registry.devices.len();
             let devices = if count == 1 { "device" } else { "devices" };
-            writeln!(out, "{}: {count} {devices}, ok", path.display())?;
+            writeln!(out, "{}: {count} {devices}, ok", text::plain(&path.display().to_string()))?;
             Ok(Outcome::Done)
         }
         (Ok(loaded), Format::Json) => {
@@ -33,7 +34,12 @@ pub fn check(path: &Path, format: Format, out: &mut dyn Write) -> io::Result<Out
         (Err(errors), Format::Text) => {
             writeln!(out, "{errors}")?;
             let count = errors.diagnostics.len();
-            writeln!(out, "{}: {count} {}", path.display(), if count == 1 { "problem" } else { "problems" })?;
+            writeln!(
+                out,
+                "{}: {count} {}",
+                text::plain(&path.display().to_string()),
+                if count == 1 { "problem" } else { "problems" }
+            )?;
             Ok(Outcome::BadConfiguration)
         }
         (Err(errors), Format::Json) => {
@@ -83,8 +89,7 @@ fn row(device: &DeviceSpec) -> Row<'_> {
 }
 
 fn line(out: &mut dyn Write, line: &Line<'_>) -> io::Result<()> {
-    serde_json::to_writer(&mut *out, line)?;
-    writeln!(out)
+    writeln!(out, "{}", text::json(line)?)
 }
 
 fn table(loaded: &Loaded, out: &mut dyn Write) -> io::Result<()> {

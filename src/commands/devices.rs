@@ -73,7 +73,16 @@ pub fn list(entries: Entries<'_>, attached: &[Attachment], formats: Formats) -> 
         };
         Plugged { node: attachment.node.label(), usb: attachment.usb.clone(), entry, reasons, camera, camera_error }
     };
-    attached.iter().map(plugged).collect()
+    attached.iter().filter(|attachment| is_worth_a_line(entries, attachment)).map(plugged).collect()
+}
+
+/// Every hub and mouse is a USB device: only those that an entry means are listed as such.
+fn is_worth_a_line(entries: Entries<'_>, attachment: &Attachment) -> bool {
+    match (&attachment.node, entries) {
+        (DeviceNode::Usb(_), Entries::Of(registry)) => !Assigner::new(registry).explain(attachment).fits.is_empty(),
+        (DeviceNode::Usb(_), Entries::NoFile | Entries::Wrong) => false,
+        _ => true,
+    }
 }
 
 fn explain(assigner: &mut Assigner, registry: &Registry, attachment: &Attachment) -> (Option<String>, Vec<String>) {
@@ -121,13 +130,11 @@ struct Missing<'a> {
 
 fn print_json(plugged: &[Plugged], missing: &[&DeviceSpec], out: &mut dyn Write) -> io::Result<()> {
     for what in plugged {
-        serde_json::to_writer(&mut *out, &Line { plugged: true, what })?;
-        writeln!(out)?;
+        writeln!(out, "{}", text::json(&Line { plugged: true, what })?)?;
     }
     for entry in missing {
         let what = Missing { entry: &entry.name, identity: &entry.identity };
-        serde_json::to_writer(&mut *out, &Line { plugged: false, what })?;
-        writeln!(out)?;
+        writeln!(out, "{}", text::json(&Line { plugged: false, what })?)?;
     }
     Ok(())
 }

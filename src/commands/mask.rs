@@ -140,7 +140,7 @@ struct ObjectDevice<'a> {
 pub fn render_json(record: &MaskRecord, layout: Option<&Layout>, now_ns: u64) -> serde_json::Result<String> {
     let count = usize::from(record.device_count);
     let online = |bit: u8| bit < 64 && record.mask.0 >> bit & 1 == 1;
-    serde_json::to_string(&Object {
+    text::json(&Object {
         mask: record.mask.hex(count),
         mask_binary: record.mask.binary(count),
         device_count: record.device_count,
@@ -264,7 +264,8 @@ impl Change {
                 Ok(render_json(record, names().as_deref(), now_ns)? + "\n")
             }
             Self::Gone(reason) if options.json => {
-                Ok(format!("{}\n", serde_json::json!({ "gone": reason, "time": crate::time::rfc3339(now_ns) })))
+                let gone = serde_json::json!({ "gone": reason, "time": crate::time::rfc3339(now_ns) });
+                Ok(text::json(&gone)? + "\n")
             }
             Self::Mask { record, before } => {
                 let layout = names();

@@ -4,7 +4,9 @@ pub mod artifacts;
 pub mod check;
 pub mod completions;
 pub mod devices;
+pub mod inspect;
 pub mod mask;
+pub mod recover;
 
 /// How a listing is written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

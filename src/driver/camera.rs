@@ -15,9 +15,10 @@ mod layout;
 mod listing;
 mod node;
 
+use std::collections::BTreeMap;
 use std::io;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
@@ -29,6 +30,7 @@ use self::layout::{Frame, Layout, Progress};
 pub use self::listing::{cameras, query};
 use self::node::Node;
 use super::{DriverError, Reading, unblock};
+use crate::provenance::Negotiated;
 use crate::registry::CameraSpec;
 use crate::sample::FLAG_DEVICE_TIME;
 use crate::time::Stamp;
@@ -36,6 +38,8 @@ use crate::time::Stamp;
 /// After this long without a picture the node is asked whether its device is still there: the wake-up
 /// of a removal reaches epoll only once, and may come before the node knows of it.
 const ASK_AFTER: Duration = Duration::from_millis(500);
+/// Reading back all controls may take this long; a camera that answers slowly names fewer of them.
+const READ_BACK: Duration = Duration::from_millis(300);
 
 /// An open, streaming camera.
 #[derive(Debug)]
@@ -47,6 +51,7 @@ pub struct Camera {
     /// Rows without their padding, for cameras that pad them.
     compact: Vec<u8>,
     description: String,
+    negotiated: Negotiated,
 }
 
 impl Camera {
@@ -57,14 +62,14 @@ impl Camera {
     /// format, size, rate or controls; the last names what is offered.
     pub async fn open(name: &str, spec: &CameraSpec, path: &Path) -> Result<Self, DriverError> {
         let (name, spec, path) = (name.to_owned(), spec.clone(), path.to_owned());
-        let (ring, layout, description) = unblock(move || start(&name, &spec, &path)).await?;
+        let Started { ring, layout, description, negotiated } = unblock(move || start(&name, &spec, &path)).await?;
         // Registered only now that it streams: before, the node reports an error to whoever polls.
         // SAFETY: the ring owns its node's descriptor, never replaces it, and closes it only when it is
         // dropped, which it is by or after the `AsyncFd`.
         let ring = unsafe { AsyncFd::register_with_interest(ring, Interest::READABLE | Interest::ERROR) }
             .map_err(|error| DriverError::Retry(format!("the node cannot be polled: {}", io::Error::from(error))))?;
         let compact = Vec::with_capacity(if layout.is_padded() { layout.picture_bytes() } else { 0 });
-        Ok(Self { ring: Some(ring), layout, progress: Progress::default(), compact, description })
+        Ok(Self { ring: Some(ring), layout, progress: Progress::default(), compact, description, negotiated })
     }
 
     /// The next picture.
@@ -103,6 +108,12 @@ impl Camera {
     #[must_use]
     pub fn description(&self) -> &str {
         &self.description
+    }
+
+    /// The same for the recording, with the controls as they stood when the camera was started.
+    #[must_use]
+    pub fn negotiated(&self) -> Negotiated {
+        self.negotiated.clone()
     }
 }
 
@@ -147,7 +158,15 @@ fn stream_error(ring: &Ring, error: &io::Error) -> DriverError {
     DriverError::Retry(format!("the camera's stream broke: {error}"))
 }
 
-fn start(name: &str, spec: &CameraSpec, path: &Path) -> Result<(Ring, Layout, String), DriverError> {
+/// A camera that streams, and what was agreed with it.
+struct Started {
+    ring: Ring,
+    layout: Layout,
+    description: String,
+    negotiated: Negotiated,
+}
+
+fn start(name: &str, spec: &CameraSpec, path: &Path) -> Result<Started, DriverError> {
     let node = Node::open(path)?;
     let card = node.capture_card(path)?;
     set_controls(name, spec, &node, path)?;
@@ -164,8 +183,16 @@ fn start(name: &str, spec: &CameraSpec, path: &Path) -> Result<(Ring, Layout, St
         return Err(DriverError::Fatal(format::not_offered(name, spec, path, &offered)));
     };
     let description = format::describe(&card, layout, rate);
+    let negotiated = format::negotiated(card, layout, rate, read_controls(&node));
     let ring = Ring::start(node).map_err(|error| node::setup_error(path, "stream", &error))?;
-    Ok((ring, layout, description))
+    Ok(Started { ring, layout, description, negotiated })
+}
+
+/// The values of all controls that tell theirs.
+fn read_controls(node: &Node) -> BTreeMap<String, i64> {
+    let begun = Instant::now();
+    let offered = node.controls().into_iter().take_while(|_| begun.elapsed() < READ_BACK);
+    offered.filter_map(|control| Some((format::plain_name(&control.name), node.control(control.id).ok()?))).collect()
 }
 
 fn set_controls(name: &str, spec: &CameraSpec, node: &Node, path: &Path) -> Result<(), DriverError> {

@@ -8,12 +8,14 @@
 //! Invariant: no bytes from a device make a driver panic.
 
 pub mod camera;
+pub mod process;
 pub mod replay;
 pub mod serial;
 pub mod sim;
 
 use std::sync::Arc;
 
+use crate::provenance::Negotiated;
 use crate::registry::scenario::{SimDevice, SimSource};
 use crate::registry::{DeviceNode, DeviceSpec, NodeSpec};
 use crate::sample::Encoding;
@@ -79,12 +81,10 @@ impl Driver {
                 Ok(Self::Serial(Box::new(serial::Serial::open(serial, path, spec.max_bytes).await?)))
             }
             (_, DeviceNode::Sim(device)) => Self::open_sim(spec, device).await,
-            (NodeSpec::Camera(_), DeviceNode::Tty(path)) => {
-                Err(wrong_kind(spec, "camera", &path.display().to_string(), "serial line"))
-            }
-            (NodeSpec::Serial(_), DeviceNode::Video(path)) => {
-                Err(wrong_kind(spec, "serial line", &path.display().to_string(), "camera"))
-            }
+            (NodeSpec::Camera(_), node) => Err(wrong_kind(spec, "camera", node)),
+            (NodeSpec::Serial(_), node) => Err(wrong_kind(spec, "serial line", node)),
+            // The rig supervises programs itself: `process` only starts and ends them.
+            (NodeSpec::Process(_), node) => Err(wrong_kind(spec, "program", node)),
         }
     }
 
@@ -93,7 +93,8 @@ impl Driver {
             return Ok(Self::Replay(Box::new(replay::Replay::open(Arc::clone(device)).await?)));
         }
         sim::check(spec, device)?;
-        Ok(Self::Sim(Box::new(sim::Sim::open(Arc::clone(device)).await?)))
+        let sim = sim::Sim::open(Arc::clone(device)).await?.with_controls(&spec.node);
+        Ok(Self::Sim(Box::new(sim)))
     }
 
     /// The next sample. Waits as long as the device sends nothing.
@@ -109,7 +110,7 @@ impl Driver {
         }
     }
 
-    /// What was agreed with the device: format, rate, driver, for the log and the recording.
+    /// What was agreed with the device: format, rate, driver, for people.
     #[must_use]
     pub fn description(&self) -> String {
         match self {
@@ -119,12 +120,31 @@ impl Driver {
             Self::Replay(driver) => driver.description().to_owned(),
         }
     }
+
+    /// What was agreed with the device, for the recording. Of the driver only what the open node
+    /// tells: a serial line tells nothing.
+    #[must_use]
+    pub fn negotiated(&self) -> Negotiated {
+        match self {
+            Self::Camera(driver) => driver.negotiated(),
+            Self::Serial(driver) => driver.negotiated(),
+            Self::Sim(driver) => driver.negotiated(),
+            Self::Replay(driver) => driver.negotiated(),
+        }
+    }
 }
 
-fn wrong_kind(spec: &DeviceSpec, wished: &str, node: &str, is: &str) -> DriverError {
+fn wrong_kind(spec: &DeviceSpec, wished: &str, node: &DeviceNode) -> DriverError {
+    let is = match node {
+        DeviceNode::Video(_) => "a camera",
+        DeviceNode::Tty(_) => "a serial line",
+        DeviceNode::Usb(_) => "a USB device",
+        DeviceNode::Sim(_) => "simulated",
+    };
     DriverError::Fatal(format!(
-        "[device.{}] is a {wished} and {node} is a {is}: correct `node` or the identity of the entry",
-        spec.name
+        "[device.{}] is a {wished} and {} is {is}: correct `node` or the identity of the entry",
+        spec.name,
+        node.label()
     ))
 }
 

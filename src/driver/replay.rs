@@ -5,12 +5,15 @@
 //! hangs does.
 //!
 //! Invariant: the file is read chunk by chunk, never held whole.
-//! Invariant: a damaged file ends the topic early; it never ends the program.
+//! Invariant: a damaged file ends the topic early or leaves out what is damaged; it never ends the
+//! program.
 
 mod episode;
 mod scenario;
 mod wire;
 
+use std::fs::File;
+use std::io::BufReader;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -20,11 +23,12 @@ use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
 use self::episode::{Episode, Messages};
-pub use self::episode::{EpisodeDescription, TopicDescription, describe};
+pub use self::episode::{EpisodeDescription, TopicDescription, describe, read_bytes};
 pub use self::scenario::{Replayed, scenario};
-use self::wire::{Schema, Shape};
+use self::wire::Shape;
 use super::sim::stamp_of;
 use super::{DriverError, Reading, unblock};
+use crate::provenance::{KernelDriver, Negotiated};
 use crate::registry::scenario::{SimDevice, SimSource};
 use crate::sample::FLAG_DEVICE_TIME;
 use crate::time::{Stamp, nanoseconds};
@@ -58,6 +62,15 @@ struct Message {
     shape: Shape,
 }
 
+/// The payload of one recorded message of the schema named so, with its width and height.
+#[doc(hidden)]
+#[must_use]
+pub fn decode(schema: &str, message: &[u8]) -> Option<(Vec<u8>, u32, u32)> {
+    let mut payload = Vec::new();
+    let shape = wire::payload(wire::Schema::named(schema)?, message, &mut payload)?;
+    Some((payload, shape.width, shape.height))
+}
+
 impl Replay {
     /// Begins to play the device's topic from the present moment of the scenario.
     ///
@@ -72,8 +85,8 @@ impl Replay {
         let from = if is_first { elapsed.saturating_sub(OPENING) } else { elapsed };
         let from_ns = begin_ns.saturating_add(nanoseconds(from));
         let description = format!("replay of {topic} in {}", file.display());
-        let (messages, schema) = unblock(move || Episode::open(&file)?.play(&topic, from_ns)).await?;
-        let reader = Reader { messages, schema, begin_ns };
+        let messages = unblock(move || Episode::open(&file)?.play(&topic, from_ns)).await?;
+        let reader = Reader { messages, begin_ns };
         let reading = Some(tokio::task::spawn_blocking(move || reader.batch(Vec::new())));
         Ok(Self { device, playing: Vec::new(), next: 0, reading, description })
     }
@@ -98,6 +111,14 @@ impl Replay {
     #[must_use]
     pub fn description(&self) -> &str {
         &self.description
+    }
+
+    /// The same for a recording of the replay: the file takes the place of the device.
+    #[must_use]
+    pub fn negotiated(&self) -> Negotiated {
+        let version = Some(env!("CARGO_PKG_VERSION").to_owned());
+        let driver = Some(KernelDriver { name: "rapid-replay".to_owned(), version });
+        Negotiated { driver, bus: Some(self.description.clone()), ..Negotiated::default() }
     }
 
     /// Waits until the message at `next` is due.
@@ -152,8 +173,7 @@ struct Batch {
 /// Reads the file, on the blocking pool.
 #[derive(Debug)]
 struct Reader {
-    messages: Messages,
-    schema: Schema,
+    messages: Messages<BufReader<File>>,
     begin_ns: u64,
 }
 
@@ -173,7 +193,7 @@ impl Reader {
             };
             let mut payload = spare.next().unwrap_or_default();
             // A message that cannot be read was not recorded by us; it has no sample to play.
-            let Some(shape) = wire::payload(self.schema, next.data, &mut payload) else { continue };
+            let Some(shape) = wire::payload(next.schema, next.data, &mut payload) else { continue };
             let after = Duration::from_nanos(next.log_time.saturating_sub(self.begin_ns));
             bytes += payload.len();
             messages.push(Message { after, payload, shape });

@@ -19,6 +19,7 @@ use tokio_serial::{ClearBuffer, SerialPort as _, SerialStream};
 
 use self::framing::{Cut, Framer};
 use super::{DriverError, Reading, unblock};
+use crate::provenance::{Format, Negotiated};
 use crate::registry::{Framing, Parse, SerialSpec};
 use crate::sample::Encoding;
 use crate::time::Stamp;
@@ -43,6 +44,7 @@ pub struct Serial {
     arrived: Stamp,
     lost: u64,
     description: String,
+    format: Format,
 }
 
 impl Serial {
@@ -58,6 +60,8 @@ impl Serial {
         let path = path.to_owned();
         let baud = spec.baud;
         let stream = unblock(move || open_line(&path, baud)).await?;
+        let baud = stream.baud_rate().unwrap_or(baud);
+        let format = Format::Messages { baud: Some(baud), channels: spec.channels, hz: None };
         Ok(Self {
             stream,
             decoder,
@@ -67,6 +71,7 @@ impl Serial {
             arrived: Stamp::default(),
             lost: 0,
             description,
+            format,
         })
     }
 
@@ -108,6 +113,12 @@ impl Serial {
     #[must_use]
     pub fn description(&self) -> &str {
         &self.description
+    }
+
+    /// The same for the recording.
+    #[must_use]
+    pub fn negotiated(&self) -> Negotiated {
+        Negotiated { format: Some(self.format.clone()), ..Negotiated::default() }
     }
 }
 
@@ -198,6 +209,30 @@ impl Decoder {
         };
         format!("{} {content} in {}", self.values.len(), self.framer.description())
     }
+}
+
+/// What a line that delivers `pieces` one after another would be read as: the payloads, and how many
+/// messages were refused.
+#[doc(hidden)]
+pub fn decode<'p>(
+    spec: &SerialSpec,
+    max_bytes: usize,
+    pieces: impl IntoIterator<Item = &'p [u8]>,
+) -> (Vec<Vec<u8>>, u64) {
+    let mut decoder = Decoder::new(spec, max_bytes);
+    let (mut payloads, mut refused) = (Vec::new(), 0);
+    for mut piece in pieces {
+        while !piece.is_empty() {
+            let (taken, outcome) = decoder.feed(piece);
+            piece = piece.get(taken..).unwrap_or_default();
+            match outcome {
+                Decoded::Nothing => {}
+                Decoded::Message => payloads.push(decoder.reading(Stamp::default(), 0).bytes.to_vec()),
+                Decoded::Malformed => refused += 1,
+            }
+        }
+    }
+    (payloads, refused)
 }
 
 fn open_line(path: &Path, baud: u32) -> Result<SerialStream, DriverError> {

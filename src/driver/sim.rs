@@ -6,6 +6,7 @@
 //!
 //! Invariant: the sequence goes on over a replug; a number that is skipped is told in `lost`.
 
+use std::collections::BTreeMap;
 use std::f64::consts::TAU;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, OnceLock};
@@ -15,10 +16,11 @@ use jpeg_encoder::{ColorType, Encoder};
 use tokio::time::Instant;
 
 use super::{DriverError, Reading, unblock};
-use crate::registry::scenario::{SimDevice, SimSource};
+use crate::provenance::{Format, Negotiated};
+use crate::registry::scenario::{self, SimDevice, SimSource};
 use crate::registry::{DeviceSpec, NodeSpec};
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
-use crate::time::Stamp;
+use crate::time::{Stamp, nanoseconds};
 
 /// Different pictures a simulated camera has.
 const PICTURES: u32 = 8;
@@ -40,6 +42,11 @@ pub struct Sim {
     next: u64,
     backlog: u64,
     payload: Vec<u8>,
+    /// Losses not told yet.
+    owed: u64,
+    /// The sample in `payload` is to be sent once more, with this stamp.
+    again: Option<Stamp>,
+    controls: BTreeMap<String, i64>,
 }
 
 #[derive(Debug)]
@@ -52,18 +59,18 @@ impl Sim {
     /// Starts the device at the next point of its grid.
     ///
     /// # Errors
-    /// When a picture of these dimensions cannot be made.
+    /// When a picture of these dimensions cannot be made, or the device has no samples of its own.
     pub async fn open(device: Arc<SimDevice>) -> Result<Self, DriverError> {
         let (content, rate, backlog) = match device.source {
-            SimSource::Camera { width, height, fps, seed } => {
-                let pictures = unblock(move || Pictures::new(width, height, seed)).await?;
+            SimSource::Camera { width, height, fps, seed, bytes } => {
+                let pictures = unblock(move || Pictures::new(width, height, seed, bytes)).await?;
                 (Content::Pictures(pictures), fps, CAMERA_BACKLOG)
             }
             SimSource::Serial { channels, hz, seed } => {
                 (Content::Values { channels, seed }, hz, SERIAL_BACKLOG.as_secs() * u64::from(hz.max(1)))
             }
-            SimSource::Replay { .. } => {
-                return Err(DriverError::Fatal(format!("{} is a recording, not a simulated device", device.name)));
+            SimSource::Process | SimSource::Replay { .. } => {
+                return Err(DriverError::Fatal(format!("{} sends no samples made up here", device.name)));
             }
         };
         let capacity = match &content {
@@ -72,7 +79,17 @@ impl Sim {
         };
         let grid = Grid { begun: device.begun, rate: u64::from(rate.max(1)) };
         let next = grid.first_after(stamp_of(Instant::now()));
-        Ok(Self { device, content, grid, next, backlog, payload: Vec::with_capacity(capacity) })
+        let (payload, controls) = (Vec::with_capacity(capacity), BTreeMap::new());
+        Ok(Self { device, content, grid, next, backlog, payload, owed: 0, again: None, controls })
+    }
+
+    /// With the controls that `spec` sets: a simulated camera has those and no others.
+    #[must_use]
+    pub(super) fn with_controls(mut self, spec: &NodeSpec) -> Self {
+        if let NodeSpec::Camera(camera) = spec {
+            self.controls = camera.controls.iter().cloned().collect();
+        }
+        self
     }
 
     /// The next sample.
@@ -80,23 +97,48 @@ impl Sim {
     /// # Errors
     /// [`DriverError::Gone`] once the cable is pulled.
     pub async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
-        let lost = self.next_due().await?;
+        if let Some(captured) = self.again.take() {
+            return Ok(self.reading(captured, 0));
+        }
+        let faults = self.device.faults;
+        let hits = |every: Option<u64>, point: u64| every.is_some_and(|every| point.is_multiple_of(every));
+        loop {
+            self.owed += self.next_due().await?;
+            if !hits(faults.lose_every, self.next) {
+                break;
+            }
+            self.next += 1;
+            self.owed += 1;
+        }
         // Nothing waits from here on: a future that is dropped has taken no sample.
+        let (lost, point) = (std::mem::take(&mut self.owed), self.next);
         let skipped = u32::try_from(lost).unwrap_or(u32::MAX);
         let sequence = self.device.sequence.fetch_add(skipped.wrapping_add(1), Ordering::AcqRel).wrapping_add(skipped);
-        let captured = self.grid.stamp(self.next);
+        let captured = self.grid.stamp(point);
         self.next += 1;
+        let elapsed = captured.since(self.device.begun);
+        if self.payload.is_empty() || faults.freeze_at.is_none_or(|freeze| elapsed < freeze) {
+            match &self.content {
+                Content::Pictures(pictures) => pictures.write(sequence, &mut self.payload),
+                Content::Values { channels, seed } => write_values(*channels, *seed, sequence, &mut self.payload),
+            }
+        }
+        if hits(faults.truncate_every, point) {
+            self.payload.truncate(self.payload.len() / 2);
+        }
+        let error = i128::from(nanoseconds(elapsed)) * i128::from(faults.clock_ppm) / 1_000_000;
+        let captured = Stamp(u64::try_from(i128::from(captured.0) + error).unwrap_or(captured.0));
+        self.again = hits(faults.duplicate_every, point).then_some(captured);
+        Ok(self.reading(captured, lost))
+    }
+
+    /// What is in `payload`.
+    fn reading(&self, captured: Stamp, lost: u64) -> Reading<'_> {
         let (encoding, width, height) = match &self.content {
-            Content::Pictures(pictures) => {
-                pictures.write(sequence, &mut self.payload);
-                (Encoding::Mjpeg, pictures.width, pictures.height)
-            }
-            Content::Values { channels, seed } => {
-                write_values(*channels, *seed, sequence, &mut self.payload);
-                (Encoding::F64, u32::try_from(*channels).unwrap_or(u32::MAX), 0)
-            }
+            Content::Pictures(pictures) => (Encoding::Mjpeg, pictures.width, pictures.height),
+            Content::Values { channels, .. } => (Encoding::F64, u32::try_from(*channels).unwrap_or(u32::MAX), 0),
         };
-        Ok(Reading { bytes: &self.payload, encoding, captured, flags: FLAG_DEVICE_TIME, width, height, lost })
+        Reading { bytes: &self.payload, encoding, captured, flags: FLAG_DEVICE_TIME, width, height, lost }
     }
 
     /// Waits until the next sample is due; tells how many the device had to drop before it because
@@ -115,7 +157,8 @@ impl Sim {
                 continue;
             }
             let due = self.grid.stamp(self.next);
-            let now_stamp = stamp_of(now);
+            // What is on its way for long is to be had as late.
+            let now_stamp = stamp_of(now).before(self.device.faults.delay);
             if due <= now_stamp {
                 let newest = self.grid.first_after(now_stamp).saturating_sub(1);
                 let lost = newest.saturating_sub(self.next).saturating_sub(self.backlog);
@@ -134,8 +177,24 @@ impl Sim {
                 format!("simulated camera, MJPG {width}x{height} at {fps} fps")
             }
             SimSource::Serial { channels, hz, .. } => format!("simulated serial line, {channels} numbers at {hz} Hz"),
-            SimSource::Replay { .. } => String::from("recording"),
+            SimSource::Process | SimSource::Replay { .. } => String::new(),
         }
+    }
+
+    /// The same for the recording.
+    #[must_use]
+    pub fn negotiated(&self) -> Negotiated {
+        let format = match self.device.source {
+            SimSource::Camera { width, height, fps, .. } => {
+                Some(Format::Pictures { fourcc: "MJPG".to_owned(), width, height, fps: Some(fps.into()) })
+            }
+            SimSource::Serial { channels, hz, .. } => {
+                Some(Format::Messages { baud: None, channels, hz: Some(hz.into()) })
+            }
+            SimSource::Replay { .. } | SimSource::Process => None,
+        };
+        let bus = Some(format!("sim:{}", self.device.name));
+        Negotiated { driver: Some(scenario::driver()), card: None, bus, format, controls: self.controls.clone() }
     }
 }
 
@@ -159,7 +218,7 @@ pub(super) fn check(spec: &DeviceSpec, device: &SimDevice) -> Result<(), DriverE
         }
         (SimSource::Camera { .. }, NodeSpec::Serial(_)) => (String::from("pictures"), String::from("a serial line")),
         (SimSource::Serial { .. }, NodeSpec::Camera(_)) => (String::from("numbers"), String::from("a camera")),
-        (SimSource::Replay { .. }, _) => return Ok(()),
+        (SimSource::Process | SimSource::Replay { .. }, _) | (_, NodeSpec::Process(_)) => return Ok(()),
     };
     Err(DriverError::Fatal(format!(
         "the scenario's device {} sends {sends}, [device.{}] says {wished}: make them equal",
@@ -167,17 +226,19 @@ pub(super) fn check(spec: &DeviceSpec, device: &SimDevice) -> Result<(), DriverE
     )))
 }
 
-/// The bytes a simulated device sends as number `sequence`, made anew; `None` for a recording.
+/// The bytes a simulated device sends as number `sequence`, made anew; `None` for a recording
+/// or a program.
 #[must_use]
 pub fn frame(source: &SimSource, sequence: u32) -> Option<Vec<u8>> {
     let mut payload = Vec::new();
     match *source {
-        SimSource::Camera { width, height, seed, .. } => {
-            let picture = encode(width, height, seed, sequence % PICTURES).ok()?;
+        SimSource::Camera { width, height, seed, bytes, .. } => {
+            let picture =
+                fill(encode(width, height, seed, sequence % PICTURES).ok()?, bytes, seed, sequence % PICTURES);
             write_picture(&picture, seed, sequence, &mut payload);
         }
         SimSource::Serial { channels, seed, .. } => write_values(channels, seed, sequence, &mut payload),
-        SimSource::Replay { .. } => return None,
+        SimSource::Process | SimSource::Replay { .. } => return None,
     }
     Some(payload)
 }
@@ -207,8 +268,9 @@ struct Pictures {
 }
 
 impl Pictures {
-    fn new(width: u32, height: u32, seed: u64) -> Result<Self, DriverError> {
-        let encoded = (0..PICTURES).map(|index| encode(width, height, seed, index)).collect::<Result<_, _>>()?;
+    fn new(width: u32, height: u32, seed: u64, bytes: usize) -> Result<Self, DriverError> {
+        let picture = |index| Ok(fill(encode(width, height, seed, index)?, bytes, seed, index));
+        let encoded = (0..PICTURES).map(picture).collect::<Result<_, DriverError>>()?;
         Ok(Self { width, height, seed, encoded })
     }
 
@@ -239,6 +301,35 @@ fn write_picture(picture: &[u8], seed: u64, sequence: u32, payload: &mut Vec<u8>
         place.copy_from_slice(&length);
     }
     payload.extend_from_slice(rest);
+}
+
+/// The picture with comment segments after its start of image that bring it to `bytes` at least, filled with
+/// noise that does not compress, as the coefficients of a real scene do not.
+fn fill(picture: Vec<u8>, bytes: usize, seed: u64, index: u32) -> Vec<u8> {
+    // Marker and length beside this many bytes of content.
+    const SEGMENT: usize = 65_533;
+    if picture.len() >= bytes {
+        return picture;
+    }
+    let (start, rest) = picture.split_at(picture.len().min(2));
+    let mut filled = Vec::with_capacity(bytes + SEGMENT);
+    filled.extend_from_slice(start);
+    // xorshift64 (Marsaglia 2003), which needs a seed that is not zero.
+    let mut state = seed.wrapping_mul(u64::from(PICTURES)).wrapping_add(u64::from(index)) | 1 << 63;
+    while filled.len() + rest.len() < bytes {
+        let content = (bytes - filled.len() - rest.len()).saturating_sub(4).clamp(1, SEGMENT);
+        let length = u16::try_from(content + 2).unwrap_or(u16::MAX);
+        filled.extend_from_slice(&[0xff, 0xfe]);
+        filled.extend_from_slice(&length.to_be_bytes());
+        filled.extend((0..content).map(|_| {
+            state ^= state << 13;
+            state ^= state >> 7;
+            state ^= state << 17;
+            state.to_le_bytes()[0]
+        }));
+    }
+    filled.extend_from_slice(rest);
+    filled
 }
 
 /// A gradient tinted by the seed, with a bright square that moves from picture to picture.

@@ -18,7 +18,7 @@ struct Timed<'a> {
 
 /// An event as one JSON object, with `time` as RFC 3339 in UTC; without a line end.
 pub(super) fn json(event: &Event, wall_ns: u64) -> serde_json::Result<String> {
-    serde_json::to_string(&Timed { event, time: crate::time::rfc3339(wall_ns) })
+    text::json(&Timed { event, time: crate::time::rfc3339(wall_ns) })
 }
 
 /// The beginning of a run, as JSON: `{"event":"begin",...}`.
@@ -43,7 +43,7 @@ pub(super) fn begin_json(snapshot: &Snapshot, wall_ns: u64) -> serde_json::Resul
     fn device(device: &DeviceStatus) -> BeginDevice<'_> {
         BeginDevice { device: &device.name, bit: device.id, topic: &device.topic }
     }
-    serde_json::to_string(&Begin {
+    text::json(&Begin {
         stamp: snapshot.taken,
         rig: &snapshot.rig,
         devices: snapshot.devices.iter().map(device).collect(),
@@ -62,6 +62,8 @@ pub(super) struct Columns {
 
 /// Columns of the word that says what happened.
 const WORD: usize = 12;
+/// Columns of the rest of a line: a device may give itself a name of many thousand characters.
+const REST: usize = 1000;
 
 impl Columns {
     /// The rig and its modalities as a line; without a line end.
@@ -76,9 +78,19 @@ impl Columns {
     pub(super) fn line(self, event: &Event, wall_ns: u64) -> String {
         let palette = self.palette;
         let (subject, bit, word, rest) = match &event.what {
-            What::Attach { device, bit, node, port, serial } => {
-                let serial = serial.as_deref().map(|serial| format!(" serial {serial}")).unwrap_or_default();
-                (device, Some(bit), pad("attached"), format!("{node} port {port}{serial}"))
+            What::Attach { device, bit, node, usb, .. } => {
+                let serial = usb.serial.as_deref().map(|serial| format!(" serial {serial}")).unwrap_or_default();
+                (device, Some(bit), pad("attached"), format!("{node} port {}{serial}", usb.port))
+            }
+            What::Opened { device, bit, provenance } => {
+                let driver = provenance.negotiated.driver.as_ref();
+                let driver = driver.map(|driver| {
+                    format!("  driver {} {}", driver.name, driver.version.as_deref().unwrap_or_default())
+                });
+                let firmware = provenance.usb.firmware.as_deref().map(|firmware| format!("  firmware {firmware}"));
+                let rest =
+                    [Some(format!("epoch {}", provenance.epoch.0)), firmware, driver].into_iter().flatten().collect();
+                (device, Some(bit), pad("opened"), rest)
             }
             What::Detach { device, bit, witness } => {
                 (device, Some(bit), palette.warn(&pad("detached")), format!("told by {witness}"))
@@ -93,25 +105,22 @@ impl Columns {
             What::Recording { file } => {
                 (&"episode".to_owned(), None, palette.good(&pad("recording")), file.display().to_string())
             }
-            What::Episode { file, seconds, messages, bytes, dropped, error } => {
+            What::Episode { file, seconds, messages, bytes, dropped, error, verdict } => {
                 let size = text::size(*bytes);
                 let file = file.display();
-                let figures = format!("{file}  {seconds:.1} s  {messages} messages  {size}  {dropped} dropped");
-                let (word, rest) = match error {
-                    Some(error) => {
-                        let word = if event.what.is_cut_short() { "cut short" } else { "not whole" };
-                        (palette.bad(&pad(word)), format!("{figures}  {error}"))
-                    }
-                    None if *dropped > 0 => (palette.warn(&pad("finished")), figures),
-                    None => (palette.good(&pad("finished")), figures),
-                };
-                (&"episode".to_owned(), None, word, rest)
+                let mut rest = format!("{file}  {seconds:.1} s  {messages} messages  {size}  {dropped} dropped");
+                // Where an error has made a reason, that says it.
+                let why = if verdict.reasons.is_empty() { error.clone().unwrap_or_default() } else { verdict.why() };
+                rest.push_str("  ");
+                rest.push_str(&why);
+                (&"episode".to_owned(), None, palette.grade(verdict.grade, &pad(verdict.grade.word())), rest)
             }
             What::DiskLow { .. } | What::ClockStep { .. } => {
                 let (level, text) = event.what.sentence().unwrap_or((Level::Warn, String::new()));
                 let subject = if matches!(event.what, What::DiskLow { .. }) { "disk" } else { "clock" };
                 (&subject.to_owned(), None, palette.level(level, &pad(level.word())), text)
             }
+            What::Recovered { text, .. } => (&"episode".to_owned(), None, palette.warn(&pad("repaired")), text.clone()),
             What::Log { level, text } => {
                 let word = palette.level(*level, &pad(level.word()));
                 (&"log".to_owned(), None, word, text.clone())
@@ -119,8 +128,10 @@ impl Columns {
         };
         let time = palette.faint(&crate::time::time_of_day(wall_ns));
         let subject = text::left(&text::plain(subject), self.name, "…");
+        let rest = text::plain(rest.trim_end());
+        let rest = text::cut(&rest, REST, "…");
         let bit = bit.map_or_else(|| " ".repeat(6), |bit| format!("bit {:<2}", bit.bit()));
-        format!("{time}  {subject}  {}  {word}  {}", palette.faint(&bit), text::plain(rest.trim_end()))
+        format!("{time}  {subject}  {}  {word}  {}", palette.faint(&bit), rest)
     }
 }
 

@@ -230,11 +230,8 @@ impl Printer {
     fn summary(&mut self, end: &Snapshot) -> io::Result<String> {
         let tally = std::mem::replace(&mut self.tally, Tally::new(end));
         let summary = tally.summary(end);
-        let text = if self.json {
-            serde_json::to_string(&summary)?
-        } else {
-            summary.text(self.columns.name, self.columns.palette)
-        };
+        let text =
+            if self.json { text::json(&summary)? } else { summary.text(self.columns.name, self.columns.palette) };
         Ok(self.whole_line(&text))
     }
 

@@ -75,7 +75,7 @@ pub(super) fn json(
     duration: Option<Duration>,
     wall_ns: u64,
 ) -> serde_json::Result<String> {
-    serde_json::to_string(&Progress {
+    text::json(&Progress {
         time: crate::time::rfc3339(wall_ns),
         elapsed: elapsed.as_secs_f64(),
         duration: duration.map(|duration| duration.as_secs_f64()),

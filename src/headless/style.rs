@@ -1,6 +1,6 @@
 //! Colour in printed lines: whether, and which.
 
-use crate::status::{Level, SlotState};
+use crate::status::{Grade, Level, SlotState};
 
 /// What the user chose.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -109,6 +109,16 @@ impl Palette {
             Level::Info => text.to_owned(),
             Level::Warn => self.warn(text),
             Level::Error => self.bad(text),
+        }
+    }
+
+    /// `text` in the colour of a verdict.
+    #[must_use]
+    pub fn grade(self, grade: Grade, text: &str) -> String {
+        match grade {
+            Grade::Good => self.good(text),
+            Grade::Suspect => self.warn(text),
+            Grade::Bad => self.bad(text),
         }
     }
 

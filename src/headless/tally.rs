@@ -9,7 +9,7 @@ use serde::Serialize;
 
 use super::style::Palette;
 use crate::modality::MAX_MODALITIES;
-use crate::status::{DeviceStatus, Event, SlotState, Snapshot, What};
+use crate::status::{DeviceStatus, Event, SlotState, Snapshot, Verdict, What};
 use crate::text;
 use crate::time::Stamp;
 
@@ -59,6 +59,8 @@ struct Episode {
     dropped: u64,
     #[serde(skip_serializing_if = "Option::is_none")]
     error: Option<String>,
+    #[serde(flatten)]
+    verdict: Verdict,
 }
 
 /// The summary, as JSON one object: `{"event":"summary",...}`.
@@ -119,13 +121,14 @@ impl Tally {
                     presence.set(*state, event.stamp);
                 }
             }
-            What::Episode { file, seconds, messages, bytes, dropped, error } => self.episodes.push(Episode {
+            What::Episode { file, seconds, messages, bytes, dropped, error, verdict } => self.episodes.push(Episode {
                 file: file.clone(),
                 seconds: *seconds,
                 messages: *messages,
                 bytes: *bytes,
                 dropped: *dropped,
                 error: error.clone(),
+                verdict: verdict.clone(),
             }),
             _ => {}
         }
@@ -188,18 +191,19 @@ impl Summary {
             let file = text::plain(&episode.file.display().to_string()).into_owned();
             let dropped = format!("{} dropped", episode.dropped);
             let dropped = if episode.dropped > 0 { palette.warn(&dropped) } else { dropped };
-            let mut line = format!(
-                "episode {}  {:.1} s  {} messages  {}  {dropped}",
+            let grade = episode.verdict.grade;
+            lines.push(format!(
+                "{}  {}  {:.1} s  {} messages  {}  {dropped}",
+                palette.grade(grade, &format!("{:7}", grade.word())),
                 palette.bold(&file),
                 episode.seconds,
                 episode.messages,
                 text::size(episode.bytes)
-            );
-            if let Some(error) = &episode.error {
-                line.push_str("  ");
-                line.push_str(&palette.bad(&format!("not whole: {}", text::plain(error))));
-            }
-            lines.push(line);
+            ));
+            // Where an error has made a reason, that says it.
+            let reasons = &episode.verdict.reasons;
+            let said = if reasons.is_empty() { episode.error.as_slice() } else { reasons };
+            lines.extend(said.iter().map(|reason| format!("         {}", text::plain(reason))));
         }
         if self.missed_events > 0 {
             let text = format!("{} events are missing above: this output was behind", self.missed_events);

@@ -3,9 +3,11 @@ use std::sync::Mutex;
 use serde_json::Value;
 
 use super::*;
+use crate::provenance::{KernelDriver, Negotiated};
+use crate::registry::UsbIdentity;
 use crate::sample::Epoch;
-use crate::status::literal::{WALL_NS, board, every_state, id, recording, three_streaming};
-use crate::status::{Level, RecordingStatus, SlotState, What};
+use crate::status::literal::{TAKEN, WALL_NS, board, every_state, id, recording, three_streaming};
+use crate::status::{Grade, Level, Provenance, RecordingStatus, SlotState, Verdict, What};
 
 /// An output that keeps what it is given.
 #[derive(Clone, Default)]
@@ -44,6 +46,27 @@ fn episode(dropped: u64, error: Option<&str>) -> What {
         bytes: 12_345_678,
         dropped,
         error: error.map(str::to_owned),
+        verdict: match (dropped, error) {
+            (0, None) => Verdict::default(),
+            (_, None) => Verdict {
+                grade: Grade::Suspect,
+                reasons: vec!["cam_wrist: 3 of 900 samples dropped on the way to the file (limit 0 %)".to_owned()],
+            },
+            (_, Some(error)) => {
+                Verdict { grade: Grade::Bad, reasons: vec![format!("the file could not be written: {error}")] }
+            }
+        },
+    }
+}
+
+fn usb() -> UsbIdentity {
+    UsbIdentity {
+        vid: 0x046d,
+        pid: 0x0825,
+        serial: Some("CAM\x1b[2J00".to_owned()),
+        port: "1-2.3".to_owned(),
+        firmware: Some("4.18".to_owned()),
+        ..UsbIdentity::default()
     }
 }
 
@@ -53,8 +76,23 @@ fn all_events() -> Vec<What> {
             device: "cam_wrist".to_owned(),
             bit: id(0),
             node: "/dev/video0".to_owned(),
-            port: "1-2.3".to_owned(),
-            serial: Some("CAM\x1b[2J00".to_owned()),
+            usb: usb(),
+            driver: None,
+        },
+        What::Opened {
+            device: "cam_wrist".to_owned(),
+            bit: id(0),
+            provenance: Box::new(Provenance {
+                epoch: Epoch(3),
+                node: "/dev/video0".to_owned(),
+                attached: TAKEN,
+                usb: usb(),
+                negotiated: Negotiated {
+                    driver: Some(KernelDriver { name: "uvcvideo".to_owned(), version: Some("6.1.0".to_owned()) }),
+                    ..Negotiated::default()
+                },
+                latency_ns: 35_000_000,
+            }),
         },
         state("cam_wrist", 0, SlotState::Streaming, "/dev/video0 MJPG 640x480@30"),
         What::Detach { device: "tof".to_owned(), bit: id(12), witness: "kernel".to_owned() },
@@ -62,6 +100,7 @@ fn all_events() -> Vec<What> {
         What::Unregistered { device: "046d:0825 \nX".to_owned(), reason: "no entry has this serial".to_owned() },
         What::Recording { file: "out/a.mcap".into() },
         episode(0, None),
+        episode(3, None),
         episode(3, Some("disk full")),
         episode(0, Some("disk nearly full")),
         What::DiskLow { folder: "out".into(), free: 1_500_000_000, seconds: 252 },
@@ -76,14 +115,16 @@ fn lines_for_people_have_their_columns() {
     let lines: Vec<_> = all_events().into_iter().map(|what| columns.line(&event(what), WALL_NS)).collect();
     insta::assert_snapshot!(lines.join("\n"), @r#"
     22:13:20.000Z  cam_wrist  bit 0   attached      /dev/video0 port 1-2.3 serial CAM [2J00
+    22:13:20.000Z  cam_wrist  bit 0   opened        epoch 3  firmware 4.18  driver uvcvideo 6.1.0
     22:13:20.000Z  cam_wrist  bit 0   streaming     mask 0x05  /dev/video0 MJPG 640x480@30
     22:13:20.000Z  tof        bit 12  detached      told by kernel
     22:13:20.000Z  tof        bit 12  absent        mask 0x05
     22:13:20.000Z  usb                unregistered  046d:0825  X   no entry has this serial
     22:13:20.000Z  episode            recording     out/a.mcap
-    22:13:20.000Z  episode            finished      out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped
-    22:13:20.000Z  episode            not whole     out/a.mcap.partial  30.0 s  1234 messages  12.3 MB  3 dropped  disk full
-    22:13:20.000Z  episode            cut short     out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped  disk nearly full
+    22:13:20.000Z  episode            GOOD          out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped
+    22:13:20.000Z  episode            SUSPECT       out/a.mcap  30.0 s  1234 messages  12.3 MB  3 dropped  cam_wrist: 3 of 900 samples dropped on the way to the file (limit 0 %)
+    22:13:20.000Z  episode            BAD           out/a.mcap.partial  30.0 s  1234 messages  12.3 MB  3 dropped  the file could not be written: disk full
+    22:13:20.000Z  episode            BAD           out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped  the file could not be written: disk nearly full
     22:13:20.000Z  disk               warn          out: disk nearly full, 1.5 GB free: the episode will be closed in about 4 min
     22:13:20.000Z  clock              warn          the wall clock was set back by 3600.000 s; times of capture stay as they are
     22:13:20.000Z  log                warn          something
@@ -174,12 +215,15 @@ fn the_summary_counts_from_its_beginning_and_means_while_present() {
     assert_eq!(object["devices"][1]["hz"], 15.0);
     assert_eq!(object["devices"][2]["gaps"], 2);
     assert_eq!(object["episodes"][0]["file"], "out/a.mcap");
+    assert_eq!(object["episodes"][0]["verdict"], "SUSPECT");
+    assert_eq!(object["episodes"][0]["reasons"].as_array().map(Vec::len), Some(1));
     insta::assert_snapshot!(summary.text(9, Palette::Plain), @r#"
     modality   bit    samples   mean Hz  present     gaps      bytes
     cam_wrist    0        150      30.0    50.0%        0        0 B
     cam_top      1        150      15.0   100.0%        1        0 B
     tof          2        150      15.0   100.0%        2        0 B
-    episode out/a.mcap  30.0 s  1234 messages  12.3 MB  3 dropped
+    SUSPECT  out/a.mcap  30.0 s  1234 messages  12.3 MB  3 dropped
+             cam_wrist: 3 of 900 samples dropped on the way to the file (limit 0 %)
     10.0 s in all
     "#);
 }
@@ -200,7 +244,7 @@ async fn what_is_announced_before_the_end_is_printed_and_summed_up() {
     output.await.unwrap();
     let text = kept.text();
     assert!(text.contains("cam_wrist  bit 0   streaming     mask 0x05  /dev/video0\n"), "{text}");
-    assert!(text.contains("episode out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped\n"), "{text}");
+    assert!(text.contains("GOOD     out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped\n"), "{text}");
     assert!(text.contains("cam_wrist    0          1"), "{text}");
 }
 

@@ -124,8 +124,8 @@ mod tests {
     /// A node `port/name` of the device with this number.
     fn node(path: &str, number: u32) -> Present {
         let port = path.split('/').next().unwrap_or_default();
-        let usb = UsbIdentity { vid: 1, pid: 2, serial: None, port: port.into(), product: None };
-        let attachment = Attachment { syspath: path.into(), node: DeviceNode::Tty(path.into()), usb };
+        let usb = UsbIdentity { vid: 1, pid: 2, serial: None, port: port.into(), ..UsbIdentity::default() };
+        let attachment = Attachment { syspath: path.into(), node: DeviceNode::Tty(path.into()), usb, driver: None };
         Present { attachment, device_number: Some(number.to_string()) }
     }
 

@@ -12,7 +12,7 @@ use futures::Stream;
 use tokio::time::{Instant, Sleep, sleep_until};
 
 use super::{HotplugError, HotplugEvent, Witness};
-use crate::registry::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, SimDevice};
+use crate::registry::scenario::{self, Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, SimDevice};
 use crate::registry::{Attachment, DeviceNode};
 use crate::time::Stamp;
 
@@ -112,10 +112,10 @@ pub fn attached(scenario: &Scenario) -> Vec<Attachment> {
 
 /// The attachment of a device that is plugged in now, and its cable.
 fn attachment(device: &ScenarioDevice, begun: Stamp) -> (Attachment, Arc<SimDevice>) {
-    let sim = Arc::new(SimDevice::new(&device.name, device.source.clone(), begun));
+    let sim = Arc::new(SimDevice::new(&device.name, device.source.clone(), begun).with_faults(device.faults));
     let syspath = PathBuf::from("/sim").join(&device.usb.port);
     let (node, usb) = (DeviceNode::Sim(Arc::clone(&sim)), device.usb.clone());
-    (Attachment { syspath, node, usb }, sim)
+    (Attachment { syspath, node, usb, driver: Some(Box::new(scenario::driver())) }, sim)
 }
 
 impl Stream for Script {
@@ -142,15 +142,16 @@ impl Stream for Script {
 mod tests {
     use super::*;
     use crate::registry::UsbIdentity;
-    use crate::registry::scenario::SimSource;
+    use crate::registry::scenario::{SimFaults, SimSource};
     use futures::StreamExt;
 
     fn device(name: &str, port: &str, plugged: bool) -> ScenarioDevice {
         ScenarioDevice {
             name: name.into(),
-            usb: UsbIdentity { vid: 1, pid: 2, serial: None, port: port.into(), product: None },
+            usb: UsbIdentity { vid: 1, pid: 2, serial: None, port: port.into(), ..UsbIdentity::default() },
             source: SimSource::Serial { channels: 1, hz: 100, seed: 1 },
             plugged,
+            faults: SimFaults::default(),
         }
     }
 

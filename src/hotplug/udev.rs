@@ -18,10 +18,11 @@ use udev::{Device, Enumerator, EventType, MonitorBuilder, MonitorSocket};
 
 use super::known::{Known, Look, Present};
 use super::{HotplugError, HotplugEvent, Witness};
+use crate::provenance::KernelDriver;
 use crate::registry::{Attachment, DeviceNode, UsbIdentity};
 use crate::time::Stamp;
 
-/// Subsystems whose nodes are opened.
+/// Subsystems whose nodes are opened, beside the USB devices themselves.
 const NODE_SUBSYSTEMS: [&str; 2] = ["video4linux", "tty"];
 
 /// See the module's comment.
@@ -151,6 +152,7 @@ fn attached() -> Result<Vec<Present>, HotplugError> {
     for subsystem in NODE_SUBSYSTEMS {
         enumerator.match_subsystem(subsystem)?;
     }
+    enumerator.match_subsystem("usb")?;
     enumerator.match_is_initialized()?;
     let mut found: Vec<_> = enumerator.scan_devices()?.filter_map(|device| present(&device)).collect();
     // In the order of ports, so that a start assigns equal units the same way each time.
@@ -167,9 +169,15 @@ fn present(device: &Device) -> Option<Present> {
     let node = match device.subsystem()?.to_str()? {
         "video4linux" if captures(device) => DeviceNode::Video(path),
         "tty" => DeviceNode::Tty(path),
+        // Of this subsystem, only the devices themselves have a node.
+        "usb" => DeviceNode::Usb(path),
         _ => return None,
     };
-    let usb_device = device.parent_with_subsystem_devtype("usb", "usb_device").ok()??;
+    let usb_device = match &node {
+        // Its parent is the hub.
+        DeviceNode::Usb(_) => device.clone(),
+        _ => device.parent_with_subsystem_devtype("usb", "usb_device").ok()??,
+    };
     let text = |name: &str| {
         let value = usb_device.attribute_value(name)?.to_string_lossy().into_owned();
         (!value.is_empty()).then_some(value)
@@ -181,9 +189,29 @@ fn present(device: &Device) -> Option<Present> {
         serial: text("serial"),
         port: usb_device.sysname().to_string_lossy().into_owned(),
         product: text("product"),
+        manufacturer: text("manufacturer"),
+        firmware: text("bcdDevice").map(|release| release_number(&release)),
     };
-    let attachment = Attachment { syspath: device.syspath().to_owned(), node, usb };
+    let attachment =
+        Attachment { syspath: device.syspath().to_owned(), node, usb, driver: kernel_driver(device).map(Box::new) };
     Some(Present { attachment, device_number: text("devnum") })
+}
+
+/// `bcdDevice` as sysfs writes it, four digits (`0418`), the way it is read: `4.18`.
+fn release_number(digits: &str) -> String {
+    match digits.split_at_checked(2) {
+        Some((major, minor)) if digits.len() == 4 => format!("{}.{minor}", major.strip_prefix('0').unwrap_or(major)),
+        _ => digits.to_owned(),
+    }
+}
+
+/// The driver of the nearest interface above a node. Most of them have no version of their own.
+fn kernel_driver(device: &Device) -> Option<KernelDriver> {
+    let interface = device.parent_with_subsystem_devtype("usb", "usb_interface").ok()??;
+    let name = interface.driver()?.to_string_lossy().into_owned();
+    let version = std::fs::read_to_string(interface.syspath().join("driver/module/version")).ok();
+    let version = version.map(|text| text.trim().to_owned()).filter(|text| !text.is_empty());
+    Some(KernelDriver { name, version })
 }
 
 /// A UVC camera offers a second video node for metadata, which has no pictures.
@@ -191,5 +219,18 @@ fn captures(device: &Device) -> bool {
     match device.property_value("ID_V4L_CAPABILITIES") {
         Some(capabilities) => capabilities.to_string_lossy().contains(":capture:"),
         None => device.attribute_value("index").is_some_and(|index| index == "0"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_release_is_read_as_lsusb_shows_it() {
+        for (digits, expected) in [("0418", "4.18"), ("1000", "10.00"), ("0000", "0.00"), ("1", "1"), ("äöü", "äöü")]
+        {
+            assert_eq!(release_number(digits), expected);
+        }
     }
 }

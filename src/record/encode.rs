@@ -303,8 +303,9 @@ mod tests {
     #[test]
     fn frames_decode() {
         let id = |bit| ModalityId::new(bit).unwrap();
-        let modalities: Vec<_> =
-            [0, 1, 63].map(|bit| SyncModality { id: id(bit), when_stale: WhenStale::Hold, capacity: 4 }).into();
+        let modalities: Vec<_> = [0, 1, 63]
+            .map(|bit| SyncModality { id: id(bit), when_stale: WhenStale::Hold, latency: Duration::ZERO, capacity: 4 })
+            .into();
         let mut sync = Synchronizer::new(&modalities, Duration::from_nanos(10));
         let stamp = Stamp(100);
         let sample = |capture, seq| SyncSample { capture: Stamp(capture), recv: stamp, seq, epoch: Epoch(0), keep: () };

@@ -2,16 +2,17 @@
 //!
 //! Invariant: no file that exists is ever opened for writing or replaced.
 
-use std::fs::{self, File, OpenOptions};
+use std::fs::File;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use rustix::fs::{CWD, RenameFlags, renameat_with};
-use rustix::io::Errno;
 use serde::Serialize;
 
 use super::RecordError;
+use super::lock::{self, Lock};
+use crate::folder::{Folder, FolderError, Links, Missing};
+use crate::status::Verdict;
 use crate::time;
 
 /// Extension of a file that is not finished.
@@ -21,6 +22,8 @@ pub(super) const PARTIAL: &str = "partial";
 const SLUG_BYTES: usize = 64;
 /// Numbers tried beyond the highest one seen, while other processes take them.
 const ATTEMPTS: u32 = 100;
+/// Beyond every number of an episode.
+const LARGEST: u32 = 1_000_000;
 
 /// What to record.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
@@ -50,84 +53,113 @@ pub struct EpisodeReport {
     pub dropped: u64,
     /// Why the file, or the episode in it, is not whole, if it is not.
     pub error: Option<String>,
+    /// What it is worth.
+    #[serde(flatten)]
+    pub verdict: Verdict,
 }
 
-/// The two names of an episode's file.
-#[derive(Debug, Clone, PartialEq, Eq)]
+/// The folder of an episode's file, held open, and its two names in it; the file is locked until the
+/// second one is given.
+#[derive(Debug)]
 pub(super) struct EpisodePath {
+    pub(super) folder: Folder,
     /// Once it is finished.
     pub(super) finished: PathBuf,
     /// While it is written.
     pub(super) partial: PathBuf,
+    /// Holds the lock.
+    #[expect(dead_code, reason = "held for its lock")]
+    pub(super) locked: File,
 }
 
 impl EpisodePath {
     /// Takes the next free number in `out` for `task` on the day of `wall_ns` (UTC) and creates the
     /// partial file.
     pub(super) fn create(out: &Path, task: &str, wall_ns: u64) -> Result<(Self, File), RecordError> {
-        let at = |path: &Path| {
-            let path = path.to_owned();
-            move |source| RecordError::Io { path, source }
-        };
-        make_folder(out)?;
+        let refused = |source| RecordError::Io { path: out.to_owned(), source };
+        let folder = open_folder(out)?;
         let stem = format!("{}_{}_", date(wall_ns), slug(task));
-        let first = next_number(out, &stem).map_err(at(out))?;
+        let first = next_number(&folder, &stem).map_err(refused)?;
         for number in first..first.saturating_add(ATTEMPTS) {
-            let finished = out.join(format!("{stem}{number:03}.mcap"));
-            let partial = out.join(format!("{stem}{number:03}.mcap.partial"));
-            if fs::symlink_metadata(&finished).is_ok() {
+            let name = format!("{stem}{number:03}.mcap");
+            let partial = format!("{name}.partial");
+            if folder.has(&name) {
                 continue;
             }
-            match OpenOptions::new().read(true).write(true).create_new(true).open(&partial) {
-                Ok(file) => return Ok((Self { finished, partial }, file)),
+            match folder.create_new(&partial, 0o666) {
+                Ok(file) => {
+                    let (finished, partial) = (out.join(name), out.join(partial));
+                    match lock(&file, &partial) {
+                        Ok(Some(locked)) => return Ok((Self { folder, finished, partial, locked }, file)),
+                        // Somebody took the empty file for one that was left behind.
+                        Ok(None) => {}
+                        Err(source) => return Err(RecordError::Io { path: partial, source }),
+                    }
+                }
                 Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
-                Err(source) => return Err(RecordError::Io { path: partial, source }),
+                Err(source) => return Err(RecordError::Io { path: out.join(partial), source }),
             }
         }
-        Err(at(out)(io::Error::new(io::ErrorKind::AlreadyExists, "no free number for this task")))
+        Err(refused(io::Error::new(io::ErrorKind::AlreadyExists, "no free number for this task")))
     }
 
-    /// Gives the finished file its name, and waits for the name to be on the disk where the file
-    /// system can be asked for that.
+    /// Gives the finished file its name.
     pub(super) fn publish(&self) -> io::Result<()> {
-        match renameat_with(CWD, &self.partial, CWD, &self.finished, RenameFlags::NOREPLACE) {
-            Ok(()) => {}
-            // A file system without the flag (NFS, some FUSE): the number was free when it was taken.
-            Err(Errno::INVAL | Errno::NOSYS | Errno::OPNOTSUPP) if fs::symlink_metadata(&self.finished).is_err() => {
-                fs::rename(&self.partial, &self.finished)?;
-            }
-            Err(error) => return Err(error.into()),
-        }
-        let folder = self.finished.parent().filter(|folder| *folder != Path::new("")).unwrap_or(Path::new("."));
-        // The file has its name: what remains is what a loss of power right now would do to it.
-        if let Err(error) = File::open(folder).and_then(|folder| folder.sync_all()) {
-            tracing::warn!(folder = %folder.display(), %error, "folder not synced");
-        }
-        Ok(())
+        rename(&self.folder, &self.partial, &self.finished)
     }
 }
 
-fn make_folder(out: &Path) -> Result<(), RecordError> {
-    match fs::create_dir(out) {
-        Ok(()) => Ok(()),
-        Err(error) if error.kind() == io::ErrorKind::AlreadyExists => Ok(()),
-        Err(error) if error.kind() == io::ErrorKind::NotFound => Err(RecordError::NoFolder(out.to_owned())),
-        Err(source) => Err(RecordError::Io { path: out.to_owned(), source }),
+/// Gives a file its final name, in the same folder, which must be free, and waits for the name to be
+/// on the disk where the file system can be asked for that.
+pub(super) fn publish(file: &Path, name: &Path) -> io::Result<()> {
+    let folder = Folder::open(name.parent().unwrap_or(Path::new("")), Links::Own, Missing::Refused);
+    rename(&folder.map_err(io::Error::from)?, file, name)
+}
+
+fn rename(folder: &Folder, file: &Path, name: &Path) -> io::Result<()> {
+    let part = |path: &'_ Path| path.file_name().unwrap_or_default().to_owned();
+    folder.rename_new(&part(file), &part(name))?;
+    // The file has its name: what remains is what a loss of power right now would do to it.
+    if let Err(error) = folder.sync() {
+        tracing::warn!(folder = %folder.path().display(), %error, "folder not synced");
+    }
+    Ok(())
+}
+
+/// Locks a partial file just made; a handle that holds the lock, `None` if somebody else has it.
+pub(super) fn lock(file: &File, partial: &Path) -> io::Result<Option<File>> {
+    match lock::take(file, partial)? {
+        Lock::Ours | Lock::Unknown => file.try_clone().map(Some),
+        Lock::Others | Lock::Gone => Ok(None),
     }
 }
 
-/// One more than the highest number of any file, finished or not, whose name begins with `stem`.
-fn next_number(out: &Path, stem: &str) -> io::Result<u32> {
+/// Opens the folder for episodes; makes it if the one above it exists.
+///
+/// # Errors
+/// When it cannot be made or entered, or lies behind another user's symbolic link.
+pub fn open_folder(out: &Path) -> Result<Folder, RecordError> {
+    Folder::open(out, Links::Own, Missing::Last).map_err(|error| match error {
+        FolderError::Io { error, .. } if error.kind() == io::ErrorKind::NotFound => {
+            RecordError::NoFolder(out.to_owned())
+        }
+        error => RecordError::Folder(error),
+    })
+}
+
+/// One more than the highest number of any file, finished, repaired or not, whose name begins with
+/// `stem`.
+///
+/// A number that no count of ours reaches does not count: somebody else made that name.
+fn next_number(folder: &Folder, stem: &str) -> io::Result<u32> {
     let mut highest = 0;
-    for entry in fs::read_dir(out)? {
-        let name = entry?.file_name();
-        let number = name
-            .to_str()
-            .and_then(|name| name.strip_prefix(stem))
-            .and_then(|rest| rest.strip_suffix(".partial").unwrap_or(rest).strip_suffix(".mcap")?.parse::<u32>().ok());
-        highest = highest.max(number.unwrap_or(0));
+    for entry in rustix::fs::Dir::read_from(folder.descriptor())? {
+        let entry = entry?;
+        let name = entry.file_name().to_str().ok().and_then(|name| name.strip_prefix(stem));
+        let number = name.and_then(|rest| rest.split_once('.')?.0.parse::<u32>().ok());
+        highest = highest.max(number.filter(|number| *number < LARGEST).unwrap_or(0));
     }
-    Ok(highest.saturating_add(1))
+    Ok(highest + 1)
 }
 
 /// The task as part of a file name: letters and digits of any script in lower case, one hyphen for
@@ -156,6 +188,9 @@ fn date(wall_ns: u64) -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+    use std::os::unix::fs::symlink;
+
     use super::*;
 
     const WALL: u64 = 1_700_000_000_000_000_000;
@@ -207,6 +242,11 @@ mod tests {
         fs::write(out.join("20231114_t_nonsense.mcap"), "kept").unwrap();
         let (third, _) = EpisodePath::create(&out, "t", WALL).unwrap();
         assert_eq!(third.finished.file_name().unwrap(), "20231114_t_042.mcap");
+        for (number, ending) in [(50, "partial"), (60, "recovering"), (70, "damaged"), (80, "empty")] {
+            fs::write(out.join(format!("20231114_t_0{number}.mcap.{ending}")), "kept").unwrap();
+            let (next, _) = EpisodePath::create(&out, "t", WALL).unwrap();
+            assert_eq!(next.finished.file_name().unwrap(), format!("20231114_t_0{}.mcap", number + 1).as_str());
+        }
         let (other, _) = EpisodePath::create(&out, "other", WALL).unwrap();
         assert_eq!(other.finished.file_name().unwrap(), "20231114_other_001.mcap");
         // A file that took the name meanwhile stays as it is.
@@ -214,6 +254,45 @@ mod tests {
         assert_eq!(third.publish().unwrap_err().kind(), io::ErrorKind::AlreadyExists);
         assert_eq!(fs::read_to_string(&third.finished).unwrap(), "kept");
         assert!(third.partial.exists());
+    }
+
+    #[test]
+    fn nothing_that_others_planted_is_written_to() {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("out");
+        fs::create_dir(&out).unwrap();
+        let victim = folder.path().join("victim");
+        fs::write(&victim, "precious").unwrap();
+        for name in ["20231114_t_001.mcap.partial", "20231114_t_002.mcap"] {
+            symlink(&victim, out.join(name)).unwrap();
+        }
+        let nowhere = folder.path().join("nowhere");
+        symlink(&nowhere, out.join("20231114_t_003.mcap")).unwrap();
+        let fifo = rustix::fs::FileType::Fifo;
+        rustix::fs::mknodat(rustix::fs::CWD, out.join("20231114_t_004.mcap.partial"), fifo, 0o666.into(), 0).unwrap();
+        fs::write(out.join("20231114_t_4294967295.mcap"), "").unwrap();
+        let (path, _) = EpisodePath::create(&out, "t", WALL).unwrap();
+        assert_eq!(path.finished.file_name().unwrap(), "20231114_t_005.mcap");
+        // Planted in the middle of the episode, under the name it was to get.
+        symlink(&nowhere, &path.finished).unwrap();
+        assert_eq!(path.publish().unwrap_err().kind(), io::ErrorKind::AlreadyExists);
+        assert!(!nowhere.exists());
+        assert_eq!(fs::read_to_string(&victim).unwrap(), "precious");
+        // The folder itself is exchanged: the episode stays where it began.
+        fs::remove_file(&path.finished).unwrap();
+        fs::rename(&out, folder.path().join("moved")).unwrap();
+        let elsewhere = folder.path().join("elsewhere");
+        fs::create_dir(&elsewhere).unwrap();
+        symlink(&elsewhere, &out).unwrap();
+        path.publish().unwrap();
+        assert!(folder.path().join("moved/20231114_t_005.mcap").exists());
+        assert_eq!(fs::read_dir(&elsewhere).unwrap().count(), 0);
+        if std::os::unix::fs::lchown(&out, Some(12_345), None).is_err() {
+            eprintln!("NOT CHECKED: only root can give links away");
+            return;
+        }
+        let error = EpisodePath::create(&out, "t", WALL).unwrap_err().to_string();
+        assert!(error.contains("out: a symbolic link of user 12345, which is not followed here; name"), "{error}");
     }
 
     #[test]

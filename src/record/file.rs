@@ -15,6 +15,7 @@ use mcap::{Attachment, McapError, WriteOptions, Writer};
 
 use super::encode::{self, EventText};
 use super::schema::{self, PROTOBUF, SampleSchema, Schema};
+use crate::episode_format::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, MASK_TOPIC, SUMMARY};
 use crate::mask::PhysicalMask;
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::registry::Registry;
@@ -22,15 +23,6 @@ use crate::sample::SampleHeader;
 use crate::status::Level;
 use crate::sync::Observation;
 use crate::time::{Stamp, WallClock};
-
-/// Topic of the physical mask.
-pub(super) const MASK_TOPIC: &str = "/rapid/mask";
-/// Topic of the frame index.
-pub(super) const FRAME_TOPIC: &str = "/rapid/frame";
-/// Topic of events.
-pub(super) const EVENT_TOPIC: &str = "/rapid/event";
-/// Topic of the log.
-pub(super) const LOG_TOPIC: &str = "/rapid/log";
 
 /// Uncompressed bytes after which a chunk is closed. The writer keeps one chunk in memory.
 const CHUNK_BYTES: u64 = 1 << 20;
@@ -44,6 +36,12 @@ pub trait Sink: Write + Send {
     /// # Errors
     /// When the disk does not take it.
     fn sync(&mut self) -> io::Result<()>;
+}
+
+impl Sink for Box<dyn Sink> {
+    fn sync(&mut self) -> io::Result<()> {
+        (**self).sync()
+    }
 }
 
 impl Sink for File {
@@ -85,17 +83,8 @@ impl EpisodeFile {
         begin: Stamp,
         metadata: BTreeMap<String, String>,
     ) -> io::Result<Self> {
-        // JPEG does not compress and raw frames are rare: no codec, so that the thread's time goes
-        // into the disk and every reader can read. Without seeking the writer keeps a chunk in
-        // memory until it is whole.
-        let options = WriteOptions::new()
-            .compression(None)
-            .chunk_size(Some(CHUNK_BYTES))
-            .disable_seeking(true)
-            .library(concat!("rapid/", env!("CARGO_PKG_VERSION")));
-        let sink = NoSeek::new(BufWriter::with_capacity(BUFFER_BYTES, sink));
-        let mut writer = Writer::with_options(sink, options).map_err(io_error)?;
-        writer.write_metadata(&Metadata { name: "rapid".to_owned(), metadata }).map_err(io_error)?;
+        let mut writer = writer(sink)?;
+        writer.write_metadata(&Metadata { name: ABOUT.to_owned(), metadata }).map_err(io_error)?;
         let wall_ns = clock.wall_ns(begin);
         writer
             .attach(&Attachment {
@@ -182,7 +171,7 @@ impl EpisodeFile {
 
     /// Ends the file with the summary and waits for the disk.
     pub(super) fn finish(mut self, summary: BTreeMap<String, String>) -> io::Result<()> {
-        let summary = Metadata { name: "rapid/summary".to_owned(), metadata: summary };
+        let summary = Metadata { name: SUMMARY.to_owned(), metadata: summary };
         self.writer.write_metadata(&summary).map_err(io_error)?;
         self.writer.finish().map_err(io_error)?;
         let buffered = self.writer.into_inner().into_inner();
@@ -198,6 +187,19 @@ impl EpisodeFile {
         self.messages += 1;
         Ok(())
     }
+}
+
+/// The writer of an episode's file.
+pub(super) fn writer<S: Sink>(sink: S) -> io::Result<Writer<NoSeek<BufWriter<S>>>> {
+    // JPEG does not compress and raw frames are rare: no codec, so that the thread's time goes
+    // into the disk and every reader can read. Without seeking the writer keeps a chunk in
+    // memory until it is whole.
+    let options = WriteOptions::new()
+        .compression(None)
+        .chunk_size(Some(CHUNK_BYTES))
+        .disable_seeking(true)
+        .library(concat!("rapid/", env!("CARGO_PKG_VERSION")));
+    Writer::with_options(NoSeek::new(BufWriter::with_capacity(BUFFER_BYTES, sink)), options).map_err(io_error)
 }
 
 impl Track {
@@ -228,7 +230,7 @@ fn add_channel(
 }
 
 /// The system's own error where there is one: it says more than the writer's.
-fn io_error(error: McapError) -> io::Error {
+pub(super) fn io_error(error: McapError) -> io::Error {
     match error {
         McapError::Io(error) => error,
         other => io::Error::other(other),

@@ -5,13 +5,14 @@
 //!
 //! Invariant: a name that means another file is left alone.
 
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, File};
 use std::io::{self, Seek, SeekFrom};
 use std::os::fd::AsRawFd;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use super::episode::{EpisodePath, PARTIAL};
+use super::episode::{EpisodePath, PARTIAL, lock};
+use crate::folder::{Folder, Links, Missing};
 
 /// Names tried for a file that is written again, while others have taken them.
 const ATTEMPTS: u32 = 100;
@@ -33,7 +34,9 @@ pub(super) fn publish(path: &EpisodePath, file: &File) -> io::Result<PathBuf> {
                 // Whoever moved it gave it the name it is to have.
                 return Ok(partial);
             }
-            let moved = EpisodePath { finished: partial.with_extension(""), partial };
+            let folder = open(partial.parent().unwrap_or(Path::new("")), Missing::Refused)?;
+            let moved =
+                EpisodePath { folder, finished: partial.with_extension(""), partial, locked: file.try_clone()? };
             moved.publish()?;
             Ok(moved.finished)
         }
@@ -107,20 +110,19 @@ fn write_again(path: &EpisodePath, file: &File, content: Content) -> io::Result<
     Err(first.unwrap_or_else(|| io::ErrorKind::NotFound.into()))
 }
 
-fn write_into(folder: &Path, stem: &str, content: Content, file: &File) -> io::Result<PathBuf> {
-    if folder != Path::new("") {
-        fs::create_dir_all(folder)?;
-    }
+fn write_into(out: &Path, stem: &str, content: Content, file: &File) -> io::Result<PathBuf> {
     for attempt in 1..=ATTEMPTS {
+        let folder = open(out, Missing::All)?;
         let stem = if attempt == 1 { stem.to_owned() } else { format!("{stem}-{attempt}") };
-        let (finished, partial) = (folder.join(format!("{stem}.mcap")), folder.join(format!("{stem}.mcap.{PARTIAL}")));
-        if fs::symlink_metadata(&finished).is_ok() {
+        let (finished, partial) = (format!("{stem}.mcap"), format!("{stem}.mcap.{PARTIAL}"));
+        if folder.has(&finished) {
             continue;
         }
-        let mut copy = match OpenOptions::new().write(true).create_new(true).open(&partial) {
+        let mut copy = match folder.create_new(&partial, 0o666) {
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => continue,
-            opened => opened?,
+            made => made?,
         };
+        let (finished, partial) = (out.join(finished), out.join(partial));
         let mut source = file;
         let copied = source.seek(SeekFrom::Start(0)).and_then(|_| io::copy(&mut source, &mut copy));
         if let Err(error) = copied.and_then(|_| copy.sync_all()) {
@@ -131,9 +133,14 @@ fn write_into(folder: &Path, stem: &str, content: Content, file: &File) -> io::R
         if content == Content::Partial {
             return Ok(partial);
         }
-        let path = EpisodePath { finished, partial };
+        let Some(locked) = lock(&copy, &partial)? else { continue };
+        let path = EpisodePath { folder, finished, partial, locked };
         path.publish()?;
         return Ok(path.finished);
     }
     Err(io::Error::new(io::ErrorKind::AlreadyExists, "no free name"))
+}
+
+fn open(folder: &Path, missing: Missing) -> io::Result<Folder> {
+    Folder::open(folder, Links::Own, missing).map_err(io::Error::from)
 }

@@ -6,20 +6,24 @@ use std::collections::BTreeMap;
 use serde_json::{Map, Value, json};
 
 use super::episode::EpisodeRequest;
-use super::session::{Attached, Tally};
-use crate::modality::ModalityId;
-use crate::registry::{Registry, WhenStale};
-use crate::time::{Stamp, WallClock};
+use super::provenance::Units;
+use super::quality::{Quality, Spread};
+use crate::registry::{DeviceSpec, Registry, WhenStale};
+use crate::status::Verdict;
+use crate::time::{Stamp, WallClock, nanoseconds};
 
 /// The record at the beginning.
 ///
-/// JSON: `layout` `{name: bit}`, `modalities` `[{name, bit, topic, kind, shape, when_stale}]`,
-/// `serials` `{name: serial or null}` of what was attached when the episode began, `tags`
-/// `{key: value}`.
+/// JSON: `layout` `{name: bit}`, `modalities` `[{name, bit, topic, kind, shape, when_stale,
+/// latency_ns}]`, `serials` `{name: serial or null}` of what was attached when the episode began,
+/// `provenance` (see [`Units::epochs`]) of what ran then, `tags` `{key: value}`.
+///
+/// A message's `log_time` is its capture time as the kernel gave it. The latency is taken off when
+/// a frame's samples are chosen: a sample stands for the moment `log_time - latency_ns`.
 pub(super) fn beginning(
     registry: &Registry,
     request: &EpisodeRequest,
-    attached: &Attached,
+    units: &Units,
     clock: WallClock,
     begin: Stamp,
 ) -> BTreeMap<String, String> {
@@ -37,11 +41,13 @@ pub(super) fn beginning(
             json!({
                 "name": device.name, "bit": device.id.bit(), "topic": device.topic,
                 "kind": modality.kind, "shape": modality.shape, "when_stale": when_stale,
+                "latency_ns": nanoseconds(device.latency),
             })
         })
         .collect();
     let tags: Map<String, Value> =
         request.tags.iter().map(|(key, value)| (key.clone(), value.clone().into())).collect();
+    let host = rustix::system::uname();
     text_map([
         ("software", concat!("rapid ", env!("CARGO_PKG_VERSION")).to_owned()),
         ("rig", registry.rig.name.clone()),
@@ -49,7 +55,11 @@ pub(super) fn beginning(
         ("tags", Value::Object(tags).to_string()),
         ("layout", Value::Object(layout).to_string()),
         ("modalities", Value::Array(modalities).to_string()),
-        ("serials", json!(attached).to_string()),
+        ("serials", units.serials().to_string()),
+        ("provenance", units.epochs(begin).to_string()),
+        ("commit", option_env!("RAPID_COMMIT").unwrap_or_default().to_owned()),
+        ("kernel", host.release().to_string_lossy().into_owned()),
+        ("host", host.nodename().to_string_lossy().into_owned()),
         ("registry", registry.text.clone()),
         ("observation_hz", registry.rig.observation_hz.to_string()),
         ("sync_window_ns", registry.rig.sync_window.as_nanos().to_string()),
@@ -72,41 +82,45 @@ pub(super) struct Ending<'a> {
     pub(super) events_missed: u64,
     /// Publications of the mask lost.
     pub(super) masks_dropped: u64,
-    /// Counts of each modality.
-    pub(super) tallies: &'a [Tally],
-    /// Serials of everything that was attached at some time.
-    pub(super) seen: &'a Attached,
+    /// What each modality was like.
+    pub(super) qualities: &'a [(&'a DeviceSpec, Quality)],
+    /// Between the earliest and the latest sample of a frame.
+    pub(super) skew: Option<Spread>,
+    /// The verdict.
+    pub(super) verdict: Verdict,
+    /// Everything that was attached or ran at some time.
+    pub(super) units: &'a Units,
+    /// When the episode began.
+    pub(super) begin: Stamp,
 }
 
 /// The record at the end.
 ///
-/// JSON: `modalities` `{name: {samples, bytes, lost, dropped, damaged}}` (`lost` by the device,
-/// `dropped` between the driver and the file), `serials` as at the beginning, of whatever was
-/// attached at some time.
-pub(super) fn end(registry: &Registry, ending: &Ending<'_>) -> BTreeMap<String, String> {
-    let tally = |id: ModalityId| ending.tallies.get(id.index()).copied().unwrap_or_default();
-    let modalities: Map<String, Value> = registry
-        .devices
-        .iter()
-        .map(|device| {
-            let Tally { samples, bytes, lost, dropped, damaged, .. } = tally(device.id);
-            let said =
-                json!({"samples": samples, "bytes": bytes, "lost": lost, "dropped": dropped, "damaged": damaged});
-            (device.name.clone(), said)
-        })
-        .collect();
-    let sum = |count: fn(&Tally) -> u64| ending.tallies.iter().map(count).fold(0, u64::saturating_add).to_string();
+/// `verdict` is GOOD, SUSPECT or BAD. JSON: `reasons` `["..."]`, why it is not GOOD; `modalities`
+/// `{name: {samples, bytes, lost, dropped, damaged, ...}}`, the fields of [`Quality`]; `skew_ms` `{p50,
+/// p95, p99, max}` between the earliest and the latest sample of a frame, or null; `serials` and
+/// `provenance` as at the beginning, of whatever was attached or ran at some time.
+pub(super) fn end(ending: &Ending<'_>) -> BTreeMap<String, String> {
+    let modalities: Map<String, Value> =
+        ending.qualities.iter().map(|(device, quality)| (device.name.clone(), json!(quality))).collect();
+    let sum = |count: fn(&Quality) -> u64| {
+        ending.qualities.iter().map(|(_, quality)| count(quality)).fold(0, u64::saturating_add).to_string()
+    };
     text_map([
+        ("verdict", ending.verdict.grade.word().to_owned()),
+        ("reasons", json!(ending.verdict.reasons).to_string()),
         ("duration_s", ending.seconds.to_string()),
         ("messages", ending.messages.to_string()),
         ("frames", ending.frames.to_string()),
-        ("lost", sum(|tally| tally.lost)),
-        ("dropped", sum(|tally| tally.dropped)),
-        ("damaged", sum(|tally| tally.damaged)),
+        ("lost", sum(|quality| quality.lost)),
+        ("dropped", sum(|quality| quality.dropped)),
+        ("damaged", sum(|quality| quality.damaged)),
         ("masks_dropped", ending.masks_dropped.to_string()),
         ("events_missed", ending.events_missed.to_string()),
         ("modalities", Value::Object(modalities).to_string()),
-        ("serials", json!(ending.seen).to_string()),
+        ("skew_ms", json!(ending.skew).to_string()),
+        ("serials", ending.units.serials().to_string()),
+        ("provenance", ending.units.epochs(ending.begin).to_string()),
     ])
 }
 

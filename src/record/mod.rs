@@ -9,14 +9,20 @@
 //! Invariant: a file without `.partial` at its end is finished; one that exists is never replaced.
 //! Invariant: what could not be recorded is counted and said.
 
+mod announce;
 pub mod encode;
 mod episode;
 mod file;
 mod hole;
 pub mod inspect;
 mod keep;
+mod lock;
+mod masks;
 mod metadata;
+mod provenance;
+mod quality;
 mod recorder;
+pub mod recover;
 pub mod schema;
 mod session;
 mod source;
@@ -24,14 +30,16 @@ mod space;
 mod streams;
 #[cfg(test)]
 mod tests;
-mod walk;
-mod wire;
+mod verdict;
 mod writer;
 
 use std::path::PathBuf;
 
-pub use episode::{EpisodeReport, EpisodeRequest};
+use crate::episode_format::{walk, wire};
+
+pub use episode::{EpisodeReport, EpisodeRequest, open_folder};
 pub use file::Sink;
+pub use quality::{Quality, Spread};
 pub use recorder::{Recorder, RecorderConfig};
 pub use source::Source;
 pub use space::{Asker, Disk};
@@ -52,6 +60,9 @@ pub enum RecordError {
         /// What the system says.
         source: std::io::Error,
     },
+    /// The folder lies behind a link of somebody else, or cannot be entered.
+    #[error("{0}; or choose another with --out")]
+    Folder(crate::folder::FolderError),
     /// There is no room for an episode.
     #[error(
         "{}: the disk is full: {} free, and {} of it are kept free (disk_reserve under [rig] in devices.toml): remove \

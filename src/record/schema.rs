@@ -73,9 +73,11 @@ impl SampleSchema {
                 PixelFormat::Mjpg => Self::CompressedImage,
                 PixelFormat::Yuyv | PixelFormat::Grey => Self::RawImage,
             },
-            NodeSpec::Serial(_) => match device.modality().kind {
+            NodeSpec::Serial(_) | NodeSpec::Process(_) => match device.modality().kind {
                 ModalityKind::Scalars => Self::Scalars,
-                ModalityKind::Image | ModalityKind::Bytes => Self::Bytes,
+                // A program's raw pictures get a channel of their own when the first one comes.
+                ModalityKind::Image => Self::CompressedImage,
+                ModalityKind::Bytes => Self::Bytes,
             },
         }
     }

@@ -2,40 +2,45 @@
 //!
 //! Time, in capture time of the monotonic clock:
 //!
-//! 1. The episode holds what was captured in `begin..end`; `end` is fixed by the duration asked for
-//!    or by the moment of the stop. One mask more is written, captured before `begin`: the one in
-//!    force when the episode began.
+//! 1. The episode holds what was captured from `begin` on and happened before `end`: a modality's
+//!    latency is how long before its capture what a sample shows happened. `end` is fixed by the
+//!    duration asked for or by the moment of the stop. One mask more is written, captured before
+//!    `begin`: the one in force when the episode began.
 //! 2. Tick `k` of the observation grid is `begin + k / observation_hz`; ticks before `end` are
 //!    written.
 //! 3. A tick is evaluated once, of what was received by its deadline, `tick + sync_window +`
-//!    [`SETTLE`], under the mask last published at or before the tick. The deadline is the frame's
+//!    [`SETTLE`] `+` the longest latency of the rig, under the mask last published at or before the tick. The deadline is the frame's
 //!    `publish_time`: whoever reads the file can choose the same samples again.
 //! 4. A sample received after its tick's deadline is in the file and in no frame.
-//! 5. The file is closed [`SETTLE`] `+` [`GRACE`] after `end`. A sample captured before `end` that
+//! 5. The file is closed [`SETTLE`] `+` [`GRACE`] `+` the longest latency after `end`. A sample captured before `end` that
 //!    arrives later than that is lost and not counted: nobody knows of it.
 //! 6. A damaged sample is recorded and counted, and belongs to no frame.
 //!
 //! Invariant: every sample a frame names was written to the file before the frame.
 
-use std::collections::{BTreeMap, VecDeque};
 use std::fs::File;
 use std::io;
 use std::sync::Arc;
 use std::time::Duration;
 
+use super::announce::Announcer;
 use super::encode::EventText;
 use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest};
 use super::file::{EpisodeFile, Sink};
 use super::hole::Hole;
 use super::keep;
+use super::masks::MaskHistory;
 use super::metadata::{self, Ending};
+use super::provenance::{Attached, Units};
+use super::quality::{Frames, Measured, Measures, Seen};
+use super::verdict::{Facts, FileState, Judged, Losses, judge};
 use crate::mask::PhysicalMask;
-use crate::modality::{MAX_MODALITIES, ModalityId};
-use crate::registry::Registry;
-use crate::sample::{Epoch, FLAG_ERROR, SampleHeader};
-use crate::status::{Board, Event, Level, RecordingStatus, What};
+use crate::modality::ModalityId;
+use crate::registry::{DeviceSpec, Registry};
+use crate::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
+use crate::status::{Board, Event, RecordingStatus, What};
 use crate::sync::{Grid, SyncModality, SyncSample, Synchronizer};
-use crate::time::{Stamp, WallClock};
+use crate::time::{Stamp, WallClock, nanoseconds};
 
 /// How long after its capture a sample may arrive and still belong to its frame. The slowest we
 /// know: a camera at 15 Hz stamps the start of exposure and delivers after exposure, transfer and
@@ -43,55 +48,8 @@ use crate::time::{Stamp, WallClock};
 pub(super) const SETTLE: Duration = Duration::from_millis(100);
 /// What has been received may still lie on the bus for this long.
 pub(super) const GRACE: Duration = Duration::from_millis(20);
-/// How often losses of one modality are announced at most.
-const ANNOUNCE_EVERY: Duration = Duration::from_secs(1);
 /// Samples of a modality that may arrive while those of a whole queue are being written.
 const RING_SLACK: usize = 1024;
-/// Publications of the mask remembered: 16 s at 500 Hz, more than any queue of it holds.
-const MASKS: usize = 8192;
-
-/// Serial of every device attached, by its modality's name.
-pub(super) type Attached = BTreeMap<String, Option<String>>;
-
-/// Counts of one modality in one episode.
-#[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Tally {
-    /// Samples written.
-    pub(super) samples: u64,
-    /// Payload bytes written.
-    pub(super) bytes: u64,
-    /// Samples that the device lost before we had them.
-    pub(super) lost: u64,
-    /// Samples lost between the driver and the file.
-    pub(super) dropped: u64,
-    /// Samples the driver called damaged.
-    pub(super) damaged: u64,
-    /// Of `dropped`, those not announced yet.
-    unannounced: u64,
-    announced: Option<Stamp>,
-}
-
-/// The last publications of the mask, in the order of publication.
-#[derive(Debug)]
-pub(super) struct MaskHistory(VecDeque<(SampleHeader, PhysicalMask, u64)>);
-
-impl MaskHistory {
-    pub(super) fn new() -> Self {
-        Self(VecDeque::with_capacity(MASKS))
-    }
-
-    pub(super) fn push(&mut self, header: &SampleHeader, mask: PhysicalMask, sequence: u64) {
-        if self.0.len() == MASKS {
-            self.0.pop_front();
-        }
-        self.0.push_back((*header, mask, sequence));
-    }
-
-    /// The publication in force at `stamp`: the last one at or before it.
-    fn at(&self, stamp: Stamp) -> Option<&(SampleHeader, PhysicalMask, u64)> {
-        self.0.iter().rev().find(|(header, ..)| header.capture_ns <= stamp.0)
-    }
-}
 
 /// See the module's comment.
 pub(super) struct Session {
@@ -106,11 +64,14 @@ pub(super) struct Session {
     grid: Grid,
     next_tick: u64,
     sync: Synchronizer<()>,
-    tallies: Vec<Tally>,
+    measures: Measures,
+    announcer: Announcer,
     masks_dropped: u64,
     events: u64,
     events_missed: u64,
-    seen: Attached,
+    units: Units,
+    /// How long a tick waits for its samples beside the window.
+    settle: Duration,
     /// The first error of the file: from then on nothing is written.
     failed: Option<io::Error>,
 }
@@ -132,17 +93,24 @@ impl Session {
     /// Begins an episode and writes what stands at its beginning.
     pub(super) fn begin(beginning: Beginning<'_>, masks: &MaskHistory) -> io::Result<Self> {
         let Beginning { registry, board, request, path, sink, handle, attached, clock, begin } = beginning;
-        let said = metadata::beginning(&registry, request, attached, clock, begin);
+        let units = Units::new(attached);
+        let said = metadata::beginning(&registry, request, &units, clock, begin);
         let mut file = EpisodeFile::begin(sink, &registry, clock, begin, said)?;
+        let settle = SETTLE + registry.devices.iter().map(|device| device.latency).max().unwrap_or_default();
+        let mut measures = Measures::new(&measured(&registry), frames(&registry, begin, settle));
         if let Some((header, mask, sequence)) = masks.at(begin) {
             file.mask(header, *mask, *sequence)?;
+            measures.mask(header.capture_ns, *mask);
         }
+        // Killed in the next moment, it is an episode all the same, of a known task and rig.
+        file.flush()?;
         let modalities: Vec<SyncModality> = registry
             .devices
             .iter()
             .map(|device| SyncModality {
                 id: device.id,
                 when_stale: device.when_stale,
+                latency: device.latency,
                 capacity: device.depth.saturating_add(RING_SLACK),
             })
             .collect();
@@ -157,39 +125,43 @@ impl Session {
             handle,
             begin,
             next_tick: 0,
-            tallies: vec![Tally::default(); MAX_MODALITIES],
+            measures,
+            announcer: Announcer::new(),
             masks_dropped: 0,
             events: 0,
             events_missed: 0,
-            seen: attached.clone(),
+            units,
+            settle,
             failed: None,
         })
     }
 
     /// Takes a sample, and the hole before it.
     pub(super) fn sample(&mut self, id: ModalityId, header: &SampleHeader, payload: &[u8], hole: Option<Hole>) {
+        let latency = self.latency(id);
         if let (Some(hole), None) = (hole, &self.failed) {
             // Also before a sample that lies beyond the end: a part of the hole may not.
-            let (lost, dropped) = (self.share(&hole, hole.lost), self.share(&hole, hole.dropped));
-            if let Some(tally) = self.tallies.get_mut(id.index()) {
-                // Saturating: the numbers come from whoever publishes.
-                tally.lost = tally.lost.saturating_add(lost);
-                tally.dropped = tally.dropped.saturating_add(dropped);
-                tally.unannounced = tally.unannounced.saturating_add(dropped);
-            }
+            let (lost, dropped) = (self.share(&hole, hole.lost, latency), self.share(&hole, hole.dropped, latency));
+            self.measures.missing(id, lost, dropped);
         }
-        if !self.holds(Stamp(header.capture_ns)) || self.failed.is_some() {
+        if !self.holds(Stamp(header.capture_ns), latency) || self.failed.is_some() {
             return;
         }
         if let Err(error) = self.file.sample(id, header, payload) {
             self.failed = Some(error);
             return;
         }
-        let Some(tally) = self.tallies.get_mut(id.index()) else { return };
-        tally.samples += 1;
-        tally.bytes += payload.len() as u64;
-        if header.flags & FLAG_ERROR != 0 {
-            tally.damaged += 1;
+        let flagged = header.flags & FLAG_ERROR != 0;
+        let seen = Seen {
+            seq: header.seq,
+            capture_ns: header.capture_ns,
+            recv_ns: header.recv_ns,
+            flagged,
+            jpeg: Encoding::from_raw(header.encoding) == Some(Encoding::Mjpeg),
+            payload,
+        };
+        self.measures.sample(id, &seen);
+        if flagged {
             return;
         }
         let sample = SyncSample {
@@ -205,20 +177,19 @@ impl Session {
     /// Takes a publication of the mask, and the hole before it.
     pub(super) fn mask(&mut self, header: &SampleHeader, mask: PhysicalMask, sequence: u64, hole: Option<Hole>) {
         if let (Some(hole), None) = (hole, &self.failed) {
-            self.masks_dropped = self.masks_dropped.saturating_add(self.share(&hole, hole.dropped));
+            self.masks_dropped = self.masks_dropped.saturating_add(self.share(&hole, hole.dropped, Duration::ZERO));
         }
-        if !self.holds(Stamp(header.capture_ns)) || self.failed.is_some() {
+        if !self.holds(Stamp(header.capture_ns), Duration::ZERO) || self.failed.is_some() {
             return;
         }
         self.failed = self.file.mask(header, mask, sequence).err();
+        self.measures.mask(header.capture_ns, mask);
     }
 
     /// Takes an event.
     pub(super) fn event(&mut self, event: &Event) {
-        if let What::Attach { device, serial, .. } = &event.what {
-            self.seen.insert(device.clone(), serial.clone());
-        }
-        if !self.holds(event.stamp) || self.failed.is_some() {
+        self.units.take(event);
+        if !self.holds(event.stamp, Duration::ZERO) || self.failed.is_some() {
             return;
         }
         self.failed = self.write_event(event).err();
@@ -231,13 +202,14 @@ impl Session {
     }
 
     /// Writes the frames whose deadline has passed by `now`, everything received before which was
-    /// taken, and announces losses.
+    /// taken, and announces what goes wrong.
     pub(super) fn advance(&mut self, now: Stamp, masks: &MaskHistory) {
         let ticks = self.end.map_or(u64::MAX, |end| self.grid.ticks_before(end));
         while self.failed.is_none() && self.next_tick < ticks && now >= self.deadline(self.next_tick).after(GRACE) {
             self.write_frame(masks);
         }
-        self.announce_losses(|tally| tally.announced.is_none_or(|at| now.since(at) >= ANNOUNCE_EVERY), now);
+        self.measures.settle();
+        self.announcer.look(&self.measures, &self.registry, &self.board, now);
     }
 
     /// Fixes the end of the episode, if it is not fixed to an earlier moment.
@@ -248,7 +220,7 @@ impl Session {
 
     /// Is it time to [`Self::finish`]?
     pub(super) fn is_over(&self, now: Stamp) -> bool {
-        self.failed.is_some() || self.end.is_some_and(|end| now >= end.after(SETTLE).after(GRACE))
+        self.failed.is_some() || self.end.is_some_and(|end| now >= end.after(self.settle).after(GRACE))
     }
 
     /// Is the end of the episode fixed by now?
@@ -271,39 +243,55 @@ impl Session {
         while self.failed.is_none() && self.next_tick < ticks {
             self.write_frame(masks);
         }
-        self.announce_losses(|_| true, now);
+        self.announcer.last(&self.measures, &self.registry, &self.board, now);
         let seconds = end.since(self.begin).as_secs_f64();
-        let dropped = self.dropped();
         let messages = self.file.messages;
+        let dropped = self.measures.dropped();
+        let qualities =
+            self.registry.devices.iter().filter_map(|device| Some((device, self.measures.quality(device.id, end.0)?)));
+        let qualities: Vec<_> = qualities.collect();
+        let judged: Vec<Judged<'_>> = qualities
+            .iter()
+            .map(|(device, quality)| Judged { name: &device.name, quality, limits: device.verdict })
+            .collect();
+        let (masks_dropped, events_missed) = (self.masks_dropped, self.events_missed);
+        let verdict = |file: FileState<'_>| {
+            judge(&Facts { modalities: &judged, masks_dropped, events_missed, losses: Losses::Apart, file })
+        };
+        let state = reason.as_deref().map_or(FileState::Whole, FileState::NotWhole);
         let ending = Ending {
             seconds,
             messages,
             frames: self.next_tick,
-            events_missed: self.events_missed,
-            masks_dropped: self.masks_dropped,
-            tallies: &self.tallies,
-            seen: &self.seen,
+            events_missed,
+            masks_dropped,
+            qualities: &qualities,
+            skew: self.measures.skew(),
+            verdict: verdict(state),
+            units: &self.units,
+            begin: self.begin,
         };
         let closed = match self.failed {
             None => {
-                let finished = self.file.finish(metadata::end(&self.registry, &ending));
+                let finished = self.file.finish(metadata::end(&ending));
                 finished.and_then(|()| keep::publish(&self.path, &self.handle))
             }
             Some(error) => Err(error),
         };
-        let (file, error) = match closed {
-            Ok(file) => (file, reason),
+        let (file, error, verdict) = match closed {
+            Ok(file) => (file, reason, ending.verdict),
             Err(error) => {
                 let file = keep::partial(&self.path, &self.handle);
                 let text = match reason {
                     Some(reason) => format!("{reason}; {}: {error}", file.display()),
                     None => format!("{}: {error}", file.display()),
                 };
-                (file, Some(text))
+                let verdict = verdict(FileState::Failed(&error.to_string()));
+                (file, Some(text), verdict)
             }
         };
         let bytes = std::fs::metadata(&file).map_or(0, |metadata| metadata.len());
-        EpisodeReport { file, seconds, messages, bytes, dropped, error }
+        EpisodeReport { file, seconds, messages, bytes, dropped, error, verdict }
     }
 
     /// For the screen.
@@ -313,7 +301,7 @@ impl Session {
             elapsed: self.end.unwrap_or(now).min(now).since(self.begin),
             messages: self.file.messages,
             bytes: self.file.bytes,
-            dropped: self.dropped(),
+            dropped: self.measures.dropped(),
             room: None,
         }
     }
@@ -323,22 +311,22 @@ impl Session {
         &self.path.finished
     }
 
-    fn dropped(&self) -> u64 {
-        self.tallies.iter().fold(0, |sum, tally| sum.saturating_add(tally.dropped))
+    fn holds(&self, capture: Stamp, latency: Duration) -> bool {
+        capture >= self.begin && self.end.is_none_or(|end| capture.before(latency) < end)
     }
 
-    fn holds(&self, capture: Stamp) -> bool {
-        capture >= self.begin && self.end.is_none_or(|end| capture < end)
+    fn latency(&self, id: ModalityId) -> Duration {
+        self.registry.device(id).map_or(Duration::ZERO, |device| device.latency)
     }
 
-    /// How many of `count` samples missing in `hole` were captured within the episode.
-    fn share(&self, hole: &Hole, count: u64) -> u64 {
-        let until_end = self.end.map_or(count, |end| hole.before(end, count));
+    /// How many of `count` samples missing in `hole` belong to the episode.
+    fn share(&self, hole: &Hole, count: u64, latency: Duration) -> u64 {
+        let until_end = self.end.map_or(count, |end| hole.before(end.after(latency), count));
         until_end.saturating_sub(hole.before(self.begin, count))
     }
 
     fn deadline(&self, tick: u64) -> Stamp {
-        self.grid.tick(tick).after(self.registry.rig.sync_window).after(SETTLE)
+        self.grid.tick(tick).after(self.registry.rig.sync_window).after(self.settle)
     }
 
     fn write_frame(&mut self, masks: &MaskHistory) {
@@ -347,6 +335,8 @@ impl Session {
         // Before the first publication nothing is known to be present.
         let mask = masks.at(tick).map_or(PhysicalMask::EMPTY, |(_, mask, _)| *mask);
         let observation = self.sync.observe(tick, deadline, mask);
+        let slots = observation.slots.iter();
+        self.measures.frame(slots.map(|slot| (slot.id, slot.present, slot.valid.then_some(slot.age_ns))));
         self.failed = self.file.frame(index, observation, deadline).err();
         self.next_tick += 1;
     }
@@ -362,27 +352,35 @@ impl Session {
         }
         Ok(())
     }
+}
 
-    fn announce_losses(&mut self, due: impl Fn(&Tally) -> bool, now: Stamp) {
-        for device in &self.registry.devices {
-            let Some(tally) = self.tallies.get_mut(device.id.index()) else { continue };
-            if tally.unannounced > 0 && due(tally) {
-                let text = format!("{}: {} samples lost on the way to the file", device.name, tally.unannounced);
-                self.board.announce(What::Log { level: Level::Warn, text });
-                tally.unannounced = 0;
-                tally.announced = Some(now);
-            }
-        }
-    }
+/// What is measured of the devices of a registry.
+fn measured(registry: &Registry) -> Vec<Measured> {
+    let measured = |device: &DeviceSpec| Measured {
+        id: device.id,
+        limits: device.verdict,
+        latency_ns: nanoseconds(device.latency),
+        max_bytes: device.max_bytes,
+    };
+    registry.devices.iter().map(measured).collect()
+}
+
+/// When the frames of an episode are that begins at `begin`.
+fn frames(registry: &Registry, begin: Stamp, settle: Duration) -> Frames {
+    Frames { begin_ns: begin.0, hz: registry.rig.observation_hz, wait: registry.rig.sync_window + settle }
 }
 
 /// An event for people.
 fn describe(what: &What) -> String {
     match what {
-        What::Attach { device, node, port, serial, .. } => match serial {
-            Some(serial) => format!("{device} attached: {node}, port {port}, serial {serial}"),
-            None => format!("{device} attached: {node}, port {port}"),
+        What::Attach { device, node, usb, .. } => match &usb.serial {
+            Some(serial) => format!("{device} attached: {node}, port {}, serial {serial}", usb.port),
+            None => format!("{device} attached: {node}, port {}", usb.port),
         },
+        What::Opened { device, provenance, .. } => {
+            let unit = provenance.usb.serial.as_deref().unwrap_or("without a serial number");
+            format!("{device} opened in epoch {}: unit {unit}", provenance.epoch.0)
+        }
         What::Detach { device, witness, .. } => format!("{device} detached, told by {witness}"),
         What::State { device, state, mask, detail, .. } => {
             let state = format!("{state:?}").to_lowercase();
@@ -391,7 +389,7 @@ fn describe(what: &What) -> String {
         What::Unregistered { device, reason } => format!("{device} not registered: {reason}"),
         What::Recording { file } => format!("recording {}", file.display()),
         What::Episode { file, .. } => format!("finished {}", file.display()),
-        What::Log { text, .. } => text.clone(),
+        What::Recovered { text, .. } | What::Log { text, .. } => text.clone(),
         What::DiskLow { .. } | What::ClockStep { .. } => {
             what.sentence().map_or_else(String::new, |(_, sentence)| sentence)
         }

@@ -1,7 +1,8 @@
 //! What passes by, recording or not: how far each stream has come, and the mask of late.
 
 use super::hole::Last;
-use super::session::{MaskHistory, Session};
+use super::masks::MaskHistory;
+use super::session::Session;
 use crate::bus::TopicId;
 use crate::mask::PhysicalMask;
 use crate::modality::MAX_MODALITIES;

@@ -20,10 +20,10 @@ use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::registry::{
     CameraSpec, DeviceSpec, Framing, IdentitySpec, NodeSpec, Parse, PixelFormat, Registry, RigSpec, SerialSpec,
-    WhenStale,
+    UsbIdentity, VerdictSpec, WhenStale,
 };
 use crate::sample::{Encoding, FLAG_ERROR, SampleHeader};
-use crate::status::{Board, Level, What};
+use crate::status::{Board, Grade, Level, What};
 use crate::time::Stamp;
 
 const MS: u64 = 1_000_000;
@@ -89,6 +89,7 @@ fn id(bit: u8) -> ModalityId {
 }
 
 fn device(bit: u8, name: &str, node: NodeSpec) -> DeviceSpec {
+    let verdict = VerdictSpec::of(node.modality_kind(), Duration::from_millis(500), None);
     DeviceSpec {
         name: name.to_owned(),
         id: id(bit),
@@ -100,11 +101,19 @@ fn device(bit: u8, name: &str, node: NodeSpec) -> DeviceSpec {
         max_bytes: 1 << 16,
         depth: 64,
         when_stale: WhenStale::Hold,
+        latency: Duration::ZERO,
+        verdict,
     }
 }
 
 fn camera(format: PixelFormat) -> NodeSpec {
     NodeSpec::Camera(CameraSpec { width: 4, height: 2, fps: 30, format, controls: Vec::new() })
+}
+
+/// What a picture looks like from outside.
+fn picture(number: u64) -> Vec<u8> {
+    let inside = number.to_le_bytes().repeat(100);
+    [&[0xff, 0xd8], inside.as_slice(), &[0xff, 0xd9]].concat()
 }
 
 pub(super) fn registry() -> Registry {
@@ -172,7 +181,7 @@ impl Bench {
     /// A sample of a device that says it lost `lost` ones so far.
     fn sample_after(&self, lost: u64, bit: u8, epoch: u32, seq: u64, capture: u64, flags: u32) {
         let (encoding, payload) = match bit {
-            CAM => (Encoding::Mjpeg, seq.to_le_bytes().repeat(100)),
+            CAM => (Encoding::Mjpeg, picture(seq)),
             TOF => (Encoding::F64, [seq as f64, 0.5].iter().flat_map(|v| v.to_le_bytes()).collect()),
             _ => (Encoding::Grey, vec![seq.to_le_bytes()[0]; 8]),
         };
@@ -216,8 +225,8 @@ impl Bench {
             device: "raw".to_owned(),
             bit: id(RAW),
             node: "/dev/video7".to_owned(),
-            port: "1-2".to_owned(),
-            serial: Some("S7".to_owned()),
+            usb: UsbIdentity { port: "1-2".to_owned(), serial: Some("S7".to_owned()), ..UsbIdentity::default() },
+            driver: None,
         };
         self.board.announce(attach);
         self.board.announce(What::Log { level: Level::Info, text: "hello".to_owned() });

@@ -18,8 +18,9 @@ use tokio::sync::oneshot;
 
 use super::RecordError;
 use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest, PARTIAL};
+use super::provenance::Attached;
 use super::recorder::RecorderConfig;
-use super::session::{Attached, Beginning, Session};
+use super::session::{Beginning, Session};
 use super::source::Source;
 use super::space::{Finding, Space};
 use super::streams::Streams;
@@ -29,8 +30,9 @@ use crate::time::{ClockWatch, Stamp};
 
 /// Longest wait for samples: what an order, an event or a due frame may have to wait.
 const TURN: Duration = Duration::from_millis(20);
-/// How often what was written is handed to the kernel: what a kill can take.
-const FLUSH_EVERY: Duration = Duration::from_secs(1);
+/// How often what was written is handed to the kernel. A kill may take a second at most: half of it
+/// is for what lies on the bus and for frames that are not due yet.
+const FLUSH_EVERY: Duration = Duration::from_millis(500);
 /// How often the board is told.
 const STATUS_EVERY: Duration = Duration::from_millis(200);
 /// How often it is looked whether the wall clock was set.
@@ -78,7 +80,7 @@ impl Writer {
             inbox,
             events,
             streams: Streams::new(),
-            attached: Attached::new(),
+            attached: Attached::default(),
             session: None,
             space: None,
             clock,
@@ -141,15 +143,7 @@ impl Writer {
         loop {
             match self.events.try_recv() {
                 Ok(event) => {
-                    match &event.what {
-                        What::Attach { device, serial, .. } => {
-                            self.attached.insert(device.clone(), serial.clone());
-                        }
-                        What::Detach { device, .. } => {
-                            self.attached.remove(device);
-                        }
-                        _ => {}
-                    }
+                    self.attached.take(&event);
                     if let Some(session) = &mut self.session {
                         session.event(&event);
                     }
@@ -287,10 +281,10 @@ impl Writer {
         let board = &self.config.board;
         board.set_recording(None);
         if report.file.extension().is_none_or(|extension| extension != PARTIAL) {
-            board.set_last_episode(report.file.clone());
+            board.set_last_episode(report.file.clone(), report.verdict.clone());
         }
-        let EpisodeReport { file, seconds, messages, bytes, dropped, error } = report.clone();
-        board.announce(What::Episode { file, seconds, messages, bytes, dropped, error });
+        let EpisodeReport { file, seconds, messages, bytes, dropped, error, verdict } = report.clone();
+        board.announce(What::Episode { file, seconds, messages, bytes, dropped, error, verdict });
         for reply in self.waiting.drain(..) {
             let _ = reply.send(Ok(report.clone()));
         }

@@ -8,13 +8,16 @@ use std::sync::Arc;
 use serde::Serialize;
 
 use super::scenario::SimDevice;
+use crate::provenance::KernelDriver;
 
 /// What a USB device says it is, and where it is plugged in.
-#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Default, Serialize)]
 pub struct UsbIdentity {
     /// Vendor id.
+    #[serde(serialize_with = "usb_id")]
     pub vid: u16,
     /// Product id.
+    #[serde(serialize_with = "usb_id")]
     pub pid: u16,
     /// Serial number, if it has one.
     pub serial: Option<String>,
@@ -22,6 +25,17 @@ pub struct UsbIdentity {
     pub port: String,
     /// Product string, if it has one.
     pub product: Option<String>,
+    /// Manufacturer string, if it has one.
+    pub manufacturer: Option<String>,
+    /// Release of the device, by which makers number their firmware: `bcdDevice` as `4.18`
+    /// (USB 2.0, table 9-8).
+    pub firmware: Option<String>,
+}
+
+/// A vendor or product id as `devices.toml` and `lsusb` write it: `046d`.
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "the signature serde asks for")]
+pub(super) fn usb_id<S: serde::Serializer>(id: &u16, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_str(&format_args!("{id:04x}"))
 }
 
 /// A node that can be opened.
@@ -31,6 +45,8 @@ pub enum DeviceNode {
     Video(PathBuf),
     /// A serial line, for example `/dev/ttyACM0`.
     Tty(PathBuf),
+    /// The USB device itself, for example `/dev/bus/usb/001/005`.
+    Usb(PathBuf),
     /// A simulated device.
     Sim(Arc<SimDevice>),
 }
@@ -45,6 +61,8 @@ pub struct Attachment {
     pub node: DeviceNode,
     /// The device it belongs to.
     pub usb: UsbIdentity,
+    /// The kernel's driver of it.
+    pub driver: Option<Box<KernelDriver>>,
 }
 
 impl Attachment {
@@ -60,7 +78,7 @@ impl DeviceNode {
     #[must_use]
     pub fn label(&self) -> String {
         match self {
-            Self::Video(path) | Self::Tty(path) => path.display().to_string(),
+            Self::Video(path) | Self::Tty(path) | Self::Usb(path) => path.display().to_string(),
             Self::Sim(device) => format!("sim:{}", device.name),
         }
     }

@@ -20,7 +20,7 @@ use std::path::Path;
 
 use super::attachment::{Attachment, DeviceNode, UsbIdentity};
 use super::scenario::SimSource;
-use super::spec::{DeviceSpec, IdentitySpec, NodeSpec, Registry};
+use super::spec::{DeviceSpec, IdentitySpec, NodeSpec, Opens, Registry};
 use crate::modality::ModalityId;
 
 /// What an attached node is to the rig.
@@ -80,6 +80,8 @@ struct Entry {
     name: String,
     identity: IdentitySpec,
     kind: Kind,
+    /// A program reads it.
+    is_process: bool,
 }
 
 #[derive(Debug, Clone)]
@@ -92,6 +94,7 @@ struct Node {
 enum Kind {
     Camera,
     Serial,
+    Usb,
 }
 
 /// The rule above by which a unit fits an entry.
@@ -238,6 +241,13 @@ impl Assigner {
 
     fn refuse(&self, attachment: &Attachment) -> Assignment {
         let entry = self.entries.iter().find(|entry| rule(&entry.identity, &attachment.usb).is_some());
+        // Hubs and keyboards are USB devices too: only one that an entry nearly means is worth a word.
+        let usb = &attachment.usb;
+        let nearly =
+            |entry: &Entry| entry.kind == Kind::Usb && (entry.identity.vid, entry.identity.pid) == (usb.vid, usb.pid);
+        if entry.is_none() && matches!(attachment.node, DeviceNode::Usb(_)) && !self.entries.iter().any(nearly) {
+            return Assignment::WrongNode { reason: format!("no entry reads {}", attachment.node.label()) };
+        }
         if let Some(entry) = entry {
             let label = attachment.node.label();
             let reason = format!("[device.{}] reads its {}, not {label}", entry.name, entry.kind.label());
@@ -330,20 +340,27 @@ impl Assigner {
 
 impl Entry {
     fn new(device: &DeviceSpec) -> Self {
-        let kind = match device.node {
-            NodeSpec::Camera(_) => Kind::Camera,
-            NodeSpec::Serial(_) => Kind::Serial,
+        let (kind, is_process) = match &device.node {
+            NodeSpec::Camera(_) => (Kind::Camera, false),
+            NodeSpec::Serial(_) => (Kind::Serial, false),
+            NodeSpec::Process(process) => match process.opens {
+                Opens::Video => (Kind::Camera, true),
+                Opens::Tty => (Kind::Serial, true),
+                Opens::Usb => (Kind::Usb, true),
+            },
         };
-        Self { id: device.id, name: device.name.clone(), identity: device.identity.clone(), kind }
+        Self { id: device.id, name: device.name.clone(), identity: device.identity.clone(), kind, is_process }
     }
 
     fn reads(&self, node: &DeviceNode) -> bool {
         match node {
             DeviceNode::Video(_) => self.kind == Kind::Camera,
             DeviceNode::Tty(_) => self.kind == Kind::Serial,
+            DeviceNode::Usb(_) => self.kind == Kind::Usb,
             DeviceNode::Sim(device) => match device.source {
-                SimSource::Camera { .. } => self.kind == Kind::Camera,
-                SimSource::Serial { .. } => self.kind == Kind::Serial,
+                SimSource::Camera { .. } => self.kind == Kind::Camera && !self.is_process,
+                SimSource::Serial { .. } => self.kind == Kind::Serial && !self.is_process,
+                SimSource::Process => self.is_process,
                 // A recorded topic stands for whatever recorded it.
                 SimSource::Replay { .. } => true,
             },
@@ -356,6 +373,7 @@ impl Kind {
         match self {
             Self::Camera => "camera",
             Self::Serial => "serial line",
+            Self::Usb => "USB device",
         }
     }
 }

@@ -8,19 +8,22 @@ pub mod artifacts;
 mod attachment;
 mod diagnostic;
 mod identity;
+mod limits;
 mod parse;
 pub mod scenario;
 mod scenario_file;
 mod section;
 mod spec;
-mod units;
+pub mod trust;
+pub mod units;
 mod words;
 
 pub use attachment::{Attachment, DeviceNode, UsbIdentity};
 pub use diagnostic::{Diagnostic, RegistryErrors};
 pub use identity::{Assigner, Assignment, Detached, Explanation};
+pub use limits::{Limits, VerdictSpec};
 pub use parse::{BUILTIN, Loaded};
 pub use spec::{
-    CameraSpec, DeviceSpec, Framing, IdentitySpec, MAX_BORROWED, MAX_SUBSCRIBERS, Mount, NodeSpec, POOL_SPARE, Parse,
-    PixelFormat, Registry, RigSpec, SerialSpec, WhenStale,
+    CameraSpec, DeviceSpec, Framing, IdentitySpec, MAX_BORROWED, MAX_SUBSCRIBERS, Mount, NodeSpec, Opens, POOL_SPARE,
+    Parse, PixelFormat, ProcessSpec, Registry, RigSpec, SerialSpec, WhenStale,
 };

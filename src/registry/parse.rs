@@ -10,6 +10,9 @@ mod budget;
 mod device;
 mod file;
 mod node;
+mod process;
+mod program;
+mod verdict;
 
 use std::path::Path;
 use std::time::Duration;
@@ -17,10 +20,13 @@ use std::time::Duration;
 use super::diagnostic::{Diagnostic, RegistryErrors};
 use super::section::{At, Problems, Section, file_label, read};
 use super::spec::{Registry, RigSpec};
+use super::trust::distrust;
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use device::Draft;
+use program::Programs;
+use verdict::Whose;
 
-pub(super) use device::{check_serial, is_port};
+pub(super) use device::is_port;
 pub(super) use file::read_file;
 
 /// The registry used when there is no file: the rig `rapid --sim` simulates.
@@ -50,10 +56,17 @@ impl Registry {
             "`rapid --sim` needs no file; for real devices write one, beginning from the \
                                     devices.toml of the repository, or name another with --config FILE",
         )?;
-        Self::parse(&text, Some(path))
+        let mut loaded = Self::parse(&text, Some(path))?;
+        // As root it would have been refused.
+        if let Ok(Some(reason)) = distrust(path) {
+            let (file, message, fix) = (file_label(Some(path), ""), reason.to_string(), Some(reason.fix()));
+            loaded.warnings.insert(0, Diagnostic { file, line: 0, column: 0, entry: None, message, fix });
+        }
+        Ok(loaded)
     }
 
-    /// Reads the text of a `devices.toml`; `path` names it in messages.
+    /// Reads the text of a `devices.toml`; `path` names it in messages, and programs are looked for
+    /// beside it. Without a path they are not looked for: nothing of such a registry will be run.
     ///
     /// # Errors
     /// All that is wrong with the text.
@@ -63,9 +76,11 @@ impl Registry {
         let document = read(text, &mut problems);
         problems.check()?;
         let root = Section::new(document.get_ref(), 0, String::new());
-        root.allow(&mut problems, &["rig", "device"]);
+        root.allow(&mut problems, &["rig", "verdict", "device"]);
         let rig = rig(&root, &mut problems);
-        let mut drafts = drafts(&root, &mut problems);
+        let verdict = verdict::read(&root, Whose::Rig, &mut problems);
+        let programs = path.map_or(Programs::Nowhere, Programs::Beside);
+        let mut drafts = drafts(&root, programs, &mut problems);
         if drafts.is_empty() && problems.is_empty() {
             return Err(nothing_registered(file));
         }
@@ -75,7 +90,7 @@ impl Registry {
         warnings.extend(unused_ports(&drafts, &problems));
         warnings.extend(budget::fit(&mut drafts, rig.memory_budget, root.at_of("rig"), &mut problems));
         problems.check()?;
-        let mut devices: Vec<_> = drafts.into_iter().filter_map(Draft::finish).collect();
+        let mut devices: Vec<_> = drafts.into_iter().filter_map(|draft| draft.finish(&verdict)).collect();
         devices.sort_by_key(|device| device.id);
         let registry = Self { rig, devices, path: path.map(Path::to_path_buf), text: text.to_owned() };
         Ok(Loaded { registry, warnings })
@@ -135,7 +150,7 @@ fn rig(root: &Section<'_>, problems: &mut Problems<'_>) -> RigSpec {
 }
 
 /// One draft an entry, in the order of the file.
-fn drafts<'a>(root: &Section<'a>, problems: &mut Problems<'_>) -> Vec<Draft<'a>> {
+fn drafts<'a>(root: &Section<'a>, programs: Programs<'_>, problems: &mut Problems<'_>) -> Vec<Draft<'a>> {
     if let Some((at, _, value)) = root.fields().into_iter().find(|(_, key, _)| *key == "device")
         && value.get_ref().is_array()
     {
@@ -158,7 +173,7 @@ fn drafts<'a>(root: &Section<'a>, problems: &mut Problems<'_>) -> Vec<Draft<'a>>
             continue;
         };
         let section = Section::new(section, at, devices.child(name));
-        drafts.push(device::read(name, section, problems));
+        drafts.push(device::read(name, section, programs, problems));
     }
     drafts
 }
@@ -171,7 +186,7 @@ fn check_identities(drafts: &[Draft<'_>], problems: &mut Problems<'_>) {
         let Some(identity) = &draft.identity else { continue };
         let same_unit = |other: &&Draft<'_>| {
             let Some(earlier) = &other.identity else { return false };
-            let same_model = (earlier.vid, earlier.pid, other.kind) == (identity.vid, identity.pid, draft.kind);
+            let same_model = (earlier.vid, earlier.pid, other.opens()) == (identity.vid, identity.pid, draft.opens());
             let same_place = match (&identity.serial, &earlier.serial) {
                 (Some(serial), Some(earlier)) => serial == earlier,
                 (None, None) => identity.port.is_some() && identity.port == earlier.port,

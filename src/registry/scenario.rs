@@ -10,6 +10,7 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::Duration;
 
 use super::attachment::UsbIdentity;
+use crate::provenance::KernelDriver;
 
 /// A whole scenario.
 #[derive(Debug, Clone, PartialEq)]
@@ -33,6 +34,25 @@ pub struct ScenarioDevice {
     pub source: SimSource,
     /// Plugged when the scenario begins.
     pub plugged: bool,
+    /// What it does wrong.
+    pub faults: SimFaults,
+}
+
+/// What a simulated device does wrong while it is plugged in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct SimFaults {
+    /// From this moment of the scenario on it sends the same bytes again and again.
+    pub freeze_at: Option<Duration>,
+    /// Every so many samples one is cut in the middle.
+    pub truncate_every: Option<u64>,
+    /// Every so many samples one is sent twice.
+    pub duplicate_every: Option<u64>,
+    /// Every so many samples one is lost by the device, which says so.
+    pub lose_every: Option<u64>,
+    /// Samples arrive so long after their capture.
+    pub delay: Duration,
+    /// Its clock runs fast by so many parts in a million, slow if negative.
+    pub clock_ppm: i64,
 }
 
 /// What a simulated device sends.
@@ -48,6 +68,8 @@ pub enum SimSource {
         fps: u32,
         /// Chooses the pictures.
         seed: u64,
+        /// Least size of a picture; what it lacks is filled up. 0: as the encoder makes it.
+        bytes: usize,
     },
     /// Vectors of numbers; values are a function of seed and sequence.
     Serial {
@@ -58,6 +80,8 @@ pub enum SimSource {
         /// Chooses the values.
         seed: u64,
     },
+    /// Nothing of its own: the program of the entry runs as it would for a real device.
+    Process,
     /// The samples of one topic of a recorded episode, at their recorded distances in time.
     Replay {
         /// The episode.
@@ -67,6 +91,12 @@ pub enum SimSource {
         /// Wall time of the episode's beginning as recorded, ns: moment zero of the scenario.
         begin_ns: u64,
     },
+}
+
+/// What stands for the kernel's driver of a simulated device.
+#[must_use]
+pub fn driver() -> KernelDriver {
+    KernelDriver { name: "rapid-sim".to_owned(), version: Some(env!("CARGO_PKG_VERSION").to_owned()) }
 }
 
 /// Something that happens in a scenario.
@@ -104,6 +134,8 @@ pub struct SimDevice {
     pub name: String,
     /// What it sends.
     pub source: SimSource,
+    /// What it does wrong.
+    pub faults: SimFaults,
     /// The scenario's moment zero.
     pub begun: crate::time::Stamp,
     unplugged: AtomicBool,
@@ -119,11 +151,18 @@ impl SimDevice {
         Self {
             name: name.to_owned(),
             source,
+            faults: SimFaults::default(),
             begun,
             unplugged: AtomicBool::new(false),
             silent: AtomicBool::new(false),
             sequence: AtomicU32::new(0),
         }
+    }
+
+    /// The same device, doing this wrong.
+    #[must_use]
+    pub fn with_faults(self, faults: SimFaults) -> Self {
+        Self { faults, ..self }
     }
 
     /// Pulls the cable: the next read says so.

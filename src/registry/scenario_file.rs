@@ -7,12 +7,21 @@
 //! name = "tactile_tip"        # an entry of the registry, whose identity and format it takes
 //! seed = 7                    # chooses the pictures or values; default: the entry's bit
 //! hz = 100                    # rate; default: the camera's fps, 100 for a serial line
+//! bytes = "60kB"              # a camera's pictures are filled up to this size, as real scenes fill them
 //! plugged = false             # when the scenario begins; default true
-//! serial = "OTHER"            # also vid, pid, port: what it says it is; serial = "" for none
+//! serial = "OTHER"            # also vid, pid, port, firmware, manufacturer, product: what it says it
+//!                             # is; serial = "" for none
 //!
 //! [[device]]
 //! name = "spare"              # any name, with
 //! like = "tactile_tip"        # the entry whose format it takes
+//! [device.fault]              # optional: what the device above does wrong
+//! freeze_at = "3s"            # from then on it sends the same bytes
+//! truncate_every = 10         # one sample in ten is cut in the middle
+//! duplicate_every = 10        # one in ten is sent twice
+//! lose_every = 10             # one in ten is lost, and the device says so
+//! delay = "200ms"             # samples arrive so long after their capture
+//! clock_ppm = 500             # its clock runs fast, or slow if negative
 //!
 //! [[event]]                   # exactly one of plug, unplug, silence, resume
 //! at = "3s"
@@ -36,16 +45,33 @@ use std::time::Duration;
 
 use super::attachment::UsbIdentity;
 use super::diagnostic::{RegistryErrors, did_you_mean};
-use super::parse::{check_serial, is_port, read_file};
-use super::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, SimSource};
+use super::parse::{is_port, read_file};
+use super::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, SimFaults, SimSource};
 use super::section::{Problems, Section, file_label, read};
 use super::spec::{DeviceSpec, NodeSpec, Registry};
 
-const DEVICE_KEYS: [&str; 9] = ["name", "like", "seed", "plugged", "hz", "vid", "pid", "serial", "port"];
+const DEVICE_KEYS: [&str; 14] = [
+    "name",
+    "like",
+    "seed",
+    "plugged",
+    "hz",
+    "bytes",
+    "vid",
+    "pid",
+    "serial",
+    "port",
+    "firmware",
+    "manufacturer",
+    "product",
+    "fault",
+];
 const ACTIONS: [&str; 4] = ["plug", "unplug", "silence", "resume"];
 const EVENT_KEYS: [&str; 6] = ["at", "plug", "unplug", "silence", "resume", "port"];
 /// Rate of a simulated serial line, Hz: that of a usual motor controller's state.
 const SERIAL_HZ: u32 = 100;
+/// What a simulated camera adds to each picture, at the most: its name.
+const PICTURE_NAME_BYTES: usize = 64;
 const LONGEST: Duration = Duration::from_hours(7 * 24);
 
 impl Scenario {
@@ -109,10 +135,11 @@ fn standing_for(spec: &DeviceSpec, name: &str) -> ScenarioDevice {
     let seed = u64::from(spec.id.bit());
     let source = match &spec.node {
         NodeSpec::Camera(camera) => {
-            SimSource::Camera { width: camera.width, height: camera.height, fps: camera.fps, seed }
+            SimSource::Camera { width: camera.width, height: camera.height, fps: camera.fps, seed, bytes: 0 }
         }
         // Raw lines have no channels; something must be sent all the same.
         NodeSpec::Serial(serial) => SimSource::Serial { channels: serial.channels.max(1), hz: SERIAL_HZ, seed },
+        NodeSpec::Process(_) => SimSource::Process,
     };
     let usb = UsbIdentity {
         vid: spec.identity.vid,
@@ -120,8 +147,10 @@ fn standing_for(spec: &DeviceSpec, name: &str) -> ScenarioDevice {
         serial: Some(spec.identity.serial.clone().unwrap_or_else(|| format!("SIM-{name}"))),
         port: spec.identity.port.clone().unwrap_or_default(),
         product: Some(format!("simulated {}", spec.name)),
+        manufacturer: Some("rapid".to_owned()),
+        firmware: Some("1.00".to_owned()),
     };
-    ScenarioDevice { name: name.to_owned(), usb, source, plugged: true }
+    ScenarioDevice { name: name.to_owned(), usb, source, plugged: true, faults: SimFaults::default() }
 }
 
 /// Ports of a bus no rig has, for devices whose port nothing says.
@@ -174,27 +203,60 @@ fn device(section: &Section<'_>, registry: &Registry, problems: &mut Problems<'_
     let mut device = standing_for(spec, name);
     let seed = section.integer(problems, "seed", 0..=i64::MAX).and_then(|seed| u64::try_from(seed.value).ok());
     let hz = section.integer(problems, "hz", 1..=10_000).and_then(|hz| u32::try_from(hz.value).ok());
+    let most = spec.max_bytes.saturating_sub(PICTURE_NAME_BYTES) as u64;
+    let bytes = section.size(problems, "bytes", 0..=most).and_then(|bytes| usize::try_from(bytes).ok());
+    if let (Some(filled), SimSource::Camera { bytes, .. }) = (bytes, &mut device.source) {
+        *bytes = filled;
+    } else if section.has("bytes") && !matches!(device.source, SimSource::Camera { .. }) {
+        let message = format!("{entry:?} sends no pictures, only they have a size");
+        section.report(problems, "bytes", message, "leave bytes out");
+    }
     match &mut device.source {
         SimSource::Camera { fps: rate, seed: chosen, .. } | SimSource::Serial { hz: rate, seed: chosen, .. } => {
             *rate = hz.unwrap_or(*rate);
             *chosen = seed.unwrap_or(*chosen);
         }
-        SimSource::Replay { .. } => {}
+        SimSource::Process | SimSource::Replay { .. } => {}
     }
     device.plugged = section.flag(problems, "plugged").unwrap_or(true);
     device.usb.vid = section.usb_id(problems, "vid").unwrap_or(device.usb.vid);
     device.usb.pid = section.usb_id(problems, "pid").unwrap_or(device.usb.pid);
     if let Some(serial) = section.text(problems, "serial").map(|serial| serial.value) {
-        match check_serial(serial) {
-            _ if serial.is_empty() => device.usb.serial = None,
-            Ok(()) => device.usb.serial = Some(serial.to_owned()),
-            Err((message, _)) => section.report(problems, "serial", message, "write a serial number of printable text"),
-        }
+        // What a device says of itself is no mistake of the file, whatever it is.
+        device.usb.serial = (!serial.is_empty()).then(|| serial.to_owned());
     }
     if let Some(port) = port(section, problems) {
         device.usb.port = port;
     }
+    device.faults = faults(section, problems);
+    let usb = &mut device.usb;
+    for (key, place) in
+        [("firmware", &mut usb.firmware), ("manufacturer", &mut usb.manufacturer), ("product", &mut usb.product)]
+    {
+        if let Some(text) = section.text(problems, key) {
+            *place = (!text.value.is_empty()).then(|| text.value.to_owned());
+        }
+    }
     Some(device)
+}
+
+fn faults(section: &Section<'_>, problems: &mut Problems<'_>) -> SimFaults {
+    let Some(table) = section.table(problems, "fault") else { return SimFaults::default() };
+    let every = ["truncate_every", "duplicate_every", "lose_every"];
+    let mut known = every.to_vec();
+    known.extend(["freeze_at", "delay", "clock_ppm"]);
+    table.allow(problems, &known);
+    // At least 2: of a device all of whose samples are lost none ever comes.
+    let [truncate_every, duplicate_every, lose_every] =
+        every.map(|key| u64::try_from(table.integer(problems, key, 2..=1_000_000)?.value).ok());
+    SimFaults {
+        freeze_at: table.duration(problems, "freeze_at", Duration::ZERO..=LONGEST),
+        truncate_every,
+        duplicate_every,
+        lose_every,
+        delay: table.duration(problems, "delay", Duration::ZERO..=Duration::from_secs(10)).unwrap_or_default(),
+        clock_ppm: table.integer(problems, "clock_ppm", -100_000..=100_000).map_or(0, |ppm| ppm.value),
+    }
 }
 
 fn port(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<String> {

@@ -137,7 +137,7 @@ fn syntax_fix(message: &str, source: &str) -> String {
 }
 
 /// Without control characters.
-fn printable(text: &str) -> String {
+pub(super) fn printable(text: &str) -> String {
     text.chars().flat_map(|c| if c.is_control() { c.escape_default().collect() } else { vec![c] }).collect()
 }
 

@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use serde::Serialize;
 
+use super::limits::VerdictSpec;
 use crate::modality::{Modality, ModalityId, ModalityKind};
 use crate::sample::SampleHeader;
 
@@ -73,7 +74,7 @@ pub struct DeviceSpec {
     /// Where on the gripper the module sits.
     pub mount: Option<Mount>,
     /// No sample for this long while attached: the slot says Stalled. At least 10 ms; default the
-    /// larger of 500 ms and 10 sample periods.
+    /// larger of 500 ms and 10 sample periods. Of a program, its `heartbeat`, default 2 s.
     pub stall_after: Duration,
     /// Largest payload in bytes.
     pub max_bytes: usize,
@@ -81,14 +82,21 @@ pub struct DeviceSpec {
     pub depth: usize,
     /// What an observation holds when the device is attached but no sample lies in the window.
     pub when_stale: WhenStale,
+    /// What a sample captured at `t` shows happened at `t - latency`; up to 1 s, default 0. Taken
+    /// off when samples are aligned, and there alone.
+    pub latency: Duration,
+    /// What the verdict on its part of an episode is made of.
+    pub verdict: VerdictSpec,
 }
 
 /// Which USB device an entry means.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize)]
 pub struct IdentitySpec {
     /// USB vendor id.
+    #[serde(serialize_with = "super::attachment::usb_id")]
     pub vid: u16,
     /// USB product id.
+    #[serde(serialize_with = "super::attachment::usb_id")]
     pub pid: u16,
     /// Serial number as the device reports it. Takes precedence over `port`.
     pub serial: Option<String>,
@@ -103,6 +111,8 @@ pub enum NodeSpec {
     Camera(CameraSpec),
     /// A serial line.
     Serial(SerialSpec),
+    /// A program that reads the device and publishes.
+    Process(ProcessSpec),
 }
 
 /// `[device.NAME.camera]`.
@@ -143,6 +153,35 @@ pub struct SerialSpec {
     pub parse: Parse,
     /// Numbers in a message, `1..=1024`; 0 with `Parse::Raw`.
     pub channels: usize,
+}
+
+/// `node = "PROGRAM"` with `[device.NAME.process]`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ProcessSpec {
+    /// The program: an absolute path, or the name as it is written where nothing is to be run (a
+    /// registry read from an episode).
+    pub program: PathBuf,
+    /// Its arguments, none by default.
+    pub args: Vec<String>,
+    /// Which node of the device it opens, default [`Opens::Usb`].
+    pub opens: Opens,
+    /// What its samples hold, default bytes.
+    pub kind: ModalityKind,
+    /// Image: `[height, width]`. Scalars: `[channels]`. Bytes: empty.
+    pub shape: Vec<u32>,
+}
+
+/// The node of its USB device that a program opens. The program starts when udev has that node in
+/// place, and is given its path.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Opens {
+    /// The V4L2 capture node.
+    Video,
+    /// The serial line.
+    Tty,
+    /// The USB device itself, `/dev/bus/usb/...`: for programs that use libusb or find the device
+    /// themselves.
+    Usb,
 }
 
 /// Message boundaries on a serial line.
@@ -197,14 +236,27 @@ impl DeviceSpec {
     /// What this device adds to an observation.
     #[must_use]
     pub fn modality(&self) -> Modality {
-        let (kind, shape) = match &self.node {
-            NodeSpec::Camera(camera) => (ModalityKind::Image, vec![camera.height, camera.width]),
-            NodeSpec::Serial(serial) if serial.parse == Parse::Raw => (ModalityKind::Bytes, Vec::new()),
-            NodeSpec::Serial(serial) => {
-                (ModalityKind::Scalars, vec![u32::try_from(serial.channels).unwrap_or(u32::MAX)])
-            }
+        let kind = self.node.modality_kind();
+        let shape = match (&self.node, kind) {
+            (NodeSpec::Camera(camera), _) => vec![camera.height, camera.width],
+            (NodeSpec::Serial(_), ModalityKind::Bytes) => Vec::new(),
+            (NodeSpec::Serial(serial), _) => vec![u32::try_from(serial.channels).unwrap_or(u32::MAX)],
+            (NodeSpec::Process(process), _) => process.shape.clone(),
         };
         Modality { name: self.name.clone(), kind, shape }
+    }
+}
+
+impl NodeSpec {
+    /// What samples of a device that is read like this hold.
+    #[must_use]
+    pub fn modality_kind(&self) -> ModalityKind {
+        match self {
+            Self::Camera(_) => ModalityKind::Image,
+            Self::Serial(serial) if serial.parse == Parse::Raw => ModalityKind::Bytes,
+            Self::Serial(_) => ModalityKind::Scalars,
+            Self::Process(process) => process.kind,
+        }
     }
 }
 

@@ -16,7 +16,8 @@ const SIZES: [(&str, u64); 7] = [
 ];
 
 /// `25ms`, `1.5s`, `2 min`. `None` without a unit, or when it is no duration.
-pub(super) fn parse_duration(text: &str) -> Option<Duration> {
+#[must_use]
+pub fn parse_duration(text: &str) -> Option<Duration> {
     let (number, unit) = split(text)?;
     let (_, seconds) = DURATIONS.into_iter().find(|(name, _)| *name == unit)?;
     // Rounded to whole ns: 0.025 s is not exactly representable.
@@ -26,7 +27,8 @@ pub(super) fn parse_duration(text: &str) -> Option<Duration> {
 }
 
 /// `512MiB`, `64 KiB`, `2MB`. `None` without a unit, or when it is no size.
-pub(super) fn parse_size(text: &str) -> Option<u64> {
+#[must_use]
+pub fn parse_size(text: &str) -> Option<u64> {
     let (number, unit) = split(text)?;
     let (_, bytes) = SIZES.into_iter().find(|(name, _)| name.eq_ignore_ascii_case(unit))?;
     let total = (number * bytes as f64).round();
@@ -42,7 +44,8 @@ fn split(text: &str) -> Option<(f64, &str)> {
 }
 
 /// A duration in its largest whole unit.
-pub(super) fn show_duration(duration: Duration) -> String {
+#[must_use]
+pub fn show_duration(duration: Duration) -> String {
     let nanoseconds = duration.as_nanos();
     for (unit, in_ns) in
         [("h", 3_600_000_000_000), ("min", 60_000_000_000), ("s", 1_000_000_000), ("ms", 1_000_000), ("us", 1_000)]
@@ -55,7 +58,8 @@ pub(super) fn show_duration(duration: Duration) -> String {
 }
 
 /// A size in the largest binary unit of which it is at least one, to one decimal.
-pub(super) fn show_size(bytes: u64) -> String {
+#[must_use]
+pub fn show_size(bytes: u64) -> String {
     for (unit, shift) in [("GiB", 30), ("MiB", 20), ("KiB", 10)] {
         let one = 1_u64 << shift;
         if bytes >= one {

@@ -3,7 +3,8 @@
 
 use std::fmt;
 
-use super::spec::{Framing, Mount, NodeSpec, Parse, PixelFormat, WhenStale};
+use super::spec::{Framing, Mount, NodeSpec, Opens, Parse, PixelFormat, WhenStale};
+use crate::modality::ModalityKind;
 
 impl PixelFormat {
     /// Every format and its V4L2 name.
@@ -21,6 +22,15 @@ impl Mount {
     pub const WORDS: [(&str, Self); 4] =
         [("front", Self::Front), ("tip", Self::Tip), ("top", Self::Top), ("bottom", Self::Bottom)];
 }
+
+impl Opens {
+    /// Every node a program may open and its name.
+    pub const WORDS: [(&str, Self); 3] = [("video", Self::Video), ("tty", Self::Tty), ("usb", Self::Usb)];
+}
+
+/// What the samples of a program may hold.
+pub(super) const KINDS: [(&str, ModalityKind); 3] =
+    [("scalars", ModalityKind::Scalars), ("image", ModalityKind::Image), ("bytes", ModalityKind::Bytes)];
 
 impl WhenStale {
     /// Every policy and its name.
@@ -55,6 +65,12 @@ impl fmt::Display for WhenStale {
     }
 }
 
+impl fmt::Display for Opens {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(word(&Self::WORDS, self))
+    }
+}
+
 impl fmt::Display for Framing {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
@@ -66,16 +82,17 @@ impl fmt::Display for Framing {
 }
 
 impl NodeSpec {
-    /// The kind of node: `camera` or `serial`.
+    /// The kind of node: `camera`, `serial` or `process`.
     #[must_use]
     pub const fn kind(&self) -> &'static str {
         match self {
             Self::Camera(_) => "camera",
             Self::Serial(_) => "serial",
+            Self::Process(_) => "process",
         }
     }
 
-    /// The format on one line: `640x480@30 MJPG`, `115200 baud line csv x3`.
+    /// The format on one line: `640x480@30 MJPG`, `115200 baud line csv x3`, `tactile_publisher scalars x16`.
     #[must_use]
     pub fn format(&self) -> String {
         match self {
@@ -85,6 +102,14 @@ impl NodeSpec {
             }
             Self::Serial(serial) => {
                 format!("{} baud {} {} x{}", serial.baud, serial.framing, serial.parse, serial.channels)
+            }
+            Self::Process(process) => {
+                let name = process.program.file_name().unwrap_or(process.program.as_os_str()).display();
+                match process.shape.as_slice() {
+                    [height, width] => format!("{name} {width}x{height}"),
+                    [channels] => format!("{name} scalars x{channels}"),
+                    _ => format!("{name} {}", word(&KINDS, &process.kind)),
+                }
             }
         }
     }

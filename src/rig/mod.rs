@@ -11,6 +11,7 @@ mod owner;
 pub mod presence;
 pub mod slot;
 mod stream;
+mod worker;
 
 pub use owner::{Rig, RigError};
 

@@ -15,6 +15,7 @@ use super::RigCommand;
 use super::presence::{JsonDevice, Presence, PresenceError};
 use super::slot::{Effects, End, Input, Slot};
 use super::stream::{Numbers, Report, Reported, Stream};
+use super::worker::{Seat, Workers};
 use crate::bus::{Bus, TopicId, Writer};
 use crate::hotplug::{HotplugError, HotplugEvent, HotplugStream, Witness};
 use crate::mask::PhysicalMask;
@@ -56,6 +57,8 @@ pub struct Rig {
     /// Which stream a task is.
     tasks: HashMap<Id, (ModalityId, Epoch)>,
     reports: mpsc::Sender<Reported>,
+    /// The programs, if an entry needs one.
+    workers: Option<Workers>,
 }
 
 /// A slot and what belongs to it.
@@ -65,8 +68,12 @@ struct Modality {
     slot: Slot<Attachment>,
     writer: Arc<Writer>,
     numbers: Arc<Numbers>,
+    /// When the newest device was attached.
+    attached: Stamp,
     /// Tells the running stream to end.
     stop: CancellationToken,
+    /// Where its program works, if it has one.
+    seat: Option<Seat>,
     /// What was agreed with the device, or why it does not run.
     detail: String,
 }
@@ -75,6 +82,7 @@ impl Rig {
     /// A rig with every slot empty, which publishes through `presence`.
     #[must_use]
     pub fn new(registry: &Registry, bus: &Bus, presence: Presence, board: Arc<Board>) -> Self {
+        let workers = Workers::new(registry, bus, &board);
         let modality = |spec: &DeviceSpec| {
             let writer = bus.writer(TopicId::Modality(spec.id))?;
             Some(Modality {
@@ -82,7 +90,9 @@ impl Rig {
                 slot: Slot::new(registry.rig.cooldown),
                 writer,
                 numbers: Arc::default(),
+                attached: Stamp::default(),
                 stop: CancellationToken::new(),
+                seat: workers.as_ref().and_then(|workers| workers.seat(spec, bus)),
                 detail: String::new(),
             })
         };
@@ -97,6 +107,20 @@ impl Rig {
             streams: JoinSet::new(),
             tasks: HashMap::new(),
             reports: mpsc::channel(1).0,
+            workers,
+        }
+    }
+
+    /// Cancelled, it kills the programs that are being ended.
+    #[must_use]
+    pub fn hurry(&self) -> CancellationToken {
+        self.workers.as_ref().map_or_else(CancellationToken::new, Workers::hurry)
+    }
+
+    /// After a run, waits for the programs of its devices, which it told to end.
+    pub async fn programs_ended(&self) {
+        if let Some(workers) = &self.workers {
+            workers.ended().await;
         }
     }
 
@@ -170,9 +194,10 @@ impl Rig {
             device: modality.spec.name.clone(),
             bit: id,
             node: attachment.node.label(),
-            port: attachment.usb.port.clone(),
-            serial: attachment.usb.serial.clone(),
+            usb: attachment.usb.clone(),
+            driver: attachment.driver.as_deref().cloned(),
         };
+        modality.attached = Stamp::now();
         self.board.announce(what);
         self.apply(id, Input::Attached(attachment));
     }
@@ -220,9 +245,11 @@ impl Rig {
         // A report may arrive after the end of its stream, whose reason must stay.
         let Some(modality) = self.modality(id).filter(|modality| modality.slot.is_current(epoch)) else { return };
         match report {
-            Report::Opened(description) => {
+            Report::Opened(description, provenance) => {
                 modality.detail = description;
+                let device = modality.spec.name.clone();
                 self.show(id);
+                self.board.announce(What::Opened { device, bit: id, provenance });
             }
             Report::Silent(limit) => {
                 modality.detail = format!("{}; it has sent nothing for {} s", modality.detail, limit.as_secs());
@@ -302,12 +329,14 @@ impl Rig {
         let stream = Stream {
             spec: Arc::clone(&modality.spec),
             attachment,
+            attached: modality.attached,
             epoch,
             writer: Arc::clone(&modality.writer),
             numbers: Arc::clone(&modality.numbers),
             board,
             reports,
             stop: modality.stop.clone(),
+            seat: modality.seat.clone(),
         };
         let task = self.streams.spawn(stream.run());
         self.tasks.insert(task.id(), (id, epoch));
@@ -336,9 +365,7 @@ impl Rig {
         };
         let devices: Vec<_> = self.modalities.iter().map(device).collect();
         let sequence = self.board.mask_sequence();
-        if let Err(error) = self.presence.write_json(self.mask, sequence, &devices) {
-            tracing::debug!(%error, "the mask's JSON file is not written");
-        }
+        self.presence.write_json(self.mask, sequence, &devices);
     }
 
     /// Tells every stream to end and gives them a moment to close their devices.

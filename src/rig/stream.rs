@@ -13,13 +13,16 @@ use tokio::time::{Instant, sleep_until, timeout};
 use tokio_util::sync::CancellationToken;
 
 use super::slot::End;
+use super::worker::{MOST_SILENT_BEATS, Seat, Worker};
 use crate::bus::Writer;
 use crate::driver::{Driver, DriverError, Reading};
 use crate::fault;
-use crate::registry::{Attachment, DeviceSpec, NodeSpec};
+use crate::provenance::Negotiated;
+use crate::registry::scenario::SimSource;
+use crate::registry::{Attachment, DeviceNode, DeviceSpec, NodeSpec};
 use crate::sample::{Epoch, SampleHeader};
-use crate::status::Board;
-use crate::time::Stamp;
+use crate::status::{Board, Provenance};
+use crate::time::{Stamp, nanoseconds};
 
 /// A device that does not open within this time is tried again.
 const OPEN_LIMIT: Duration = Duration::from_secs(10);
@@ -32,10 +35,10 @@ const SILENT_AFTER: Duration = Duration::from_secs(2);
 const CAMERA_LIMIT: Duration = Duration::from_secs(5);
 
 /// What a stream tells the rig while it runs.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub(super) enum Report {
-    /// The node is open; what was agreed with the device.
-    Opened(String),
+    /// The node is open; what was agreed with the device, for people and for the recording.
+    Opened(String, Box<Provenance>),
     /// Open for so long, and no sample yet.
     Silent(Duration),
     /// The first sample was published.
@@ -75,12 +78,70 @@ impl Numbers {
 pub(super) struct Stream {
     pub(super) spec: Arc<DeviceSpec>,
     pub(super) attachment: Attachment,
+    /// When it was attached.
+    pub(super) attached: Stamp,
     pub(super) epoch: Epoch,
     pub(super) writer: Arc<Writer>,
     pub(super) numbers: Arc<Numbers>,
     pub(super) board: Arc<Board>,
     pub(super) reports: mpsc::Sender<Reported>,
     pub(super) stop: CancellationToken,
+    /// Where the program of the entry works, if it has one.
+    pub(super) seat: Option<Seat>,
+}
+
+/// Where the samples of a stream come from.
+#[derive(Debug)]
+enum Source {
+    Driver(Driver),
+    Worker(Box<Worker>),
+}
+
+impl Source {
+    async fn open(stream: &Stream) -> Result<Self, DriverError> {
+        let Stream { spec, attachment, epoch, seat, .. } = stream;
+        match (&spec.node, seat) {
+            // A recorded topic needs no program.
+            (NodeSpec::Process(process), Some(seat)) if !is_recording(&attachment.node) => {
+                Ok(Self::Worker(Box::new(Worker::open(seat, spec, process, attachment, *epoch).await?)))
+            }
+            _ => Ok(Self::Driver(Driver::open(spec, &attachment.node).await?)),
+        }
+    }
+
+    async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
+        match self {
+            Self::Driver(driver) => driver.read().await,
+            Self::Worker(worker) => worker.read().await,
+        }
+    }
+
+    fn description(&self) -> String {
+        match self {
+            Self::Driver(driver) => driver.description(),
+            Self::Worker(worker) => worker.description(),
+        }
+    }
+
+    fn negotiated(&self) -> Negotiated {
+        match self {
+            Self::Driver(driver) => driver.negotiated(),
+            // What a program agrees with its device, only the program knows.
+            Self::Worker(worker) => Negotiated { card: Some(worker.description()), ..Negotiated::default() },
+        }
+    }
+
+    /// A source that is silent for this long is opened anew.
+    fn patience(&self, stall_after: Duration) -> Option<Duration> {
+        match self {
+            Self::Driver(_) => None,
+            Self::Worker(_) => Some(stall_after * MOST_SILENT_BEATS),
+        }
+    }
+}
+
+fn is_recording(node: &DeviceNode) -> bool {
+    matches!(node, DeviceNode::Sim(device) if matches!(device.source, SimSource::Replay { .. }))
 }
 
 impl Stream {
@@ -96,13 +157,14 @@ impl Stream {
     }
 
     async fn read(self) -> (End, String) {
-        let opened = timeout(OPEN_LIMIT, Driver::open(&self.spec, &self.attachment.node)).await;
-        let mut driver = match opened {
-            Ok(Ok(driver)) => driver,
+        let opened = timeout(OPEN_LIMIT, Source::open(&self)).await;
+        let mut source = match opened {
+            Ok(Ok(source)) => source,
             Ok(Err(error)) => return end(&error),
             Err(_) => return (End::Retry, format!("did not open within {} s", OPEN_LIMIT.as_secs())),
         };
-        self.report(Report::Opened(driver.description())).await;
+        self.report(Report::Opened(source.description(), Box::new(self.provenance(&source)))).await;
+        let patience = source.patience(self.spec.stall_after);
         let mut pulse = Pulse::Silent;
         let mut refused = false;
         let stall = sleep_until(Instant::now() + self.spec.stall_after);
@@ -114,7 +176,7 @@ impl Stream {
         loop {
             tokio::select! {
                 biased;
-                reading = driver.read() => {
+                reading = source.read() => {
                     let reading = match reading {
                         Ok(reading) => reading,
                         Err(error) => return end(&error),
@@ -139,6 +201,9 @@ impl Stream {
                         stall.as_mut().reset(due);
                         continue;
                     }
+                    if patience.is_some_and(|patience| newest.elapsed() >= patience) {
+                        return (End::Retry, format!("nothing came for {:?}", newest.elapsed()));
+                    }
                     if pulse == Pulse::Beating {
                         pulse = Pulse::Stalled;
                         self.report(Report::Stalled).await;
@@ -156,12 +221,25 @@ impl Stream {
         let Some(at) = opened.checked_add(say) else { return std::future::pending().await };
         sleep_until(at).await;
         self.report(Report::Silent(say)).await;
-        if !matches!(self.spec.node, NodeSpec::Camera(_)) {
+        if !matches!(self.spec.node, NodeSpec::Camera(_)) || is_recording(&self.attachment.node) {
             return std::future::pending().await;
         }
         let limit = CAMERA_LIMIT.max(2 * say);
         sleep_until(opened + limit).await;
         format!("open, but sent nothing for {} s", limit.as_secs())
+    }
+
+    fn provenance(&self, source: &Source) -> Provenance {
+        let mut negotiated = source.negotiated();
+        negotiated.driver = negotiated.driver.or_else(|| self.attachment.driver.as_deref().cloned());
+        Provenance {
+            epoch: self.epoch,
+            node: self.attachment.node.label(),
+            attached: self.attached,
+            usb: self.attachment.usb.clone(),
+            negotiated,
+            latency_ns: nanoseconds(self.spec.latency),
+        }
     }
 
     /// One copy, from the driver's buffer into shared memory.

@@ -14,7 +14,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::broadcast;
 
-use super::{DeviceStatus, Event, LogLine, RecordingStatus, SlotState, Snapshot, What};
+use super::{DeviceStatus, Event, LogLine, RecordingStatus, SlotState, Snapshot, Verdict, What};
 use crate::mask::PhysicalMask;
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::registry::Registry;
@@ -71,7 +71,7 @@ pub struct Board {
     mask: AtomicU64,
     mask_sequence: AtomicU64,
     recording: Mutex<Option<RecordingStatus>>,
-    last_episode: Mutex<Option<PathBuf>>,
+    last_episode: Mutex<Option<(PathBuf, Verdict)>>,
     log: Mutex<VecDeque<LogLine>>,
     events: broadcast::Sender<Event>,
 }
@@ -129,8 +129,8 @@ impl Board {
     }
 
     /// Reports the last file finished.
-    pub fn set_last_episode(&self, file: PathBuf) {
-        *lock(&self.last_episode) = Some(file);
+    pub fn set_last_episode(&self, file: PathBuf, verdict: Verdict) {
+        *lock(&self.last_episode) = Some((file, verdict));
     }
 
     /// Adds a line to the log, without what of a device's text could move the cursor of a terminal.
@@ -182,6 +182,7 @@ impl Board {
                 newest: (newest > 0).then_some(Stamp(newest)),
             }
         });
+        let (last_episode, last_verdict) = lock(&self.last_episode).clone().unzip();
         Snapshot {
             rig: self.rig.clone(),
             taken,
@@ -190,7 +191,8 @@ impl Board {
             mask_sequence: self.mask_sequence.load(Ordering::Relaxed),
             devices: devices.collect(),
             recording: lock(&self.recording).clone(),
-            last_episode: lock(&self.last_episode).clone(),
+            last_episode,
+            last_verdict: last_verdict.unwrap_or_default(),
             log: lock(&self.log).iter().cloned().collect(),
         }
     }

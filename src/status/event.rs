@@ -5,8 +5,11 @@ use std::time::Duration;
 
 use serde::Serialize;
 
-use super::{Level, SlotState};
+use super::{Grade, Level, SlotState, Verdict};
 use crate::modality::ModalityId;
+use crate::provenance::{KernelDriver, Negotiated};
+use crate::registry::UsbIdentity;
+use crate::sample::Epoch;
 use crate::text;
 use crate::time::Stamp;
 
@@ -32,10 +35,21 @@ pub enum What {
         bit: ModalityId,
         /// Node, for example `/dev/video0`.
         node: String,
-        /// Port path.
-        port: String,
-        /// Serial, if it has one.
-        serial: Option<String>,
+        /// The unit.
+        #[serde(flatten)]
+        usb: UsbIdentity,
+        /// The kernel's driver of it.
+        driver: Option<KernelDriver>,
+    },
+    /// A registered device was opened, in a new epoch: its samples come from this unit.
+    Opened {
+        /// Modality.
+        device: String,
+        /// Its bit.
+        bit: ModalityId,
+        /// Where its samples come from.
+        #[serde(flatten)]
+        provenance: Box<Provenance>,
     },
     /// A registered device was pulled out.
     Detach {
@@ -85,6 +99,9 @@ pub enum What {
         dropped: u64,
         /// Why the file is not whole, if it is not.
         error: Option<String>,
+        /// What it is worth.
+        #[serde(flatten)]
+        verdict: Verdict,
     },
     /// The disk of the episode in progress is nearly full; told once an episode.
     DiskLow {
@@ -100,6 +117,21 @@ pub enum What {
         /// By how much, forward; back if negative.
         seconds: f64,
     },
+    /// An episode that an earlier run did not finish was repaired.
+    Recovered {
+        /// The repaired file.
+        file: PathBuf,
+        /// Length of what was recorded, in seconds.
+        seconds: f64,
+        /// Messages.
+        messages: u64,
+        /// Bytes of the unfinished file that are not in the repaired one.
+        unread_bytes: u64,
+        /// Chunks left out because they are not what was written.
+        damaged_chunks: u64,
+        /// What is there and what is lost, for people.
+        text: String,
+    },
     /// A line of the log that has no event of its own.
     Log {
         /// Severity.
@@ -107,6 +139,25 @@ pub enum What {
         /// Text.
         text: String,
     },
+}
+
+/// Where the samples of one epoch of a modality come from.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Provenance {
+    /// The incarnation; every sample's header names it.
+    pub epoch: Epoch,
+    /// Node, for example `/dev/video0`.
+    pub node: String,
+    /// When the unit was attached: one that was started again is still the same attachment.
+    pub attached: Stamp,
+    /// The unit.
+    #[serde(flatten)]
+    pub usb: UsbIdentity,
+    /// What was agreed with it. The driver is hot-plug's where the open node names none.
+    #[serde(flatten)]
+    pub negotiated: Negotiated,
+    /// `latency` of the registry's entry, ns.
+    pub latency_ns: u64,
 }
 
 impl What {
@@ -121,12 +172,12 @@ impl What {
     #[must_use]
     pub fn sentence(&self) -> Option<(Level, String)> {
         Some(match self {
-            Self::Attach { device, node, port, serial, .. } => {
-                let serial = serial.as_deref().map(|serial| format!(", serial {serial}")).unwrap_or_default();
-                (Level::Info, format!("{device} attached ({node} at port {port}{serial})"))
+            Self::Attach { device, node, usb, .. } => {
+                let serial = usb.serial.as_deref().map(|serial| format!(", serial {serial}")).unwrap_or_default();
+                (Level::Info, format!("{device} attached ({node} at port {}{serial})", usb.port))
             }
-            // The slot's state changes with it and names the witness.
-            Self::Detach { .. } => return None,
+            // The slot's state changes with it and names the witness, or what was agreed.
+            Self::Detach { .. } | Self::Opened { .. } => return None,
             Self::State { device, state, detail, .. } => {
                 let level = match state {
                     SlotState::Failed => Level::Error,
@@ -143,13 +194,20 @@ impl What {
             }
             Self::Unregistered { device, reason } => (Level::Info, format!("{device} is not used: {reason}")),
             Self::Recording { file } => (Level::Info, format!("recording {}", file.display())),
-            Self::Episode { file, seconds, error: Some(error), .. } => {
+            Self::Episode { file, seconds, error: Some(error), verdict, .. } => {
                 let word = if self.is_cut_short() { "cut short" } else { "not whole" };
-                (Level::Error, format!("{} is {word} after {seconds:.1} s: {error}", file.display()))
+                let grade = verdict.grade.word();
+                (Level::Error, format!("{grade} {} is {word} after {seconds:.1} s: {error}", file.display()))
             }
-            Self::Episode { file, seconds, dropped, error: None, .. } => {
-                let level = if *dropped > 0 { Level::Warn } else { Level::Info };
-                (level, format!("{} finished, {seconds:.1} s, {dropped} samples dropped", file.display()))
+            Self::Episode { file, seconds, error: None, verdict, .. } => {
+                let level = match verdict.grade {
+                    Grade::Good => Level::Info,
+                    Grade::Suspect => Level::Warn,
+                    Grade::Bad => Level::Error,
+                };
+                let (file, word) = (file.display(), verdict.grade.word());
+                let why = if verdict.reasons.is_empty() { String::new() } else { format!(": {}", verdict.why()) };
+                (level, format!("{word} {file} finished, {seconds:.1} s{why}"))
             }
             Self::DiskLow { folder, free, seconds } => {
                 let (free, left) = (text::size(*free), text::about(Duration::from_secs(*seconds)));
@@ -166,6 +224,8 @@ impl What {
                     format!("the wall clock was set {direction} by {by:.3} s; times of capture stay as they are"),
                 )
             }
+            // Something was lost before this run began.
+            Self::Recovered { text, .. } => (Level::Warn, text.clone()),
             Self::Log { level, text } => (*level, text.clone()),
         })
     }

@@ -50,6 +50,7 @@ pub(crate) fn snapshot(devices: Vec<DeviceStatus>) -> Snapshot {
         devices,
         recording: None,
         last_episode: None,
+        last_verdict: super::Verdict::default(),
         log: Vec::new(),
     }
 }
@@ -124,6 +125,12 @@ pub(crate) fn board(names: &[&str]) -> Board {
         max_bytes: 1 << 20,
         depth: 8,
         when_stale: WhenStale::Hold,
+        latency: Duration::ZERO,
+        verdict: crate::registry::VerdictSpec::of(
+            crate::modality::ModalityKind::Image,
+            Duration::from_millis(500),
+            Some(30.0),
+        ),
     };
     Board::new(&Registry {
         rig: RigSpec {

@@ -9,6 +9,7 @@ mod event;
 #[cfg(test)]
 pub(crate) mod literal;
 pub mod rates;
+mod verdict;
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -21,7 +22,8 @@ use crate::sample::Epoch;
 use crate::time::Stamp;
 
 pub use board::Board;
-pub use event::{Event, What};
+pub use event::{Event, Provenance, What};
+pub use verdict::{Grade, Verdict};
 
 /// What the device of a modality is doing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize)]
@@ -156,6 +158,8 @@ pub struct Snapshot {
     pub recording: Option<RecordingStatus>,
     /// The last file finished.
     pub last_episode: Option<PathBuf>,
+    /// The verdict on it.
+    pub last_verdict: Verdict,
     /// The newest log lines, oldest first.
     pub log: Vec<LogLine>,
 }

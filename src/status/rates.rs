@@ -151,6 +151,7 @@ mod tests {
                 room: None,
             }),
             last_episode: None,
+            last_verdict: crate::status::Verdict::default(),
             log: Vec::new(),
         }
     }

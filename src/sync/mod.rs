@@ -34,6 +34,8 @@ pub struct SyncModality {
     pub id: ModalityId,
     /// What an observation holds when it is attached but no sample lies in the window.
     pub when_stale: WhenStale,
+    /// How long before its capture what a sample shows happened.
+    pub latency: Duration,
     /// Samples kept, at least 1: those of the longest time between a sample's capture and the
     /// evaluation of the last tick that may want it.
     pub capacity: usize,
@@ -41,19 +43,22 @@ pub struct SyncModality {
 
 /// See the module's comment.
 ///
+/// A sample stands for a moment: its capture time less the latency of its modality. All that
+/// follows is about that moment, so that sensors of different latency show the same instant.
+///
 /// The rules, for a tick and a moment `now` at which it is evaluated:
 ///
-/// 1. A sample counts only if it was received and captured by `now`.
-/// 2. A sample of an older epoch than the newest one of which a sample that counts by rule 1 was
-///    captured by the end of the window does not count: what was seen before the device was last
+/// 1. A sample counts only if it was received by `now` and stands for no later moment.
+/// 2. A sample of an older epoch than the newest one of which a sample that counts by rule 1 lies
+///    before the end of the window does not count: what was seen before the device was last
 ///    attached says nothing about what is attached. A replug later than that is another tick's:
 ///    who looks back at a tick sees what was to be seen at it.
 /// 3. Bit clear in the mask: absent. Not valid, not stale, nothing kept, whatever the ring holds.
-/// 4. Bit set: of the samples that count, the one captured nearest to the tick is chosen if it lies
+/// 4. Bit set: of the samples that count, the one nearest to the tick is chosen if it lies
 ///    within the window (both ends included); of two equally near the earlier, then the one of the
 ///    lower sequence number. Valid.
-/// 5. Bit set, nothing in the window: stale, not valid. `Hold` gives the newest sample captured at
-///    or before the tick, if there is one; `Zero` gives none.
+/// 5. Bit set, nothing in the window: stale, not valid. `Hold` gives the newest sample at or
+///    before the tick, if there is one; `Zero` gives none.
 #[derive(Debug)]
 pub struct Synchronizer<T> {
     window_ns: u64,
@@ -66,6 +71,7 @@ pub struct Synchronizer<T> {
 #[derive(Debug)]
 struct Lane<T> {
     when_stale: WhenStale,
+    latency_ns: u64,
     ring: Ring<T>,
 }
 
@@ -81,7 +87,11 @@ impl<T> Synchronizer<T> {
             let lane = &mut lane_of[modality.id.index()];
             if lane.is_none() {
                 *lane = Some(lanes.len());
-                lanes.push(Lane { when_stale: modality.when_stale, ring: Ring::new(modality.capacity) });
+                lanes.push(Lane {
+                    when_stale: modality.when_stale,
+                    latency_ns: nanoseconds(modality.latency),
+                    ring: Ring::new(modality.capacity),
+                });
                 ids.push(modality.id);
             }
         }
@@ -134,17 +144,19 @@ impl<T> Synchronizer<T> {
 
 impl<T> Lane<T> {
     fn choose(&self, tick: Stamp, now: Stamp, window_ns: u64, slot: &mut Slot) {
-        let known = || self.ring.iter().filter(move |(_, s)| s.recv <= now && s.capture <= now);
-        let reach = tick.0.saturating_add(window_ns);
-        let epoch = known().filter(|(_, s)| s.capture.0 <= reach).map(|(_, s)| s.epoch).max().unwrap_or(Epoch(0));
+        // The moment a sample stands for.
+        let shown = |s: &SyncSample<T>| Stamp(s.capture.0.saturating_sub(self.latency_ns));
+        let known = || self.ring.iter().filter(move |(_, s)| s.recv <= now && shown(s) <= now);
+        let reach = Stamp(tick.0.saturating_add(window_ns));
+        let epoch = known().filter(|(_, s)| shown(s) <= reach).map(|(_, s)| s.epoch).max().unwrap_or(Epoch(0));
         let current = || known().filter(move |(_, s)| s.epoch == epoch);
 
-        let nearest = current()
-            .filter(|(_, s)| s.capture.0.abs_diff(tick.0) <= window_ns)
-            .min_by_key(|(_, s)| (s.capture.0.abs_diff(tick.0), s.capture, s.seq));
+        let distance = |s: &SyncSample<T>| shown(s).0.abs_diff(tick.0);
+        let nearest =
+            current().filter(|(_, s)| distance(s) <= window_ns).min_by_key(|(_, s)| (distance(s), shown(s), s.seq));
         if let Some((handle, sample)) = nearest {
             slot.valid = true;
-            slot.hold(handle, sample, tick);
+            slot.hold(handle, sample.seq, tick, shown(sample));
             return;
         }
         slot.stale = true;
@@ -152,9 +164,9 @@ impl<T> Lane<T> {
             return;
         }
         let newest =
-            current().filter(|(_, s)| s.capture <= tick).max_by_key(|(_, s)| (s.capture, std::cmp::Reverse(s.seq)));
+            current().filter(|(_, s)| shown(s) <= tick).max_by_key(|(_, s)| (shown(s), std::cmp::Reverse(s.seq)));
         if let Some((handle, sample)) = newest {
-            slot.hold(handle, sample, tick);
+            slot.hold(handle, sample.seq, tick, shown(sample));
         }
     }
 }

@@ -2,7 +2,6 @@
 //!
 //! Invariant: one slot a registered modality, in the order of registration, whatever the mask.
 
-use super::ring::SyncSample;
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::time::Stamp;
@@ -22,8 +21,8 @@ pub struct Slot {
     pub valid: bool,
     /// Present, and no sample lies in the window.
     pub stale: bool,
-    /// The tick minus the capture time of the sample chosen, ns; negative for a sample captured
-    /// after the tick; 0 without a sample.
+    /// The tick minus the moment that the sample chosen stands for (its capture time less the
+    /// latency of the modality), ns; negative for one after the tick; 0 without a sample.
     pub age_ns: i64,
     /// Sequence number of the sample chosen. Without one the modality is to be filled with zeros.
     pub seq: Option<u64>,
@@ -36,10 +35,11 @@ impl Slot {
         *self = Self { present, ..Self::empty(self.id) };
     }
 
-    pub(super) fn hold<T>(&mut self, handle: Handle, sample: &SyncSample<T>, tick: Stamp) {
-        let age = i128::from(tick.0) - i128::from(sample.capture.0);
+    /// Names the sample `seq`, which stands for the moment `shown`.
+    pub(super) fn hold(&mut self, handle: Handle, seq: u64, tick: Stamp, shown: Stamp) {
+        let age = i128::from(tick.0) - i128::from(shown.0);
         self.age_ns = i64::try_from(age).unwrap_or(if age < 0 { i64::MIN } else { i64::MAX });
-        self.seq = Some(sample.seq);
+        self.seq = Some(seq);
         self.handle = Some(handle);
     }
 

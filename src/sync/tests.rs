@@ -11,7 +11,7 @@ fn id(bit: u8) -> ModalityId {
 }
 
 fn modality(bit: u8, when_stale: WhenStale) -> SyncModality {
-    SyncModality { id: id(bit), when_stale, capacity: 64 }
+    SyncModality { id: id(bit), when_stale, latency: Duration::ZERO, capacity: 64 }
 }
 
 fn sample(capture_ms: u64, recv_ms: u64, seq: u64, epoch: u32) -> SyncSample<()> {
@@ -70,7 +70,7 @@ fn each_rule_decides_as_written() {
 
 #[test]
 fn a_full_ring_keeps_the_newest_pushed_and_handles_lead_to_the_sample() {
-    let modalities = [SyncModality { id: id(3), when_stale: WhenStale::Hold, capacity: 4 }];
+    let modalities = [SyncModality { id: id(3), when_stale: WhenStale::Hold, latency: Duration::ZERO, capacity: 4 }];
     let mut sync = Synchronizer::new(&modalities, Duration::from_millis(1));
     for n in 0..10_u64 {
         let stamp = Stamp(n * MS);
@@ -177,6 +177,25 @@ proptest! {
         }
         prop_assert_eq!(said(sync.observe(tick, now, PhysicalMask(7))), few);
         prop_assert_eq!(before.len(), 3);
+    }
+
+    #[test]
+    fn a_latency_undoes_the_delay_of_its_modality(
+        samples in samples(), latencies in proptest::array::uniform3(0_u64..1_000_000_000),
+        tick in 0_u64..350, late in 0_u64..150, mask in 0_u64..8,
+    ) {
+        let (tick, now) = (Stamp(tick * MS), Stamp((tick + late) * MS));
+        let prompt = said(synchronizer(&samples).observe(tick, now, PhysicalMask(mask)));
+        let modalities = [(0, WhenStale::Hold), (1, WhenStale::Zero), (2, WhenStale::Hold)].map(|(bit, when_stale)| {
+            let latency = Duration::from_nanos(latencies[usize::from(bit)]);
+            SyncModality { latency, ..modality(bit, when_stale) }
+        });
+        let mut sync = Synchronizer::new(&modalities, Duration::from_millis(25));
+        for (bit, sample) in &samples {
+            let capture = Stamp(sample.capture.0 + latencies[usize::from(*bit)]);
+            sync.push(id(*bit), SyncSample { capture, ..*sample });
+        }
+        prop_assert_eq!(said(sync.observe(tick, now, PhysicalMask(mask))), prompt);
     }
 
     #[test]

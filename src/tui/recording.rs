@@ -9,7 +9,7 @@ use ratatui::text::{Line, Span};
 use super::model::Model;
 use super::theme::Theme;
 use super::view;
-use crate::status::RecordingStatus;
+use crate::status::{RecordingStatus, Verdict};
 use crate::text;
 
 pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
@@ -62,15 +62,27 @@ fn under_way(recording: &RecordingStatus, area: Rect, model: &Model, theme: Them
 fn idle(area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
     let mut first = Line::from(vec![Span::styled("space", theme.title()), Span::raw(" starts an episode")]);
     let Some(last) = &model.shown().last_episode else { return vec![first] };
+    let Verdict { grade, reasons } = &model.shown().last_verdict;
+    let word = Span::styled(format!("{} ", grade.word()), theme.grade(*grade));
     let label = Span::styled("last ", theme.faint());
     let width = usize::from(area.width);
-    if area.height >= 2 {
-        let file = file(last, width.saturating_sub(label.width()), theme);
-        return vec![first, Line::from(vec![label, Span::raw(file)])];
+    if area.height < 2 {
+        let room = width.saturating_sub(first.width() + 3 + label.width() + word.width());
+        first.spans.extend([Span::raw("   "), label, word, Span::raw(file(last, room, theme))]);
+        return vec![first];
     }
-    let file = file(last, width.saturating_sub(first.width() + 3 + label.width()), theme);
-    first.spans.extend([Span::raw("   "), label, Span::raw(file)]);
-    vec![first]
+    // The reasons beside the name as far as there is room; the log has all of them.
+    let room = width.saturating_sub(label.width() + word.width());
+    let name_width = last.file_name().map_or(0, |name| text::width(&name.to_string_lossy()));
+    let why = theme.safe(&reasons.join("; "));
+    let room_why = room.saturating_sub(name_width + 2);
+    let path = file(last, if why.is_empty() { room } else { name_width.min(room) }, theme);
+    let mut line = Line::from(vec![label, word, Span::raw(path)]);
+    if !why.is_empty() && room_why > 0 {
+        line.push_span(Span::raw("  "));
+        line.push_span(Span::styled(text::cut(&why, room_why, theme.ellipsis()).into_owned(), theme.grade(*grade)));
+    }
+    vec![first, line]
 }
 
 /// The path if it fits, otherwise the name of the file.

@@ -6,7 +6,7 @@
 use ratatui::style::{Color, Modifier, Style};
 use ratatui::symbols::border;
 
-use crate::status::{Level, SlotState};
+use crate::status::{Grade, Level, SlotState};
 use crate::text;
 
 /// Can the terminal show colours?
@@ -116,6 +116,16 @@ impl Theme {
     #[must_use]
     pub fn recording(self) -> Style {
         self.alarm()
+    }
+
+    /// A verdict.
+    #[must_use]
+    pub fn grade(self, grade: Grade) -> Style {
+        match grade {
+            Grade::Good => self.colour(Color::Green),
+            Grade::Suspect => self.warning(),
+            Grade::Bad => self.alarm(),
+        }
     }
 
     /// A state of a slot.

@@ -66,9 +66,9 @@ fn a_planted_folder_is_refused_by_name() {
     let planted = dir.path().join("udev");
     symlink(&elsewhere, &planted).unwrap();
     let error = write_file(&planted.join("99-rapid.rules"), &one(), Links::Refused).unwrap_err();
-    assert!(matches!(&error, ArtifactsError::Link { path } if *path == planted), "{error}");
+    assert!(matches!(&error, ArtifactsError::Folder(FolderError::Link { path, .. }) if *path == planted), "{error}");
     assert_eq!(std::fs::read_dir(&elsewhere).unwrap().count(), 0);
-    write_file(&planted.join("99-rapid.rules"), &one(), Links::Followed).unwrap();
+    write_file(&planted.join("99-rapid.rules"), &one(), Links::Own).unwrap();
     assert_eq!(std::fs::read_dir(&elsewhere).unwrap().count(), 1);
 }
 

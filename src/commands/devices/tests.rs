@@ -42,12 +42,19 @@ fn registry() -> Registry {
 
 fn usb(ids: (u16, u16), serial: Option<&str>, port: &str, product: Option<&str>) -> UsbIdentity {
     let owned = |text: Option<&str>| text.map(str::to_owned);
-    UsbIdentity { vid: ids.0, pid: ids.1, serial: owned(serial), port: port.to_owned(), product: owned(product) }
+    UsbIdentity {
+        vid: ids.0,
+        pid: ids.1,
+        serial: owned(serial),
+        port: port.to_owned(),
+        product: owned(product),
+        ..UsbIdentity::default()
+    }
 }
 
 fn attachment(node: DeviceNode, usb: UsbIdentity) -> Attachment {
     let syspath = format!("/sys/{}/{}", usb.port, node.label().replace('/', "_"));
-    Attachment { syspath: syspath.into(), node, usb }
+    Attachment { syspath: syspath.into(), node, usb, driver: None }
 }
 
 fn video(number: u8, ids: (u16, u16), serial: Option<&str>, port: &str) -> Attachment {

@@ -2,6 +2,7 @@
 //!
 //! Invariant: nothing here touches a device.
 
+use std::collections::BTreeMap;
 use std::fmt;
 use std::path::{Path, PathBuf};
 
@@ -10,6 +11,7 @@ use serde::Serialize;
 use super::super::DriverError;
 use super::layout::Layout;
 use super::node::Card;
+use crate::provenance::{Format, Negotiated};
 use crate::registry::{CameraSpec, PixelFormat};
 
 /// How far a rate may be from the wished one: 30000/1001 is what many cameras call 30.
@@ -230,7 +232,7 @@ impl Agreed {
 
 /// Names compare without case, and blanks, `_`, `-` and `,` alike: `White Balance, Automatic` is
 /// `white_balance_automatic`.
-fn plain_name(name: &str) -> String {
+pub(super) fn plain_name(name: &str) -> String {
     name.split(|c: char| !c.is_alphanumeric())
         .filter(|word| !word.is_empty())
         .collect::<Vec<_>>()
@@ -271,11 +273,23 @@ pub(super) fn not_offered(name: &str, spec: &CameraSpec, path: &Path, offered: &
     )
 }
 
-/// What was agreed, for the log and the recording.
+/// What was agreed, for people.
 pub(super) fn describe(card: &Card, layout: Layout, rate: Option<Rate>) -> String {
     let Layout { format, width, height, .. } = layout;
     let rate = rate.map_or_else(|| String::from("its own rate"), |rate| format!("{rate} fps"));
-    format!("{} {width}x{height} at {rate}, {} ({})", fourcc_text(fourcc(format)), card.name, card.driver)
+    format!("{} {width}x{height} at {rate}, {} ({})", fourcc_text(fourcc(format)), card.name, card.driver.name)
+}
+
+/// What was agreed, for the recording.
+pub(super) fn negotiated(
+    card: Card,
+    layout: Layout,
+    rate: Option<Rate>,
+    controls: BTreeMap<String, i64>,
+) -> Negotiated {
+    let Layout { format, width, height, .. } = layout;
+    let format = Format::Pictures { fourcc: fourcc_text(fourcc(format)), width, height, fps: rate.map(Rate::hz) };
+    Negotiated { driver: Some(card.driver), card: Some(card.name), bus: Some(card.bus), format: Some(format), controls }
 }
 
 #[cfg(test)]

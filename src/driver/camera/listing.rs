@@ -45,7 +45,13 @@ pub fn query(path: &Path) -> Result<CameraInfo, DriverError> {
     };
     let exact = enumerate(path)?;
     let found = video_number(path).filter(|_| nokhwa_can_list(&exact)).and_then(through_nokhwa).unwrap_or_default();
-    Ok(CameraInfo { path: path.to_owned(), name: card.name, driver: card.driver, modes: merge(found, exact), controls })
+    Ok(CameraInfo {
+        path: path.to_owned(),
+        name: card.name,
+        driver: card.driver.name,
+        modes: merge(found, exact),
+        controls,
+    })
 }
 
 /// Only plain sizes and whole rates: anything else ends nokhwa's listing with an error or worse.

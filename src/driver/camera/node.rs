@@ -20,6 +20,7 @@ use v4l::v4l2::{self, vidioc};
 
 use super::super::DriverError;
 use super::format::{Agreed, ControlInfo, Rate, fourcc};
+use crate::provenance::KernelDriver;
 use crate::registry::CameraSpec;
 
 /// `V4L2_BUF_TYPE_VIDEO_CAPTURE`.
@@ -76,7 +77,16 @@ impl Node {
                 path.display()
             )));
         }
-        Ok(Card { name: text(&capability.card), driver: text(&capability.driver) })
+        // KERNEL_VERSION of linux/version.h: major, minor and revision, a byte each.
+        let [revision, minor, major, _] = capability.version.to_le_bytes();
+        Ok(Card {
+            name: text(&capability.card),
+            driver: KernelDriver {
+                name: text(&capability.driver),
+                version: Some(format!("{major}.{minor}.{revision}")).filter(|_| capability.version != 0),
+            },
+            bus: text(&capability.bus_info),
+        })
     }
 
     /// Is the device behind the node gone?
@@ -156,6 +166,12 @@ impl Node {
         controls
     }
 
+    pub(super) fn control(&self, id: u32) -> io::Result<i64> {
+        let mut control = v4l2_control { id, value: 0 };
+        self.ioctl(vidioc::VIDIOC_G_CTRL, &mut control)?;
+        Ok(control.value.into())
+    }
+
     pub(super) fn set_control(&self, id: u32, value: i64) -> io::Result<()> {
         let value = i32::try_from(value).map_err(|_| io::Error::from(io::ErrorKind::InvalidInput))?;
         self.ioctl(vidioc::VIDIOC_S_CTRL, &mut v4l2_control { id, value })
@@ -194,11 +210,12 @@ impl AsFd for Node {
     }
 }
 
-/// Who made the camera, as far as the driver says.
+/// What the driver says the camera is.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Card {
     pub(super) name: String,
-    pub(super) driver: String,
+    pub(super) driver: KernelDriver,
+    pub(super) bus: String,
 }
 
 /// Text up to its first zero byte, anything that does not belong into a line of text replaced: it

@@ -1,27 +1,31 @@
 //! A recorded episode as a file: what is in it, and its messages one by one.
 //!
-//! Invariant: lengths found in the file are checked against the file before memory is taken.
+//! Invariant: the file is read from its beginning to its end, one chunk at a time; its index is not
+//! looked at, so a wrong one leads nowhere.
+//! Invariant: what lies in a damaged chunk is not played.
 
+use std::collections::BTreeMap;
 use std::fs::File;
-use std::os::unix::fs::FileExt as _;
+use std::io::{self, BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
-
-use mcap::records::Record;
-use mcap::sans_io::indexed_reader::{IndexedReadEvent, IndexedReader, IndexedReaderOptions};
-use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
-use mcap::sans_io::summary_reader::{SummaryReadEvent, SummaryReader, SummaryReaderOptions};
-use mcap::{McapError, Summary};
 
 use super::wire::{self, Schema};
 use super::{DriverError, fatal};
+use crate::episode_format::walk::{FileEnd, MAGIC, Trust, Walk, op};
+use crate::episode_format::wire::Fields;
+use crate::episode_format::{self, ABOUT, MASK_TOPIC};
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 
-/// Largest record or chunk that is read; a 4K raw picture has 16 MiB.
-const RECORD_LIMIT: usize = 256 << 20;
-const MASK_TOPIC: &str = "/rapid/mask";
-/// Name of the metadata record that holds layout and registry.
-const METADATA: &str = "rapid";
+/// Changes of the mask that are played: a device that flaps at 500 Hz, the rate of the mask, reaches
+/// them after half an hour.
+const MAX_CHANGES: usize = 1_000_000;
+/// Longest text of a record that is remembered, such as the registry.
+const MAX_TEXT: usize = 16 << 20;
+/// Channel, sequence number and two times stand before a message's data.
+const MESSAGE_HEAD: usize = 2 + 4 + 8 + 8;
+/// Bytes read at once.
+const BUFFER_BYTES: usize = 1 << 16;
 
 /// What an episode holds.
 #[derive(Debug, Clone, PartialEq)]
@@ -49,11 +53,11 @@ pub struct TopicDescription {
     pub schema: String,
     /// Encoding of the messages, for example `protobuf`.
     pub message_encoding: String,
-    /// Messages, if the file counts them.
-    pub messages: Option<u64>,
+    /// Messages.
+    pub messages: u64,
 }
 
-/// What is in `file`. Reads the whole of it, a chunk at a time, for the mask's changes; blocks.
+/// What is in `file`. Reads the whole of it, a chunk at a time; blocks.
 ///
 /// # Errors
 /// When the file cannot be read, or is damaged or was never closed.
@@ -61,279 +65,295 @@ pub fn describe(file: &Path) -> Result<EpisodeDescription, DriverError> {
     Episode::open(file)?.describe()
 }
 
-/// An open file with its index.
+/// An open file that ends as a finished one does.
 pub(super) struct Episode {
     path: PathBuf,
-    file: Source,
-    summary: Summary,
+    file: File,
+    size: u64,
 }
 
 impl Episode {
     pub(super) fn open(path: &Path) -> Result<Self, DriverError> {
-        let file = File::open(path).map_err(|error| fatal(path, error))?;
-        let length = file.metadata().map_err(|error| fatal(path, error))?.len();
-        let file = Source { file, length };
-        let summary = match file.summary() {
-            Ok(Some(summary)) => summary,
-            Ok(None) | Err(McapError::BadMagic) => {
-                return Err(fatal(
-                    path,
-                    "has no index: it was not closed, and cannot be played; `rapid inspect` reads what is there",
-                ));
-            }
-            Err(error) => return Err(fatal(path, format!("its index cannot be read: {error}"))),
+        let (mut file, size) = episode_format::open(path).map_err(|error| DriverError::Fatal(error.to_string()))?;
+        let mut end = [0; MAGIC.len()];
+        let from_end = i64::try_from(MAGIC.len()).unwrap_or(0);
+        let is_closed = size >= MAGIC.len() as u64 && {
+            let read = file.seek(SeekFrom::End(-from_end)).and_then(|_| file.read_exact(&mut end));
+            read.and_then(|()| file.rewind()).map_err(|error| fatal(path, error))?;
+            end == MAGIC
         };
-        Ok(Self { path: path.to_owned(), file, summary })
+        if !is_closed {
+            return Err(fatal(path, format!("was not closed, and cannot be played; {}", fix(path))));
+        }
+        Ok(Self { path: path.to_owned(), file, size })
     }
 
-    /// The messages of `topic` from `from_ns` on, and what they are.
-    pub(super) fn play(self, topic: &str, from_ns: u64) -> Result<(Messages, Schema), DriverError> {
-        let Some(channel) = self.summary.channels.values().find(|channel| channel.topic == topic) else {
-            let mut topics: Vec<&str> = self.summary.channels.values().map(|channel| channel.topic.as_str()).collect();
-            topics.sort_unstable();
-            return Err(fatal(&self.path, format!("has no topic {topic}; it has {}", topics.join(", "))));
-        };
-        let name = channel.schema.as_ref().map_or("", |schema| schema.name.as_str());
-        let Some(schema) = Schema::named(name).filter(|_| channel.message_encoding == "protobuf") else {
-            return Err(fatal(&self.path, format!("{topic} holds {name:?} messages, which no device sends")));
-        };
-        let messages = self.messages(topic, from_ns)?;
-        Ok((messages, schema))
-    }
-
-    fn messages(self, topic: &str, from_ns: u64) -> Result<Messages, DriverError> {
-        let channels =
-            self.summary.channels.values().filter(|channel| channel.topic == topic).map(|channel| channel.id).collect();
-        let reader = if self.summary.chunk_indexes.is_empty() {
-            // Not chunked: messages stand in the file in the order they were written.
-            Reader::Linear(Box::new(LinearReader::new_with_options(
-                LinearReaderOptions::default().with_record_length_limit(RECORD_LIMIT),
-            )))
-        } else {
-            let options = IndexedReaderOptions::new()
-                .include_topics([topic])
-                .starting_at(from_ns)
-                .with_record_length_limit(RECORD_LIMIT);
-            let reader = IndexedReader::new_with_options(&self.summary, options)
-                .map_err(|error| fatal(&self.path, format!("its index cannot be used: {error}")))?;
-            Reader::Indexed(Box::new(reader))
-        };
-        Ok(Messages { file: self.file, reader, channels, from_ns, chunk: Vec::new(), position: 0 })
+    /// The messages of `topic` from `from_ns` on.
+    pub(super) fn play(self, topic: &str, from_ns: u64) -> Result<Messages<BufReader<File>>, DriverError> {
+        let Self { path, file, size } = self;
+        let walk = begin(&path, file, size)?;
+        let mut messages = Messages::new(walk, topic, from_ns);
+        if messages.seek().map_err(|error| fatal(&path, error))? {
+            return Ok(messages);
+        }
+        Err(fatal(&path, messages.channels.refusal(topic)))
     }
 
     fn describe(self) -> Result<EpisodeDescription, DriverError> {
-        let statistics = self.summary.stats.as_ref();
-        let mut topics: Vec<TopicDescription> = self
-            .summary
-            .channels
-            .values()
-            .map(|channel| TopicDescription {
-                topic: channel.topic.clone(),
-                schema: channel.schema.as_ref().map_or_else(String::new, |schema| schema.name.clone()),
-                message_encoding: channel.message_encoding.clone(),
-                messages: statistics.and_then(|counts| counts.channel_message_counts.get(&channel.id).copied()),
-            })
-            .collect();
-        topics.sort_by(|a, b| a.topic.cmp(&b.topic));
-        let times = statistics.map(|times| (times.message_start_time, times.message_end_time)).unwrap_or_default();
-        let (layout, registry) = self.metadata()?;
-        let path = self.path.clone();
-        let mask = if topics.iter().any(|topic| topic.topic == MASK_TOPIC) {
-            mask_changes(self.messages(MASK_TOPIC, 0)?).map_err(|error| fatal(&path, error))?
-        } else {
-            Vec::new()
-        };
-        let (begin_ns, end_ns) = times;
-        Ok(EpisodeDescription { begin_ns, end_ns, topics, layout, registry, mask })
+        let walk = begin(&self.path, self.file, self.size)?;
+        let collected = Collected::read(walk).map_err(|error| fatal(&self.path, error))?;
+        match collected.end {
+            FileEnd::Finished => {}
+            _ => return Err(fatal(&self.path, format!("is damaged; {}", fix(&self.path)))),
+        }
+        collected.description().map_err(|why| fatal(&self.path, why))
+    }
+}
+
+fn fix(path: &Path) -> String {
+    format!("`rapid recover {}` makes it whole, `rapid inspect` reads what is there", path.display())
+}
+
+fn begin(path: &Path, file: File, size: u64) -> Result<Walk<BufReader<File>>, DriverError> {
+    let walk = Walk::new(BufReader::with_capacity(BUFFER_BYTES, file), size).map_err(|error| fatal(path, error))?;
+    walk.ok_or_else(|| fatal(path, "not an MCAP file"))
+}
+
+/// Reads `bytes`, which may be any, as replay reads a file: what they hold and every message that a
+/// device could play.
+pub fn read_bytes(bytes: &[u8]) {
+    let size = bytes.len() as u64;
+    let Ok(Some(walk)) = Walk::new(bytes, size) else { return };
+    let Ok(Ok(described)) = Collected::read(walk).map(Collected::description) else { return };
+    for topic in described.topics {
+        let Ok(Some(walk)) = Walk::new(bytes, size) else { return };
+        let mut messages = Messages::new(walk, &topic.topic, described.begin_ns);
+        let mut payload = Vec::new();
+        while let Ok(Some(message)) = messages.next() {
+            let _ = wire::payload(message.schema, message.data, &mut payload);
+        }
+    }
+}
+
+/// Channels and schemas, as they come.
+#[derive(Debug, Default)]
+struct Channels {
+    schemas: BTreeMap<u16, String>,
+    channels: BTreeMap<u16, Channel>,
+}
+
+#[derive(Debug)]
+struct Channel {
+    topic: String,
+    encoding: String,
+    schema: String,
+    messages: u64,
+}
+
+impl Channels {
+    /// Takes a record; one that cannot be read is passed over.
+    fn take(&mut self, opcode: u8, data: &[u8]) -> Option<()> {
+        let mut fields = Fields(data);
+        let id = fields.u16()?;
+        match opcode {
+            op::SCHEMA => {
+                let name = short(fields.string()?)?;
+                self.schemas.entry(id).or_insert(name);
+            }
+            op::CHANNEL => {
+                let schema = fields.u16()?;
+                let (topic, encoding) = (short(fields.string()?)?, short(fields.string()?)?);
+                let schema = self.schemas.get(&schema).cloned().unwrap_or_default();
+                self.channels.entry(id).or_insert(Channel { topic, encoding, schema, messages: 0 });
+            }
+            _ => {}
+        }
+        Some(())
     }
 
-    /// Layout by bit and registry text; empty where the file holds none.
-    fn metadata(&self) -> Result<(Vec<(String, ModalityId)>, String), DriverError> {
-        let Some(index) = self.summary.metadata_indexes.iter().find(|index| index.name == METADATA) else {
-            return Ok((Vec::new(), String::new()));
+    /// What a device could play of the channel `id` of `topic`.
+    fn schema(&self, id: u16, topic: &str) -> Option<Schema> {
+        let channel = self.channels.get(&id).filter(|channel| channel.topic == topic)?;
+        Schema::named(&channel.schema).filter(|_| channel.encoding == "protobuf")
+    }
+
+    /// Why `topic` cannot be played.
+    fn refusal(&self, topic: &str) -> String {
+        if let Some(channel) = self.channels.values().find(|channel| channel.topic == topic) {
+            return format!("{topic} holds {:?} messages, which no device sends", channel.schema);
+        }
+        let mut topics: Vec<&str> = self.channels.values().map(|channel| channel.topic.as_str()).collect();
+        topics.sort_unstable();
+        topics.dedup();
+        format!("has no topic {topic}; it has {}", topics.join(", "))
+    }
+}
+
+/// A name that can be meant: there may be 65536 of them.
+fn short(text: &str) -> Option<String> {
+    (text.len() <= 1024).then(|| text.to_owned())
+}
+
+/// What a walk through the whole file gathers.
+#[derive(Debug)]
+struct Collected {
+    channels: Channels,
+    about: BTreeMap<String, String>,
+    times: Option<(u64, u64)>,
+    mask: Vec<(u64, PhysicalMask)>,
+    end: FileEnd,
+}
+
+impl Collected {
+    fn read(mut walk: Walk<impl Read>) -> io::Result<Self> {
+        let mut collected = Self {
+            channels: Channels::default(),
+            about: BTreeMap::new(),
+            times: None,
+            mask: Vec::new(),
+            end: FileEnd::Unfinished,
         };
-        let damaged = |why: &dyn std::fmt::Display| fatal(&self.path, format!("its metadata cannot be read: {why}"));
-        let mut bytes = Vec::new();
-        self.file.read(index.offset, index.length, &mut bytes).map_err(|error| damaged(&error))?;
-        // A record is its opcode, its length as u64, its content (mcap.dev/spec, "Records").
-        let (Some(&opcode), Some(body)) = (bytes.first(), bytes.get(9..)) else {
-            return Err(damaged(&"it is too short"));
-        };
-        let mut metadata = match mcap::parse_record(opcode, body) {
-            Ok(Record::Metadata(metadata)) => metadata.metadata,
-            Ok(_) => return Err(damaged(&"the index points elsewhere")),
-            Err(error) => return Err(damaged(&error)),
-        };
-        let layout = metadata.remove("layout").unwrap_or_default();
-        let layout: std::collections::BTreeMap<String, u8> = if layout.is_empty() {
-            std::collections::BTreeMap::new()
+        while let Some(record) = walk.next()? {
+            if record.trust == Trust::Damaged {
+                continue;
+            }
+            // `None` is a record that is shorter than it says.
+            let _ = match record.opcode {
+                op::MESSAGE => collected.message(record.data),
+                op::METADATA => collected.metadata(record.data),
+                opcode => collected.channels.take(opcode, record.data),
+            };
+            if collected.mask.len() > MAX_CHANGES {
+                return Err(io::Error::other("the mask changes more than a million times"));
+            }
+        }
+        collected.end = walk.walked().end;
+        Ok(collected)
+    }
+
+    fn message(&mut self, data: &[u8]) -> Option<()> {
+        let mut fields = Fields(data);
+        let (id, _sequence) = (fields.u16()?, fields.u32()?);
+        let (at, _published) = (fields.u64()?, fields.u64()?);
+        let channel = self.channels.channels.get_mut(&id)?;
+        channel.messages += 1;
+        let (first, last) = self.times.unwrap_or((at, at));
+        self.times = Some((first.min(at), last.max(at)));
+        if channel.topic == MASK_TOPIC {
+            let mask = wire::mask(fields.0)?;
+            if self.mask.last().is_none_or(|(_, last)| *last != mask) {
+                self.mask.push((at, mask));
+            }
+        }
+        Some(())
+    }
+
+    fn metadata(&mut self, data: &[u8]) -> Option<()> {
+        let mut fields = Fields(data);
+        if fields.string()? == ABOUT && fields.0.len() <= MAX_TEXT {
+            self.about = fields.map()?;
+        }
+        Some(())
+    }
+
+    fn description(mut self) -> Result<EpisodeDescription, String> {
+        let mut topics: BTreeMap<String, TopicDescription> = BTreeMap::new();
+        for channel in self.channels.channels.into_values() {
+            let Channel { topic, encoding, schema, messages } = channel;
+            let described = TopicDescription { topic: topic.clone(), schema, message_encoding: encoding, messages: 0 };
+            topics.entry(topic).or_insert(described).messages += messages;
+        }
+        let layout = self.about.remove("layout").unwrap_or_default();
+        let layout: BTreeMap<String, u8> = if layout.is_empty() {
+            BTreeMap::new()
         } else {
-            serde_json::from_str(&layout).map_err(|error| damaged(&error))?
+            serde_json::from_str(&layout).map_err(|error| format!("its metadata cannot be read: {error}"))?
         };
         let mut layout: Vec<_> =
             layout.into_iter().filter_map(|(name, bit)| Some((name, ModalityId::new(bit)?))).collect();
         layout.sort_by_key(|(_, id)| *id);
-        Ok((layout, metadata.remove("registry").unwrap_or_default()))
+        // Within a topic of ours times ascend; of another writer's file nothing is known.
+        self.mask.sort_by_key(|(at, _)| *at);
+        let (begin_ns, end_ns) = self.times.unwrap_or_default();
+        let registry = self.about.remove("registry").unwrap_or_default();
+        Ok(EpisodeDescription {
+            begin_ns,
+            end_ns,
+            topics: topics.into_values().collect(),
+            layout,
+            registry,
+            mask: self.mask,
+        })
     }
 }
 
-/// The first mask and each that differs from the one before. Damage ends the list early.
-fn mask_changes(mut messages: Messages) -> Result<Vec<(u64, PhysicalMask)>, McapError> {
-    let mut changes: Vec<(u64, PhysicalMask)> = Vec::new();
-    while let Some(message) = messages.next()? {
-        let Some(mask) = wire::mask(message.data) else { continue };
-        if changes.last().is_none_or(|(_, last)| *last != mask) {
-            changes.push((message.log_time, mask));
-        }
-    }
-    Ok(changes)
-}
-
-/// The file and its length.
-struct Source {
-    file: File,
-    length: u64,
-}
-
-impl Source {
-    /// Reads `length` bytes at `offset`, which must lie in the file.
-    fn read(&self, offset: u64, length: u64, into: &mut Vec<u8>) -> Result<(), McapError> {
-        let ends = offset.checked_add(length).ok_or(McapError::BadIndex)?;
-        let length = usize::try_from(length).map_err(|_| McapError::BadIndex)?;
-        if ends > self.length || length > RECORD_LIMIT {
-            return Err(McapError::BadIndex);
-        }
-        into.resize(length, 0);
-        self.file.read_exact_at(into, offset).map_err(McapError::from)
-    }
-
-    fn summary(&self) -> Result<Option<Summary>, McapError> {
-        let options =
-            SummaryReaderOptions::default().with_file_size(self.length).with_record_length_limit(RECORD_LIMIT);
-        let mut reader = SummaryReader::new_with_options(options);
-        let mut position = 0_u64;
-        while let Some(event) = reader.next_event() {
-            match event? {
-                SummaryReadEvent::ReadRequest(wished) => {
-                    let count = self.file.read_at(reader.insert(wished), position)?;
-                    position += count as u64;
-                    reader.notify_read(count);
-                }
-                SummaryReadEvent::SeekRequest(to) => {
-                    position = match to {
-                        std::io::SeekFrom::Start(offset) => offset,
-                        std::io::SeekFrom::End(offset) => self.length.saturating_add_signed(offset),
-                        std::io::SeekFrom::Current(offset) => position.saturating_add_signed(offset),
-                    };
-                    if position > self.length {
-                        return Err(McapError::BadIndex);
-                    }
-                    reader.notify_seeked(position);
-                }
-            }
-        }
-        Ok(reader.finish())
-    }
-}
-
-impl std::fmt::Debug for Messages {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Messages").field("channels", &self.channels).finish_non_exhaustive()
-    }
-}
-
-/// The messages of a topic, ascending by log time where the file has an index of its chunks.
-pub(super) struct Messages {
-    file: Source,
-    reader: Reader,
-    channels: Vec<u16>,
+/// The messages of a topic that a device could play, in the order they were recorded.
+pub(super) struct Messages<R> {
+    walk: Walk<R>,
+    channels: Channels,
+    topic: String,
     from_ns: u64,
-    chunk: Vec<u8>,
-    position: u64,
 }
 
-enum Reader {
-    Indexed(Box<IndexedReader>),
-    Linear(Box<LinearReader>),
+impl<R> std::fmt::Debug for Messages<R> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Messages").field("topic", &self.topic).finish_non_exhaustive()
+    }
 }
 
 /// One message of the topic.
+#[derive(Debug, Clone, Copy)]
 pub(super) struct Recorded<'a> {
     pub(super) log_time: u64,
+    pub(super) schema: Schema,
     pub(super) data: &'a [u8],
 }
 
-impl Messages {
-    /// The next message; `None` at the end.
-    pub(super) fn next(&mut self) -> Result<Option<Recorded<'_>>, McapError> {
-        match &mut self.reader {
-            Reader::Indexed(reader) => next_indexed(reader, &self.file, &mut self.chunk),
-            Reader::Linear(reader) => {
-                next_linear(reader, &self.file, &mut self.position, &self.channels, self.from_ns, &mut self.chunk)
+impl<R: Read> Messages<R> {
+    fn new(walk: Walk<R>, topic: &str, from_ns: u64) -> Self {
+        Self { walk, channels: Channels::default(), topic: topic.to_owned(), from_ns }
+    }
+
+    /// Reads on to a channel of the topic that can be played; is there one?
+    fn seek(&mut self) -> io::Result<bool> {
+        while let Some(record) = self.walk.next()? {
+            if record.trust == Trust::Damaged || record.opcode == op::MESSAGE {
+                continue;
+            }
+            let _ = self.channels.take(record.opcode, record.data);
+            let id = Fields(record.data).u16().filter(|_| record.opcode == op::CHANNEL);
+            if id.is_some_and(|id| self.channels.schema(id, &self.topic).is_some()) {
+                return Ok(true);
             }
         }
+        Ok(false)
     }
-}
 
-fn next_indexed<'a>(
-    reader: &mut IndexedReader,
-    file: &Source,
-    chunk: &'a mut Vec<u8>,
-) -> Result<Option<Recorded<'a>>, McapError> {
-    loop {
-        let (offset, length) = match reader.next_event() {
-            None => return Ok(None),
-            Some(event) => match event? {
-                IndexedReadEvent::ReadChunkRequest { offset, length } => (offset, length),
-                IndexedReadEvent::Message { header, data } => {
-                    // Copied: the borrow of a message cannot leave the loop that also reads chunks.
-                    chunk.clear();
-                    chunk.extend_from_slice(data);
-                    return Ok(Some(Recorded { log_time: header.log_time, data: chunk }));
-                }
-            },
-        };
-        file.read(offset, length as u64, chunk)?;
-        reader.insert_chunk_record_data(offset, chunk)?;
+    /// The next message; `None` at the end.
+    pub(super) fn next(&mut self) -> io::Result<Option<Recorded<'_>>> {
+        while self.walk.advance()? {
+            if let Some((log_time, schema)) = self.wanted() {
+                let data = self.walk.record().data.get(MESSAGE_HEAD..).unwrap_or_default();
+                return Ok(Some(Recorded { log_time, schema, data }));
+            }
+        }
+        Ok(None)
     }
-}
 
-fn next_linear<'a>(
-    reader: &mut LinearReader,
-    file: &Source,
-    position: &mut u64,
-    channels: &[u16],
-    from_ns: u64,
-    message: &'a mut Vec<u8>,
-) -> Result<Option<Recorded<'a>>, McapError> {
-    loop {
-        let wished = match reader.next_event() {
-            None => return Ok(None),
-            Some(event) => match event? {
-                LinearReadEvent::ReadRequest(wished) => wished,
-                LinearReadEvent::Record { opcode, data } => {
-                    // The footer is the last record of interest.
-                    if opcode == mcap::records::op::DATA_END {
-                        return Ok(None);
-                    }
-                    if opcode != mcap::records::op::MESSAGE {
-                        continue;
-                    }
-                    let Record::Message { header, data } = mcap::parse_record(opcode, data)? else { continue };
-                    if !channels.contains(&header.channel_id) || header.log_time < from_ns {
-                        continue;
-                    }
-                    message.clear();
-                    message.extend_from_slice(&data);
-                    return Ok(Some(Recorded { log_time: header.log_time, data: message }));
-                }
-            },
-        };
-        // A length from a damaged record must not take more memory than the file has bytes.
-        let left = file.length.saturating_sub(*position);
-        let wished = wished.min(usize::try_from(left).unwrap_or(usize::MAX));
-        let count = file.file.read_at(reader.insert(wished), *position)?;
-        *position += count as u64;
-        reader.notify_read(count);
+    /// Is the record at hand a message to be played? Its time, and what it is.
+    fn wanted(&mut self) -> Option<(u64, Schema)> {
+        let record = self.walk.record();
+        if record.trust == Trust::Damaged {
+            return None;
+        }
+        if record.opcode != op::MESSAGE {
+            self.channels.take(record.opcode, record.data)?;
+            return None;
+        }
+        let mut fields = Fields(record.data);
+        let (id, _sequence) = (fields.u16()?, fields.u32()?);
+        let (log_time, _published) = (fields.u64()?, fields.u64()?);
+        let schema = self.channels.schema(id, &self.topic)?;
+        (log_time >= self.from_ns).then_some((log_time, schema))
     }
 }

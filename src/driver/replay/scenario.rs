@@ -6,7 +6,7 @@ use std::time::Duration;
 use super::episode::{EpisodeDescription, describe};
 use super::{DriverError, fatal};
 use crate::modality::ModalityId;
-use crate::registry::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, SimSource};
+use crate::registry::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, SimFaults, SimSource};
 use crate::registry::{DeviceSpec, Registry, UsbIdentity};
 
 /// A device is attached before its first sample, with which its bit begins: by this much.
@@ -41,6 +41,7 @@ pub fn scenario(file: &Path) -> Result<Replayed, DriverError> {
         usb: usb_identity(spec),
         source: SimSource::Replay { file: file.to_owned(), topic: spec.topic.clone(), begin_ns: episode.begin_ns },
         plugged: episode.mask.first().is_some_and(|(_, mask)| mask.contains(spec.id)),
+        faults: SimFaults::default(),
     };
     let mut events: Vec<_> =
         registry.devices.iter().flat_map(|spec| plug_events(&episode, &spec.name, spec.id)).collect();
@@ -76,5 +77,6 @@ fn usb_identity(spec: &DeviceSpec) -> UsbIdentity {
         serial: identity.serial.clone(),
         port: identity.port.clone().unwrap_or_else(|| format!("9-{}", spec.id.bit() + 1)),
         product: Some(String::from("replay")),
+        ..UsbIdentity::default()
     }
 }

@@ -1,73 +1,11 @@
-use std::collections::BTreeMap;
-use std::io::{Cursor, Write as _};
+use std::io::Write as _;
+
+use proptest::prelude::*;
 
 use super::*;
+use crate::episode_format::testing::{BEGIN, REGISTRY, episode, layouts, mutated, mutations, options};
 use crate::mask::PhysicalMask;
 use crate::registry::scenario::ScenarioAction;
-
-const BEGIN: u64 = 1_700_000_000_000_000_000;
-const REGISTRY: &str = r#"
-[device.tof]
-vid = "0x10c4"
-pid = 0xea60
-serial_number = "T1"
-node = "serial"
-bit = 0
-topic = "/rapid/tof"
-[device.tof.serial]
-channels = 1
-[device.cam]
-vid = "046d"
-pid = "0825"
-port = "1-2.3"
-node = "camera"
-bit = 3
-topic = "/rapid/cam"
-"#;
-
-/// A `rapid.Scalars` of one value, by hand: field 2, length-delimited, eight bytes.
-fn scalars(value: f64) -> Vec<u8> {
-    [&[0x12, 8][..], &value.to_le_bytes()].concat()
-}
-
-/// A `rapid.Mask`, by hand: field 2, fixed64.
-fn mask(bits: u64) -> Vec<u8> {
-    [&[0x11][..], &bits.to_le_bytes()].concat()
-}
-
-fn options() -> mcap::WriteOptions {
-    mcap::WriteOptions::new().chunk_size(Some(512)).compression(Some(mcap::Compression::Zstd))
-}
-
-/// 100 samples, 10 ms apart, and a mask that shows `tof` (bit 0) from the beginning, gone at 400 ms,
-/// back at 700 ms; `cam` (bit 3) comes at 500 ms.
-fn episode(options: mcap::WriteOptions) -> Vec<u8> {
-    let mut bytes = Vec::new();
-    let mut writer = options.create(Cursor::new(&mut bytes)).unwrap();
-    let channel = |writer: &mut mcap::Writer<_>, topic: &str, schema: &str| {
-        let schema = writer.add_schema(schema, "protobuf", b"").unwrap();
-        writer.add_channel(schema, topic, "protobuf", &BTreeMap::new()).unwrap()
-    };
-    let tof = channel(&mut writer, "/rapid/tof", "rapid.Scalars");
-    let masks = channel(&mut writer, "/rapid/mask", "rapid.Mask");
-    let mut write = |channel_id, at_ms: u64, data: &[u8]| {
-        let log_time = BEGIN + at_ms * 1_000_000;
-        let header = mcap::records::MessageHeader { channel_id, sequence: 0, log_time, publish_time: log_time };
-        writer.write_to_known_channel(&header, data).unwrap();
-    };
-    for i in 0..100_u32 {
-        let at = u64::from(i) * 10;
-        let bits = u64::from(!(400..700).contains(&at)) | u64::from(at >= 500) << 3;
-        write(masks, at, &mask(bits));
-        write(tof, at, &scalars(f64::from(i)));
-    }
-    let entries = [("layout", r#"{"tof":0,"cam":3}"#), ("registry", REGISTRY), ("task", "x")];
-    let metadata = entries.iter().map(|(key, value)| ((*key).to_owned(), (*value).to_owned())).collect();
-    writer.write_metadata(&mcap::records::Metadata { name: "rapid".into(), metadata }).unwrap();
-    writer.finish().unwrap();
-    drop(writer);
-    bytes
-}
 
 fn file(bytes: &[u8]) -> tempfile::NamedTempFile {
     let mut file = tempfile::NamedTempFile::new().unwrap();
@@ -86,7 +24,7 @@ fn value(reading: &Reading<'_>) -> f64 {
 
 #[tokio::test(start_paused = true)]
 async fn samples_come_in_order_at_their_recorded_distances_then_silence() {
-    for options in [options(), options().use_chunks(false), options().compression(None)] {
+    for options in layouts() {
         let file = file(&episode(options));
         let device = device(file.path(), "/rapid/tof");
         let mut replay = Replay::open(Arc::clone(&device)).await.unwrap();
@@ -122,7 +60,7 @@ fn an_episode_describes_itself() {
     let episode = describe(file.path()).unwrap();
     assert_eq!((episode.begin_ns, episode.end_ns), (BEGIN, BEGIN + 990_000_000));
     let topics: Vec<_> = episode.topics.iter().map(|t| (t.topic.as_str(), t.schema.as_str(), t.messages)).collect();
-    assert_eq!(topics, [("/rapid/mask", "rapid.Mask", Some(100)), ("/rapid/tof", "rapid.Scalars", Some(100))]);
+    assert_eq!(topics, [("/rapid/mask", "rapid.Mask", 100), ("/rapid/tof", "rapid.Scalars", 100)]);
     let layout: Vec<_> = episode.layout.iter().map(|(name, id)| (name.as_str(), id.bit())).collect();
     assert_eq!(layout, [("tof", 0), ("cam", 3)]);
     let ms = |at: u64| BEGIN + at * 1_000_000;
@@ -164,15 +102,29 @@ async fn what_cannot_be_played_is_said() {
     let bytes = episode(options());
     let cut = file(&bytes[..bytes.len() - 20]);
     let unclosed = refused(cut.path(), "/rapid/tof").await;
-    assert!(unclosed.contains("rapid inspect"), "{unclosed}");
+    assert!(unclosed.contains("was not closed") && unclosed.contains("`rapid recover /"), "{unclosed}");
+    let mut bytes = bytes;
+    let last = bytes.len() - 30;
+    bytes[last] = 0xff;
+    let error = describe(file(&bytes).path()).unwrap_err().to_string();
+    assert!(error.contains("is damaged; `rapid recover /"), "{error}");
     assert!(refused(Path::new("/no/such.mcap"), "/rapid/tof").await.contains("/no/such.mcap"));
     assert!(describe(file(b"").path()).is_err());
+    let folder = tempfile::tempdir().unwrap();
+    let pipe = folder.path().join("pipe.mcap");
+    rustix::fs::mknodat(rustix::fs::CWD, &pipe, rustix::fs::FileType::Fifo, 0o600.into(), 0).unwrap();
+    let link = folder.path().join("link.mcap");
+    std::os::unix::fs::symlink(&pipe, &link).unwrap();
+    for path in [folder.path(), &pipe, &link, Path::new("/dev/zero")] {
+        let error = describe(path).unwrap_err().to_string();
+        assert!(error.contains("not a file"), "{error}");
+    }
 }
 
 /// Every damaged file gives an error or fewer messages.
 #[test]
 fn damaged_files_never_panic() {
-    for options in [options(), options().compression(None), options().use_chunks(false)] {
+    for options in layouts() {
         let whole = episode(options);
         for at in (0..whole.len()).step_by(11) {
             let mut bytes = whole.clone();
@@ -182,7 +134,7 @@ fn damaged_files_never_panic() {
             }
             let file = file(&bytes);
             let Ok(episode) = Episode::open(file.path()) else { continue };
-            if let Ok((mut messages, _)) = episode.play("/rapid/tof", 0) {
+            if let Ok(mut messages) = episode.play("/rapid/tof", 0) {
                 let mut count = 0;
                 while let Ok(Some(_)) = messages.next() {
                     count += 1;
@@ -191,5 +143,10 @@ fn damaged_files_never_panic() {
             }
             let _ = scenario(file.path());
         }
+        for cut in 0..whole.len() {
+            read_bytes(&whole[..cut]);
+        }
+        let config = ProptestConfig { cases: 300, failure_persistence: None, ..ProptestConfig::default() };
+        proptest!(config, |(mutations in mutations())| read_bytes(&mutated(&whole, &mutations)));
     }
 }

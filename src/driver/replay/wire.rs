@@ -1,6 +1,6 @@
 //! Payloads out of recorded messages, which are protobuf.
 //!
-//! Reads just the fields a driver needs (encoding: <https://protobuf.dev/programming-guides/encoding/>):
+//! Reads just the fields a driver needs:
 //! `foxglove.CompressedImage` { data = 2, format = 3 }, `foxglove.RawImage` { width = 2, height = 3,
 //! encoding = 4, step = 5, data = 6 }, `rapid.Scalars` { values = 2 }, `rapid.Bytes` { data = 2 } and
 //! `rapid.Mask` { mask = 2, sequence = 3 }.
@@ -8,6 +8,7 @@
 //! Invariant: any bytes may stand in a message; what cannot be read is `None`, never a panic.
 
 use super::super::camera::compact_rows;
+use crate::episode_format::wire::{Proto, whole_protobuf};
 use crate::mask::PhysicalMask;
 use crate::sample::Encoding;
 
@@ -57,9 +58,9 @@ pub(super) fn payload(schema: Schema, message: &[u8], payload: &mut Vec<u8>) -> 
 /// The value of a `rapid.Mask`.
 pub(super) fn mask(message: &[u8]) -> Option<PhysicalMask> {
     let mut mask = 0;
-    for field in Fields(message) {
-        if let (2, Value::Fixed64(bytes)) = field? {
-            mask = u64::from_le_bytes(bytes);
+    for field in whole_protobuf(message) {
+        if let (2, Proto::Fixed64(bits)) = field? {
+            mask = bits;
         }
     }
     Some(PhysicalMask(mask))
@@ -78,13 +79,13 @@ fn compressed(message: &[u8], payload: &mut Vec<u8>) -> Option<Shape> {
 
 fn raw(message: &[u8], payload: &mut Vec<u8>) -> Option<Shape> {
     let (mut width, mut height, mut step, mut encoding, mut data) = (0, 0, 0, &[][..], &[][..]);
-    for field in Fields(message) {
+    for field in whole_protobuf(message) {
         match field? {
-            (2, Value::Fixed32(bytes)) => width = u32::from_le_bytes(bytes),
-            (3, Value::Fixed32(bytes)) => height = u32::from_le_bytes(bytes),
-            (4, Value::Bytes(bytes)) => encoding = bytes,
-            (5, Value::Fixed32(bytes)) => step = u32::from_le_bytes(bytes),
-            (6, Value::Bytes(bytes)) => data = bytes,
+            (2, Proto::Fixed32(number)) => width = number,
+            (3, Proto::Fixed32(number)) => height = number,
+            (4, Proto::Bytes(bytes)) => encoding = bytes,
+            (5, Proto::Fixed32(number)) => step = number,
+            (6, Proto::Bytes(bytes)) => data = bytes,
             _ => {}
         }
     }
@@ -103,10 +104,10 @@ fn raw(message: &[u8], payload: &mut Vec<u8>) -> Option<Shape> {
 
 /// Doubles lie in the message as the driver once gave them: little endian, packed one after another.
 fn scalars(message: &[u8], payload: &mut Vec<u8>) -> Option<Shape> {
-    for field in Fields(message) {
+    for field in whole_protobuf(message) {
         match field? {
-            (2, Value::Bytes(packed)) if packed.len() % 8 == 0 => payload.extend_from_slice(packed),
-            (2, Value::Fixed64(one)) => payload.extend_from_slice(&one),
+            (2, Proto::Bytes(packed)) if packed.len() % 8 == 0 => payload.extend_from_slice(packed),
+            (2, Proto::Fixed64(one)) => payload.extend_from_slice(&one.to_le_bytes()),
             (2, _) => return None,
             _ => {}
         }
@@ -115,10 +116,10 @@ fn scalars(message: &[u8], payload: &mut Vec<u8>) -> Option<Shape> {
 }
 
 /// The bytes of field `wished`; the last one counts, a missing one is empty.
-fn last_bytes(message: &[u8], wished: u32) -> Option<&[u8]> {
+fn last_bytes(message: &[u8], wished: u64) -> Option<&[u8]> {
     let mut found = &[][..];
-    for field in Fields(message) {
-        if let (number, Value::Bytes(bytes)) = field?
+    for field in whole_protobuf(message) {
+        if let (number, Proto::Bytes(bytes)) = field?
             && number == wished
         {
             found = bytes;
@@ -148,75 +149,6 @@ fn jpeg_size(bytes: &[u8]) -> Option<(u32, u32)> {
             return None;
         }
         rest = after.get(2 + segment.len()..)?;
-    }
-}
-
-/// A field's value by wire type.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Value<'a> {
-    Varint,
-    Fixed64([u8; 8]),
-    Bytes(&'a [u8]),
-    Fixed32([u8; 4]),
-}
-
-/// Field numbers and values of a message; `None` where the bytes are no message, and nothing more
-/// after it.
-struct Fields<'a>(&'a [u8]);
-
-impl<'a> Iterator for Fields<'a> {
-    type Item = Option<(u32, Value<'a>)>;
-
-    fn next(&mut self) -> Option<Self::Item> {
-        if self.0.is_empty() {
-            return None;
-        }
-        let field = self.field();
-        if field.is_none() {
-            self.0 = &[];
-        }
-        Some(field)
-    }
-}
-
-impl<'a> Fields<'a> {
-    fn field(&mut self) -> Option<(u32, Value<'a>)> {
-        let tag = self.varint()?;
-        let number = u32::try_from(tag >> 3).ok()?;
-        let value = match tag & 7 {
-            0 => self.varint().map(|_| Value::Varint)?,
-            1 => Value::Fixed64(self.chunk()?),
-            2 => {
-                let length = usize::try_from(self.varint()?).ok()?;
-                let (bytes, rest) = self.0.split_at_checked(length)?;
-                self.0 = rest;
-                Value::Bytes(bytes)
-            }
-            5 => Value::Fixed32(self.chunk()?),
-            // Groups (3, 4) are not used by any of these messages.
-            _ => return None,
-        };
-        Some((number, value))
-    }
-
-    fn chunk<const N: usize>(&mut self) -> Option<[u8; N]> {
-        let (&chunk, rest) = self.0.split_first_chunk()?;
-        self.0 = rest;
-        Some(chunk)
-    }
-
-    /// Seven bits a byte, least significant first, at most ten bytes.
-    fn varint(&mut self) -> Option<u64> {
-        let mut value = 0;
-        for shift in (0..70).step_by(7) {
-            let (&byte, rest) = self.0.split_first()?;
-            self.0 = rest;
-            value |= u64::from(byte & 0x7f).checked_shl(shift)?;
-            if byte & 0x80 == 0 {
-                return Some(value);
-            }
-        }
-        None
     }
 }
 

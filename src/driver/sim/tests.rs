@@ -1,6 +1,6 @@
 use super::*;
 
-const CAMERA: SimSource = SimSource::Camera { width: 64, height: 48, fps: 30, seed: 7 };
+const CAMERA: SimSource = SimSource::Camera { width: 64, height: 48, fps: 30, seed: 7, bytes: 0 };
 
 fn device(source: SimSource) -> Arc<SimDevice> {
     Arc::new(SimDevice::new("sim", source, stamp_of(Instant::now())))
@@ -27,8 +27,23 @@ fn a_picture_is_a_jpeg_that_names_seed_and_sequence() {
     assert_eq!(picture[picture.len() - 2..], [0xff, 0xd9], "end of image");
     assert_ne!(frame(&CAMERA, 13).unwrap()[22..], picture[22..], "something moves");
     assert_eq!(frame(&CAMERA, 20).unwrap()[22..], picture[22..], "and comes back");
-    let other = SimSource::Camera { width: 64, height: 48, fps: 30, seed: 8 };
+    let other = SimSource::Camera { width: 64, height: 48, fps: 30, seed: 8, bytes: 0 };
     assert_ne!(frame(&other, 12).unwrap()[22..], picture[22..]);
+}
+
+#[test]
+fn a_picture_is_filled_up_with_segments_that_a_decoder_skips() {
+    for bytes in [0, 5_000, 65_600, 150_000] {
+        let picture = frame(&SimSource::Camera { width: 64, height: 48, fps: 30, seed: 7, bytes }, 12).unwrap();
+        let plain = frame(&CAMERA, 12).unwrap();
+        let named = picture.len() - bytes.max(plain.len());
+        assert!(named < 64, "{bytes}: {}", picture.len());
+        let mut at = 2;
+        while picture[at..at + 2] == [0xff, 0xfe] {
+            at += 2 + usize::from(u16::from_be_bytes([picture[at + 2], picture[at + 3]]));
+        }
+        assert!(picture[at..] == plain[20..], "{bytes}: the picture goes on where the comments end");
+    }
 }
 
 #[test]

@@ -3,10 +3,12 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use super::super::file::{EVENT_TOPIC, FRAME_TOPIC, MASK_TOPIC};
 use super::super::walk::{Walked, op};
 use super::super::wire::{Fields, protobuf};
+use super::judge::{Ending, Judge, recorded_verdict};
+use super::units;
 use super::{EventReport, Inspection, Lateness, MaskEdge, ModalityReport, TopicReport};
+use crate::episode_format::{EVENT_TOPIC, FRAME_TOPIC, MASK_TOPIC};
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 
@@ -28,11 +30,17 @@ pub(super) struct Collected {
     /// Frames in which each bit is valid and stale.
     slots: BTreeMap<u8, (u64, u64)>,
     events: Vec<(u64, EventReport)>,
+    /// Absent until the file has said that it is an episode of ours.
+    judge: Option<Judge>,
+    /// Of those, what `opened` says as JSON.
+    opened: Vec<(u64, String)>,
 }
 
 #[derive(Debug, Default)]
 struct Channel {
     topic: String,
+    /// The modality, if it is one's.
+    id: Option<ModalityId>,
     metadata: BTreeMap<String, String>,
     messages: u64,
     first: u64,
@@ -62,8 +70,14 @@ impl Collected {
         let (id, _schema) = (fields.u16()?, fields.u16()?);
         let (topic, _encoding) = (fields.string()?, fields.string()?);
         let metadata = fields.map()?;
+        let modality = metadata.get("bit").and_then(|bit| bit.parse().ok()).and_then(ModalityId::new);
         // The summary repeats the channels.
-        self.channels.entry(id).or_insert_with(|| Channel { topic: topic.to_owned(), metadata, ..Channel::default() });
+        self.channels.entry(id).or_insert_with(|| Channel {
+            topic: topic.to_owned(),
+            id: modality,
+            metadata,
+            ..Channel::default()
+        });
         Some(())
     }
 
@@ -71,7 +85,10 @@ impl Collected {
         let name = fields.string()?;
         let map = fields.map()?;
         match name {
-            "rapid" => self.about = map,
+            "rapid" => {
+                self.judge = Judge::of(&map);
+                self.about = map;
+            }
             "rapid/summary" => self.summary = map,
             _ => {}
         }
@@ -86,6 +103,9 @@ impl Collected {
         self.messages += 1;
         self.first = Some(self.first.map_or(captured, |first| first.min(captured)));
         self.last = self.last.max(captured);
+        if let (Some(id), Some(judge)) = (channel.id, &mut self.judge) {
+            judge.sample(id, sequence, captured, received, fields.0);
+        }
         match channel.topic.as_str() {
             MASK_TOPIC => self.mask(captured, fields.0),
             FRAME_TOPIC => self.frame(fields.0),
@@ -97,6 +117,9 @@ impl Collected {
 
     fn mask(&mut self, at: u64, message: &[u8]) {
         let mask = protobuf(message).filter(|(field, _)| *field == 2).last().map_or(0, |(_, value)| value.number());
+        if let Some(judge) = &mut self.judge {
+            judge.mask(at, PhysicalMask(mask));
+        }
         if self.masks.last().is_none_or(|(_, last)| *last != mask) {
             self.masks.push((at, mask));
         }
@@ -104,6 +127,9 @@ impl Collected {
 
     fn frame(&mut self, message: &[u8]) {
         self.frames += 1;
+        if let Some(judge) = &mut self.judge {
+            judge.frame(message);
+        }
         for (_, slot) in protobuf(message).filter(|(field, _)| *field == 4) {
             let (mut bit, mut valid, mut stale) = (0, 0, 0);
             for (field, value) in protobuf(slot.bytes()) {
@@ -131,6 +157,7 @@ impl Collected {
                 2 => event.kind = value.text(),
                 3 => event.device = value.text(),
                 4 => event.text = value.text(),
+                5 if event.kind == "opened" => self.opened.push((at, value.text())),
                 _ => {}
             }
         }
@@ -147,7 +174,13 @@ impl Collected {
         for (at, event) in &mut events {
             event.at = from(begin_ns, *at);
         }
-        let (modalities, topics) = self.topics(begin_ns, seconds);
+        let judge = self.judge.take();
+        let opened =
+            std::mem::take(&mut self.opened).into_iter().map(|(at, json)| (from(begin_ns, at), json)).collect();
+        let units = units::told(&said(&self.summary, "provenance"), &said(&self.about, "provenance"), opened);
+        let (mut modalities, topics) = self.topics(begin_ns, seconds);
+        let ending = Ending { file: walked, seconds, summary: &self.summary };
+        let verdict = judge.as_ref().map(|judge| judge.judge(&mut modalities, &ending)).unwrap_or_default();
         let count = modalities.len();
         let mask = self
             .masks
@@ -157,9 +190,14 @@ impl Collected {
             file: path.to_owned(),
             bytes: size,
             end: walked.end,
+            verdict,
+            recorded_verdict: recorded_verdict(&self.summary),
             unread_bytes: size.saturating_sub(walked.bytes),
             damaged_chunks: walked.damaged_chunks,
             software: said(&self.about, "software"),
+            commit: said(&self.about, "commit"),
+            host: said(&self.about, "host"),
+            kernel: said(&self.about, "kernel"),
             rig: said(&self.about, "rig"),
             task: said(&self.about, "task"),
             tags: serde_json::from_str(&said(&self.about, "tags")).unwrap_or_default(),
@@ -170,7 +208,9 @@ impl Collected {
             lost: said(&self.summary, "lost").parse().ok(),
             damaged: said(&self.summary, "damaged").parse().ok(),
             frames: self.frames,
+            skew: judge.and_then(|judge| judge.skew()),
             modalities,
+            units,
             topics,
             mask: mask.collect(),
             events: events.into_iter().map(|(_, event)| event).collect(),
@@ -181,8 +221,7 @@ impl Collected {
         let (mut modalities, mut topics) = (Vec::new(), Vec::new());
         for mut channel in std::mem::take(&mut self.channels).into_values() {
             let topic = channel.report();
-            let bit = channel.metadata.get("bit").and_then(|bit| bit.parse().ok()).and_then(ModalityId::new);
-            let Some(id) = bit else {
+            let Some(id) = channel.id else {
                 topics.push(topic);
                 continue;
             };
@@ -197,6 +236,7 @@ impl Collected {
                 present,
                 frames_valid,
                 frames_stale,
+                quality: None,
             });
         }
         modalities.sort_by_key(|modality| modality.bit);
@@ -250,7 +290,9 @@ impl Channel {
             let last = self.lateness.len().checked_sub(1)?;
             self.lateness.get(last * percent / 100).map(|us| f64::from(*us) / 1e3)
         };
-        let lateness = (|| Some(Lateness { p50: at(50)?, p99: at(99)?, max: at(100)? }))();
+        // A frame waits for its deadline, always as long.
+        let shown = self.topic != FRAME_TOPIC;
+        let lateness = (|| Some(Lateness { p50: at(50)?, p99: at(99)?, max: at(100)? }))().filter(|_| shown);
         TopicReport {
             topic: self.topic.clone(),
             messages: self.messages,

@@ -1,25 +1,32 @@
-//! What a recorded file holds: counts, rates, gaps, lateness and presence of every modality.
+//! What a recorded file holds: counts, rates, gaps, lateness and presence of every modality, and the
+//! verdict on it, by the same code as the recorder's.
 //!
 //! Reads any file the recorder wrote, finished or not, from its beginning to where it ends.
 //!
 //! Invariant: no file makes this panic, and memory does not grow with a file's payloads.
 
 mod collect;
+mod judge;
+mod list;
 mod render;
 #[cfg(test)]
 mod tests;
+mod units;
 
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
+use super::quality::{Quality, Spread};
 use super::walk::walk;
+use crate::episode_format::{self, OpenError};
+use crate::status::Verdict;
 use collect::Collected;
 
 pub use super::walk::FileEnd;
+pub use list::{Listed, episodes, list, render_list};
 pub use render::{Paint, render};
 
 /// Why a file cannot be inspected.
@@ -50,12 +57,23 @@ pub struct Inspection {
     pub bytes: u64,
     /// How it ends.
     pub end: FileEnd,
+    /// What it is worth, by what it holds.
+    #[serde(flatten)]
+    pub verdict: Verdict,
+    /// What the recorder said when it was finished.
+    pub recorded_verdict: Option<Verdict>,
     /// Bytes at its end that could not be understood.
     pub unread_bytes: u64,
     /// Chunks whose content is not what was written.
     pub damaged_chunks: u64,
     /// The program that wrote it, with its version.
     pub software: String,
+    /// The commit it was built from; empty if that was not known.
+    pub commit: String,
+    /// The computer it ran on.
+    pub host: String,
+    /// Release of that computer's kernel.
+    pub kernel: String,
     /// Name of the rig.
     pub rig: String,
     /// The task in the user's words.
@@ -76,8 +94,12 @@ pub struct Inspection {
     pub damaged: Option<u64>,
     /// Ticks of the frame index.
     pub frames: u64,
+    /// Between the earliest and the latest sample of a frame, ms.
+    pub skew: Option<Spread>,
     /// The modalities, ascending by bit.
     pub modalities: Vec<ModalityReport>,
+    /// By modality, the unit behind each epoch and what was agreed with it, as recorded.
+    pub units: BTreeMap<String, Vec<serde_json::Value>>,
     /// The other topics.
     pub topics: Vec<TopicReport>,
     /// Values of the mask over time: the first one and every change.
@@ -104,6 +126,8 @@ pub struct ModalityReport {
     pub frames_valid: u64,
     /// Frames in which it is present without such a sample.
     pub frames_stale: u64,
+    /// What was measured for the verdict; absent in a file that is not an episode of ours.
+    pub quality: Option<Quality>,
 }
 
 /// One topic.
@@ -113,13 +137,14 @@ pub struct TopicReport {
     pub topic: String,
     /// Messages.
     pub messages: u64,
-    /// Messages a second between the first and the last.
+    /// Messages a second between the first and the last; of a modality, while it was present.
     pub hz: f64,
     /// Sequence numbers missing between messages.
     pub missing: u64,
-    /// Longest time between two messages, seconds.
+    /// Longest time between two messages, seconds; of a modality, while it was present.
     pub longest_gap: f64,
-    /// Times from capture to receipt; absent without messages.
+    /// Times from capture to receipt; absent without messages, and of the frame index, which is
+    /// written when it is due.
     pub lateness: Option<Lateness>,
 }
 
@@ -162,16 +187,19 @@ pub struct EventReport {
 /// When it cannot be read or is no MCAP file. An unfinished or damaged one is no error.
 pub fn inspect(path: &Path) -> Result<Inspection, InspectError> {
     let io = |source| InspectError::Io { path: path.to_owned(), source };
-    // Asked before it is opened: opening a pipe would wait for its writer.
-    let metadata = std::fs::metadata(path).map_err(io)?;
-    if !metadata.is_file() {
-        return Err(InspectError::NotFile(path.to_owned()));
-    }
-    let file = File::open(path).map_err(io)?;
-    let size = file.metadata().map_err(io)?.len();
+    let (file, size) = episode_format::open(path).map_err(|error| match error {
+        OpenError::Io { path, source } => InspectError::Io { path, source },
+        OpenError::NotFile(path) => InspectError::NotFile(path),
+    })?;
     // One that grows meanwhile is read as it was.
     let mut file = BufReader::with_capacity(1 << 16, file.take(size));
     inspect_from(&mut file, size, path).map_err(io)?.ok_or_else(|| InspectError::NotMcap(path.to_owned()))
+}
+
+/// What a file of these bytes, which may be any, holds; `None` if they are no MCAP file.
+#[must_use]
+pub fn inspect_bytes(bytes: &[u8]) -> Option<Inspection> {
+    inspect_from(&mut &*bytes, bytes.len() as u64, Path::new("bytes.mcap")).ok()?
 }
 
 /// `None`: no MCAP file.

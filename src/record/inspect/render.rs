@@ -2,7 +2,11 @@
 
 use std::fmt::Write;
 
+use super::units;
 use super::{FileEnd, Inspection, Lateness, ModalityReport, TopicReport};
+use crate::record::Spread;
+use crate::status::{Grade, Verdict};
+use crate::text;
 
 /// Whether the terminal shows colours.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -34,6 +38,7 @@ fn write_all(out: &mut String, inspection: &Inspection, width: usize, paint: Pai
         let text = format!("{} damaged chunks: their messages may be missing or wrong", inspection.damaged_chunks);
         writeln!(out, "{}", colour(paint, RED, &text))?;
     }
+    write_verdict(out, inspection, paint)?;
     let mut about = vec![format!("task {}", or_dash(&inspection.task)), format!("rig {}", or_dash(&inspection.rig))];
     about.extend(inspection.tags.iter().map(|(key, value)| format!("{key}={value}")));
     writeln!(out, "{}", clean(&about.join("   ")))?;
@@ -72,12 +77,27 @@ fn write_all(out: &mut String, inspection: &Inspection, width: usize, paint: Pai
         write_topic(out, &topic.topic, topic, "", column)?;
     }
 
+    if let Some(Spread { p50, p95, max, .. }) = inspection.skew {
+        writeln!(out, "\nsamples of a frame lie {p50:.1}/{p95:.1}/{max:.1} ms apart (p50/95/max)")?;
+    }
     writeln!(out, "\npresence")?;
     let cells = width.saturating_sub(column + 8).max(TIMELINE);
     for modality in &inspection.modalities {
         let share = modality.presence.map_or("?".to_owned(), percent);
         let line = timeline(modality, inspection.seconds, cells, paint);
         writeln!(out, "{:column$} {line} {share:>6}", clean(&modality.name))?;
+    }
+
+    if !inspection.units.is_empty() {
+        writeln!(out, "\nunits")?;
+    }
+    for (name, epochs) in &inspection.units {
+        let mut name = clean(name);
+        for epoch in epochs {
+            let words: Vec<_> = units::words(epoch).iter().map(|word| clean(word)).collect();
+            out.push_str(&wrapped(&format!("{name:column$} "), &words, width));
+            name.clear();
+        }
     }
 
     if !inspection.events.is_empty() {
@@ -91,6 +111,49 @@ fn write_all(out: &mut String, inspection: &Inspection, width: usize, paint: Pai
         }
     }
     Ok(())
+}
+
+fn write_verdict(out: &mut String, inspection: &Inspection, paint: Paint) -> std::fmt::Result {
+    let Verdict { grade, reasons } = &inspection.verdict;
+    if inspection.modalities.iter().all(|modality| modality.quality.is_none()) {
+        return Ok(());
+    }
+    let word = colour(paint, grade_colour(Some(*grade)), grade.word());
+    match &inspection.recorded_verdict {
+        Some(recorded) if recorded != &inspection.verdict => {
+            let other = colour(paint, grade_colour(Some(recorded.grade)), recorded.grade.word());
+            writeln!(out, "{word}   when it was recorded: {other} {}", clean(&recorded.why()))?;
+        }
+        _ => writeln!(out, "{word}")?,
+    }
+    for reason in reasons {
+        writeln!(out, "  {}", clean(reason))?;
+    }
+    Ok(())
+}
+
+/// `words` behind `head`, two blanks apart, in lines of at most `width` characters, as far as words
+/// allow; further lines are set in a little more.
+fn wrapped(head: &str, words: &[String], width: usize) -> String {
+    let indent = head.chars().count();
+    let mut text = head.to_owned();
+    let mut used = indent;
+    for (index, word) in words.iter().enumerate() {
+        let length = word.chars().count();
+        let space = if index == 0 {
+            String::new()
+        } else if used + 2 + length > width {
+            used = indent;
+            format!("\n{:indent$}  ", "")
+        } else {
+            "  ".to_owned()
+        };
+        used += if index == 0 { length } else { 2 + length };
+        text.push_str(&space);
+        text.push_str(word);
+    }
+    text.push('\n');
+    text
 }
 
 fn ending(inspection: &Inspection, paint: Paint) -> String {
@@ -149,11 +212,20 @@ fn timeline(modality: &ModalityReport, seconds: f64, cells: usize, paint: Paint)
     line
 }
 
+/// The colour of a verdict, or of the lack of one.
+pub(super) fn grade_colour(grade: Option<Grade>) -> u8 {
+    match grade {
+        Some(Grade::Good) => GREEN,
+        Some(Grade::Suspect) => YELLOW,
+        Some(Grade::Bad) | None => RED,
+    }
+}
+
 const RED: u8 = 31;
 const GREEN: u8 = 32;
 const YELLOW: u8 = 33;
 
-fn colour(paint: Paint, code: u8, text: &str) -> String {
+pub(super) fn colour(paint: Paint, code: u8, text: &str) -> String {
     match paint {
         Paint::Plain => text.to_owned(),
         Paint::Ansi => format!("\x1b[{code}m{text}\x1b[0m"),
@@ -161,8 +233,8 @@ fn colour(paint: Paint, code: u8, text: &str) -> String {
 }
 
 /// Text of a file, without what could move the cursor of a terminal.
-fn clean(text: &str) -> String {
-    text.replace(char::is_control, " ")
+pub(super) fn clean(text: &str) -> String {
+    text::plain(text).into_owned()
 }
 
 fn or_dash(text: &str) -> &str {
@@ -176,7 +248,7 @@ fn percent(share: f64) -> String {
     format!("{:.0} %", percent.abs())
 }
 
-fn size(bytes: u64) -> String {
+pub(super) fn size(bytes: u64) -> String {
     match bytes {
         0..10_000 => format!("{bytes} B"),
         10_000..1_000_000 => format!("{:.1} kB", bytes as f64 / 1e3),

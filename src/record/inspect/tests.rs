@@ -3,7 +3,9 @@
 use proptest::prelude::*;
 
 use super::*;
+use crate::episode_format::testing;
 use crate::record::tests::Bench;
+use crate::status::Grade;
 
 fn of(bytes: &[u8]) -> Option<Inspection> {
     inspect_from(&mut &*bytes, bytes.len() as u64, Path::new("x.mcap")).unwrap()
@@ -32,7 +34,13 @@ async fn a_finished_episode_is_told_as_it_was() {
     let [first, second] = cam.present.as_slice() else { panic!("{:?}", cam.present) };
     assert!((second.0 - first.1 - 0.3).abs() < 1e-6 && first.0.abs() < 1e-9 && (second.1 - 1.0).abs() < 1e-9);
     assert!((cam.presence.unwrap() - 0.7).abs() < 1e-6);
-    assert!((0.3..0.4).contains(&cam.topic.longest_gap), "{}", cam.topic.longest_gap);
+    // The absence is neither a gap nor a loss of rate.
+    assert!((0.02..0.1).contains(&cam.topic.longest_gap), "{}", cam.topic.longest_gap);
+    assert!((30.0..36.0).contains(&cam.topic.hz), "{}", cam.topic.hz);
+    assert_eq!(said.recorded_verdict.as_ref(), Some(&said.verdict), "the recorder says the same");
+    assert!(said.verdict.reasons.iter().any(|reason| reason.starts_with("tof: 7 of ")), "{:?}", said.verdict);
+    let frame = said.topics.iter().find(|topic| topic.topic == "/rapid/frame").unwrap();
+    assert_eq!((frame.messages, frame.lateness), (30, None));
     assert_eq!(cam.topic.lateness, Some(Lateness { p50: 5.0, p99: 5.0, max: 5.0 }));
     assert!(cam.frames_valid > 10 && cam.frames_valid + cam.frames_stale < 25);
     assert_eq!((tof.topic.missing, tof.presence), (8, Some(1.0)));
@@ -83,25 +91,16 @@ async fn a_cut_or_damaged_file_is_read_as_far_as_it_goes() {
     assert!(noticed * 37 > bytes.len() / 2, "{noticed}");
 }
 
-#[tokio::test]
-async fn several_flips_and_hostile_lengths_do_not_panic() {
-    let (_bench, file) = episode().await;
-    let bytes = std::fs::read(&file).unwrap();
+#[test]
+fn whatever_happened_to_a_file_it_is_told_of() {
     let config = ProptestConfig { cases: 300, failure_persistence: None, ..ProptestConfig::default() };
-    let places = proptest::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..12);
-    proptest!(config, |(places in places, word in any::<prop::sample::Index>(), value in any::<u64>())| {
-        let mut bytes = bytes.clone();
-        for (place, value) in places {
-            let at = place.index(bytes.len());
-            bytes[at] = value;
-        }
-        if let Some(field) = bytes.get_mut(word.index(4000)..).and_then(|rest| rest.first_chunk_mut()) {
-            *field = value.to_le_bytes();
-        }
-        if let Some(said) = of(&bytes) {
-            assert!(!render(&said, 80, Paint::Plain).is_empty());
-        }
-    });
+    for bytes in testing::layouts().map(testing::episode) {
+        proptest!(config.clone(), |(mutations in testing::mutations())| {
+            if let Some(said) = inspect_bytes(&testing::mutated(&bytes, &mutations)) {
+                prop_assert!(!render(&said, 80, Paint::Plain).is_empty());
+            }
+        });
+    }
 }
 
 #[test]
@@ -166,9 +165,17 @@ fn the_report_on_a_screen() {
         file: PathBuf::from("/data/20261121_place-block_001.mcap"),
         bytes: 7_400_000,
         end: FileEnd::Torn,
+        verdict: Verdict {
+            grade: Grade::Suspect,
+            reasons: vec!["the file is not whole: its last record is cut".to_owned()],
+        },
+        recorded_verdict: None,
         unread_bytes: 512,
         damaged_chunks: 0,
         software: "rapid 0.1.0".to_owned(),
+        commit: String::new(),
+        host: "rig-7".to_owned(),
+        kernel: "6.1.0".to_owned(),
         rig: "bench".to_owned(),
         task: "place \x1b[31mblock".to_owned(),
         tags: BTreeMap::from([("finger".to_owned(), "soft".to_owned())]),
@@ -179,6 +186,7 @@ fn the_report_on_a_screen() {
         lost: Some(3),
         damaged: None,
         frames: 300,
+        skew: Some(Spread { p50: 4.0, p95: 11.5, p99: 14.0, max: 15.25 }),
         modalities: vec![
             ModalityReport {
                 name: "cam_wrist".to_owned(),
@@ -188,6 +196,7 @@ fn the_report_on_a_screen() {
                 present: vec![(0.0, 3.2), (6.2, 10.0)],
                 frames_valid: 209,
                 frames_stale: 1,
+                quality: Some(quality()),
             },
             ModalityReport {
                 name: "tof".to_owned(),
@@ -197,8 +206,16 @@ fn the_report_on_a_screen() {
                 present: Vec::new(),
                 frames_valid: 0,
                 frames_stale: 0,
+                quality: None,
             },
         ],
+        units: BTreeMap::from([(
+            "cam_wrist".to_owned(),
+            vec![
+                serde_json::json!({"epoch": 1, "from_s": -2.0, "to_s": 3.2, "vid": "046d", "pid": "0825", "serial": "A\u{1b}7"}),
+                serde_json::json!({"epoch": 2, "from_s": 6.2, "to_s": null, "vid": "046d", "pid": "0825", "serial": "B"}),
+            ],
+        )]),
         topics: vec![topic("/rapid/mask", 5000, 0, late)],
         mask: Vec::new(),
         events: vec![EventReport {
@@ -209,4 +226,64 @@ fn the_report_on_a_screen() {
         }],
     };
     insta::assert_snapshot!(render(&said, 60, Paint::Plain));
+}
+
+#[tokio::test]
+async fn a_folder_is_a_line_for_each_of_its_episodes() {
+    let (bench, file) = episode().await;
+    let folder = file.parent().unwrap();
+    std::fs::write(folder.join("20231114_t_001.mcap"), "no").unwrap();
+    std::fs::write(folder.join("notes.txt"), "no episode").unwrap();
+    let whole = std::fs::read(&file).unwrap();
+    std::fs::write(folder.join("99990101_t_001.mcap.partial"), &whole[..whole.len() / 2]).unwrap();
+    let files = episodes(&[folder.to_owned(), file.clone()]).unwrap();
+    let names: Vec<_> = files.iter().map(|file| file.file_name().unwrap().to_str().unwrap()).collect();
+    let name = file.file_name().unwrap().to_str().unwrap();
+    assert_eq!(names, ["20231114_t_001.mcap", name, "99990101_t_001.mcap.partial", name]);
+
+    let lines: Vec<_> = files.iter().map(|file| render_list(&list(file), 30, Paint::Plain)).collect();
+    assert!(
+        lines[0].starts_with("?        20231114_t_001.mcap") && lines[0].ends_with("not an MCAP file"),
+        "{lines:?}"
+    );
+    assert!(lines[1].starts_with(&format!("BAD      {name}")) && lines[1].contains(" 1.0 s "), "{lines:?}");
+    assert!(lines[1].contains("tof: 7 of ") && lines[1].ends_with(" (and 3 more)"), "{lines:?}");
+    assert!(
+        !lines[2].starts_with("GOOD") && lines[2].contains("not whole") || lines[2].starts_with("BAD"),
+        "{lines:?}"
+    );
+    let json = serde_json::to_value(list(&files[1])).unwrap();
+    assert_eq!((&json["verdict"], &json["end"], json.get("error")), (&"BAD".into(), &"finished".into(), None));
+    let json = serde_json::to_value(list(&files[0])).unwrap();
+    assert_eq!((json.get("verdict"), &json["error"]), (None, &"not an MCAP file".into()));
+    assert!(matches!(episodes(&[folder.join("none")]).map(|files| files.len()), Ok(1)), "said when it is read");
+    drop(bench);
+}
+
+/// What was measured of a modality, for a report on a screen.
+fn quality() -> Quality {
+    Quality {
+        samples: 200,
+        bytes: 7_000_000,
+        lost: 0,
+        dropped: 3,
+        damaged: 0,
+        truncated: 0,
+        duplicates: 0,
+        repeated: 0,
+        frozen_samples: 0,
+        frozen: 0.0,
+        late: 0,
+        lateness: None,
+        clock_drift: None,
+        clock_ahead: 0.0,
+        offset: None,
+        presence: Some(0.7),
+        present: 7.0,
+        hz: Some(28.6),
+        nominal_hz: Some(30.0),
+        longest_gap: 0.0667,
+        frames_present: 210,
+        frames_valid: 209,
+    }
 }

@@ -7,10 +7,19 @@ async fn an_episode_holds_what_was_captured_and_nothing_else() {
     let bench = Bench::new();
     let mut events = bench.board.events();
     let (finished, t0) = bench.one_second().await;
-    let What::Episode { file, seconds, messages, bytes, dropped, error } = bench.until_closed(&mut events).await else {
+    let What::Episode { file, seconds, messages, bytes, dropped, error, verdict } =
+        bench.until_closed(&mut events).await
+    else {
         unreachable!()
     };
     assert_eq!((file.as_path(), error, seconds), (finished.as_path(), None, 1.0));
+    // The camera was away and the mask says so; what else happened is told.
+    let reasons = ["tof: 1 of 1", "tof: 7 of 1", "raw: 1 of 2 samples damaged (limit 5 %)", "raw: no sample for "];
+    assert_eq!(verdict.grade, Grade::Bad);
+    for reason in reasons {
+        assert!(verdict.reasons.iter().any(|said| said.starts_with(reason)), "{reason:?} in {:?}", verdict.reasons);
+    }
+    assert_eq!(verdict.reasons.len(), reasons.len(), "{:?}", verdict.reasons);
     assert_eq!(bytes, std::fs::metadata(&finished).unwrap().len());
     assert!(!finished.with_extension("mcap.partial").exists());
     let snapshot = bench.board.snapshot();
@@ -64,7 +73,7 @@ async fn an_episode_holds_what_was_captured_and_nothing_else() {
     assert_eq!(values.as_list().unwrap().iter().map(|v| v.as_f64().unwrap()).collect::<Vec<_>>(), [101.0, 0.5]);
     let cam = read.on("/rapid/cam_wrist").nth(3).unwrap();
     let data = cam.4.get_field_by_name("data").unwrap().as_bytes().unwrap().to_vec();
-    assert_eq!(data, u64::from(cam.1).to_le_bytes().repeat(100));
+    assert_eq!(data, picture(u64::from(cam.1)));
     assert_eq!([text(&cam.4, "format"), text(&cam.4, "frame_id")], ["jpeg", "cam_wrist"]);
 
     // Losses: seven of the device's own and one on the way.

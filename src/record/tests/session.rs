@@ -2,22 +2,28 @@
 
 use super::super::episode::EpisodePath;
 use super::super::hole::Hole;
-use super::super::session::{Beginning, MaskHistory, Session};
+use super::super::masks::MaskHistory;
+use super::super::provenance::Attached;
+use super::super::session::{Beginning, Session};
 use super::*;
 use crate::time::WallClock;
 
 /// A session of its own clock, one second after the monotonic clock's zero.
 fn session(folder: &Path, board: &Arc<Board>, masks: &MaskHistory) -> Session {
+    session_of(registry(), folder, board, masks)
+}
+
+fn session_of(registry: Registry, folder: &Path, board: &Arc<Board>, masks: &MaskHistory) -> Session {
     let clock = WallClock::with_offset(i128::from(1_700_000_000 * 1000 * MS));
     let (path, file) = EpisodePath::create(folder, "t", clock.wall_ns(Stamp(0))).unwrap();
     let beginning = Beginning {
-        registry: Arc::new(registry()),
+        registry: Arc::new(registry),
         board: Arc::clone(board),
         request: &EpisodeRequest::default(),
         path,
         handle: file.try_clone().unwrap(),
         sink: Box::new(file),
-        attached: &BTreeMap::new(),
+        attached: &Attached::default(),
         clock,
         begin: Stamp(1000 * MS),
     };
@@ -102,7 +108,8 @@ fn losses_are_announced_once_a_second_and_counted_all() {
         }
     }
     let lost = |count: u64, name: &str| format!("{name}: {count} samples lost on the way to the file");
-    assert_eq!(said, [lost(2, "tof"), lost(200, "tof"), lost(u64::MAX, "cam_wrist"), lost(196, "tof")]);
+    let both = |count, own| format!("{}, {own} samples lost by the device", lost(count, "tof"));
+    assert_eq!(said, [lost(2, "tof"), both(200, 101), lost(u64::MAX, "cam_wrist"), both(196, 98)]);
     let tallies = &read(&report.file).metadata["rapid/summary"]["modalities"];
     let tallies: serde_json::Value = serde_json::from_str(tallies).unwrap();
     assert_eq!((&tallies["tof"]["samples"], &tallies["tof"]["dropped"]), (&200.into(), &398.into()));
@@ -132,4 +139,35 @@ fn of_a_hole_across_the_beginning_or_the_end_only_the_part_within_counts() {
     session.sample(id(TOF), &scalars(50, 1300, 1300), &[0; 8], hole(1300, 1300, 10));
     let report = session.finish(Stamp(1300 * MS), &masks, None);
     assert_eq!((report.error, report.dropped), (None, 9));
+}
+
+#[test]
+fn a_slow_sensor_makes_its_frame_and_every_frame_waits_for_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let board = Arc::new(Board::new(&registry()));
+    let mut masks = MaskHistory::new();
+    masks.push(&scalars(1, 990, 990), PhysicalMask(0b10), 1);
+    let mut late = registry();
+    late.devices[usize::from(TOF)].latency = Duration::from_millis(300);
+    let mut session = session_of(late, folder.path(), &board, &masks);
+    let at = |ms: u64| Stamp(ms * MS);
+    session.end_at(at(1010));
+    // It stands for tick 0, at 1000 ms; and one, captured as late, for a moment after the end.
+    session.sample(id(TOF), &scalars(0, 1299, 1420), &[0; 8], None);
+    session.sample(id(TOF), &scalars(1, 1310, 1425), &[0; 8], None);
+    session.advance(at(1444), &masks);
+    assert_eq!(session.status(at(1444)).messages, 2, "a sample and a mask; the frame not before 1445 ms");
+    assert!(!session.is_over(at(1429)) && session.is_over(at(1430)));
+    session.advance(at(1445), &masks);
+    let report = session.finish(at(1445), &masks, None);
+    assert_eq!((report.error.as_deref(), report.messages, report.seconds), (None, 3, 0.01));
+    let read = read(&report.file);
+    let frame = &read.on("/rapid/frame").next().unwrap().4;
+    let slots = frame.get_field_by_name("modalities").unwrap().into_owned();
+    let slot = slots.as_list().unwrap()[usize::from(TOF)].as_message().unwrap().clone();
+    assert_eq!(["valid", "seq", "age_ns"].map(|field| number(&slot, field)), [1, 0, i128::from(MS)]);
+    let sample = read.on("/rapid/tof").next().unwrap();
+    assert_eq!(sample.2 - read.on("/rapid/frame").next().unwrap().2, 299 * MS, "the file keeps the capture time");
+    let modalities: serde_json::Value = serde_json::from_str(&read.metadata["rapid"]["modalities"]).unwrap();
+    assert_eq!(modalities[usize::from(TOF)]["latency_ns"], 300_000_000);
 }

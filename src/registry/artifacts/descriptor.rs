@@ -4,6 +4,7 @@
 use std::fmt::Write as _;
 
 use super::HEADER;
+use crate::modality::ModalityKind;
 use crate::registry::spec::{DeviceSpec, NodeSpec};
 
 /// The descriptor of one entry; `stable_path` is the name the rules give it, if they can.
@@ -48,6 +49,15 @@ fn sensor(node: &NodeSpec) -> String {
             "  - kind: \"{kind}\"\n    baud: {}\n    framing: \"{}\"\n    parse: \"{}\"\n    channels: {}\n",
             serial.baud, serial.framing, serial.parse, serial.channels
         ),
+        NodeSpec::Process(process) => {
+            let program = process.program.file_name().unwrap_or_default().to_string_lossy();
+            let shape = match (process.kind, process.shape.as_slice()) {
+                (ModalityKind::Image, [height, width]) => format!("    width: {width}\n    height: {height}\n"),
+                (ModalityKind::Scalars, [channels]) => format!("    channels: {channels}\n"),
+                _ => String::new(),
+            };
+            format!("  - kind: \"{kind}\"\n    program: {}\n{shape}", quoted(&program))
+        }
     }
 }
 

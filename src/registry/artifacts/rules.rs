@@ -8,7 +8,7 @@
 use std::fmt::Write as _;
 
 use super::HEADER;
-use crate::registry::spec::{DeviceSpec, NodeSpec, Registry};
+use crate::registry::spec::{DeviceSpec, NodeSpec, Opens, Registry};
 
 /// The rules of a whole registry.
 pub(super) fn rules(registry: &Registry) -> String {
@@ -35,7 +35,7 @@ pub(super) fn identify(registry: &Registry, device: &DeviceSpec) -> Result<Strin
     let usb = &device.identity;
     if let Some(serial) = &usb.serial {
         return match quoted_match(serial) {
-            Some(serial) => Ok(format!(", ATTRS{{serial}}==\"{serial}\"")),
+            Some(serial) => Ok(format!(", {}{{serial}}==\"{serial}\"", keys(device).0)),
             None => Err("its serial number contains characters that a udev rule cannot match exactly; \
                          identify it by its port to get one"
                 .to_owned()),
@@ -43,7 +43,7 @@ pub(super) fn identify(registry: &Registry, device: &DeviceSpec) -> Result<Strin
     }
     if let Some(port) = &usb.port {
         // Validated to consist of digits, `-` and `.`.
-        return Ok(format!(", KERNELS==\"{port}\""));
+        return Ok(format!(", {}==\"{port}\"", keys(device).1));
     }
     let same_model = |other: &&DeviceSpec| {
         (other.identity.vid, other.identity.pid) == (usb.vid, usb.pid) && subsystem(other) == subsystem(device)
@@ -56,12 +56,14 @@ pub(super) fn identify(registry: &Registry, device: &DeviceSpec) -> Result<Strin
 
 fn rule(device: &DeviceSpec, identity: &str) -> String {
     // A camera has several nodes; index 0 is the one that captures pictures.
-    let (index, group) = match device.node {
-        NodeSpec::Camera(_) => (", ATTR{index}==\"0\"", "video"),
-        NodeSpec::Serial(_) => ("", "dialout"),
+    let (index, group) = match opens(device) {
+        Opens::Video => (", ATTR{index}==\"0\"", "video"),
+        Opens::Tty => ("", "dialout"),
+        Opens::Usb => (", ENV{DEVTYPE}==\"usb_device\"", "plugdev"),
     };
+    let attr = keys(device).0;
     format!(
-        "SUBSYSTEM==\"{}\"{index}, ATTRS{{idVendor}}==\"{:04x}\", ATTRS{{idProduct}}==\"{:04x}\"{identity}, \
+        "SUBSYSTEM==\"{}\"{index}, {attr}{{idVendor}}==\"{:04x}\", {attr}{{idProduct}}==\"{:04x}\"{identity}, \
          SYMLINK+=\"rapid/{}\", GROUP=\"{group}\", MODE=\"0660\", TAG+=\"uaccess\", RUN{{builtin}}+=\"uaccess\"",
         subsystem(device),
         device.identity.vid,
@@ -71,9 +73,27 @@ fn rule(device: &DeviceSpec, identity: &str) -> String {
 }
 
 const fn subsystem(device: &DeviceSpec) -> &'static str {
-    match device.node {
-        NodeSpec::Camera(_) => "video4linux",
-        NodeSpec::Serial(_) => "tty",
+    match opens(device) {
+        Opens::Video => "video4linux",
+        Opens::Tty => "tty",
+        Opens::Usb => "usb",
+    }
+}
+
+const fn opens(device: &DeviceSpec) -> Opens {
+    match &device.node {
+        NodeSpec::Camera(_) => Opens::Video,
+        NodeSpec::Serial(_) => Opens::Tty,
+        NodeSpec::Process(process) => process.opens,
+    }
+}
+
+/// The keys that match an attribute of the USB device and its name. Those that also look at parents
+/// would match the devices behind a hub with the hub's.
+const fn keys(device: &DeviceSpec) -> (&'static str, &'static str) {
+    match opens(device) {
+        Opens::Usb => ("ATTR", "KERNEL"),
+        Opens::Video | Opens::Tty => ("ATTRS", "KERNELS"),
     }
 }
 

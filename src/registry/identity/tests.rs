@@ -57,17 +57,23 @@ fn entry(bit: u8) -> Assignment {
 }
 
 fn unit(model: u16, serial: Option<&str>, port: &str) -> UsbIdentity {
-    UsbIdentity { vid: model, pid: model, serial: serial.map(str::to_owned), port: port.to_owned(), product: None }
+    UsbIdentity {
+        vid: model,
+        pid: model,
+        serial: serial.map(str::to_owned),
+        port: port.to_owned(),
+        ..UsbIdentity::default()
+    }
 }
 
 fn video(number: u32, usb: UsbIdentity) -> Attachment {
     let syspath = PathBuf::from(format!("/sys/devices/usb1/{}/video4linux/video{number}", usb.port));
-    Attachment { syspath, node: DeviceNode::Video(format!("/dev/video{number}").into()), usb }
+    Attachment { syspath, node: DeviceNode::Video(format!("/dev/video{number}").into()), usb, driver: None }
 }
 
 fn tty(usb: UsbIdentity) -> Attachment {
     let syspath = PathBuf::from(format!("/sys/devices/usb1/{}/tty/ttyACM0", usb.port));
-    Attachment { syspath, node: DeviceNode::Tty("/dev/ttyACM0".into()), usb }
+    Attachment { syspath, node: DeviceNode::Tty("/dev/ttyACM0".into()), usb, driver: None }
 }
 
 fn device_path(port: &str) -> PathBuf {

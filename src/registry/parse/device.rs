@@ -2,19 +2,21 @@
 
 use std::time::Duration;
 
-use super::node;
+use super::program::Programs;
+use super::verdict::{VerdictTable, Whose};
+use super::{node, process, verdict};
 use crate::modality::ModalityId;
-use crate::registry::diagnostic::{did_you_mean, nearest};
+use crate::registry::diagnostic::did_you_mean;
 use crate::registry::section::{At, Problems, Section};
-use crate::registry::spec::{DeviceSpec, IdentitySpec, Mount, NodeSpec, WhenStale};
+use crate::registry::spec::{DeviceSpec, IdentitySpec, Mount, NodeSpec, Opens, WhenStale};
 
 /// Kinds of node this version has a driver for.
-const BUILT_IN: [(&str, Kind); 2] = [("camera", Kind::Camera), ("serial", Kind::Serial)];
+pub(super) const BUILT_IN: [(&str, Kind); 2] = [("camera", Kind::Camera), ("serial", Kind::Serial)];
 /// Kinds of node that are designed but have no driver in this version.
-const PLANNED: [&str; 3] = ["can", "lan", "process"];
+const PLANNED: [&str; 2] = ["can", "lan"];
 /// Keys that only planned kinds of node have.
-const PLANNED_KEYS: [&str; 6] = ["can", "lan", "process", "on_attach", "on_detach", "heartbeat"];
-const KEYS: [&str; 14] = [
+const PLANNED_KEYS: [&str; 4] = ["can", "lan", "on_attach", "on_detach"];
+const KEYS: [&str; 17] = [
     "vid",
     "pid",
     "serial",
@@ -28,17 +30,24 @@ const KEYS: [&str; 14] = [
     "max_bytes",
     "depth",
     "when_stale",
+    "latency",
     "camera",
+    "process",
+    "verdict",
 ];
 
 /// The mask is 64 bits wide.
 const HIGHEST_BIT: i64 = 63;
+
+/// More than any sensor takes; every frame of an episode waits for the longest latency of the rig.
+const LONGEST_LATENCY: Duration = Duration::from_secs(1);
 
 /// How a device is read, without the settings.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kind {
     Camera,
     Serial,
+    Process,
 }
 
 /// An entry as far as it could be read.
@@ -59,22 +68,28 @@ pub(super) struct Draft<'a> {
     /// The depth was written in the file and is not ours to lower.
     pub(super) depth_written: bool,
     when_stale: WhenStale,
+    latency: Duration,
+    verdict: VerdictTable,
 }
 
 impl Draft<'_> {
-    /// The entry; `None` only if a problem with it was reported.
-    pub(super) fn finish(self) -> Option<DeviceSpec> {
+    /// The entry, with what `[verdict]` says for all; `None` only if a problem with it was reported.
+    pub(super) fn finish(self, rig: &VerdictTable) -> Option<DeviceSpec> {
+        let node = self.node?;
+        let fps = if let NodeSpec::Camera(camera) = &node { Some(f64::from(camera.fps)) } else { None };
         Some(DeviceSpec {
+            verdict: verdict::spec(node.modality_kind(), self.stall_after, fps, rig, &self.verdict),
             name: self.name,
             id: self.id?,
             identity: self.identity?,
-            node: self.node?,
+            node,
             topic: self.topic,
             mount: self.mount,
             stall_after: self.stall_after,
             max_bytes: usize::try_from(self.max_bytes).ok()?,
             depth: usize::try_from(self.depth).ok()?,
             when_stale: self.when_stale,
+            latency: self.latency,
         })
     }
 
@@ -87,22 +102,46 @@ impl Draft<'_> {
         if self.section.has("serial_number") { "serial_number" } else { "serial" }
     }
 
+    /// Which node of the unit the entry takes.
+    pub(super) fn opens(&self) -> Option<Opens> {
+        Some(match self.node.as_ref()? {
+            NodeSpec::Camera(_) => Opens::Video,
+            NodeSpec::Serial(_) => Opens::Tty,
+            NodeSpec::Process(process) => process.opens,
+        })
+    }
+
     pub(super) fn is_camera(&self) -> bool {
         self.kind == Some(Kind::Camera)
     }
 }
 
 /// Reads one entry.
-pub(super) fn read<'a>(name: &str, section: Section<'a>, problems: &mut Problems<'_>) -> Draft<'a> {
+pub(super) fn read<'a>(
+    name: &str,
+    section: Section<'a>,
+    programs: Programs<'_>,
+    problems: &mut Problems<'_>,
+) -> Draft<'a> {
     check_name(name, &section, problems);
     check_keys(&section, problems);
     let kind = kind(&section, problems);
     let identity = identity(&section, problems);
+    let mut heartbeat = None;
     let settings = match kind {
         Some(Kind::Camera) => Some(NodeSpec::Camera(node::camera(&section, problems))),
         Some(Kind::Serial) => node::serial(&section, problems).map(NodeSpec::Serial),
+        Some(Kind::Process) => section.text(problems, "node").and_then(|program| {
+            let (process, silent) = process::process(&section, program.value, programs, problems)?;
+            heartbeat = Some(silent);
+            Some(NodeSpec::Process(process))
+        }),
         None => None,
     };
+    if kind.is_some_and(|kind| kind != Kind::Process) && section.has("process") {
+        let message = format!("a built-in node has no table [{}]", section.child("process"));
+        section.report(problems, "process", message, "remove the table, or write node = the name of a program");
+    }
     let topic = topic(&section, problems).unwrap_or_else(|| default_topic(kind, name));
     let bit = section
         .integer(problems, "bit", 0..=HIGHEST_BIT)
@@ -110,8 +149,10 @@ pub(super) fn read<'a>(name: &str, section: Section<'a>, problems: &mut Problems
     let mount = section.choice(problems, "slot", &Mount::WORDS);
     let when_stale = section.choice(problems, "when_stale", &WhenStale::WORDS).unwrap_or_default();
     let stall = Duration::from_millis(10)..=Duration::from_hours(1);
-    let stall_after =
-        section.duration(problems, "stall_after", stall).unwrap_or_else(|| node::default_stall(settings.as_ref()));
+    let stall_after = heartbeat
+        .or_else(|| section.duration(problems, "stall_after", stall))
+        .unwrap_or_else(|| node::default_stall(settings.as_ref()));
+    let latency = section.duration(problems, "latency", Duration::ZERO..=LONGEST_LATENCY).unwrap_or_default();
     let max_bytes = node::max_bytes(&section, settings.as_ref(), problems);
     let written = section.integer(problems, "depth", 2..=4096).and_then(|depth| u64::try_from(depth.value).ok());
     Draft {
@@ -127,6 +168,8 @@ pub(super) fn read<'a>(name: &str, section: Section<'a>, problems: &mut Problems
         depth: written.unwrap_or_else(|| node::default_depth(settings.as_ref())),
         depth_written: written.is_some(),
         when_stale,
+        latency,
+        verdict: verdict::read(&section, Whose::Device, problems),
         node: settings,
         section,
     }
@@ -153,7 +196,7 @@ fn check_keys(section: &Section<'_>, problems: &mut Problems<'_>) {
             continue;
         }
         if PLANNED_KEYS.contains(&key) {
-            let fix = "remove it; this version reads camera and serial devices";
+            let fix = "remove it; this version reads camera and serial devices, and through programs";
             problems.report(at, &section.entry, format!("{key:?} is not supported by this version of rapid"), fix);
         } else {
             let fix = did_you_mean(key, &KEYS, "known keys here");
@@ -164,27 +207,21 @@ fn check_keys(section: &Section<'_>, problems: &mut Problems<'_>) {
 
 fn kind(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<Kind> {
     if !section.has("node") {
-        section.missing(problems, "node", "write node = \"camera\" or node = \"serial\"");
+        section.missing(problems, "node", "write node = \"camera\", \"serial\" or the name of a program");
         return None;
     }
     let text = section.text(problems, "node")?.value;
-    let found = BUILT_IN.iter().find(|(name, _)| *name == text).map(|(_, kind)| *kind);
-    if found.is_some() {
-        return found;
+    if PLANNED.contains(&text) {
+        let fix = "built in are \"camera\" and \"serial\"; leave the entry out until then, or name a program";
+        section.report(problems, "node", format!("node {text:?} is not supported by this version of rapid"), fix);
+        return None;
     }
-    let fix = match nearest(text, BUILT_IN.map(|(name, _)| name)) {
-        Some(name) if !PLANNED.contains(&text) => format!("did you mean \"{name}\"?"),
-        _ => "built in are \"camera\" and \"serial\"; leave the entry out until then".to_owned(),
-    };
-    let message = if PLANNED.contains(&text) {
-        format!("node {text:?} is not supported by this version of rapid")
-    } else if fix.starts_with("did") {
-        format!("unknown node {text:?}")
-    } else {
-        format!("node {text:?} is not built in, and programs as nodes are not supported by this version of rapid")
-    };
-    section.report(problems, "node", message, fix);
-    None
+    if text == "process" {
+        let fix = "write node = the name of the program, for example node = \"tactile_publisher\"";
+        section.report(problems, "node", "node \"process\" does not say which program".to_owned(), fix);
+        return None;
+    }
+    Some(BUILT_IN.iter().find(|(name, _)| *name == text).map_or(Kind::Process, |(_, kind)| *kind))
 }
 
 fn identity(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<IdentitySpec> {
@@ -229,7 +266,7 @@ fn serial_number(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<S
 }
 
 /// A serial number ends up in rules and descriptors: it must at least be one line of text.
-pub(crate) fn check_serial(serial: &str) -> Result<(), (String, &'static str)> {
+fn check_serial(serial: &str) -> Result<(), (String, &'static str)> {
     /// A USB string descriptor holds at most 126 UTF-16 units.
     const LONGEST: usize = 126;
     if serial.is_empty() {
@@ -261,7 +298,8 @@ pub(crate) fn is_port(text: &str) -> bool {
 }
 
 fn default_topic(kind: Option<Kind>, name: &str) -> String {
-    let kind = BUILT_IN.iter().find(|(_, built_in)| Some(*built_in) == kind).map_or("device", |(kind, _)| kind);
+    let word = BUILT_IN.iter().find(|(_, built_in)| Some(*built_in) == kind).map(|(word, _)| *word);
+    let kind = word.unwrap_or(if kind == Some(Kind::Process) { "process" } else { "device" });
     format!("/rapid/{kind}/{name}")
 }
 

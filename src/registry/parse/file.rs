@@ -2,11 +2,12 @@
 
 use std::fs::{File, OpenOptions};
 use std::io::{ErrorKind, Read};
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 
 use crate::registry::diagnostic::RegistryErrors;
 use crate::registry::section::file_label;
+use crate::registry::trust::distrust;
 
 /// No registry is this large; the wrong file may be.
 const LARGEST: u64 = 1 << 20;
@@ -34,9 +35,11 @@ pub(crate) fn read_file(path: &Path, when_missing: &str) -> Result<String, Regis
     if !metadata.is_file() {
         return Err(problem("it is not a regular file".to_owned(), "name a file on disk".to_owned()));
     }
-    let euid = rustix::process::geteuid().as_raw();
-    if let Some((message, fix)) = distrust(metadata.mode(), metadata.uid(), euid, &label) {
-        return Err(problem(message, fix));
+    // As root we run with rights that whoever may change the file would gain.
+    if rustix::process::geteuid().is_root()
+        && let Some(reason) = distrust(path).map_err(cannot_read)?
+    {
+        return Err(problem(reason.to_string(), reason.fix()));
     }
     let mut bytes = Vec::new();
     file.by_ref().take(LARGEST + 1).read_to_end(&mut bytes).map_err(cannot_read)?;
@@ -49,35 +52,9 @@ pub(crate) fn read_file(path: &Path, when_missing: &str) -> Result<String, Regis
     })
 }
 
-/// As root we run with rights that whoever may write the file would gain.
-fn distrust(mode: u32, owner: u32, euid: u32, label: &str) -> Option<(String, String)> {
-    if euid != 0 {
-        return None;
-    }
-    if owner != 0 {
-        let message = format!("it belongs to user {owner}, who could change what root runs");
-        return Some((message, format!("chown root {label}")));
-    }
-    if mode & 0o022 != 0 {
-        let message = format!("other users may write to it (mode {:04o})", mode & 0o7777);
-        return Some((message, format!("chmod go-w {label}")));
-    }
-    None
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn only_root_distrusts_and_only_what_others_may_write() {
-        assert_eq!(distrust(0o100_666, 1000, 1000, "f"), None);
-        assert_eq!(distrust(0o100_644, 0, 0, "f"), None);
-        let fix = |mode, owner| distrust(mode, owner, 0, "f").map(|(_, fix)| fix);
-        assert_eq!(fix(0o100_664, 0).as_deref(), Some("chmod go-w f"));
-        assert_eq!(fix(0o100_646, 0).as_deref(), Some("chmod go-w f"));
-        assert_eq!(fix(0o100_644, 1000).as_deref(), Some("chown root f"));
-    }
 
     #[test]
     fn what_is_no_text_file_is_refused_with_a_reason() {

@@ -3,6 +3,7 @@
 
 use std::time::Duration;
 
+use crate::modality::ModalityKind;
 use crate::registry::diagnostic::nearest;
 use crate::registry::section::{Problems, Section};
 use crate::registry::spec::{CameraSpec, Framing, NodeSpec, Parse, PixelFormat, SerialSpec};
@@ -127,6 +128,13 @@ pub(super) fn max_bytes(section: &Section<'_>, node: Option<&NodeSpec>, problems
             // Numbers travel as 64-bit floats.
             _ => (8 * serial.channels as u64, 8 * serial.channels as u64),
         },
+        Some(NodeSpec::Process(process)) => match (process.kind, process.shape.as_slice()) {
+            (ModalityKind::Image, [height, width]) => {
+                ((2 * u64::from(*width) * u64::from(*height)).max(SMALLEST_JPEG), 1024)
+            }
+            (ModalityKind::Scalars, [channels]) => (8 * u64::from(*channels), 8 * u64::from(*channels)),
+            _ => (64 << 10, 1),
+        },
         None => (1, 1),
     };
     section.size(problems, "max_bytes", least..=256 << 20).unwrap_or(default)
@@ -136,6 +144,8 @@ pub(super) fn max_bytes(section: &Section<'_>, node: Option<&NodeSpec>, problems
 pub(super) fn default_depth(node: Option<&NodeSpec>) -> u64 {
     match node {
         Some(NodeSpec::Camera(camera)) => (2 * u64::from(camera.fps)).clamp(16, 1024),
+        // Of a camera with 30 pictures a second, and of what may be as large.
+        Some(NodeSpec::Process(process)) if process.kind != ModalityKind::Scalars => 60,
         _ => 2048,
     }
 }

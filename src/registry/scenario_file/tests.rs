@@ -26,7 +26,7 @@ fn without_devices_every_entry_is_plugged() {
             ("motor_state", "MOT00C1", "9-3", true),
         ]
     );
-    assert_eq!(scenario.devices[1].source, SimSource::Camera { width: 320, height: 240, fps: 30, seed: 1 });
+    assert_eq!(scenario.devices[1].source, SimSource::Camera { width: 320, height: 240, fps: 30, seed: 1, bytes: 0 });
     assert_eq!(scenario.devices[2].source, SimSource::Serial { channels: 3, hz: 100, seed: 2 });
 }
 
@@ -86,6 +86,7 @@ fn two_units_of_one_model_without_serial_numbers_can_be_told() {
         port = "1-3"
         seed = 9
         hz = 60
+        bytes = "60kB"
         plugged = false
         [[event]]
         at = "1s"
@@ -96,8 +97,33 @@ fn two_units_of_one_model_without_serial_numbers_can_be_told() {
     let [one, two] = scenario.devices.as_slice() else { panic!("two devices") };
     assert_eq!((one.usb.vid, one.usb.pid, &one.usb.serial), (two.usb.vid, two.usb.pid, &two.usb.serial));
     assert_eq!((one.usb.port.as_str(), two.usb.port.as_str()), ("1-2", "1-3"));
-    assert_eq!(two.source, SimSource::Camera { width: 640, height: 480, fps: 60, seed: 9 });
+    assert_eq!(two.source, SimSource::Camera { width: 640, height: 480, fps: 60, seed: 9, bytes: 60_000 });
     assert!(one.plugged && !two.plugged);
+}
+
+#[test]
+fn faults_are_those_of_the_device_above() {
+    let scenario = parse(
+        r#"
+        [[device]]
+        name = "cam_wrist"
+        [device.fault]
+        freeze_at = "3s"
+        truncate_every = 10
+        clock_ppm = -20
+        [[device]]
+        name = "motor_state"
+        "#,
+    )
+    .unwrap();
+    let expected = SimFaults {
+        freeze_at: Some(Duration::from_secs(3)),
+        truncate_every: Some(10),
+        clock_ppm: -20,
+        ..SimFaults::default()
+    };
+    assert_eq!(scenario.devices[0].faults, expected);
+    assert_eq!(scenario.devices[1].faults, SimFaults::default());
 }
 
 #[test]
@@ -142,6 +168,12 @@ fn mistakes_are_placed_and_all_told() {
             "[device]\nname = \"cam_wrist\"\nspeed = 1\n",
             "scenario:1:1: device must be a list of tables, but is a table\n    \
              fix: write [[device]] with two brackets",
+        ),
+        (
+            "[[device]]\nname = \"cam_wrist\"\n[device.fault]\nfreeze = \"1s\"\nlose_every = 1\n",
+            "scenario:4:1: [device 1.fault] unknown key \"freeze\"\n    fix: did you mean \"freeze_at\"?\n\
+             scenario:5:14: [device 1.fault] lose_every = 1 is out of range\n    \
+             fix: write a whole number from 2 to 1000000, without quotes",
         ),
     ] {
         assert_eq!(parse(text).unwrap_err(), expected);

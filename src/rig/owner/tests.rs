@@ -32,6 +32,12 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
         max_bytes: 64,
         depth: 16,
         when_stale: WhenStale::Hold,
+        latency: Duration::ZERO,
+        verdict: crate::registry::VerdictSpec::of(
+            crate::modality::ModalityKind::Image,
+            Duration::from_millis(500),
+            Some(30.0),
+        ),
     };
     Registry {
         rig: RigSpec {
@@ -81,9 +87,9 @@ impl Bench {
                 let source = SimSource::Serial { channels: *channels, hz: 200, seed: 1 };
                 let unit = Arc::new(SimDevice::new(port, source, Stamp::now()));
                 self.units.insert(port, Arc::clone(&unit));
-                let usb = UsbIdentity { vid: 1, pid: 2, serial: None, port: (*port).into(), product: None };
+                let usb = UsbIdentity { vid: 1, pid: 2, serial: None, port: (*port).into(), ..UsbIdentity::default() };
                 let syspath = PathBuf::from("/test").join(port);
-                self.tell(HotplugEvent::Added(Attachment { syspath, node: DeviceNode::Sim(unit), usb }));
+                self.tell(HotplugEvent::Added(Attachment { syspath, node: DeviceNode::Sim(unit), usb, driver: None }));
             }
             Pull(port) => self.units[port].unplug(),
             Removed(port, witness) => {
@@ -122,7 +128,7 @@ impl Bench {
 
 fn word(what: &What) -> Option<String> {
     match what {
-        What::Attach { device, port, .. } => Some(format!("{device} at {port}")),
+        What::Attach { device, usb, .. } => Some(format!("{device} at {}", usb.port)),
         What::Detach { device, witness, .. } => Some(format!("{device} gone {witness}")),
         What::State { device, state, .. } => Some(format!("{device} {}", state.word())),
         What::Unregistered { .. } => Some("unused".into()),

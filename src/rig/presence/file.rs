@@ -10,6 +10,7 @@ use std::time::Duration;
 use rustix::fs::{FlockOperation, Mode, OFlags};
 use rustix::io::Errno;
 
+use crate::folder::FolderError;
 use crate::mask::{MaskRecord, MaskRecordError, PhysicalMask, RECORD_LEN};
 use crate::time::{Stamp, realtime_ns};
 
@@ -37,13 +38,16 @@ pub enum PresenceError {
         pid: Option<u32>,
     },
     /// Something other than our own file lies there.
-    #[error("{path}: {what}; remove it: rm {path}")]
+    #[error("{path}: {what}; remove it: rm -r {path}")]
     Foreign {
         /// The file.
         path: PathBuf,
         /// What it is.
-        what: &'static str,
+        what: String,
     },
+    /// The folder of the file cannot be used.
+    #[error(transparent)]
+    Folder(#[from] FolderError),
     /// The file cannot be made, written or read.
     #[error("{path}: {error}")]
     Io {
@@ -129,9 +133,10 @@ impl Drop for MaskFile {
 
 fn take(path: &Path) -> Result<File, PresenceError> {
     let io = |error: Errno| PresenceError::Io { path: path.to_owned(), error: error.into() };
-    let foreign = |what| PresenceError::Foreign { path: path.to_owned(), what };
+    let foreign = |what: &str| PresenceError::Foreign { path: path.to_owned(), what: what.to_owned() };
     for _ in 0..TRIES {
-        let flags = OFlags::RDWR | OFlags::CREATE | OFlags::NOFOLLOW | OFlags::CLOEXEC | OFlags::NONBLOCK;
+        let flags =
+            OFlags::RDWR | OFlags::CREATE | OFlags::NOFOLLOW | OFlags::CLOEXEC | OFlags::NONBLOCK | OFlags::NOCTTY;
         let mode = Mode::RUSR | Mode::WUSR | Mode::RGRP | Mode::ROTH;
         let file = match rustix::fs::open(path, flags, mode) {
             Ok(descriptor) => File::from(descriptor),
@@ -143,6 +148,10 @@ fn take(path: &Path) -> Result<File, PresenceError> {
         let opened = file.metadata().map_err(|error| PresenceError::Io { path: path.to_owned(), error })?;
         if !opened.is_file() || opened.nlink() > 1 {
             return Err(foreign("it is not an ordinary file of its own"));
+        }
+        // Whoever owns it may write to it at any time, even if it may be written to by us.
+        if opened.uid() != rustix::process::geteuid().as_raw() {
+            return Err(refused(path, Errno::ACCESS));
         }
         match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {
             Ok(()) => {}
@@ -167,7 +176,8 @@ pub(super) fn refused(path: &Path, error: Errno) -> PresenceError {
     match std::fs::symlink_metadata(path) {
         Ok(there) if holder(&there).is_some() => PresenceError::Taken { path: path.to_owned(), pid: holder(&there) },
         Ok(there) if there.uid() != rustix::process::geteuid().as_raw() => {
-            PresenceError::Foreign { path: path.to_owned(), what: "it was left behind by another user's rapid" }
+            let what = format!("it belongs to user {}: another user's rapid left it behind", there.uid());
+            PresenceError::Foreign { path: path.to_owned(), what }
         }
         _ => PresenceError::Io { path: path.to_owned(), error: error.into() },
     }
@@ -195,7 +205,17 @@ pub fn read_mask(path: &Path) -> Result<MaskRecord, PresenceError> {
         ErrorKind::NotFound => PresenceError::NotPublished { path: path.to_owned() },
         _ => PresenceError::Io { path: path.to_owned(), error },
     };
-    let file = File::open(path).map_err(io)?;
+    let foreign = |what: &str| PresenceError::Foreign { path: path.to_owned(), what: what.to_owned() };
+    // Nothing that was planted there is followed or waited for.
+    let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::NOCTTY | OFlags::CLOEXEC;
+    let file = match rustix::fs::open(path, flags, Mode::empty()) {
+        Ok(file) => File::from(file),
+        Err(Errno::LOOP) => return Err(foreign("it is a symbolic link, and rapid follows none there")),
+        Err(error) => return Err(io(error.into())),
+    };
+    if !file.metadata().map_err(io)?.is_file() {
+        return Err(foreign("it is not an ordinary file"));
+    }
     let begun = Stamp::now();
     for look in 0_u32.. {
         let mut bytes = [0; RECORD_LEN];

@@ -1,11 +1,12 @@
 //! The mask for people: JSON beside the binary record (paper, appendix "Physical Mask Data Format").
 
-use std::io::Write;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
 use super::PresenceError;
+use crate::folder::{Folder, Links, Missing, Sync};
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::status::SlotState;
@@ -46,7 +47,7 @@ pub fn json_path(mask: &Path) -> PathBuf {
     PathBuf::from(name)
 }
 
-/// Writes a temporary file and renames it: a reader sees a whole document or the one before.
+/// Writes the document whole: a reader sees a whole document or the one before.
 pub(super) fn write(
     path: &Path,
     mask: PhysicalMask,
@@ -66,17 +67,22 @@ pub(super) fn write(
     let io = |error| PresenceError::Io { path: path.to_owned(), error };
     let mut text = serde_json::to_vec_pretty(&document).map_err(|error| io(error.into()))?;
     text.push(b'\n');
-    let mut temporary = path.as_os_str().to_owned();
-    temporary.push(format!(".{}.tmp", std::process::id()));
-    let temporary = PathBuf::from(temporary);
-    // A leftover of a process that had this pid before, or a link planted by somebody else, goes;
-    // `create_new` follows none.
-    let _ = std::fs::remove_file(&temporary);
-    let mut file = std::fs::OpenOptions::new().write(true).create_new(true).open(&temporary).map_err(io)?;
-    let written = file.write_all(&text).and_then(|()| std::fs::rename(&temporary, path));
-    if written.is_err() {
-        // Shared memory may be full: leave it no fuller than it was.
-        let _ = std::fs::remove_file(&temporary);
+    folder(path)?.replace(path.file_name().unwrap_or_default(), &text, 0o644, Sync::Skip).map_err(io)
+}
+
+/// Is the name free, or what lies there ours to replace?
+pub(super) fn claim(path: &Path) -> Result<(), PresenceError> {
+    let foreign = |what| Err(PresenceError::Foreign { path: path.to_owned(), what });
+    // Who can plant something between this look and the first document is told by the write.
+    match std::fs::symlink_metadata(path) {
+        Ok(there) if !there.is_file() => foreign("it is not an ordinary file".to_owned()),
+        Ok(there) if there.uid() != rustix::process::geteuid().as_raw() => {
+            foreign(format!("it belongs to user {}", there.uid()))
+        }
+        _ => Ok(()),
     }
-    written.map_err(io)
+}
+
+fn folder(path: &Path) -> Result<Folder, PresenceError> {
+    Ok(Folder::open(path.parent().unwrap_or(Path::new("/")), Links::Own, Missing::Refused)?)
 }

@@ -50,6 +50,7 @@ pub struct Presence {
     thread: Option<JoinHandle<()>>,
     ended: CancellationToken,
     json: PathBuf,
+    json_failed: AtomicBool,
 }
 
 #[derive(Debug, Default)]
@@ -71,6 +72,7 @@ impl Claim {
     /// # Errors
     /// When another live process publishes there (its pid is named), or the file cannot be made.
     pub fn new(path: &Path, device_count: u8) -> Result<Self, PresenceError> {
+        json::claim(&json_path(path))?;
         Ok(Self { path: path.to_owned(), file: MaskFile::create(path, device_count)? })
     }
 }
@@ -94,7 +96,7 @@ impl Presence {
                 beat.run();
             })
             .map_err(|error| PresenceError::Io { path: path.clone(), error })?;
-        Ok(Self { shared, thread: Some(thread), ended, json: json_path(&path) })
+        Ok(Self { shared, thread: Some(thread), ended, json: json_path(&path), json_failed: AtomicBool::new(false) })
     }
 
     /// Cancelled when the thread has ended: before this is dropped, by a panic.
@@ -111,12 +113,13 @@ impl Presence {
         }
     }
 
-    /// Writes the file for people: a temporary one, renamed.
-    ///
-    /// # Errors
-    /// When the file cannot be written.
-    pub fn write_json(&self, mask: PhysicalMask, sequence: u64, devices: &[JsonDevice]) -> Result<(), PresenceError> {
-        json::write(&self.json, mask, sequence, devices)
+    /// Writes the file for people, whole. Why it cannot be is logged, once until it can again.
+    pub fn write_json(&self, mask: PhysicalMask, sequence: u64, devices: &[JsonDevice]) {
+        let written = json::write(&self.json, mask, sequence, devices);
+        let failed_before = self.json_failed.swap(written.is_err(), Ordering::Relaxed);
+        if let (Err(error), false) = (written, failed_before) {
+            tracing::warn!(%error, "the mask's JSON file is not written");
+        }
     }
 }
 
@@ -130,6 +133,7 @@ impl Drop for Presence {
             // panic of its own.
             let _ = thread.join();
         }
+        // Another user's file stays: it may not be removed where everybody may write.
         let _ = std::fs::remove_file(&self.json);
     }
 }
@@ -146,7 +150,11 @@ impl Beat {
     fn run(mut self) {
         match use_fifo() {
             Ok(()) => tracing::debug!("thread mask runs under SCHED_FIFO"),
-            Err(reason) => tracing::debug!(reason, "thread mask runs under the ordinary scheduler"),
+            Err(reason) => tracing::warn!(
+                reason,
+                "the mask has no real-time priority, so that a busy machine may delay it: run rapid as rapid.service does, \
+                 or give the user `rtprio {FIFO_PRIORITY}` in /etc/security/limits.conf"
+            ),
         }
         let mut due = Stamp::now();
         let mut published = None;

@@ -42,7 +42,10 @@ fn a_file_that_may_not_be_opened_is_explained() {
     // Only root can give a file away.
     if std::os::unix::fs::chown(&path, Some(12_345), None).is_ok() {
         let error = file::refused(&path, rustix::io::Errno::ACCESS);
-        assert!(error.to_string().contains("another user's rapid; remove it: rm "), "{error}");
+        assert!(
+            error.to_string().contains("user 12345: another user's rapid left it behind; remove it: rm -r "),
+            "{error}"
+        );
     }
     std::fs::remove_file(&path).expect("clean");
     assert!(matches!(file::refused(&path, rustix::io::Errno::ACCESS), PresenceError::Io { .. }));
@@ -71,6 +74,61 @@ fn links_are_not_followed() {
     assert_eq!(std::fs::read_to_string(&target).expect("target"), "precious");
     std::fs::remove_file(&path).expect("clean");
     std::fs::remove_file(&target).expect("clean");
+}
+
+#[test]
+fn what_others_planted_is_named_and_neither_waited_for_nor_written_to() {
+    let (path, victim) = (path(), path());
+    let json = json_path(&path);
+    std::fs::write(&victim, "precious").expect("victim");
+    let pipe = |path: &Path| {
+        rustix::fs::mknodat(rustix::fs::CWD, path, rustix::fs::FileType::Fifo, 0o666.into(), 0).expect("pipe");
+    };
+    let refused = |path: &Path, error: PresenceError| {
+        let said = error.to_string();
+        assert!(matches!(error, PresenceError::Foreign { .. }), "{said}");
+        assert!(said.ends_with(&format!("remove it: rm -r {}", path.display())), "{said}");
+    };
+    pipe(&path);
+    refused(&path, Claim::new(&path, 1).expect_err("a pipe as the mask"));
+    refused(&path, read_mask(&path).expect_err("a pipe as the mask"));
+    std::fs::remove_file(&path).expect("clean");
+    std::os::unix::fs::symlink(&victim, &path).expect("link");
+    refused(&path, read_mask(&path).expect_err("a link as the mask"));
+    std::fs::remove_file(&path).expect("clean");
+    for plant in [pipe as fn(&Path), |path| std::fs::create_dir(path).expect("folder")] {
+        plant(&json);
+        refused(&json, Claim::new(&path, 1).expect_err("something as the JSON file"));
+        assert!(!path.exists(), "the mask was made all the same");
+        std::fs::remove_file(&json).or_else(|_| std::fs::remove_dir(&json)).expect("clean");
+    }
+    // After the claim: a link is replaced, what it led to is not touched.
+    let _claim = Claim::new(&path, 1).expect("claim");
+    std::os::unix::fs::symlink(&victim, &json).expect("link");
+    json::write(&json, PhysicalMask(0), 1, &[]).expect("write");
+    assert!(!json.is_symlink());
+    assert_eq!(std::fs::read_to_string(&victim).expect("victim"), "precious");
+    for path in [&json, &victim] {
+        std::fs::remove_file(path).expect("clean");
+    }
+}
+
+#[test]
+fn files_of_another_user_are_not_published_through() {
+    let path = path();
+    let json = json_path(&path);
+    for planted in [&path, &json] {
+        std::fs::write(planted, "").expect("plant");
+        std::fs::set_permissions(planted, std::os::unix::fs::PermissionsExt::from_mode(0o666)).expect("mode");
+        if std::os::unix::fs::chown(planted, Some(12_345), None).is_err() {
+            eprintln!("NOT CHECKED: only root can give files away");
+            std::fs::remove_file(planted).expect("clean");
+            return;
+        }
+        let error = Claim::new(&path, 1).expect_err("another user's file").to_string();
+        assert!(error.starts_with(&format!("{}: it belongs to user 12345", planted.display())), "{error}");
+        std::fs::remove_file(planted).expect("clean");
+    }
 }
 
 #[test]

@@ -31,6 +31,13 @@ emu_start() {
 # emu COMMAND...: one line to the emulator.
 emu() { echo "$*" >&7; }
 
+# emu_done SECONDS: until the emulator has done all it was told so far.
+emu_done() {
+  emu_asked=$((${emu_asked:-0} + 1))
+  emu "say done-$emu_asked"
+  wait_for "$1" said "$out/emu.jsonl" "\"word\":\"done-$emu_asked\"" || fail "the emulator is not done: $(tail -n 1 "$out/emu.jsonl")"
+}
+
 # emu_quit: what is still plugged is pulled, and the log is complete.
 emu_quit() { emu quit; wait "$emu_pid"; }
 
@@ -61,6 +68,29 @@ await_rapid() {
 rapid_wait() {
   wait "$rapid_pid"
   echo $? >"$out/rapid.rc"
+}
+
+# rapid_stop: asks it to end, as systemd and a user would.
+rapid_stop() { kill -TERM "$rapid_pid"; rapid_wait; }
+
+# published KEY: a value of the mask's JSON file, or the state of a device: `published mask`, `published cam_wrist`.
+published() {
+  tr -d ' \n' </dev/shm/rapid_hardware_mask.json \
+    | sed -n 's/.*"'"$1"'":"\([^"]*\)".*/\1\n/p; s/.*"name":"'"$1"'"[^}]*"state":"\([^"]*\)".*/\1\n/p'
+}
+
+# is VALUE COMMAND...: the command prints exactly this.
+is() { local value=$1; shift; [ "$("$@")" = "$value" ]; }
+
+# held fd|task: descriptors or threads rapid has.
+held() { ls "/proc/$rapid_pid/$1" | wc -l; }
+
+# sample NAME: what rapid holds now, as a line of samples.jsonl. Sizes in KiB; `anon` is memory of its own, `pss` its share of all.
+sample() {
+  local rollup status
+  rollup=$(cat "/proc/$rapid_pid/smaps_rollup") status=$(cat "/proc/$rapid_pid/status")
+  kib() { awk -v key="$2:" '$1 == key { print $2; found = 1 } END { if (!found) print 0 }' <<<"$1"; }
+  echo "{\"sample\":\"$1\",\"fds\":$(held fd),\"threads\":$(held task),\"rss\":$(kib "$status" VmRSS),\"pss\":$(kib "$rollup" Pss),\"anon\":$(kib "$rollup" Pss_Anon),\"shm\":$(du -sk /dev/shm | cut -f1),\"files\":$(find /dev/shm /tmp/iceoryx2 | wc -l)}" >>"$out/samples.jsonl"
 }
 
 fail() { echo "bench: $*"; exit 1; }

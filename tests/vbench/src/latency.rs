@@ -34,6 +34,11 @@ impl Delays {
         Self { found, missing: 0 }
     }
 
+    /// How many came, of how many: `n=19/20`.
+    pub fn count(&self) -> String {
+        format!("n={}/{}", self.found.len(), self.found.len() + self.missing)
+    }
+
     /// The value that this share of the delays does not exceed (nearest rank).
     pub fn quantile(&self, share: f64) -> Option<f64> {
         let rank = (share * self.found.len() as f64).ceil() as usize;
@@ -43,8 +48,7 @@ impl Delays {
 
 impl fmt::Display for Delays {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let of = self.found.len() + self.missing;
-        write!(f, "n={}/{of}", self.found.len())?;
+        f.write_str(&self.count())?;
         for (name, share) in [("min", 0.0), ("p50", 0.5), ("p95", 0.95), ("max", 1.0)] {
             if let Some(value) = self.quantile(share) {
                 write!(f, " {name}={value:.1}")?;

@@ -6,8 +6,12 @@
 //! Invariant: nothing here imports `rapid`; the bench knows it by its command line, its output and its files.
 //! Invariant: a missing image or binary is an error that names the remedy, never a skipped test.
 
+pub mod check;
 pub mod clock;
+pub mod deaf;
 pub mod emu;
+pub mod entries;
+pub mod figure;
 pub mod guest;
 pub mod latency;
 pub mod outcome;

@@ -12,12 +12,15 @@ use vbench::emu::function::{Function, PictureStore};
 use vbench::emu::log::{Log, Moment};
 use vbench::emu::script;
 use vbench::emu::spec::{DeviceSpec, PORTS};
-use vbench::probe::{mask, v4l};
+use vbench::probe::{beat, mask, uevent, v4l};
 
 const USAGE: &str = "\
-usage: usbemu SPEC...                    emulate; commands on stdin (plug, unplug, silent, port, sleep, t0, at, quit)
+usage: usbemu SPEC...                    emulate; commands on stdin (plug, unplug, hub, silent, port, sleep, t0, at, say, quit)
        usbemu --read NODE FRAMES         read a camera, print what came as one JSON object
+       usbemu --first-frames             open each camera that comes, print how soon its first frame came
        usbemu --watch-mask [SECONDS]     print each change of the physical mask as a JSON line
+       usbemu --watch-uevents            print what the kernel and udev tell of devices, a JSON line each
+       usbemu --beat MICROSECONDS FILE   sleep to absolute deadlines, note each waking in FILE
 
 SPEC: uvc:vid=046d,pid=0825,serial=A,port=0,mode=MJPG-640x480@30[,mode=..]
       acm:vid=2e8a,pid=000a,serial=B,hz=100
@@ -34,6 +37,9 @@ fn main() -> ExitCode {
             return if words.is_empty() { ExitCode::FAILURE } else { ExitCode::SUCCESS };
         }
         ["--read", node, frames] => read(node, frames),
+        ["--first-frames"] => v4l::first_frames(&Log::new(Box::new(io::stdout()))).map_err(Failure::from),
+        ["--watch-uevents"] => uevent::watch(&Log::new(Box::new(io::stdout()))).map_err(Failure::from),
+        ["--beat", micros, file] => beat(micros, file),
         ["--watch-mask"] => watch(None),
         ["--watch-mask", seconds] => watch(Some(seconds)),
         _ => emulate(&words),
@@ -66,6 +72,10 @@ fn emulate(specs: &[&str]) -> Result<(), Failure> {
 fn read(node: &str, frames: &str) -> Result<(), Failure> {
     println!("{}", v4l::read(Path::new(node), frames.parse()?)?);
     Ok(())
+}
+
+fn beat(micros: &str, file: &str) -> Result<(), Failure> {
+    Ok(beat::run(Duration::from_micros(micros.parse()?), Path::new(file))?)
 }
 
 fn watch(seconds: Option<&str>) -> Result<(), Failure> {

@@ -66,9 +66,9 @@ impl Outcome {
         self.emu.iter().filter(of_device).filter_map(moment).collect()
     }
 
-    /// When the timeline's clock started.
-    pub fn origin(&self) -> Option<Moment> {
-        self.emu.iter().find(|line| line["action"] == "t0").and_then(moment)
+    /// Each time the timeline's clock started.
+    pub fn origins(&self) -> Vec<Moment> {
+        self.emu.iter().filter(|line| line["action"] == "t0").filter_map(moment).collect()
     }
 
     /// What went wrong in the emulator.
@@ -148,6 +148,6 @@ fn moment(line: &Value) -> Option<Moment> {
 }
 
 /// The lines that are JSON objects; a line cut off at the end of a run is not.
-fn json_lines(text: &str) -> Vec<Value> {
+pub fn json_lines(text: &str) -> Vec<Value> {
     text.lines().filter_map(|line| serde_json::from_str(line).ok()).filter(Value::is_object).collect()
 }

@@ -38,6 +38,17 @@ pub fn rapid() -> Result<PathBuf, ProgramError> {
     find("rapid", "RAPID_BIN", candidates.collect())
 }
 
+/// The example of a program as a node: `PROCESS_NODE_BIN`, else the newer of the workspace's builds.
+pub fn process_node() -> Result<PathBuf, ProgramError> {
+    let workspace = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap_or(Path::new("."));
+    let mut places = vec![workspace.join("target")];
+    places.extend(std::env::var_os("CARGO_TARGET_DIR").map(PathBuf::from));
+    let candidates = places
+        .iter()
+        .flat_map(|target| ["release", "debug"].map(|profile| target.join(profile).join("examples/process_node")));
+    find("process_node", "PROCESS_NODE_BIN", candidates.collect())
+}
+
 /// This crate's own emulator: `USBEMU_BIN`, else beside the running test or tool.
 pub fn usbemu() -> Result<PathBuf, ProgramError> {
     let here = std::env::current_exe().unwrap_or_default();

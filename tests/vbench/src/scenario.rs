@@ -8,6 +8,7 @@
 
 use std::fmt::Write as _;
 use std::fs;
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -43,6 +44,7 @@ pub struct Scenario {
     play: Play,
     timeline: Vec<(u64, String)>,
     watch_mask: bool,
+    node_program: bool,
     limit: Duration,
 }
 
@@ -64,6 +66,7 @@ impl Scenario {
             play: Play::Script(String::new()),
             timeline: Vec::new(),
             watch_mask: false,
+            node_program: false,
             limit: Duration::from_secs(120),
         }
     }
@@ -118,6 +121,13 @@ impl Scenario {
         self
     }
 
+    /// Puts `process_node`, the example of a program as a node, beside `devices.toml`.
+    #[must_use]
+    pub fn node_program(mut self) -> Self {
+        self.node_program = true;
+        self
+    }
+
     /// How long the guest's script may take.
     #[must_use]
     pub fn limit(mut self, limit: Duration) -> Self {
@@ -142,6 +152,14 @@ impl Scenario {
             let path = inside.join(name);
             fs::write(&path, text).map_err(|error| ScenarioError::Share(path, error))
         };
+        if self.node_program {
+            let words = install(&programs::process_node()?)?;
+            // It may have to be run through a loader; a registry names one file.
+            write("process_node", &format!("#!/bin/sh\nexec {} \"$@\"\n", self::words(&words)))?;
+            let path = inside.join("process_node");
+            fs::set_permissions(&path, PermissionsExt::from_mode(0o755))
+                .map_err(|error| ScenarioError::Share(path, error))?;
+        }
         write("bench.sh", WORDS)?;
         write("devices.toml", &self.registry)?;
         write("run.sh", &self.guest_script(&usbemu, &rapid))?;

@@ -2,11 +2,10 @@
 //!
 //! Wall-clock times in a recording are compared with the emulator's: both run in one guest, on one clock.
 
-use std::fmt::Write;
-
+use vbench::check::{assert_whole, episode, ms, only, play, recorded, rises_after};
 use vbench::emu::spec::{DeviceSpec, Format};
-use vbench::outcome::Outcome;
-use vbench::recording::{Recording, falls, holes, rises};
+use vbench::entries::{camera, registry, scalars};
+use vbench::recording::{falls, holes};
 use vbench::scenario::Scenario;
 
 /// Two cameras of different formats and both serial kinds: nodes, udev properties, frames, and the way back.
@@ -94,7 +93,7 @@ fn unplugging_one_device_leaves_the_others_whole() {
     let registry = registry(&[
         camera("cam_wrist", WRIST, 0, Some("CAM00A1"), (640, 480)),
         camera("cam_side", SIDE, 1, Some("CAM00B2"), (320, 240)),
-        distance_sensor(2),
+        scalars("tof", TOF, 2, "2e8a:000a", "TOF1"),
     ]);
     let outcome = recorded(
         Scenario::new("unplug")
@@ -257,72 +256,4 @@ fn silence_is_not_absence() {
 
 fn vga(serial: &str) -> DeviceSpec {
     DeviceSpec::uvc(0x046d, 0x0825).serial(serial).mode(Format::Mjpg, 640, 480, &[30])
-}
-
-/// The bench's own troubles end a test with a sentence that says what to do.
-fn play(scenario: Scenario) -> Outcome {
-    let outcome = scenario.run().unwrap_or_else(|error| panic!("{error}"));
-    println!("{:.1} s wall", outcome.wall.as_secs_f64());
-    outcome
-}
-
-/// Plays a scenario in which `rapid` records to its end without an error on any side.
-fn recorded(scenario: Scenario) -> Outcome {
-    let outcome = play(scenario);
-    assert_eq!(outcome.code, 0, "the guest's script");
-    assert_eq!(outcome.rapid_code, Some(0), "rapid's exit code");
-    assert!(outcome.emulator_errors().is_empty(), "{:?}", outcome.emulator_errors());
-    assert!(outcome.rapid.iter().any(|line| line["event"] == "episode"), "no episode was announced");
-    outcome
-}
-
-fn episode(outcome: &Outcome) -> Recording {
-    outcome.episode().unwrap_or_else(|error| panic!("{error}"))
-}
-
-/// Frames in this span are there, whole, and without a hole in their numbers.
-fn assert_whole(episode: &Recording, topic: &str, span: impl std::ops::RangeBounds<u64> + Clone) {
-    let frames = episode.frames(topic);
-    let damaged =
-        frames.iter().filter(|frame| span.contains(&frame.log_time)).filter(|frame| frame.id.is_none() || !frame.whole);
-    assert_eq!(damaged.count(), 0, "{topic}: damaged frames");
-    let numbers = episode.numbers(topic, span);
-    println!("{topic}: {} frames", numbers.len());
-    assert!(numbers.len() > 10, "{topic}: only {} frames", numbers.len());
-    assert_eq!(holes(numbers), [], "{topic}: a hole in the frame numbers");
-}
-
-fn rises_after(edges: &[vbench::recording::Edge], bit: u32, after: u64) -> Vec<u64> {
-    rises(edges, bit).into_iter().filter(|time| *time > after).collect()
-}
-
-fn only(times: &[u64]) -> u64 {
-    assert_eq!(times.len(), 1, "expected one edge");
-    times[0]
-}
-
-fn ms(later: u64, earlier: u64) -> u64 {
-    later.saturating_sub(earlier) / 1_000_000
-}
-
-fn registry(entries: &[String]) -> String {
-    format!("[rig]\nname = \"vbench\"\n\n{}", entries.join("\n"))
-}
-
-fn camera(name: &str, topic: &str, bit: u32, serial: Option<&str>, (width, height): (u32, u32)) -> String {
-    let mut text = format!("[device.{name}]\nvid = \"0x046d\"\npid = \"0x0825\"\nnode = \"camera\"\n");
-    if let Some(serial) = serial {
-        writeln!(text, "serial = \"{serial}\"").expect("writing to a string cannot fail");
-    }
-    writeln!(text, "topic = \"{topic}\"\nslot = \"top\"\nbit = {bit}").expect("writing to a string cannot fail");
-    writeln!(text, "[device.{name}.camera]\nwidth = {width}\nheight = {height}\nfps = 30\nformat = \"MJPG\"")
-        .expect("writing to a string cannot fail");
-    text
-}
-
-fn distance_sensor(bit: u32) -> String {
-    format!(
-        "[device.tof]\nvid = \"0x2e8a\"\npid = \"0x000a\"\nserial_number = \"TOF1\"\nnode = \"serial\"\ntopic = \"{TOF}\"\nslot = \"tip\"\n\
-         bit = {bit}\n[device.tof.serial]\nbaud = 115200\nframing = \"line\"\nparse = \"csv\"\nchannels = 4\n"
-    )
 }

@@ -9,6 +9,7 @@ use std::io::{self, Read, Write};
 use std::net::Shutdown;
 use std::os::fd::AsRawFd;
 use std::os::unix::net::UnixStream;
+use std::path::PathBuf;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -121,6 +122,7 @@ impl Device {
             return Err(PortError::Plugged(port));
         }
         self.await_free();
+        self.await_forgotten();
         let (ours, kernels) = UnixStream::pair().map_err(PortError::Socket)?;
         for end in [&ours, &kernels] {
             set_socket_send_buffer_size(end, SOCKET_BUFFER).map_err(|e| PortError::Socket(e.into()))?;
@@ -169,6 +171,16 @@ impl Device {
         told.map_err(|source| PortError::Vhci { file: "detach", text: port.to_string(), source })
     }
 
+    /// Waits until the kernel has let go of the device that was in the port. A hub disables a port that loses its device, so
+    /// that the kernel cannot take the next one for it; `vhci_hcd` leaves the port enabled, and a device that returns before
+    /// the kernel's hub thread has looked is taken for the one that left, with the settings of that one.
+    fn await_forgotten(&self) {
+        let give_up = Instant::now() + PORT_FREE_WITHIN;
+        while kernels_device(self.next_port).exists() && Instant::now() < give_up {
+            thread::sleep(Duration::from_millis(2));
+        }
+    }
+
     /// Waits until the threads of the last attachment have let go; cuts the line when the kernel has not.
     fn await_free(&self) {
         let free = |state: &mut State| state.line.is_some();
@@ -183,6 +195,29 @@ impl Device {
             self.shared.hang_up(epoch);
         }
     }
+}
+
+/// Pulls everything that is plugged, as fast as the kernel can be told; which devices these were.
+pub fn unplug_together(devices: &mut [Device]) -> Result<Vec<usize>, PortError> {
+    let told = |text: &str, source| PortError::Vhci { file: "detach", text: text.into(), source };
+    let mut detach = OpenOptions::new().write(true).open(format!("{VHCI}/detach")).map_err(|error| told("", error))?;
+    let mut pulled = Vec::new();
+    // Nothing is logged before the last one is out.
+    for device in devices.iter_mut() {
+        let Some(port) = device.plugged.take() else { continue };
+        let moment = Moment::now();
+        detach.write_all(port.to_string().as_bytes()).map_err(|error| told(&port.to_string(), error))?;
+        pulled.push((device.index, port, moment));
+    }
+    for (index, port, moment) in &pulled {
+        devices[*index].shared.log.say("unplug", *moment, json!({"device": index, "port": port}));
+    }
+    Ok(pulled.into_iter().map(|(index, ..)| index).collect())
+}
+
+/// What the kernel shows of the device in a port, as long as it knows one there. `vhci_hcd.0` is the machine's only USB 2 bus.
+fn kernels_device(port: u8) -> PathBuf {
+    PathBuf::from(format!("/sys/bus/usb/devices/1-{}", port + 1))
 }
 
 fn tell_vhci(file: &str, text: &str) -> io::Result<()> {

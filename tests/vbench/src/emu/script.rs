@@ -1,11 +1,13 @@
 //! The emulator's commands, one a line:
 //!
 //! ```text
-//! plug N..      unplug N..      silent N 0|1      port N P
-//! sleep MS      t0              at MS [COMMAND]   quit
+//! plug N..      unplug N..      silent N 0|1      port N P       hub out|in
+//! sleep MS      t0              at MS [COMMAND]   say WORD       quit
 //! ```
 //!
-//! `t0` starts the timeline's clock; `at MS` waits until MS after it. The end of the input means `quit`.
+//! `t0` starts the timeline's clock; `at MS` waits until MS after it. `say` logs the word, once everything before it is done.
+//! `hub out` pulls everything that is plugged, in one go, as a hub that loses its own cable does; `hub in` returns what it pulled.
+//! The end of the input means `quit`.
 //! Invariant: a line that makes no sense is reported and skipped; it never ends the emulator.
 
 use std::io::BufRead;
@@ -17,7 +19,7 @@ use std::time::Duration;
 use serde_json::json;
 use thiserror::Error;
 
-use super::device::Device;
+use super::device::{self, Device, PortError};
 use super::log::{Log, Moment};
 use super::spec::PORTS;
 use crate::clock;
@@ -29,6 +31,10 @@ pub enum Command {
     Plug(Vec<usize>),
     /// Pull these devices, in this order.
     Unplug(Vec<usize>),
+    /// Pull everything in one go.
+    HubOut,
+    /// Plug what the hub took along.
+    HubIn,
     /// Stop or resume sending.
     Silent(usize, bool),
     /// Port of the next plug.
@@ -39,6 +45,8 @@ pub enum Command {
     Origin,
     /// Wait until this long after the start of the timeline, then do.
     At(Duration, Option<Box<Command>>),
+    /// Log a word.
+    Say(String),
     /// Unplug everything and end.
     Quit,
 }
@@ -60,6 +68,11 @@ fn parse(words: &mut SplitWhitespace<'_>) -> Option<Command> {
     let command = match words.next()? {
         "plug" => Command::Plug(indices(words)?),
         "unplug" => Command::Unplug(indices(words)?),
+        "hub" => match words.next()? {
+            "out" => Command::HubOut,
+            "in" => Command::HubIn,
+            _ => return None,
+        },
         "silent" => {
             let device = words.next()?.parse().ok()?;
             Command::Silent(device, words.next()?.parse::<u8>().ok()? != 0)
@@ -78,6 +91,7 @@ fn parse(words: &mut SplitWhitespace<'_>) -> Option<Command> {
             };
             Command::At(when, then)
         }
+        "say" => Command::Say(words.next()?.into()),
         "quit" => Command::Quit,
         _ => return None,
     };
@@ -95,7 +109,7 @@ fn millis(words: &mut SplitWhitespace<'_>) -> Option<Duration> {
 
 /// Runs commands from `input` until `quit` or its end, then unplugs what is left.
 pub fn run(input: impl BufRead, devices: &mut [Device], log: &Arc<Log>) {
-    let mut player = Player { devices, log, origin_ns: clock::mono_ns() };
+    let mut player = Player { devices, log, origin_ns: clock::mono_ns(), on_hub: Vec::new() };
     for line in input.lines().map_while(Result::ok).filter(|line| !line.trim().is_empty()) {
         match line.parse() {
             Ok(Command::Quit) => break,
@@ -112,6 +126,8 @@ struct Player<'a> {
     devices: &'a mut [Device],
     log: &'a Log,
     origin_ns: u64,
+    /// What the hub took along.
+    on_hub: Vec<usize>,
 }
 
 impl Player<'_> {
@@ -119,6 +135,13 @@ impl Player<'_> {
         match command {
             Command::Plug(devices) => devices.iter().for_each(|index| self.with(*index, Device::plug)),
             Command::Unplug(devices) => devices.iter().for_each(|index| self.with(*index, Device::unplug)),
+            Command::HubOut => match device::unplug_together(self.devices) {
+                Ok(pulled) => self.on_hub = pulled,
+                Err(error) => self.report(&error),
+            },
+            Command::HubIn => {
+                std::mem::take(&mut self.on_hub).into_iter().for_each(|index| self.with(index, Device::plug));
+            }
             Command::Silent(index, silent) => {
                 let moment = Moment::now();
                 self.with(index, |device| {
@@ -144,11 +167,12 @@ impl Player<'_> {
                     self.play(*then);
                 }
             }
+            Command::Say(word) => self.log.say("say", Moment::now(), json!({"word": word})),
             Command::Quit => {}
         }
     }
 
-    fn with(&mut self, index: usize, act: impl FnOnce(&mut Device) -> Result<(), super::device::PortError>) {
+    fn with(&mut self, index: usize, act: impl FnOnce(&mut Device) -> Result<(), PortError>) {
         match self.devices.get_mut(index).map(act) {
             Some(Ok(())) => {}
             Some(Err(error)) => self.report(&format!("device {index}: {error}")),
@@ -171,12 +195,15 @@ mod tests {
         let cases = [
             ("plug 0 2", Command::Plug(vec![0, 2])),
             ("unplug 1", Command::Unplug(vec![1])),
+            ("hub out", Command::HubOut),
+            ("hub in", Command::HubIn),
             ("silent 1 1", Command::Silent(1, true)),
             ("port 0 14", Command::Port(0, 14)),
             ("sleep 250", Command::Sleep(ms(250))),
             ("t0", Command::Origin),
             ("at 5000", Command::At(ms(5000), None)),
             ("  at 300 unplug 1 ", Command::At(ms(300), Some(Box::new(Command::Unplug(vec![1]))))),
+            ("say done", Command::Say("done".into())),
             ("quit", Command::Quit),
         ];
         for (line, command) in cases {
@@ -186,7 +213,9 @@ mod tests {
 
     #[test]
     fn refuses_what_it_cannot_read() {
-        for line in ["plug", "plug x", "silent 0", "port 0 15", "sleep", "at", "at 5 jump", "quit now", "jump"] {
+        for line in
+            ["plug", "plug x", "hub", "hub up", "silent 0", "port 0 15", "sleep", "at", "at 5 jump", "quit now", "jump"]
+        {
             assert_eq!(line.parse::<Command>(), Err(CommandError(line.into())));
         }
     }

@@ -6,6 +6,8 @@
 //! ftdi:port=3,vid=0403,pid=6001,serial=FT1,hz=50
 //! ```
 //!
+//! A comma, a per cent sign or a control character in a string is written as in a URL: `%2c`.
+//!
 //! Invariant: `Display` prints what `FromStr` reads, so the harness and the emulator share one vocabulary.
 
 use std::fmt;
@@ -133,6 +135,14 @@ impl DeviceSpec {
         self
     }
 
+    /// Gives it these names instead of the bench's own.
+    #[must_use]
+    pub fn names(mut self, manufacturer: &str, product: &str) -> Self {
+        self.identity.manufacturer = manufacturer.into();
+        self.identity.product = product.into();
+        self
+    }
+
     /// Plugs it into this port first.
     #[must_use]
     pub fn port(mut self, port: u8) -> Self {
@@ -183,6 +193,7 @@ impl FromStr for DeviceSpec {
             let (key, value) = field.split_once('=').ok_or_else(unknown)?;
             let wrong = |expected| SpecError::Value { key: key.into(), value: value.into(), expected };
             let hex = || u16::from_str_radix(value, 16).map_err(|_| wrong("four hexadecimal digits"));
+            let string = || unescaped(value).ok_or_else(|| wrong("text, with %25 for a per cent sign"));
             match (key, &mut spec.kind) {
                 ("port", _) => {
                     let port = value.parse().ok().filter(|port| *port < PORTS);
@@ -190,9 +201,9 @@ impl FromStr for DeviceSpec {
                 }
                 ("vid", _) => spec.identity.vid = hex()?,
                 ("pid", _) => spec.identity.pid = hex()?,
-                ("serial", _) => spec.identity.serial = value.into(),
-                ("product", _) => spec.identity.product = value.into(),
-                ("manufacturer", _) => spec.identity.manufacturer = value.into(),
+                ("serial", _) => spec.identity.serial = string()?,
+                ("product", _) => spec.identity.product = string()?,
+                ("manufacturer", _) => spec.identity.manufacturer = string()?,
                 ("mode", Kind::Uvc(modes)) if modes.len() < MODES => {
                     modes.push(parse_mode(value).ok_or_else(|| wrong("FORMAT-WxH@FPS[/FPS..], FORMAT MJPG or YUYV"))?);
                 }
@@ -208,6 +219,22 @@ impl FromStr for DeviceSpec {
         }
         Ok(spec)
     }
+}
+
+fn escaped(text: &str) -> String {
+    let escape =
+        |c: char| if c.is_ascii_control() || matches!(c, ',' | '%') { format!("%{:02x}", c as u32) } else { c.into() };
+    text.chars().map(escape).collect()
+}
+
+fn unescaped(text: &str) -> Option<String> {
+    let mut parts = text.split('%');
+    let mut bytes = parts.next()?.as_bytes().to_vec();
+    for part in parts {
+        bytes.push(u8::from_str_radix(part.get(..2)?, 16).ok()?);
+        bytes.extend_from_slice(&part.as_bytes()[2..]);
+    }
+    String::from_utf8(bytes).ok()
 }
 
 fn parse_mode(text: &str) -> Option<Mode> {
@@ -239,7 +266,9 @@ impl fmt::Display for Format {
 
 impl fmt::Display for DeviceSpec {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Identity { vid, pid, serial, product, manufacturer } = &self.identity;
+        let Identity { vid, pid, .. } = self.identity;
+        let [serial, product, manufacturer] =
+            [&self.identity.serial, &self.identity.product, &self.identity.manufacturer].map(|text| escaped(text));
         write!(
             f,
             "{}:vid={vid:04x},pid={pid:04x},serial={serial},product={product},manufacturer={manufacturer}",
@@ -269,9 +298,13 @@ mod tests {
             .port(3)
             .mode(Format::Mjpg, 640, 480, &[30])
             .mode(Format::Yuyv, 320, 240, &[30, 15]);
-        for spec in
-            [camera, DeviceSpec::acm(0x2e8a, 0x000a, 100.0).serial("TOF1"), DeviceSpec::ftdi(0x0403, 0x6001, 0.5)]
-        {
+        let hostile = DeviceSpec::uvc(1, 2).serial("a,b=%2c\n\"'\\ \0相").names("\u{1b}[2J,", "%");
+        for spec in [
+            camera,
+            hostile,
+            DeviceSpec::acm(0x2e8a, 0x000a, 100.0).serial("TOF1"),
+            DeviceSpec::ftdi(0x0403, 0x6001, 0.5),
+        ] {
             assert_eq!(spec.to_string().parse(), Ok(spec));
         }
     }
@@ -281,6 +314,7 @@ mod tests {
         let cases = [
             ("cam:", "unknown kind `cam`: use uvc, acm or ftdi"),
             ("uvc:hz=3", "unknown key `hz=3` for uvc"),
+            ("acm:serial=%4", "`serial=%4`: expected text, with %25 for a per cent sign"),
             ("acm:port=15", "`port=15`: expected a port from 0 to 14"),
             ("uvc:mode=MJPG-640@30", "`mode=MJPG-640@30`: expected FORMAT-WxH@FPS[/FPS..], FORMAT MJPG or YUYV"),
         ];

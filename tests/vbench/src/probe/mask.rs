@@ -1,4 +1,4 @@
-//! Watches `/dev/shm/rapid_hardware_mask` and prints each change, with the time it was first seen.
+//! Watches `/dev/shm/rapid_hardware_mask` and prints each change, with the time it was first seen, and how it beats.
 //!
 //! Layout, little endian: bytes "RAPD", u8 version, u8 count, u16 write generation (odd while being written) at 6,
 //! u64 mask at 8, u64 CLOCK_REALTIME ns at 16, u64 sequence at 24.
@@ -19,6 +19,8 @@ pub const MASK_PATH: &str = "/dev/shm/rapid_hardware_mask";
 const RECORD: usize = 32;
 /// Between two looks. The mask is published every 2 ms.
 const INTERVAL: Duration = Duration::from_micros(500);
+/// A line about the beat covers this much.
+const WINDOW_NS: u64 = 100_000_000;
 /// Looks between two checks that the file has not been replaced.
 const LOOKS_PER_CHECK: u32 = 100;
 
@@ -57,8 +59,10 @@ pub fn watch(path: &Path, limit: Option<Duration>, log: &Log) {
 fn follow(file: &File, running: impl Fn() -> bool, log: &Log) {
     let mut last: Option<Record> = None;
     let mut looks = 0u32;
+    let mut beat = Beat::default();
     while running() {
         if let Some(record) = read(file) {
+            beat.look(record.sequence, Moment::now(), log);
             if last.is_none_or(|last| last.mask != record.mask) {
                 let fields = json!({
                     "mask": format!("{:#04x}", record.mask),
@@ -75,6 +79,54 @@ fn follow(file: &File, running: impl Fn() -> bool, log: &Log) {
             return;
         }
         thread::sleep(INTERVAL);
+    }
+}
+
+/// How the sequence advances, one `beat` line a window: looks and publications in it, the longest silence of the mask that
+/// ended in it, and the longest pause between two looks, which is the sampler's own.
+#[derive(Default)]
+struct Beat {
+    begun_ns: u64,
+    looks: u64,
+    publications: u64,
+    longest_ns: u64,
+    pause_ns: u64,
+    /// Sequence last seen, and when it was new.
+    last: Option<(u64, u64)>,
+    looked_ns: u64,
+}
+
+impl Beat {
+    fn look(&mut self, sequence: u64, now: Moment, log: &Log) {
+        let now_ns = now.mono_ns;
+        match self.last {
+            None => {
+                self.last = Some((sequence, now_ns));
+                self.begun_ns = now_ns;
+            }
+            Some((before, seen_ns)) if before != sequence => {
+                self.publications += sequence.wrapping_sub(before);
+                self.longest_ns = self.longest_ns.max(now_ns - seen_ns);
+                self.last = Some((sequence, now_ns));
+            }
+            Some(_) => {}
+        }
+        if self.looked_ns > 0 {
+            self.pause_ns = self.pause_ns.max(now_ns - self.looked_ns);
+        }
+        self.looked_ns = now_ns;
+        self.looks += 1;
+        if now_ns - self.begun_ns >= WINDOW_NS {
+            let fields = json!({
+                "from_ns": self.begun_ns,
+                "looks": self.looks,
+                "publications": self.publications,
+                "longest_ns": self.longest_ns,
+                "pause_ns": self.pause_ns,
+            });
+            log.say("beat", now, fields);
+            *self = Self { begun_ns: now_ns, last: self.last, looked_ns: now_ns, ..Self::default() };
+        }
     }
 }
 

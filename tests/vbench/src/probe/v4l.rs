@@ -12,8 +12,10 @@ use rustix::mm::{MapFlags, ProtFlags, mmap, munmap};
 use serde_json::{Value, json};
 use thiserror::Error;
 
+use super::uevent::Listener;
 use crate::clock;
 use crate::emu::frame;
+use crate::emu::log::{Log, Moment};
 
 const CAPTURE: u32 = 1;
 const MMAP: u32 = 1;
@@ -87,6 +89,36 @@ pub fn read(path: &Path, count: u32) -> Result<Value, ReadError> {
         if tally.frames < count { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
     })?;
     Ok(tally.describe(&format))
+}
+
+/// Opens each camera as soon as udev has made it ready, takes one frame, closes it and prints how long the steps took, without
+/// end. The plainest program there can be: it keeps the camera's format, and does nothing else meanwhile.
+pub fn first_frames(log: &Log) -> Result<(), ReadError> {
+    let heard = |error| ReadError::Call("recv from udev", error);
+    let mut listener = Listener::open().map_err(heard)?;
+    loop {
+        let (event, told) = listener.receive().map_err(heard)?;
+        let Some(node) = event.camera_added() else { continue };
+        match first_frame(Path::new(&node)) {
+            Ok((streaming, came)) => {
+                let fields = json!({"node": node, "told_ns": told.mono_ns, "streaming_ns": streaming.mono_ns});
+                log.say("first_frame", came, fields);
+            }
+            Err(error) => log.say("missed", told, json!({"node": node, "error": error.to_string()})),
+        }
+    }
+}
+
+/// When the camera streamed and when its first frame had come.
+fn first_frame(node: &Path) -> Result<(Moment, Moment), ReadError> {
+    let mut camera = Camera::open(node)?;
+    let streaming = Moment::now();
+    let mut came = streaming;
+    let _one_is_enough = camera.next(0, |_| {
+        came = Moment::now();
+        ControlFlow::Break(())
+    })?;
+    Ok((streaming, came))
 }
 
 /// Hands each captured frame to `take` until it breaks off, in the node's current format.

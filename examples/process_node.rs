@@ -1,0 +1,124 @@
+//! A program that reads a device for `rapid`: `node = "process_node"` in `devices.toml`.
+//!
+//!     [device.counter]
+//!     vid = "0x2e8a"
+//!     pid = "0x000a"
+//!     node = "process_node"            # beside devices.toml, or on PATH
+//!     [device.counter.process]
+//!     args = ["--rate", "100"]
+//!     kind = "scalars"
+//!     channels = 2
+//!
+//! `rapid` starts it when the device is plugged and ends it with SIGTERM when it is pulled. It
+//! publishes what it reads, here a counter, on the topic it is given; any language with an iceoryx2
+//! binding will do. What it prints goes to the log of `rapid`.
+//!
+//! Options: `--rate HZ`, `--channels N`; and to try what happens when a program misbehaves:
+//! `--ignore-sigterm`, `--crash-after SAMPLES`, `--silent-after SAMPLES`, `--flood-stderr`.
+
+use std::error::Error;
+use std::str::FromStr;
+use std::time::{Duration, Instant};
+
+use iceoryx2::prelude::*;
+use rapid::sample::{Encoding, SampleHeader};
+use rapid::time::Stamp;
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let options = Options::from_arguments()?;
+    if options.ignore_sigterm {
+        // SAFETY: no handler of ours is called: the signal is ignored.
+        unsafe { libc::signal(libc::SIGTERM, libc::SIG_IGN) };
+    }
+    if options.flood_stderr {
+        std::thread::spawn(|| {
+            for line in 0_u64.. {
+                eprintln!("flood {line}");
+            }
+        });
+    }
+    let topic = std::env::var("RAPID_TOPIC")?;
+    println!("reads {}, publishes on {topic}", std::env::var("DEVICE_NODE")?);
+
+    let mut config = Config::global_config().clone();
+    config.global.prefix = FileName::new(std::env::var("RAPID_BUS_PREFIX")?.as_bytes())?;
+    let node = NodeBuilder::new()
+        .config(&config)
+        // SIGTERM ends this program as it ends any other.
+        .signal_handling_mode(SignalHandlingMode::Disabled)
+        .create::<ipc::Service>()?;
+    let name = ServiceName::new(&topic)?;
+    let samples = node.service_builder(&name).publish_subscribe::<[u8]>().user_header::<SampleHeader>().open()?;
+    let publisher = samples.publisher_builder().initial_max_slice_len(8 * options.channels).create()?;
+    // Without a notification a sample is found a little later.
+    let wake = node.service_builder(&name).event().open()?.notifier_builder().create()?;
+
+    let header = SampleHeader {
+        id: number("RAPID_BIT")?,
+        epoch: number("RAPID_EPOCH")?,
+        encoding: Encoding::F64 as u32,
+        ..SampleHeader::default()
+    };
+    let begun = Instant::now();
+    for seq in 0_u32.. {
+        if options.crash_after == Some(seq) {
+            return Err(format!("crashes after {seq} samples, as told").into());
+        }
+        if options.silent_after == Some(seq) {
+            std::thread::sleep(Duration::MAX);
+        }
+        let mut values = vec![0.0; options.channels];
+        values[0] = f64::from(seq);
+        let payload: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
+        let mut sample = publisher.loan_slice_uninit(payload.len())?;
+        *sample.user_header_mut() = SampleHeader { seq: seq.into(), capture_ns: Stamp::now().0, ..header };
+        sample.write_from_slice(&payload).send()?;
+        wake.notify()?;
+        let due = begun + Duration::from_secs_f64(f64::from(seq + 1) / options.rate);
+        std::thread::sleep(due.saturating_duration_since(Instant::now()));
+    }
+    Ok(())
+}
+
+fn number(variable: &str) -> Result<u32, Box<dyn Error>> {
+    Ok(std::env::var(variable)?.parse()?)
+}
+
+struct Options {
+    rate: f64,
+    channels: usize,
+    ignore_sigterm: bool,
+    crash_after: Option<u32>,
+    silent_after: Option<u32>,
+    flood_stderr: bool,
+}
+
+impl Options {
+    fn from_arguments() -> Result<Self, Box<dyn Error>> {
+        let mut options = Self {
+            rate: 100.0,
+            channels: 2,
+            ignore_sigterm: false,
+            crash_after: None,
+            silent_after: None,
+            flood_stderr: false,
+        };
+        let mut arguments = std::env::args().skip(1);
+        while let Some(option) = arguments.next() {
+            match option.as_str() {
+                "--rate" => options.rate = value(&option, arguments.next())?,
+                "--channels" => options.channels = value(&option, arguments.next())?,
+                "--ignore-sigterm" => options.ignore_sigterm = true,
+                "--crash-after" => options.crash_after = Some(value(&option, arguments.next())?),
+                "--silent-after" => options.silent_after = Some(value(&option, arguments.next())?),
+                "--flood-stderr" => options.flood_stderr = true,
+                other => return Err(format!("unknown option {other}").into()),
+            }
+        }
+        Ok(options)
+    }
+}
+
+fn value<T: FromStr>(option: &str, text: Option<String>) -> Result<T, Box<dyn Error>> {
+    text.and_then(|text| text.parse().ok()).ok_or_else(|| format!("{option} needs a number").into())
+}

@@ -1,0 +1,181 @@
+//! An ingress: the topic on which a program of the rig publishes for one modality.
+//!
+//! It stands beside the modality's own topic and never reaches a consumer: what comes here is judged
+//! by the rig and published anew by the topic's one writer. An event service of the same name wakes
+//! the rig; a program that does not notify is looked after every [`LOOK`].
+//!
+//! Invariant: at most [`Ingress::depth`] samples wait; the oldest give way.
+//! Invariant: a header is copied before anybody looks at it: its program can still write to it.
+
+use std::os::fd::{AsRawFd, RawFd};
+use std::sync::Arc;
+use std::time::Duration;
+
+use iceoryx2::port::listener::Listener;
+use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::prelude::*;
+use iceoryx2::sample::Sample;
+use tokio::io::Interest;
+use tokio::io::unix::AsyncFd;
+
+use super::{BusError, MAX_NODES, Service, service_name, topic_error};
+use crate::registry::DeviceSpec;
+use crate::sample::SampleHeader;
+
+/// Begins the name of an ingress; the modality's topic follows.
+const PREFIX: &str = "/rapid/ingress";
+/// The longest that a sample of which nobody was notified waits.
+const LOOK: Duration = Duration::from_millis(10);
+/// A successor may come while the place of a program that died is not yet given back.
+const PUBLISHERS: usize = 4;
+/// Samples that may wait: the rig fetches each at once, and their pool is memory of the program.
+const DEPTH: usize = 256;
+/// The same for samples of more than [`LARGE`] bytes.
+const DEPTH_OF_LARGE: usize = 16;
+const LARGE: usize = 64 << 10;
+
+/// See the module's comment.
+pub struct Ingress {
+    topic: String,
+    depth: usize,
+    subscriber: Subscriber<Service, [u8], SampleHeader>,
+    listener: Listener<Service>,
+}
+
+impl std::fmt::Debug for Ingress {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Ingress").field("topic", &self.topic).finish_non_exhaustive()
+    }
+}
+
+impl Ingress {
+    pub(super) fn open(node: &Node<Service>, device: &DeviceSpec) -> Result<Self, BusError> {
+        let topic = format!("{PREFIX}{}", device.topic);
+        let depth = if device.max_bytes > LARGE { DEPTH_OF_LARGE } else { DEPTH }.min(device.depth);
+        let name = service_name(&topic)?;
+        let failed = |error: &dyn std::fmt::Debug| topic_error(&topic, error);
+        let samples = node
+            .service_builder(&name)
+            .publish_subscribe::<[u8]>()
+            .user_header::<SampleHeader>()
+            .max_publishers(PUBLISHERS)
+            .max_subscribers(1)
+            .max_nodes(MAX_NODES)
+            .subscriber_max_buffer_size(depth)
+            .subscriber_max_borrowed_samples(2)
+            .history_size(0)
+            .enable_safe_overflow(true)
+            .open_or_create()
+            .map_err(|error| failed(&error))?;
+        let subscriber = samples.subscriber_builder().buffer_size(depth).create().map_err(|error| failed(&error))?;
+        let wake = node
+            .service_builder(&name)
+            .event()
+            .max_notifiers(PUBLISHERS)
+            .max_listeners(1)
+            .max_nodes(MAX_NODES)
+            .open_or_create()
+            .map_err(|error| failed(&error))?;
+        let listener = wake.listener_builder().create().map_err(|error| failed(&error))?;
+        Ok(Self { topic, depth, subscriber, listener })
+    }
+
+    /// Where the program publishes.
+    #[must_use]
+    pub fn topic(&self) -> &str {
+        &self.topic
+    }
+
+    /// Samples that may wait.
+    #[must_use]
+    pub const fn depth(&self) -> usize {
+        self.depth
+    }
+
+    /// The oldest sample that waits.
+    ///
+    /// # Errors
+    /// When the topic cannot be read.
+    pub fn take(&self) -> Result<Option<Given>, BusError> {
+        match self.subscriber.receive() {
+            Ok(sample) => Ok(sample.map(|sample| Given { header: *sample.user_header(), sample })),
+            Err(error) => Err(BusError::Transfer { topic: self.topic.clone(), reason: format!("{error:?}") }),
+        }
+    }
+
+    /// Throws away what waits.
+    pub fn clear(&self) {
+        // A program that publishes meanwhile must not hold us here.
+        for _ in 0..2 * self.depth {
+            if !matches!(self.take(), Ok(Some(_))) {
+                return;
+            }
+        }
+    }
+
+    /// Waits for samples; needs tokio's I/O.
+    ///
+    /// # Errors
+    /// When the system cannot watch the event service.
+    pub fn watch(self: &Arc<Self>) -> Result<Watch, BusError> {
+        let ear = Ear(Arc::clone(self));
+        // SAFETY: the ear keeps the descriptor's owner alive, and always names the same one.
+        let ear = unsafe { AsyncFd::register_with_interest(ear, Interest::READABLE) };
+        Ok(Watch { ear: ear.map_err(|error| topic_error(&self.topic, &error))? })
+    }
+}
+
+/// A sample as its program gave it; nothing in it has been checked.
+pub struct Given {
+    header: SampleHeader,
+    sample: Sample<Service, [u8], SampleHeader>,
+}
+
+impl std::fmt::Debug for Given {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Given").field("header", &self.header).finish_non_exhaustive()
+    }
+}
+
+impl Given {
+    /// The header as it was when the sample was taken.
+    #[must_use]
+    pub const fn header(&self) -> &SampleHeader {
+        &self.header
+    }
+
+    /// The payload.
+    #[must_use]
+    pub fn bytes(&self) -> &[u8] {
+        self.sample.payload()
+    }
+}
+
+/// Wakes the reader of an ingress.
+#[derive(Debug)]
+pub struct Watch {
+    ear: AsyncFd<Ear>,
+}
+
+impl Watch {
+    /// Returns when a sample may have come, at the latest after [`LOOK`]. Cancel-safe.
+    pub async fn wait(&self) {
+        let Ok(Ok(mut ready)) = tokio::time::timeout(LOOK, self.ear.readable()).await else { return };
+        // What is taken here was published before; the caller looks now.
+        if !matches!(self.ear.get_ref().0.listener.try_wait(|_| {}), Ok(1..)) {
+            ready.clear_ready();
+        }
+    }
+}
+
+/// The event service's socket.
+#[derive(Debug)]
+struct Ear(Arc<Ingress>);
+
+impl AsRawFd for Ear {
+    fn as_raw_fd(&self) -> RawFd {
+        // SAFETY: the descriptor belongs to the listener, which lives as long as `self` and neither
+        // closes nor exchanges it before; it is only watched here.
+        unsafe { self.0.listener.file_descriptor().native_handle() }
+    }
+}

@@ -1,0 +1,90 @@
+//! Where iceoryx2 keeps its files, and whether they are ours to use.
+//!
+//! iceoryx2 0.10 makes its folder (`/tmp/iceoryx2`) for the user who comes first, mode 0750, and its
+//! shared memory under names that anybody can foretell. Of another user's folder it only says
+//! `InternalError`; in one that is open to everybody it would use what lies there.
+
+use std::fs::Metadata;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+
+use rustix::fs::Access;
+
+use super::BusError;
+
+/// Where Linux keeps POSIX shared memory, see `shm_overview(7)`.
+const SHARED_MEMORY: &str = "/dev/shm";
+
+/// Refuses a folder that another user made, which leads elsewhere by another's link, or which we
+/// may not use. One that is missing will be made.
+pub(super) fn check(folder: &Path) -> Result<(), BusError> {
+    let foreign = |what: String| BusError::Foreign { path: folder.to_owned(), what };
+    let Ok(named) = std::fs::symlink_metadata(folder) else { return Ok(()) };
+    if !is_trusted(&named) {
+        return Err(foreign(belongs(&named)));
+    }
+    let Ok(folder_itself) = std::fs::metadata(folder) else {
+        return Err(foreign("a link that leads nowhere".to_owned()));
+    };
+    if !folder_itself.is_dir() {
+        return Err(foreign("not a folder".to_owned()));
+    }
+    if !is_trusted(&folder_itself) {
+        return Err(foreign(belongs(&folder_itself)));
+    }
+    match rustix::fs::access(folder, Access::WRITE_OK | Access::EXEC_OK) {
+        Ok(()) => Ok(()),
+        Err(_) => Err(foreign(belongs(&folder_itself))),
+    }
+}
+
+/// A file of another user under a name that begins with ours: why a node could not be made.
+pub(super) fn in_the_way(prefix: &str) -> Option<BusError> {
+    let entries = std::fs::read_dir(SHARED_MEMORY).ok()?.flatten();
+    let ours = |path: &PathBuf| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(prefix));
+    entries.map(|entry| entry.path()).filter(ours).find_map(|path| {
+        let there = std::fs::symlink_metadata(&path).ok()?;
+        let what = belongs(&there);
+        (!is_trusted(&there)).then_some(BusError::Foreign { path, what })
+    })
+}
+
+fn is_trusted(metadata: &Metadata) -> bool {
+    metadata.uid() == 0 || metadata.uid() == rustix::process::geteuid().as_raw()
+}
+
+fn belongs(metadata: &Metadata) -> String {
+    format!("belongs to user {}", metadata.uid())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::{chown, lchown, symlink};
+
+    use super::*;
+
+    #[test]
+    fn only_a_folder_of_ours_is_used() {
+        let dir = tempfile::tempdir().unwrap();
+        let folder = dir.path().join("iceoryx2");
+        assert!(check(&folder).is_ok(), "it is made when it is missing");
+        std::fs::create_dir(&folder).unwrap();
+        assert!(check(&folder).is_ok());
+        let link = dir.path().join("link");
+        symlink(&folder, &link).unwrap();
+        assert!(check(&link).is_ok());
+        let file = dir.path().join("file");
+        std::fs::write(&file, "").unwrap();
+        assert!(check(&file).unwrap_err().to_string().contains("file: not a folder; "));
+        symlink(dir.path().join("nowhere"), dir.path().join("dangling")).unwrap();
+        assert!(check(&dir.path().join("dangling")).is_err());
+        if lchown(&link, Some(12_345), None).is_err() {
+            eprintln!("NOT CHECKED: only root can give links away");
+            return;
+        }
+        assert!(check(&link).unwrap_err().to_string().contains("link: belongs to user 12345; "));
+        chown(&folder, Some(12_345), None).unwrap();
+        let error = check(&folder).unwrap_err().to_string();
+        assert!(error.contains("iceoryx2: belongs to user 12345; ") && error.contains("rm -r"), "{error}");
+    }
+}

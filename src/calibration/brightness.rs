@@ -1,0 +1,115 @@
+//! The mean brightness of a picture.
+
+use zune_jpeg::JpegDecoder;
+use zune_jpeg::zune_core::bytestream::ZCursor;
+use zune_jpeg::zune_core::colorspace::ColorSpace;
+use zune_jpeg::zune_core::options::DecoderOptions;
+
+use crate::sample::Encoding;
+
+/// Pixels a picture may have along a side, as in the registry.
+const LARGEST: usize = 8192;
+
+/// Why a picture has no brightness.
+#[derive(Debug, thiserror::Error)]
+pub enum BrightnessError {
+    /// It is no picture.
+    #[error("the samples are no pictures")]
+    NoPicture,
+    /// It cannot be decoded.
+    #[error("{0}")]
+    Damaged(String),
+}
+
+/// The mean luminance of a picture, 0 (black) to 255 (white).
+///
+/// # Errors
+/// When the bytes are no picture, or a damaged one.
+pub fn brightness(encoding: Encoding, bytes: &[u8]) -> Result<f64, BrightnessError> {
+    match encoding {
+        Encoding::Grey => mean(bytes.iter()),
+        // Y0 U Y1 V: every other byte is luminance.
+        Encoding::Yuyv => mean(bytes.iter().step_by(2)),
+        Encoding::Mjpeg => {
+            // Cameras that leave out the Huffman tables mean those of the standard; the decoder knows.
+            let options = DecoderOptions::default()
+                .jpeg_set_out_colorspace(ColorSpace::Luma)
+                .set_max_width(LARGEST)
+                .set_max_height(LARGEST);
+            let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
+            let pixels = decoder.decode().map_err(|error| BrightnessError::Damaged(error.to_string()))?;
+            mean(pixels.iter())
+        }
+        Encoding::Bytes | Encoding::F64 | Encoding::Mask => Err(BrightnessError::NoPicture),
+    }
+}
+
+fn mean<'a>(luminance: impl Iterator<Item = &'a u8>) -> Result<f64, BrightnessError> {
+    let (sum, count) =
+        luminance.fold((0_u64, 0_u64), |(sum, count), luminance| (sum + u64::from(*luminance), count + 1));
+    if count == 0 {
+        return Err(BrightnessError::Damaged("the picture is empty".to_owned()));
+    }
+    Ok(sum as f64 / count as f64)
+}
+
+#[cfg(test)]
+mod tests {
+    use jpeg_encoder::{ColorType, Encoder};
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn jpeg(shade: u8) -> Vec<u8> {
+        let mut jpeg = Vec::new();
+        Encoder::new(&mut jpeg, 80).encode(&[shade; 3 * 64 * 48], 64, 48, ColorType::Rgb).unwrap();
+        jpeg
+    }
+
+    /// The JPEG without its Huffman tables (marker FFC4), as many cameras send it.
+    fn without_tables(jpeg: &[u8]) -> Vec<u8> {
+        let mut rest = &jpeg[2..];
+        let mut bare = jpeg[..2].to_vec();
+        while rest[1] != 0xda {
+            let length = 2 + usize::from(u16::from_be_bytes([rest[2], rest[3]]));
+            if rest[1] != 0xc4 {
+                bare.extend_from_slice(&rest[..length]);
+            }
+            rest = &rest[length..];
+        }
+        bare.extend_from_slice(rest);
+        bare
+    }
+
+    #[test]
+    fn each_encoding_has_its_luminance() {
+        assert!((brightness(Encoding::Grey, &[10, 30]).unwrap() - 20.0).abs() < 1e-9);
+        assert!((brightness(Encoding::Yuyv, &[10, 255, 30, 0]).unwrap() - 20.0).abs() < 1e-9);
+        for shade in [0, 77, 200, 255] {
+            let whole = jpeg(shade);
+            assert!((brightness(Encoding::Mjpeg, &whole).unwrap() - f64::from(shade)).abs() < 2.0, "{shade}");
+            let bare = without_tables(&whole);
+            assert!(bare.len() < whole.len() - 100);
+            assert!((brightness(Encoding::Mjpeg, &bare).unwrap() - f64::from(shade)).abs() < 2.0, "{shade}");
+        }
+        assert!(brightness(Encoding::Grey, &[]).is_err() && brightness(Encoding::F64, &[0; 8]).is_err());
+        assert!(brightness(Encoding::Mjpeg, b"no picture").is_err());
+    }
+
+    proptest! {
+        #[test]
+        fn damaged_pictures_are_refused_or_shown_and_nothing_panics(
+            places in proptest::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..20), cut in any::<prop::sample::Index>(),
+        ) {
+            let mut bytes = jpeg(90);
+            for (place, value) in places {
+                let at = place.index(bytes.len());
+                bytes[at] = value;
+            }
+            bytes.truncate(1 + cut.index(bytes.len()));
+            if let Ok(mean) = brightness(Encoding::Mjpeg, &bytes) {
+                prop_assert!((0.0..=255.0).contains(&mean));
+            }
+        }
+    }
+}

@@ -1,0 +1,63 @@
+//! Episodes as bytes: the MCAP file read record by record, whole or not, and the names in it.
+//!
+//! What reads an episode, to tell of it, to repair it or to play it, reads it through a
+//! [`walk::Walk`]; what only one of them needs is theirs.
+//!
+//! Invariant: no bytes make anything here panic, and memory holds one record of a file at a time.
+
+mod chunk;
+#[cfg(test)]
+pub(crate) mod testing;
+#[cfg(test)]
+mod tests;
+pub(crate) mod walk;
+pub(crate) mod wire;
+
+pub(crate) use chunk::is_sound;
+
+use std::fs::File;
+use std::io;
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::{Path, PathBuf};
+
+use rustix::fs::OFlags;
+
+/// Topic of the physical mask.
+pub(crate) const MASK_TOPIC: &str = "/rapid/mask";
+/// Topic of the frame index.
+pub(crate) const FRAME_TOPIC: &str = "/rapid/frame";
+/// Topic of events.
+pub(crate) const EVENT_TOPIC: &str = "/rapid/event";
+/// Topic of the log.
+pub(crate) const LOG_TOPIC: &str = "/rapid/log";
+
+/// Metadata record at an episode's beginning.
+pub(crate) const ABOUT: &str = "rapid";
+/// Metadata record at an episode's end.
+pub(crate) const SUMMARY: &str = "rapid/summary";
+/// Metadata record of an episode that was repaired.
+pub(crate) const RECOVERED: &str = "rapid/recovered";
+
+/// Why a file cannot be opened to be read.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum OpenError {
+    #[error("{}: {source}", path.display())]
+    Io { path: PathBuf, source: io::Error },
+    #[error("{}: not a file; name an episode, a file that ends in .mcap or .mcap.partial", .0.display())]
+    NotFile(PathBuf),
+}
+
+/// Opens a file to be read, and its size in bytes. Pipes, devices and folders are refused without
+/// being opened: opening one may wait for ever, or do something.
+pub(crate) fn open(path: &Path) -> Result<(File, u64), OpenError> {
+    let io = |source| OpenError::Io { path: path.to_owned(), source };
+    let not_file = || OpenError::NotFile(path.to_owned());
+    if !std::fs::metadata(path).map_err(io)?.is_file() {
+        return Err(not_file());
+    }
+    let flags = OFlags::NONBLOCK.bits().cast_signed();
+    let file = File::options().read(true).custom_flags(flags).open(path).map_err(io)?;
+    // What has the name now may be another thing than what had it a moment ago.
+    let metadata = file.metadata().map_err(io)?;
+    if metadata.is_file() { Ok((file, metadata.len())) } else { Err(not_file()) }
+}

@@ -1,0 +1,66 @@
+//! Provenance: what was agreed with a device when it was opened, and through which driver.
+//!
+//! Plain data for the log, the events and the recording; who asks the device fills it in.
+//!
+//! Invariant: everything here is what the device or the kernel answered, not what was wished; what
+//! they do not tell is absent.
+
+use std::collections::BTreeMap;
+
+use serde::Serialize;
+
+/// A driver of the kernel.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize)]
+pub struct KernelDriver {
+    /// Its name, for example `uvcvideo`, `cdc_acm`, `ftdi_sio`.
+    pub name: String,
+    /// Its version, where it has one: drivers of V4L2 tell that of the kernel they belong to.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub version: Option<String>,
+}
+
+/// What was agreed with a device when it was opened.
+#[derive(Debug, Clone, PartialEq, Default, Serialize)]
+pub struct Negotiated {
+    /// The driver that answered.
+    pub driver: Option<KernelDriver>,
+    /// What the driver calls the device (V4L2 `card`).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub card: Option<String>,
+    /// Where the driver says the device is (V4L2 `bus_info`).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub bus: Option<String>,
+    /// How its samples come.
+    pub format: Option<Format>,
+    /// Controls and their values as read back, by the names `devices.toml` gives them.
+    pub controls: BTreeMap<String, i64>,
+}
+
+/// How the samples of a device come.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(untagged)]
+pub enum Format {
+    /// Pictures.
+    Pictures {
+        /// V4L2 name of the pixel format.
+        fourcc: String,
+        /// Pixels.
+        width: u32,
+        /// Pixels.
+        height: u32,
+        /// Pictures a second; absent if the driver cannot set a rate.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        fps: Option<f64>,
+    },
+    /// Messages on a serial line.
+    Messages {
+        /// Bits a second; absent where there is no line.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        baud: Option<u32>,
+        /// Numbers in a message; 0 if it is not looked into.
+        channels: usize,
+        /// Messages a second, where it is known.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        hz: Option<f64>,
+    },
+}

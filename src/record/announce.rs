@@ -1,0 +1,107 @@
+//! What goes wrong while an episode is recorded, said while something can still be done about it.
+//!
+//! Invariant: at most one announcement a modality a second, however fast things go wrong.
+
+use std::time::Duration;
+
+use super::quality::{Measures, Meter};
+use crate::modality::MAX_MODALITIES;
+use crate::registry::{DeviceSpec, Limits, Registry};
+use crate::status::{Board, Level, What};
+use crate::time::{Stamp, nanoseconds};
+
+/// How often a modality's troubles are announced at most.
+const ANNOUNCE_EVERY: Duration = Duration::from_secs(1);
+/// So many samples make a trouble that is announced; fewer may be chance, and the verdict has them.
+const LEAST_SAMPLES: u64 = 3;
+
+/// See the module's comment.
+#[derive(Debug)]
+pub(super) struct Announcer {
+    told: Vec<Told>,
+}
+
+/// What has been announced of a modality.
+#[derive(Debug, Clone, Copy, Default)]
+struct Told {
+    dropped: u64,
+    lost: u64,
+    damaged: u64,
+    late: u64,
+    frozen: bool,
+    at: Option<Stamp>,
+}
+
+impl Announcer {
+    pub(super) fn new() -> Self {
+        Self { told: vec![Told::default(); MAX_MODALITIES] }
+    }
+
+    /// Announces what is new and was not announced within the last second.
+    pub(super) fn look(&mut self, measures: &Measures, registry: &Registry, board: &Board, now: Stamp) {
+        self.each(measures, registry, board, now, |told| told.at.is_none_or(|at| now.since(at) >= ANNOUNCE_EVERY));
+    }
+
+    /// Announces what has not been announced yet, at the end.
+    pub(super) fn last(&mut self, measures: &Measures, registry: &Registry, board: &Board, now: Stamp) {
+        self.each(measures, registry, board, now, |_| true);
+    }
+
+    fn each(
+        &mut self,
+        measures: &Measures,
+        registry: &Registry,
+        board: &Board,
+        now: Stamp,
+        due: impl Fn(&Told) -> bool,
+    ) {
+        for device in &registry.devices {
+            let Some(told) = self.told.get_mut(device.id.index()) else { continue };
+            let Some(meter) = measures.meter(device.id) else { continue };
+            if due(told)
+                && let Some(text) = told.news(device, meter)
+            {
+                told.at = Some(now);
+                let text = format!("{}: {text}", device.name);
+                board.announce(What::Log { level: Level::Warn, text });
+            }
+        }
+    }
+}
+
+impl Told {
+    /// What is new, if anything; from now on it is told.
+    fn news(&mut self, device: &DeviceSpec, meter: &Meter) -> Option<String> {
+        let Limits { lost, damaged, late, frozen, .. } = device.verdict.suspect;
+        let counts = &meter.counts;
+        let mut news = Vec::new();
+        if counts.dropped > self.dropped {
+            news.push(format!("{} samples lost on the way to the file", counts.dropped - self.dropped));
+            self.dropped = counts.dropped;
+        }
+        // Of these some are normal: what is announced would make the episode suspect by now.
+        let expected = counts.expected();
+        for (count, told, limit, what) in [
+            (counts.lost, &mut self.lost, lost, "lost by the device"),
+            (counts.damaged, &mut self.damaged, damaged, "damaged"),
+            (counts.late, &mut self.late, late, "too late for their frame"),
+        ] {
+            let beyond = limit.is_some_and(|limit| count as f64 > limit * expected as f64);
+            if beyond && count >= told.saturating_add(LEAST_SAMPLES) {
+                news.push(format!("{} samples {what}", count - *told));
+                *told = count;
+            }
+        }
+        let still = frozen.is_some_and(|limit| meter.run.length_ns > nanoseconds(limit));
+        match (still, self.frozen) {
+            (true, false) => {
+                let seconds = meter.run.length_ns as f64 / 1e9;
+                news.push(format!("frozen, the same bytes for {seconds:.1} s"));
+            }
+            (false, true) => news.push("no longer frozen".to_owned()),
+            _ => {}
+        }
+        self.frozen = still;
+        (!news.is_empty()).then(|| news.join(", "))
+    }
+}

@@ -1,0 +1,111 @@
+//! Many episodes at a glance: one line each.
+
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+
+use super::render::{clean, colour, grade_colour, size};
+use super::{FileEnd, InspectError, Inspection, Paint, inspect};
+use crate::status::Verdict;
+
+/// An episode of a list. As JSON, one object a line.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Listed {
+    /// The file.
+    pub file: PathBuf,
+    /// The verdict; absent if the file could not be read.
+    #[serde(flatten)]
+    pub verdict: Option<Verdict>,
+    /// Length in seconds.
+    pub seconds: f64,
+    /// Bytes of the file.
+    pub bytes: u64,
+    /// Samples and other messages.
+    pub messages: u64,
+    /// The task in the user's words.
+    pub task: String,
+    /// How the file ends.
+    pub end: Option<FileEnd>,
+    /// Why it could not be read.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub error: Option<String>,
+}
+
+/// The episodes that are meant: a file is itself, a folder those in it (`.mcap`, `.mcap.partial`), by
+/// name.
+///
+/// # Errors
+/// When a folder cannot be read.
+pub fn episodes(paths: &[PathBuf]) -> Result<Vec<PathBuf>, InspectError> {
+    let mut files = Vec::new();
+    for path in paths {
+        if !path.is_dir() {
+            files.push(path.clone());
+            continue;
+        }
+        let io = |source| InspectError::Io { path: path.clone(), source };
+        let mut inside = Vec::new();
+        for entry in std::fs::read_dir(path).map_err(io)? {
+            let entry = entry.map_err(io)?.path();
+            if is_episode(&entry) {
+                inside.push(entry);
+            }
+        }
+        inside.sort();
+        files.extend(inside);
+    }
+    Ok(files)
+}
+
+fn is_episode(path: &Path) -> bool {
+    let name = match path.extension() {
+        Some(extension) if extension == "partial" => path.with_extension(""),
+        _ => path.to_owned(),
+    };
+    name.extension().is_some_and(|extension| extension == "mcap")
+}
+
+/// What is said of one episode of a list.
+#[must_use]
+pub fn list(file: &Path) -> Listed {
+    match inspect(file) {
+        Ok(Inspection { file, bytes, end, verdict, task, seconds, messages, .. }) => {
+            Listed { file, verdict: Some(verdict), seconds, bytes, messages, task, end: Some(end), error: None }
+        }
+        Err(error) => {
+            // The file is named beside it.
+            let text = error.to_string();
+            let text = text.strip_prefix(&format!("{}: ", file.display())).unwrap_or(&text).to_owned();
+            Listed {
+                file: file.to_owned(),
+                verdict: None,
+                seconds: 0.0,
+                bytes: 0,
+                messages: 0,
+                task: String::new(),
+                end: None,
+                error: Some(text),
+            }
+        }
+    }
+}
+
+/// The episode in a line without its end; `name` columns are those of the longest file name.
+#[must_use]
+pub fn render_list(listed: &Listed, name: usize, paint: Paint) -> String {
+    let file = clean(&listed.file.file_name().unwrap_or_default().to_string_lossy());
+    let Some(Verdict { grade, reasons }) = &listed.verdict else {
+        let word = colour(paint, grade_colour(None), &format!("{:7}", "?"));
+        return format!("{word}  {file:name$}  {}", clean(listed.error.as_deref().unwrap_or_default()));
+    };
+    let word = colour(paint, grade_colour(Some(*grade)), &format!("{:7}", grade.word()));
+    let mut line = format!("{word}  {file:name$}  {:>8.1} s  {:>8}", listed.seconds, size(listed.bytes));
+    if let Some(first) = reasons.first() {
+        let _ = write!(line, "  {}", clean(first));
+    }
+    if reasons.len() > 1 {
+        let _ = write!(line, " (and {} more)", reasons.len() - 1);
+    }
+    line
+}

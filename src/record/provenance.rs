@@ -1,0 +1,201 @@
+//! Which unit each modality's samples come from: what runs now, and every epoch of an episode.
+//!
+//! An epoch begins when the device is opened and ends when its slot runs no more. Both are told by
+//! events, which are in the file too.
+//!
+//! Invariant: pure: what is known is what events told.
+
+use std::collections::BTreeMap;
+
+use serde_json::{Value, json};
+
+use crate::status::{Event, Provenance, SlotState, What};
+use crate::time::Stamp;
+
+/// Serial of every device attached, by its modality's name.
+type Serials = BTreeMap<String, Option<String>>;
+
+/// One epoch of a modality.
+#[derive(Debug, Clone)]
+struct Incarnation {
+    opened: Stamp,
+    ended: Option<Stamp>,
+    provenance: Provenance,
+}
+
+/// What is attached and what runs at this moment, recording or not.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Attached {
+    serials: Serials,
+    running: BTreeMap<String, Incarnation>,
+}
+
+impl Attached {
+    /// Takes an event.
+    pub(super) fn take(&mut self, event: &Event) {
+        match &event.what {
+            What::Attach { device, usb, .. } => drop(self.serials.insert(device.clone(), usb.serial.clone())),
+            What::Detach { device, .. } => drop(self.serials.remove(device)),
+            What::Opened { device, provenance, .. } => {
+                self.running.insert(device.clone(), opened(event.stamp, provenance));
+            }
+            What::State { device, state, .. } if has_ended(*state) => drop(self.running.remove(device)),
+            _ => {}
+        }
+    }
+}
+
+/// Every unit and every epoch of an episode.
+#[derive(Debug)]
+pub(super) struct Units {
+    serials: Serials,
+    epochs: BTreeMap<String, Vec<Incarnation>>,
+}
+
+impl Units {
+    /// Those that are there when an episode begins.
+    pub(super) fn new(attached: &Attached) -> Self {
+        let running = attached.running.iter();
+        Self {
+            serials: attached.serials.clone(),
+            epochs: running.map(|(device, epoch)| (device.clone(), vec![epoch.clone()])).collect(),
+        }
+    }
+
+    /// Takes an event.
+    pub(super) fn take(&mut self, event: &Event) {
+        match &event.what {
+            What::Attach { device, usb, .. } => drop(self.serials.insert(device.clone(), usb.serial.clone())),
+            What::Opened { device, provenance, .. } => {
+                self.end(device, event.stamp);
+                self.epochs.entry(device.clone()).or_default().push(opened(event.stamp, provenance));
+            }
+            What::State { device, state, .. } if has_ended(*state) => self.end(device, event.stamp),
+            _ => {}
+        }
+    }
+
+    fn end(&mut self, device: &str, at: Stamp) {
+        if let Some(last) = self.epochs.get_mut(device).and_then(|epochs| epochs.last_mut()) {
+            last.ended.get_or_insert(at);
+        }
+    }
+
+    /// `{modality: serial or null}` of what was attached at some time.
+    pub(super) fn serials(&self) -> Value {
+        json!(self.serials)
+    }
+
+    /// `{modality: [epoch, ...]}` in the order of time: each the event `opened` without its
+    /// modality, with `from_s` and `to_s` in seconds from `begin`: negative for one that ran before
+    /// the episode, null for one that did not end in it.
+    pub(super) fn epochs(&self, begin: Stamp) -> Value {
+        let seconds = |at: Stamp| at.since(begin).as_secs_f64() - begin.since(at).as_secs_f64();
+        let one = |epoch: &Incarnation| {
+            let mut said = json!(epoch.provenance);
+            if let Value::Object(fields) = &mut said {
+                fields.insert("from_s".to_owned(), seconds(epoch.opened).into());
+                fields.insert("to_s".to_owned(), epoch.ended.map(seconds).into());
+            }
+            said
+        };
+        let all = self.epochs.iter();
+        all.map(|(device, epochs)| (device.clone(), epochs.iter().map(one).collect::<Value>())).collect()
+    }
+}
+
+fn opened(at: Stamp, provenance: &Provenance) -> Incarnation {
+    Incarnation { opened: at, ended: None, provenance: provenance.clone() }
+}
+
+const fn has_ended(state: SlotState) -> bool {
+    match state {
+        SlotState::Absent | SlotState::Backoff | SlotState::Failed => true,
+        SlotState::Opening | SlotState::Streaming | SlotState::Stalled => false,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::modality::ModalityId;
+    use crate::provenance::Negotiated;
+    use crate::registry::UsbIdentity;
+    use crate::sample::Epoch;
+
+    const BEGIN: Stamp = Stamp(10_000_000_000);
+
+    fn unit(serial: &str) -> UsbIdentity {
+        UsbIdentity { vid: 0x046d, serial: Some(serial.to_owned()), ..UsbIdentity::default() }
+    }
+
+    fn attach(ms: u64, serial: &str) -> Event {
+        let bit = ModalityId::new(0).unwrap();
+        let what = What::Attach { device: "cam".into(), bit, node: String::new(), usb: unit(serial), driver: None };
+        Event { stamp: Stamp(ms * 1_000_000), what }
+    }
+
+    fn open(ms: u64, epoch: u32, serial: &str) -> Event {
+        let provenance = Provenance {
+            epoch: Epoch(epoch),
+            node: "/dev/video0".into(),
+            attached: Stamp(ms),
+            usb: unit(serial),
+            negotiated: Negotiated::default(),
+            latency_ns: 0,
+        };
+        let (bit, provenance) = (ModalityId::new(0).unwrap(), Box::new(provenance));
+        Event { stamp: Stamp(ms * 1_000_000), what: What::Opened { device: "cam".into(), bit, provenance } }
+    }
+
+    fn state(ms: u64, state: SlotState) -> Event {
+        let bit = ModalityId::new(0).unwrap();
+        let what = What::State { device: "cam".into(), bit, state, mask: String::new(), detail: String::new() };
+        Event { stamp: Stamp(ms * 1_000_000), what }
+    }
+
+    #[test]
+    fn each_epoch_of_an_episode_names_its_unit() {
+        let mut attached = Attached::default();
+        for event in [attach(1_000, "A"), open(8_000, 1, "A"), state(8_100, SlotState::Streaming)] {
+            attached.take(&event);
+        }
+        let mut units = Units::new(&attached);
+        for event in [
+            state(12_000, SlotState::Absent),
+            state(12_001, SlotState::Backoff),
+            attach(13_000, "B"),
+            open(15_000, 2, "B"),
+            state(15_100, SlotState::Stalled),
+            // The end of the second was not told: the third says it.
+            open(16_500, 3, "B"),
+        ] {
+            units.take(&event);
+        }
+        let epochs = units.epochs(BEGIN);
+        let said: Vec<_> = epochs["cam"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|e| (e["epoch"].as_u64(), e["serial"].as_str(), e["from_s"].as_f64(), e["to_s"].as_f64()))
+            .collect();
+        let expected = [
+            (Some(1), Some("A"), Some(-2.0), Some(2.0)),
+            (Some(2), Some("B"), Some(5.0), Some(6.5)),
+            (Some(3), Some("B"), Some(6.5), None),
+        ];
+        assert_eq!(said, expected);
+        assert_eq!(epochs["cam"][0]["vid"], "046d");
+        assert_eq!(units.serials(), json!({"cam": "B"}));
+    }
+
+    #[test]
+    fn what_ended_before_the_episode_is_not_in_it() {
+        let mut attached = Attached::default();
+        for event in [attach(1_000, "A"), open(2_000, 1, "A"), state(3_000, SlotState::Failed)] {
+            attached.take(&event);
+        }
+        let units = Units::new(&attached);
+        assert_eq!((units.epochs(BEGIN), units.serials()), (json!({}), json!({"cam": "A"})));
+    }
+}

@@ -1,0 +1,270 @@
+//! Each measure by a table, and all of them against a plain count over any episode.
+
+use std::time::Duration;
+
+use proptest::prelude::*;
+
+use super::drift::Drift;
+use super::*;
+use crate::modality::ModalityKind;
+
+const MS: u64 = 1_000_000;
+const BEGIN: u64 = 5_000 * MS;
+
+fn id(bit: u8) -> ModalityId {
+    ModalityId::new(bit).unwrap()
+}
+
+fn measures(kind: ModalityKind) -> Measures {
+    let limits = VerdictSpec::of(kind, Duration::from_millis(500), Some(30.0));
+    let measured = [
+        Measured { id: id(0), limits, max_bytes: 64, latency_ns: 0 },
+        Measured { id: id(3), limits, max_bytes: 64, latency_ns: 0 },
+    ];
+    Measures::new(&measured, Frames { begin_ns: BEGIN, hz: 30.0, wait: Duration::from_millis(125) })
+}
+
+/// A sample captured `at` ms after the beginning and received `late` ms later.
+fn seen(seq: u64, at: u64, late: u64, payload: &[u8]) -> Seen<'_> {
+    let capture_ns = BEGIN + at * MS;
+    Seen { seq, capture_ns, recv_ns: capture_ns + late * MS, flagged: false, jpeg: false, payload }
+}
+
+fn quality_at(measures: &Measures, end_ms: u64) -> Quality {
+    measures.quality(id(0), BEGIN + end_ms * MS).unwrap()
+}
+
+#[test]
+fn a_picture_is_whole_when_it_begins_and_ends_as_one() {
+    for (payload, whole) in [
+        (&b"\xff\xd8\xff\xd9"[..], true),
+        (b"\xff\xd8 picture \xff\xd9", true),
+        (b"\xff\xd8 picture \xff\xd9\0\0\0", true),
+        (b"\xff\xd8 picture \xff", false),
+        (b"\xff\xd8 pict", false),
+        (b"\xff\xd8 pict\0\0\0\0", false),
+        (b"picture \xff\xd9", false),
+        (b"\xff\xd8\xd9", false),
+        (b"\xff\xd8", false),
+        (b"\0\0\0", false),
+        (b"", false),
+    ] {
+        assert_eq!(jpeg::is_whole(payload), whole, "{payload:?}");
+    }
+}
+
+#[test]
+fn damaged_is_what_the_driver_flagged_or_what_is_no_whole_picture_and_counts_once() {
+    let mut measures = measures(ModalityKind::Image);
+    for (n, (flagged, jpeg, payload)) in [
+        (false, true, &b"\xff\xd8a\xff\xd9"[..]),
+        (true, true, b"\xff\xd8b\xff\xd9"),
+        (false, true, b"\xff\xd8c"),
+        (true, true, b"\xff\xd8d"),
+        (false, false, b"not a picture"),
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let n = n as u64;
+        measures.sample(id(0), &Seen { flagged, jpeg, ..seen(n, n * 10, 1, payload) });
+    }
+    let said = quality_at(&measures, 100);
+    assert_eq!((said.samples, said.damaged, said.truncated, said.bytes), (5, 3, 2, 5 + 5 + 3 + 3 + 13));
+}
+
+#[test]
+fn a_number_or_a_time_that_does_not_go_on_is_a_duplicate() {
+    let mut measures = measures(ModalityKind::Scalars);
+    // A new number at an old time, an old number at a new time; a publisher that began anew is none.
+    for (seq, at, duplicates) in [(7, 10, 0), (8, 20, 0), (9, 20, 1), (9, 30, 2), (10, 25, 3), (0, 40, 3), (1, 50, 3)] {
+        measures.sample(id(0), &seen(seq, at, 1, b""));
+        assert_eq!(quality_at(&measures, 100).duplicates, duplicates, "{seq} at {at} ms");
+    }
+}
+
+#[test]
+fn equal_pictures_are_frozen_and_equal_numbers_are_not() {
+    let payloads = [b"aa", b"aa", b"ab", b"bb", b"bb", b"bb", b"bb", b"aa", b"aa"];
+    for (kind, repeated, frozen_samples, frozen) in
+        [(ModalityKind::Image, 5, 3, 0.3), (ModalityKind::Scalars, 0, 0, 0.0), (ModalityKind::Bytes, 0, 0, 0.0)]
+    {
+        let mut measures = measures(kind);
+        for (n, payload) in payloads.iter().enumerate() {
+            let n = n as u64;
+            measures.sample(id(0), &seen(n, n * 100, 1, *payload));
+        }
+        let said = quality_at(&measures, 1000);
+        assert_eq!((said.repeated, said.frozen_samples), (repeated, frozen_samples), "{kind:?}");
+        assert!((said.frozen - frozen).abs() < 1e-9, "{kind:?}: {}", said.frozen);
+    }
+}
+
+#[test]
+fn late_is_what_misses_the_deadline_of_the_nearest_tick() {
+    // Ticks at 0, 33.3, 66.7 ms; each waits 125 ms.
+    for (at, late_by, late) in
+        [(0, 125, 0), (0, 126, 1), (16, 109, 0), (16, 110, 1), (17, 141, 0), (17, 142, 1), (60, 131, 0), (60, 132, 1)]
+    {
+        let mut measures = measures(ModalityKind::Scalars);
+        measures.sample(id(0), &seen(0, at, late_by, b""));
+        assert_eq!(quality_at(&measures, 1000).late, late, "captured at {at} ms, {late_by} ms late");
+    }
+}
+
+#[test]
+fn an_absence_is_no_gap_and_no_loss_of_rate() {
+    let mut measures = measures(ModalityKind::Scalars);
+    measures.mask(BEGIN - MS, PhysicalMask(0b1001));
+    let mut seq = 0;
+    for at in (0..1000).step_by(10).chain((4000..5000).step_by(10)) {
+        if at == 4000 {
+            measures.mask(BEGIN + 4000 * MS, PhysicalMask(0b1001));
+        }
+        measures.sample(id(0), &seen(seq, at, 1, b""));
+        measures.settle();
+        seq += 1;
+        if at == 990 {
+            measures.mask(BEGIN + 1000 * MS, PhysicalMask(0b1000));
+        }
+    }
+    let said = quality_at(&measures, 5000);
+    assert_eq!((said.presence, said.present, said.hz), (Some(0.4), 2.0, Some(100.0)));
+    assert!((said.longest_gap - 0.01).abs() < 1e-9, "{}", said.longest_gap);
+    // The other one was there all the time and never spoke.
+    let other = measures.quality(id(3), BEGIN + 5000 * MS).unwrap();
+    assert_eq!((other.samples, other.presence, other.longest_gap, other.hz), (0, Some(1.0), 5.0, Some(0.0)));
+    assert!(measures.quality(id(1), BEGIN).is_none(), "not measured");
+}
+
+#[test]
+fn gaps_at_both_ends_count_and_a_mask_that_comes_after_its_samples_is_waited_for() {
+    let mut late_mask = measures(ModalityKind::Scalars);
+    late_mask.mask(BEGIN, PhysicalMask(1));
+    // A backlog: all samples first, then all masks.
+    for (seq, at) in [(0, 300), (1, 400), (2, 3000), (3, 3100)] {
+        late_mask.sample(id(0), &seen(seq, at, 1, b""));
+    }
+    late_mask.mask(BEGIN + 450 * MS, PhysicalMask(0));
+    late_mask.mask(BEGIN + 3000 * MS, PhysicalMask(1));
+    late_mask.settle();
+    assert!((quality_at(&late_mask, 3200).longest_gap - 0.3).abs() < 1e-9, "the one at the beginning");
+    assert!((quality_at(&late_mask, 3500).longest_gap - 0.4).abs() < 1e-9, "the one at the end");
+}
+
+#[test]
+fn a_clock_that_runs_differently_drifts_and_one_that_is_ahead_is_in_the_future() {
+    let run = |ppm: i64, jitter_ms: u64, seconds: u64| {
+        let mut measures = measures(ModalityKind::Scalars);
+        for n in 0..seconds * 30 {
+            let at = BEGIN + n * 33 * MS;
+            let error = i64::try_from(n * 33 * MS).unwrap() * ppm / 1_000_000;
+            let capture_ns = at.checked_add_signed(error).unwrap();
+            let recv_ns = at + 20 * MS + n % 7 * jitter_ms * MS;
+            let seen = Seen { seq: n, capture_ns, recv_ns, flagged: false, jpeg: false, payload: b"" };
+            measures.sample(id(0), &seen);
+        }
+        quality_at(&measures, seconds * 1000)
+    };
+    for seconds in [4, 30, 600] {
+        let said = run(0, 5, seconds);
+        assert!(said.clock_drift.unwrap().abs() < 1e-9, "jitter is no drift: {said:?}");
+        assert!(said.clock_ahead.abs() < 1e-9);
+    }
+    // From the earliest of the first quarter to that of the last lie three quarters of an episode.
+    let slow = run(-1000, 5, 30).clock_drift.unwrap();
+    assert!((19.0..31.0).contains(&slow), "{slow}");
+    let fast = run(1000, 0, 30);
+    assert!((-31.0..-19.0).contains(&fast.clock_drift.unwrap()), "{fast:?}");
+    assert!((9.0..11.0).contains(&fast.clock_ahead), "30 ms ahead of a way of 20: {fast:?}");
+    assert_eq!(run(1000, 0, 0).clock_drift, None);
+}
+
+#[test]
+fn drift_has_a_fixed_size_and_survives_any_time() {
+    let mut drift = Drift::new();
+    for since in [0, 1, 250 * MS, 4000 * MS, u64::MAX, u64::MAX / 2, 0] {
+        drift.push(since, i64::MIN);
+    }
+    assert_eq!(drift.over_the_episode(), None);
+}
+
+#[test]
+fn frames_say_how_far_samples_lie_from_their_tick_and_from_one_another() {
+    let mut measures = measures(ModalityKind::Scalars);
+    let ms = |ms: i64| Some(ms * 1_000_000);
+    for (a, b) in [(ms(5), ms(-5)), (ms(10), ms(10)), (ms(3), None), (None, None)] {
+        measures.frame([(id(0), true, a), (id(3), b.is_some(), b), (id(9), true, ms(900))].into_iter());
+    }
+    let said = quality_at(&measures, 100);
+    assert_eq!((said.frames_present, said.frames_valid), (4, 3));
+    assert!((said.offset.unwrap().max - 10.0).abs() < 1e-9);
+    assert!((said.offset.unwrap().p50 - 5.0).abs() < 0.1, "{said:?}");
+    let skew = measures.skew().unwrap();
+    assert!((skew.max - 10.0).abs() < 1e-9 && skew.p50 < 1e-9, "{skew:?}");
+}
+
+/// Any samples and masks, in the order of their times.
+fn episode() -> impl Strategy<Value = (Vec<(u64, u8, u64)>, Vec<(u64, u64)>)> {
+    let samples = prop::collection::vec((0_u64..3000, 0_u8..3, 0_u64..300), 0..60);
+    let masks = prop::collection::vec((0_u64..3000, 0_u64..4), 0..12);
+    (samples, masks).prop_map(|(mut samples, mut masks)| {
+        samples.sort_unstable();
+        masks.sort_unstable();
+        (samples, masks)
+    })
+}
+
+proptest! {
+    /// Against the definition: count by count, and gaps millisecond by millisecond.
+    #[test]
+    fn measures_are_what_they_are_defined_to_be((samples, masks) in episode()) {
+        let mut measures = measures(ModalityKind::Image);
+        for (n, (at, byte, late)) in samples.iter().enumerate() {
+            measures.sample(id(0), &seen(n as u64, *at, *late, &[*byte]));
+        }
+        for (at, mask) in &masks {
+            measures.mask(BEGIN + at * MS, PhysicalMask(*mask));
+        }
+        measures.settle();
+        let said = quality_at(&measures, 3000);
+        prop_assert_eq!(said.samples, samples.len() as u64);
+        let repeated = samples.windows(2).filter(|pair| pair[0].1 == pair[1].1).count();
+        prop_assert_eq!(said.repeated, repeated as u64);
+        let duplicates = samples.windows(2).filter(|pair| pair[0].0 == pair[1].0).count();
+        prop_assert_eq!(said.duplicates, duplicates as u64);
+
+        let is_present = |ms: u64| match masks.iter().rfind(|(at, _)| *at <= ms) {
+            Some((_, mask)) => mask & 1 == 1,
+            None => masks.is_empty(),
+        };
+        let (mut longest, mut run, mut present) = (0, 0, 0);
+        for ms in 0..3000 {
+            if samples.iter().any(|(at, ..)| *at == ms) {
+                run = 0;
+            }
+            run = if is_present(ms) { run + 1 } else { 0 };
+            present += u64::from(is_present(ms));
+            longest = longest.max(run);
+        }
+        prop_assert!((said.present - present as f64 / 1e3).abs() < 1e-6, "{} {present}", said.present);
+        prop_assert!((said.longest_gap - longest as f64 / 1e3).abs() < 1e-6, "{} {longest}", said.longest_gap);
+    }
+
+    /// Hostile numbers: nothing panics, no count exceeds what came.
+    #[test]
+    fn no_sample_makes_it_panic(samples in prop::collection::vec(any::<(u64, u64, u64, bool)>(), 0..40), end in any::<u64>()) {
+        let mut measures = measures(ModalityKind::Image);
+        for (seq, capture_ns, recv_ns, jpeg) in &samples {
+            let seen = Seen { seq: *seq, capture_ns: *capture_ns, recv_ns: *recv_ns, flagged: false, jpeg: *jpeg, payload: b"" };
+            measures.sample(id(0), &seen);
+            measures.mask(*capture_ns, PhysicalMask(*seq));
+            measures.missing(id(0), *seq, *recv_ns);
+            measures.frame([(id(0), *jpeg, Some(seq.cast_signed()))].into_iter());
+        }
+        let said = measures.quality(id(0), end).unwrap();
+        let most = samples.len() as u64;
+        prop_assert!(said.samples == most && said.late <= most && said.duplicates <= most && said.truncated <= most);
+        prop_assert!(serde_json::to_string(&said).is_ok());
+    }
+}

@@ -1,0 +1,158 @@
+//! A folder of episodes: which of them were not finished, and their repair in the background.
+//!
+//! Invariant: nobody waits for a repair in the background, which works half of the time at most and
+//! leaves room on the disk for what is being recorded.
+
+use std::fs::{self, DirEntry};
+use std::io;
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{self, Receiver};
+use std::time::{Duration, Instant, SystemTime};
+
+use rustix::process::setpriority_process;
+
+use super::{Outcome, RecoverError, Recovered, recover};
+use crate::status::{Board, Level, What};
+use crate::text;
+
+/// Bytes a repair in the background leaves free.
+const LEAVE_FREE: u64 = 1 << 30;
+/// How soon a repair in the background notices that it is to end.
+const NOTICE: Duration = Duration::from_millis(20);
+/// How long the end of a run waits for it: it may be in the middle of writing to the disk.
+const PATIENCE: Duration = Duration::from_millis(500);
+/// Below everything else of this machine that wants to compute.
+const NICE: i32 = 15;
+
+/// The episodes of `folder` that were not finished, by name.
+///
+/// # Errors
+/// When the folder cannot be read.
+pub fn left_behind(folder: &Path) -> io::Result<Vec<PathBuf>> {
+    Ok(entries(folder)?.into_iter().map(|entry| entry.path()).collect())
+}
+
+fn entries(folder: &Path) -> io::Result<Vec<DirEntry>> {
+    let mut entries: Vec<DirEntry> = fs::read_dir(folder)?.collect::<Result<_, _>>()?;
+    entries.retain(|entry| {
+        let is_file = entry.file_type().is_ok_and(|kind| kind.is_file());
+        is_file && entry.file_name().to_str().is_some_and(|name| name.ends_with(".mcap.partial"))
+    });
+    entries.sort_by_key(DirEntry::file_name);
+    Ok(entries)
+}
+
+/// The repair of a folder, in a thread of its own. Dropping it interrupts the repair.
+#[derive(Debug)]
+pub struct Repairs {
+    stop: Arc<AtomicBool>,
+    ended: Receiver<()>,
+}
+
+impl Repairs {
+    /// Repairs what an earlier run left unfinished in `folder`, and says so on `board`.
+    ///
+    /// # Errors
+    /// When the system gives no thread.
+    pub fn start(folder: PathBuf, board: Arc<Board>) -> io::Result<Self> {
+        let stop = Arc::new(AtomicBool::new(false));
+        let (tell, ended) = mpsc::channel();
+        let asked = Arc::clone(&stop);
+        let begun = SystemTime::now();
+        std::thread::Builder::new().name("recover".to_owned()).spawn(move || {
+            repair_all(&folder, begun, &board, &asked);
+            // Whoever waited may have gone.
+            let _ = tell.send(());
+        })?;
+        Ok(Self { stop, ended })
+    }
+}
+
+impl Drop for Repairs {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        // What it is doing then can be ended at any moment.
+        let _ = self.ended.recv_timeout(PATIENCE);
+    }
+}
+
+fn repair_all(folder: &Path, begun: SystemTime, board: &Board, stop: &AtomicBool) {
+    // Of this thread alone; refused, it is a neighbour like any other.
+    let _ = setpriority_process(None, NICE);
+    let log = |level, text| board.announce(What::Log { level, text });
+    let entries = match entries(folder) {
+        Ok(entries) => entries,
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return,
+        Err(error) => return log(Level::Warn, format!("{}: {error}; nothing in it is repaired", folder.display())),
+    };
+    for entry in entries {
+        // What was made since is ours, or will be looked after by whoever starts next.
+        let metadata = entry.metadata();
+        let is_new = metadata.as_ref().is_ok_and(|metadata| metadata.created().is_ok_and(|made| made >= begun));
+        if is_new || stop.load(Ordering::Relaxed) {
+            continue;
+        }
+        let path = entry.path();
+        let size = metadata.map_or(0, |metadata| metadata.len());
+        if let Some(free) = free_bytes(folder).filter(|free| *free < size.saturating_add(LEAVE_FREE)) {
+            let (size, free) = (text::size(size), text::size(free));
+            log(
+                Level::Warn,
+                format!(
+                    "{}: not repaired: it takes {size} and {free} are free; make room and run `rapid recover`",
+                    path.display()
+                ),
+            );
+            continue;
+        }
+        let mut worked = Instant::now();
+        let mut watch = |_, _| {
+            rest(worked.elapsed(), stop);
+            worked = Instant::now();
+            if stop.load(Ordering::Relaxed) { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        };
+        match recover(&path, &mut watch) {
+            Ok(recovered) => board.announce(event(recovered)),
+            Err(RecoverError::Busy(_)) => {
+                log(Level::Info, format!("{}: another rapid writes or repairs it; left alone", path.display()));
+            }
+            Err(RecoverError::Interrupted(_)) => {}
+            Err(RecoverError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {}
+            Err(error) => log(Level::Warn, format!("{error}; it stays as it is")),
+        }
+    }
+}
+
+/// As much rest as there was work.
+fn rest(time: Duration, stop: &AtomicBool) {
+    let end = Instant::now() + time;
+    while let Some(left) = end.checked_duration_since(Instant::now()).filter(|left| !left.is_zero()) {
+        if stop.load(Ordering::Relaxed) {
+            return;
+        }
+        std::thread::sleep(left.min(NOTICE));
+    }
+}
+
+fn free_bytes(folder: &Path) -> Option<u64> {
+    let disk = rustix::fs::statvfs(folder).ok()?;
+    Some(disk.f_bavail.saturating_mul(disk.f_frsize))
+}
+
+fn event(recovered: Recovered) -> What {
+    let (level, text) = recovered.sentence();
+    match recovered.outcome {
+        Outcome::Repaired(repaired) => What::Recovered {
+            file: repaired.to,
+            seconds: repaired.seconds,
+            messages: repaired.messages,
+            unread_bytes: repaired.unread_bytes,
+            damaged_chunks: repaired.damaged_chunks,
+            text,
+        },
+        _ => What::Log { level, text },
+    }
+}

@@ -1,0 +1,354 @@
+//! Repair of episodes that were not finished: a `.partial` left by a kill or a full disk, a file cut
+//! or damaged later.
+//!
+//! `copy` reads what is there and writes a whole file of it, `names` says how the files are called,
+//! `folder` goes through a folder, in the background if asked. What becomes of a file is an
+//! [`Outcome`]:
+//!
+//! 1. Not whole, with something recorded: repaired into a file of the finished name. The `.partial`
+//!    is removed once that file has its name, or kept as `.damaged` if there is more in it than could
+//!    be read. A finished file is never touched: the repaired one stands beside it, `.recovered.mcap`.
+//! 2. Whole, and only its name is missing (a kill at the very end): it gets its name.
+//! 3. Of no bytes: removed, and said. Without a sample: set aside as `.empty`. No MCAP file: set aside
+//!    as `.damaged`. Both are said once, and their number stays taken.
+//!
+//! Invariant: every message of a repaired file is, byte for byte, one that was recorded.
+//! Invariant: at every moment all that was recorded is in a file that a later repair finds or in the
+//! repaired file; a repair that ends in its middle leaves a `.recovering`, which the next one replaces.
+//! Invariant: a file somebody else writes or repairs is left alone.
+//! Invariant: memory does not grow with the file, but for the index of its chunks.
+
+mod copy;
+mod folder;
+mod names;
+mod said;
+mod summary;
+#[cfg(test)]
+mod tests;
+
+use std::fs::{self, File};
+use std::io::{self, Read, Seek};
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+
+use super::episode::publish;
+use super::lock::{self, Lock};
+use crate::episode_format::walk::MAGIC;
+use crate::episode_format::{self, OpenError};
+use crate::time;
+
+pub use self::copy::recover_bytes;
+use self::copy::{Copied, Damage};
+pub use self::folder::{Repairs, left_behind};
+use self::names::{Names, set_aside};
+use self::summary::Summary;
+pub use super::walk::FileEnd;
+
+/// Why a file was not repaired. It is as it was.
+#[derive(Debug, thiserror::Error)]
+pub enum RecoverError {
+    /// The system refuses.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// It is a folder, a pipe, a device or a link.
+    #[error("{}: not a file; name an episode itself, a file that ends in .mcap or .mcap.partial", .0.display())]
+    NotFile(PathBuf),
+    /// It is being written, or repaired, at this moment.
+    #[error("{}: another rapid is writing or repairing it; end that first", .0.display())]
+    Busy(PathBuf),
+    /// Whether it is being written cannot be known.
+    #[error("{}: its file system knows no locks, so it may still be written; copy it to another disk and repair it there", .0.display())]
+    NoLock(PathBuf),
+    /// A finished file that is no MCAP file.
+    #[error("{}: not an MCAP file", .0.display())]
+    NotMcap(PathBuf),
+    /// A finished file in which nothing can be read.
+    #[error("{}: no message in it can be read", .0.display())]
+    Nothing(PathBuf),
+    /// The user ended it.
+    #[error("{}: interrupted; it is as it was", .0.display())]
+    Interrupted(PathBuf),
+}
+
+impl RecoverError {
+    /// Was something named that cannot be meant?
+    #[must_use]
+    pub fn is_bad_argument(&self) -> bool {
+        match self {
+            Self::NotFile(_) | Self::NotMcap(_) => true,
+            Self::Io { source, .. } => source.kind() == io::ErrorKind::NotFound,
+            _ => false,
+        }
+    }
+}
+
+/// What became of a file.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Recovered {
+    /// The file.
+    pub file: PathBuf,
+    /// What became of it.
+    #[serde(flatten)]
+    pub outcome: Outcome,
+}
+
+/// What became of a file.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(tag = "outcome", rename_all = "snake_case")]
+pub enum Outcome {
+    /// A whole file was made of it.
+    Repaired(Repaired),
+    /// Nothing was missing but its name, which it has now; or nothing at all.
+    Whole {
+        /// Its name.
+        to: PathBuf,
+    },
+    /// An earlier repair was ended after its work was done; what was left of the original is removed.
+    AlreadyRepaired {
+        /// The repaired file.
+        to: PathBuf,
+    },
+    /// Nothing was recorded in it.
+    Empty {
+        /// What it is called now; a file of no bytes is removed.
+        kept: Option<PathBuf>,
+    },
+    /// It is no MCAP file.
+    Unreadable {
+        /// What it is called now.
+        kept: PathBuf,
+    },
+}
+
+/// What a repaired file holds, and what it lacks.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Repaired {
+    /// The repaired file.
+    pub to: PathBuf,
+    /// Seconds from the episode's beginning to the last message.
+    pub seconds: f64,
+    /// Messages.
+    pub messages: u64,
+    /// How the original ends.
+    pub end: FileEnd,
+    /// Bytes at the original's end that are not in the file.
+    pub unread_bytes: u64,
+    /// Chunks left out because they are not what was written.
+    pub damaged_chunks: u64,
+    /// Records left out because they contradict others or are too large.
+    pub refused_records: u64,
+    /// Time of the last message, RFC 3339.
+    pub last: String,
+    /// The original, where it holds more than the repaired file, or where it is no `.partial`.
+    pub original: Option<PathBuf>,
+}
+
+/// What is asked between two pieces of a long work: `done` of `size` bytes are read. It may wait.
+pub type Watch<'a> = dyn FnMut(u64, u64) -> ControlFlow<()> + 'a;
+
+/// Repairs the file at `path`; blocks for as long as it takes to copy it.
+///
+/// # Errors
+/// See [`RecoverError`]; the file is as it was.
+pub fn recover(path: &Path, watch: &mut Watch<'_>) -> Result<Recovered, RecoverError> {
+    let io = |source| RecoverError::Io { path: path.to_owned(), source };
+    if fs::symlink_metadata(path).map_err(io)?.is_symlink() {
+        return Err(RecoverError::NotFile(path.to_owned()));
+    }
+    let (file, _) = episode_format::open(path).map_err(|error| match error {
+        OpenError::Io { path, source } => RecoverError::Io { path, source },
+        OpenError::NotFile(path) => RecoverError::NotFile(path),
+    })?;
+    let names = Names::of(path);
+    match lock::take(&file, path).map_err(io)? {
+        Lock::Ours => {}
+        Lock::Others => return Err(RecoverError::Busy(path.to_owned())),
+        Lock::Gone => return Err(io(io::ErrorKind::NotFound.into())),
+        // A finished file is written by nobody.
+        Lock::Unknown if !names.is_partial => {}
+        Lock::Unknown => return Err(RecoverError::NoLock(path.to_owned())),
+    }
+    // From here on nobody else writes it.
+    let size = file.metadata().map_err(io)?.len();
+    let mut source = Source { path, file, size };
+    let outcome = if names.is_partial { source.partial(&names, watch) } else { source.finished(&names, watch) };
+    outcome.map(|outcome| Recovered { file: path.to_owned(), outcome })
+}
+
+/// The file being repaired, under its lock.
+struct Source<'a> {
+    path: &'a Path,
+    file: File,
+    size: u64,
+}
+
+impl Source<'_> {
+    fn partial(&mut self, names: &Names, watch: &mut Watch<'_>) -> Result<Outcome, RecoverError> {
+        if self.size == 0 {
+            fs::remove_file(self.path).map_err(|source| self.io(source))?;
+            return Ok(Outcome::Empty { kept: None });
+        }
+        // A footer at the end: perhaps the whole episode, perhaps one that was repaired already.
+        let known = if self.ends_with_magic()? { self.read(watch)?.unwrap_or_default() } else { Summary::default() };
+        if known.is_sound {
+            match publish(self.path, &names.finished) {
+                Ok(()) => return Ok(Outcome::Whole { to: names.finished.clone() }),
+                Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
+                Err(error) => return Err(self.io(error)),
+            }
+        }
+        if self.is_repaired(&names.finished, watch)? {
+            fs::remove_file(self.path).map_err(|source| self.io(source))?;
+            return Ok(Outcome::AlreadyRepaired { to: names.finished.clone() });
+        }
+        let path = self.path;
+        let aside = |ending| {
+            set_aside(path, &names.finished, ending)
+                .map_err(|source| RecoverError::Io { path: path.to_owned(), source })
+        };
+        let Some(copied) = self.copy(&names.recovering, &known, watch)? else {
+            return Ok(Outcome::Unreadable { kept: aside("damaged")? });
+        };
+        if copied.summary.is_empty() {
+            remove(&names.recovering);
+            return Ok(Outcome::Empty { kept: Some(aside("empty")?) });
+        }
+        let to = self.publish(names)?;
+        // Removed only where nothing is lost by it: what follows a torn end is less than one record.
+        let original = if copied.damage.is_torn_alone() {
+            fs::remove_file(self.path).err().map(|error| {
+                tracing::warn!(file = %self.path.display(), %error, "repaired, but not removed");
+                self.path.to_owned()
+            })
+        } else {
+            Some(aside("damaged")?)
+        };
+        Ok(Outcome::Repaired(copied.repaired(to, original)))
+    }
+
+    fn finished(&mut self, names: &Names, watch: &mut Watch<'_>) -> Result<Outcome, RecoverError> {
+        let Some(known) = self.read(watch)? else { return Err(RecoverError::NotMcap(self.path.to_owned())) };
+        if known.is_sound {
+            return Ok(Outcome::Whole { to: self.path.to_owned() });
+        }
+        if self.is_repaired(&names.finished, watch)? {
+            return Ok(Outcome::AlreadyRepaired { to: names.finished.clone() });
+        }
+        // Channels that a damaged chunk defines are repeated in the index, if that is left.
+        let Some(copied) = self.copy(&names.recovering, &known, watch)? else {
+            return Err(RecoverError::NotMcap(self.path.to_owned()));
+        };
+        if copied.summary.messages == 0 {
+            remove(&names.recovering);
+            return Err(RecoverError::Nothing(self.path.to_owned()));
+        }
+        let to = self.publish(names)?;
+        Ok(Outcome::Repaired(copied.repaired(to, Some(self.path.to_owned()))))
+    }
+
+    /// Copies what can be read into a whole file of the name `to`; `None` if this is no MCAP file.
+    /// After an error there is no such file.
+    fn copy(&mut self, to: &Path, known: &Summary, watch: &mut Watch<'_>) -> Result<Option<Copied>, RecoverError> {
+        self.rewind()?;
+        let about = copy::About { name: &self.name(), time_ns: time::realtime_ns() };
+        let copied = names::create(to).map_err(copy::Error::Write).and_then(|file| {
+            let copied = copy::copy(&self.file, self.size, known, &about, file, watch);
+            if !matches!(copied, Ok(Some(_))) {
+                remove(to);
+            }
+            copied
+        });
+        copied.map_err(|error| match error {
+            copy::Error::Read(source) => self.io(source),
+            copy::Error::Write(source) => RecoverError::Io { path: to.to_owned(), source },
+            copy::Error::Interrupted => RecoverError::Interrupted(self.path.to_owned()),
+        })
+    }
+
+    /// Reads the file without writing anything.
+    fn read(&mut self, watch: &mut Watch<'_>) -> Result<Option<Summary>, RecoverError> {
+        self.rewind()?;
+        self.summary_of(&self.file, self.size, watch)
+    }
+
+    fn summary_of(&self, file: &File, size: u64, watch: &mut Watch<'_>) -> Result<Option<Summary>, RecoverError> {
+        copy::summary(file, size, watch).map_err(|error| match error {
+            copy::Error::Read(source) | copy::Error::Write(source) => self.io(source),
+            copy::Error::Interrupted => RecoverError::Interrupted(self.path.to_owned()),
+        })
+    }
+
+    /// Is `finished` a whole file that was made of this one?
+    fn is_repaired(&self, finished: &Path, watch: &mut Watch<'_>) -> Result<bool, RecoverError> {
+        let Ok((file, size)) = episode_format::open(finished) else { return Ok(false) };
+        let made = self.summary_of(&file, size, watch)?;
+        Ok(made.is_some_and(|made| made.is_sound && made.is_of(&self.name(), self.size)))
+    }
+
+    /// Gives the repaired file its name, another one if that is taken.
+    fn publish(&self, names: &Names) -> Result<PathBuf, RecoverError> {
+        for to in names.candidates() {
+            match publish(&names.recovering, &to) {
+                Ok(()) => return Ok(to),
+                Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
+                Err(source) => {
+                    remove(&names.recovering);
+                    return Err(RecoverError::Io { path: to, source });
+                }
+            }
+        }
+        remove(&names.recovering);
+        Err(self.io(io::Error::new(io::ErrorKind::AlreadyExists, "no free name for the repaired file")))
+    }
+
+    fn ends_with_magic(&mut self) -> Result<bool, RecoverError> {
+        let mut end = [0; MAGIC.len()];
+        let Some(at) = self.size.checked_sub(MAGIC.len() as u64) else { return Ok(false) };
+        let read = self.file.seek(io::SeekFrom::Start(at)).and_then(|_| self.file.read_exact(&mut end));
+        read.map_err(|source| self.io(source))?;
+        Ok(end == MAGIC)
+    }
+
+    fn rewind(&mut self) -> Result<(), RecoverError> {
+        self.file.rewind().map_err(|source| self.io(source))
+    }
+
+    fn name(&self) -> String {
+        self.path.file_name().unwrap_or_default().to_string_lossy().into_owned()
+    }
+
+    fn io(&self, source: io::Error) -> RecoverError {
+        RecoverError::Io { path: self.path.to_owned(), source }
+    }
+}
+
+/// What is left of it is replaced by the next repair.
+fn remove(recovering: &Path) {
+    if let Err(error) = fs::remove_file(recovering) {
+        tracing::warn!(file = %recovering.display(), %error, "not removed");
+    }
+}
+
+impl Copied {
+    fn repaired(&self, to: PathBuf, original: Option<PathBuf>) -> Repaired {
+        let Damage { end, unread_bytes, damaged_chunks, refused_records } = self.damage;
+        Repaired {
+            to,
+            seconds: self.summary.seconds(),
+            messages: self.summary.messages,
+            end,
+            unread_bytes,
+            damaged_chunks,
+            refused_records,
+            last: time::rfc3339(self.summary.last_ns),
+            original,
+        }
+    }
+}

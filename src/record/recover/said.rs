@@ -1,0 +1,109 @@
+//! What a repaired file says about itself, and what is said of a repair. Pure.
+
+use std::collections::BTreeMap;
+
+use serde_json::{Map, Value, json};
+
+use super::copy::{About, Damage};
+use super::summary::Summary;
+use super::{FileEnd, Outcome, Recovered, Repaired};
+use crate::status::Level;
+use crate::text;
+use crate::time;
+
+/// The metadata record `rapid/summary` of an episode whose recorder wrote none, as far as it is
+/// known. Same keys as the recorder's; what only the recorder could count is not there.
+///
+/// JSON: `modalities` `{name: {samples}}`.
+pub(super) fn end(summary: &Summary) -> BTreeMap<String, String> {
+    let mut modalities = Map::new();
+    for channel in summary.channels.values() {
+        let Some(name) = &channel.modality else { continue };
+        let before = modalities.get(name).and_then(|said| said["samples"].as_u64()).unwrap_or(0);
+        modalities.insert(name.clone(), json!({"samples": before.saturating_add(channel.messages)}));
+    }
+    text_map([
+        ("duration_s", summary.seconds().to_string()),
+        ("messages", summary.messages.to_string()),
+        ("frames", summary.frames.to_string()),
+        ("modalities", Value::Object(modalities).to_string()),
+    ])
+}
+
+/// The metadata record `rapid/recovered`: what was repaired when and by whom, what is there and what
+/// is not.
+pub(super) fn recovered(summary: &Summary, damage: Damage, about: &About<'_>, size: u64) -> BTreeMap<String, String> {
+    let Damage { end, unread_bytes, damaged_chunks, refused_records } = damage;
+    let end = serde_json::to_value(end).ok();
+    text_map([
+        ("software", concat!("rapid ", env!("CARGO_PKG_VERSION")).to_owned()),
+        ("time", time::rfc3339(about.time_ns)),
+        ("source", about.name.to_owned()),
+        ("source_bytes", size.to_string()),
+        ("end", end.as_ref().and_then(Value::as_str).unwrap_or_default().to_owned()),
+        ("messages", summary.messages.to_string()),
+        ("seconds", summary.seconds().to_string()),
+        ("last_wall_ns", summary.last_ns.to_string()),
+        ("unread_bytes", unread_bytes.to_string()),
+        ("damaged_chunks", damaged_chunks.to_string()),
+        ("refused_records", refused_records.to_string()),
+    ])
+}
+
+fn text_map<const N: usize>(pairs: [(&str, String); N]) -> BTreeMap<String, String> {
+    pairs.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
+}
+
+impl Recovered {
+    /// What became of the file, for people, and how bad that is.
+    #[must_use]
+    pub fn sentence(&self) -> (Level, String) {
+        let name = |path: &std::path::Path| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
+        let (level, text) = match &self.outcome {
+            Outcome::Repaired(repaired) => {
+                let whole = repaired.original.is_none();
+                let mut said = repaired.sentence();
+                if repaired.to != self.file.with_extension("") {
+                    said = format!("{said}; now {}", name(&repaired.to));
+                }
+                if let Some(original) = repaired.original.as_ref().filter(|original| **original != self.file) {
+                    said = format!("{said}; what could not be read is kept in {}", name(original));
+                }
+                (if whole { Level::Info } else { Level::Warn }, said)
+            }
+            Outcome::Whole { to } if *to == self.file => (Level::Info, "whole; nothing to repair".to_owned()),
+            Outcome::Whole { to } => (Level::Info, format!("whole; it only lacked its name, {}", name(to))),
+            Outcome::AlreadyRepaired { to } => (Level::Info, format!("already repaired: {}", name(to))),
+            Outcome::Empty { kept: None } => (Level::Info, "of no bytes; removed".to_owned()),
+            Outcome::Empty { kept: Some(kept) } => {
+                (Level::Info, format!("nothing was recorded in it; set aside as {}", name(kept)))
+            }
+            Outcome::Unreadable { kept } => (Level::Warn, format!("not an MCAP file; set aside as {}", name(kept))),
+        };
+        (level, format!("{}: {text}", self.file.display()))
+    }
+}
+
+impl Repaired {
+    fn sentence(&self) -> String {
+        let mut said = format!("repaired, {:.1} s, {} messages", self.seconds, text::count(self.messages));
+        let mut but = |text: String| {
+            said.push_str("; ");
+            said.push_str(&text);
+        };
+        let bytes = text::count(self.unread_bytes);
+        match self.end {
+            FileEnd::Finished => {}
+            FileEnd::Unfinished => but("the last second may be missing".to_owned()),
+            FileEnd::Torn => but(format!("the last second may be missing: {bytes} bytes at the end were torn")),
+            FileEnd::Damaged => but(format!("the last {bytes} bytes cannot be read")),
+        }
+        if self.damaged_chunks > 0 {
+            but(format!("{} damaged chunks are left out", text::count(self.damaged_chunks)));
+        }
+        if self.refused_records > 0 {
+            but(format!("{} records that make no sense are left out", text::count(self.refused_records)));
+        }
+        said
+    }
+}

@@ -1,0 +1,140 @@
+//! What is counted of a file while it is read.
+
+use std::collections::BTreeMap;
+
+use super::super::walk::op;
+use super::super::wire::Fields;
+use crate::episode_format::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, RECOVERED, SUMMARY};
+
+/// Bytes of channels and schemas that are remembered: a hundred times what an episode of 64 devices
+/// has. What goes beyond it is not taken over from an index.
+const DEFINITIONS: usize = 16 << 20;
+
+/// See the module's comment.
+#[derive(Debug, Default)]
+pub(super) struct Summary {
+    /// Messages on channels that are known.
+    pub(super) messages: u64,
+    /// Time of the first message, ns since 1970.
+    pub(super) first_ns: Option<u64>,
+    /// Time of the last one.
+    pub(super) last_ns: u64,
+    /// Ticks of the frame index.
+    pub(super) frames: u64,
+    /// The recorder wrote its own summary.
+    pub(super) has_end: bool,
+    /// The file is whole.
+    pub(super) is_sound: bool,
+    /// Channels, by number.
+    pub(super) channels: BTreeMap<u16, Channel>,
+    /// When the episode began, as the recorder says.
+    begin_ns: Option<u64>,
+    /// Messages that say something of the episode: not events or lines of the log, nor what was so
+    /// before it began.
+    captured: u64,
+    /// Name and size of the file this one was made of.
+    origin: Option<(String, u64)>,
+    definitions: BTreeMap<(u8, u16), Vec<u8>>,
+    defined_bytes: usize,
+}
+
+/// A channel and what came on it.
+#[derive(Debug, Default)]
+pub(super) struct Channel {
+    pub(super) topic: String,
+    /// The modality it belongs to.
+    pub(super) modality: Option<String>,
+    pub(super) messages: u64,
+}
+
+impl Summary {
+    /// Counts a record; one that cannot be read is passed over.
+    pub(super) fn record(&mut self, opcode: u8, data: &[u8]) {
+        let fields = Fields(data);
+        // `None` is a record that is shorter than it says.
+        let _ = match opcode {
+            op::SCHEMA => self.define(opcode, fields),
+            op::CHANNEL => self.channel(fields),
+            op::MESSAGE => self.message(fields),
+            op::METADATA => self.metadata(fields),
+            _ => None,
+        };
+    }
+
+    /// Length: from the beginning the recorder tells, else from the first message, to the last.
+    pub(super) fn seconds(&self) -> f64 {
+        let begin = self.begin_ns.or(self.first_ns).unwrap_or(0);
+        self.last_ns.saturating_sub(begin) as f64 / 1e9
+    }
+
+    /// Was nothing recorded?
+    pub(super) fn is_empty(&self) -> bool {
+        self.captured == 0
+    }
+
+    pub(super) fn has_channel(&self, id: u16) -> bool {
+        self.channels.contains_key(&id)
+    }
+
+    /// The record that defines a channel or schema.
+    pub(super) fn definition(&self, opcode: u8, id: u16) -> Option<&[u8]> {
+        self.definitions.get(&(opcode, id)).map(Vec::as_slice)
+    }
+
+    /// Was it made by repair of a file of this name and size?
+    pub(super) fn is_of(&self, name: &str, bytes: u64) -> bool {
+        self.origin.as_ref().is_some_and(|origin| *origin == (name.to_owned(), bytes))
+    }
+
+    fn define(&mut self, opcode: u8, mut fields: Fields<'_>) -> Option<()> {
+        let record = fields.0;
+        let id = fields.u16()?;
+        let bytes = self.defined_bytes + record.len();
+        if bytes <= DEFINITIONS && !self.definitions.contains_key(&(opcode, id)) {
+            self.definitions.insert((opcode, id), record.to_owned());
+            self.defined_bytes = bytes;
+        }
+        Some(())
+    }
+
+    fn channel(&mut self, fields: Fields<'_>) -> Option<()> {
+        self.define(op::CHANNEL, fields);
+        let mut fields = fields;
+        let (id, _schema) = (fields.u16()?, fields.u16()?);
+        let (topic, _encoding) = (fields.string()?, fields.string()?);
+        let mut metadata = fields.map()?;
+        self.channels.entry(id).or_insert_with(|| Channel {
+            topic: topic.to_owned(),
+            modality: metadata.remove("modality"),
+            messages: 0,
+        });
+        Some(())
+    }
+
+    fn message(&mut self, mut fields: Fields<'_>) -> Option<()> {
+        let (id, _sequence, at) = (fields.u16()?, fields.u32()?, fields.u64()?);
+        let channel = self.channels.get_mut(&id)?;
+        channel.messages += 1;
+        self.messages += 1;
+        self.frames += u64::from(channel.topic == FRAME_TOPIC);
+        let remark = [EVENT_TOPIC, LOG_TOPIC].contains(&channel.topic.as_str());
+        self.captured += u64::from(!remark && at >= self.begin_ns.unwrap_or(0));
+        self.first_ns = Some(self.first_ns.map_or(at, |first| first.min(at)));
+        self.last_ns = self.last_ns.max(at);
+        Some(())
+    }
+
+    fn metadata(&mut self, mut fields: Fields<'_>) -> Option<()> {
+        let name = fields.string()?;
+        if ![ABOUT, SUMMARY, RECOVERED].contains(&name) {
+            return None;
+        }
+        let mut map = fields.map()?;
+        match name {
+            ABOUT => self.begin_ns = map.get("begin_wall_ns").and_then(|ns| ns.parse().ok()),
+            SUMMARY => self.has_end = true,
+            _ => self.origin = map.remove("source").zip(map.get("source_bytes").and_then(|bytes| bytes.parse().ok())),
+        }
+        Some(())
+    }
+}

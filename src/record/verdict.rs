@@ -1,0 +1,196 @@
+//! The verdict on an episode: what was measured, held against the limits of the registry.
+//!
+//! 1. Each check of a modality has a limit for SUSPECT and one for BAD; the graver one that is
+//!    exceeded counts. An episode is as good as its worst check.
+//! 2. A modality that the mask says was not there is not missed.
+//! 3. Nothing received from a modality that was there: BAD. So is an episode in which nothing at all
+//!    was received.
+//! 4. A file that is not whole is SUSPECT; one that the disk did not take is BAD.
+//! 5. Of two checks that one fault breaks, the one that names the fault is told: a frozen camera also
+//!    repeats its pictures, a silent one also has a low rate.
+//!
+//! Invariant: pure.
+
+#[cfg(test)]
+mod tests;
+
+use std::time::Duration;
+
+use super::quality::Quality;
+use crate::registry::{Limits, VerdictSpec};
+use crate::status::{Grade, Verdict};
+
+/// A modality with its limits.
+#[derive(Debug, Clone)]
+pub(super) struct Judged<'a> {
+    /// Its name.
+    pub(super) name: &'a str,
+    /// What was measured.
+    pub(super) quality: &'a Quality,
+    /// What it is held against.
+    pub(super) limits: VerdictSpec,
+}
+
+/// The state of an episode's file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum FileState<'a> {
+    /// It holds all that was taken.
+    Whole,
+    /// Something is missing at its end; the text says why.
+    NotWhole(&'a str),
+    /// It could not be written; the text says why.
+    Failed(&'a str),
+}
+
+/// Who lost the samples that are missing?
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Losses {
+    /// Known: device and `rapid` are counted apart.
+    Apart,
+    /// Not known: all are counted as dropped.
+    Together,
+}
+
+/// What an episode is judged by.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Facts<'a> {
+    /// Its modalities.
+    pub(super) modalities: &'a [Judged<'a>],
+    /// Publications of the mask that are not in the file.
+    pub(super) masks_dropped: u64,
+    /// Events that are not in the file.
+    pub(super) events_missed: u64,
+    /// Whether losses are told apart.
+    pub(super) losses: Losses,
+    /// Its file.
+    pub(super) file: FileState<'a>,
+}
+
+/// Less than this many expected samples, or less than this long, says nothing about a rate.
+const LEAST_SAMPLES: f64 = 10.0;
+const LEAST_PRESENCE: f64 = 1.0;
+
+/// The verdict.
+pub(super) fn judge(facts: &Facts<'_>) -> Verdict {
+    let mut found: Vec<(Grade, String)> = Vec::new();
+    match facts.file {
+        FileState::Whole => {}
+        FileState::NotWhole(why) => found.push((Grade::Suspect, format!("the file is not whole: {why}"))),
+        FileState::Failed(why) => found.push((Grade::Bad, format!("the file could not be written: {why}"))),
+    }
+    for judged in facts.modalities {
+        let of_it = modality(judged, facts.losses);
+        found.extend(of_it.into_iter().map(|(grade, text)| (grade, format!("{}: {text}", judged.name))));
+    }
+    let silent = facts.modalities.iter().all(|judged| judged.quality.samples == 0);
+    if silent && !facts.modalities.is_empty() && !found.iter().any(|(grade, _)| *grade == Grade::Bad) {
+        found.push((Grade::Bad, "nothing was received from any modality".to_owned()));
+    }
+    for (count, what) in [(facts.masks_dropped, "publications of the mask"), (facts.events_missed, "events")] {
+        if count > 0 {
+            found.push((Grade::Suspect, format!("{count} {what} are not in the file (limit 0)")));
+        }
+    }
+    // Stable: of one grade in the order above.
+    found.sort_by_key(|(grade, _)| std::cmp::Reverse(*grade));
+    let grade = found.first().map_or(Grade::Good, |(grade, _)| *grade);
+    Verdict { grade, reasons: found.into_iter().map(|(_, text)| text).collect() }
+}
+
+/// What speaks against a modality.
+fn modality(judged: &Judged<'_>, losses: Losses) -> Vec<(Grade, String)> {
+    let Judged { quality, limits, .. } = judged;
+    // As long as this a device that is there may be silent.
+    let patience = limits.suspect.gap.map_or(0.0, |gap| gap.as_secs_f64());
+    if quality.samples == 0 {
+        let silent = quality.present > 0.0 && quality.present >= patience;
+        let text = format!("nothing was received, although it was present for {}", seconds(quality.present));
+        return silent.then_some((Grade::Bad, text)).into_iter().collect();
+    }
+    let expected = quality.samples.saturating_add(quality.lost).saturating_add(quality.dropped);
+    let share = |limit: fn(&Limits) -> Option<f64>, count: u64, what: &str| {
+        let (grade, limit) =
+            exceeded(limits, |limits| limit(limits).filter(|limit| count as f64 > limit * expected as f64))?;
+        Some((grade, format!("{count} of {expected} samples {what} (limit {})", percent(limit))))
+    };
+    let lost = share(|limits| limits.lost, quality.lost, "lost by the device");
+    let dropped = share(
+        |limits| limits.dropped,
+        quality.dropped,
+        match losses {
+            Losses::Apart => "dropped on the way to the file",
+            Losses::Together => "missing, lost by the device or dropped on the way to the file",
+        },
+    );
+    let cut = match quality.truncated {
+        0 => "damaged".to_owned(),
+        cut if cut == quality.damaged => "not whole pictures".to_owned(),
+        cut => format!("damaged, {cut} of them not whole pictures"),
+    };
+    let damaged = share(|limits| limits.damaged, quality.damaged, &cut);
+    let duplicate = share(|limits| limits.duplicate, quality.duplicates, "whose number or capture time does not go on");
+    let late = quality.lateness.map_or(0.0, |lateness| lateness.max / 1e3);
+    let late = format!("too late for their frame, up to {} after capture", seconds(late));
+    let late = share(|limits| limits.late, quality.late, &late);
+    let frozen = longer(limits, |limits| limits.frozen, quality.frozen).map(|(grade, limit)| {
+        let (time, samples) = (seconds(quality.frozen), quality.frozen_samples + 1);
+        (grade, format!("frozen for {time}: {samples} samples byte for byte the same (limit {limit})"))
+    });
+    let repeated = share(|limits| limits.repeated, quality.repeated, "byte for byte the one before")
+        .filter(|repeated| unless(repeated, [&frozen]));
+    let gap = longer(limits, |limits| limits.gap, quality.longest_gap).map(|(grade, limit)| {
+        (grade, format!("no sample for {} while present (limit {limit})", seconds(quality.longest_gap)))
+    });
+    let rate = rate(quality, limits).filter(|rate| unless(rate, [&gap, &lost, &dropped]));
+    [dropped, lost, damaged, duplicate, repeated, frozen, late, gap, clock(quality, limits), rate]
+        .into_iter()
+        .flatten()
+        .collect()
+}
+
+fn clock(quality: &Quality, limits: &VerdictSpec) -> Option<(Grade, String)> {
+    let drift = quality.clock_drift.unwrap_or(0.0) / 1e3;
+    let (drifted, ahead) = (drift.abs(), quality.clock_ahead / 1e3);
+    let (grade, limit) = longer(limits, |limits| limits.clock, drifted.max(ahead))?;
+    let text = if ahead >= drifted {
+        format!("captured up to {} after it was received (limit {limit})", seconds(ahead))
+    } else {
+        let way = if drift > 0.0 { "fell behind" } else { "ran ahead of" };
+        format!("its clock {way} this machine's by {} (limit {limit})", seconds(drifted))
+    };
+    Some((grade, text))
+}
+
+fn rate(quality: &Quality, limits: &VerdictSpec) -> Option<(Grade, String)> {
+    let (nominal, hz) = (limits.hz?, quality.hz?);
+    if quality.present < LEAST_PRESENCE || nominal * quality.present < LEAST_SAMPLES {
+        return None;
+    }
+    let (grade, limit) = exceeded(limits, |limits| limits.rate.filter(|limit| hz < limit * nominal))?;
+    Some((grade, format!("{hz:.1} samples a second while present, of {nominal} (limit {})", percent(limit))))
+}
+
+/// The graver grade whose limit `exceeds` gives, and the limit.
+fn exceeded<T>(limits: &VerdictSpec, exceeds: impl Fn(&Limits) -> Option<T>) -> Option<(Grade, T)> {
+    let bad = exceeds(&limits.bad).map(|limit| (Grade::Bad, limit));
+    bad.or_else(|| exceeds(&limits.suspect).map(|limit| (Grade::Suspect, limit)))
+}
+
+fn longer(limits: &VerdictSpec, limit: impl Fn(&Limits) -> Option<Duration>, length: f64) -> Option<(Grade, String)> {
+    let (grade, limit) = exceeded(limits, |limits| limit(limits).filter(|limit| length > limit.as_secs_f64()))?;
+    Some((grade, seconds(limit.as_secs_f64())))
+}
+
+/// Is `found` graver than everything that already tells of the same fault?
+fn unless<const N: usize>(found: &(Grade, String), others: [&Option<(Grade, String)>; N]) -> bool {
+    others.iter().all(|other| other.as_ref().is_none_or(|(grade, _)| *grade < found.0))
+}
+
+fn percent(share: f64) -> String {
+    // Three decimals say more than anybody sets.
+    format!("{} %", (share * 1e5).round() / 1e3)
+}
+
+fn seconds(seconds: f64) -> String {
+    if seconds < 1.0 { format!("{:.0} ms", seconds * 1e3) } else { format!("{seconds:.1} s") }
+}

@@ -1,0 +1,244 @@
+//! Which figures earn which word, and what is said about them.
+
+use std::time::Duration;
+
+use proptest::prelude::*;
+
+use super::*;
+use crate::modality::ModalityKind;
+
+/// Ten seconds of a camera of 30 Hz, away for three of them, without a fault.
+fn good() -> Quality {
+    Quality {
+        samples: 210,
+        bytes: 6_000_000,
+        lost: 0,
+        dropped: 0,
+        damaged: 0,
+        truncated: 0,
+        duplicates: 0,
+        repeated: 0,
+        frozen_samples: 0,
+        frozen: 0.0,
+        late: 0,
+        lateness: Some(crate::record::Spread { p50: 20.0, p95: 25.0, p99: 40.0, max: 240.0 }),
+        clock_drift: Some(0.2),
+        clock_ahead: 0.0,
+        offset: None,
+        presence: Some(0.7),
+        present: 7.0,
+        hz: Some(30.0),
+        nominal_hz: Some(30.0),
+        longest_gap: 0.04,
+        frames_present: 210,
+        frames_valid: 210,
+    }
+}
+
+fn limits() -> VerdictSpec {
+    VerdictSpec::of(ModalityKind::Image, Duration::from_millis(500), Some(30.0))
+}
+
+fn verdict_on(quality: &Quality, file: FileState<'_>) -> Verdict {
+    let modalities = [Judged { name: "cam", quality, limits: limits() }];
+    judge(&Facts { modalities: &modalities, masks_dropped: 0, events_missed: 0, losses: Losses::Apart, file })
+}
+
+#[track_caller]
+fn is(change: impl Fn(&mut Quality), grade: Grade, reasons: &[&str]) {
+    let mut quality = good();
+    change(&mut quality);
+    let verdict = verdict_on(&quality, FileState::Whole);
+    assert_eq!(
+        (verdict.grade, verdict.reasons.as_slice()),
+        (grade, reasons.iter().map(ToString::to_string).collect::<Vec<_>>().as_slice())
+    );
+}
+
+#[test]
+fn an_absence_that_the_mask_explains_is_good() {
+    is(|_| {}, Grade::Good, &[]);
+    assert_eq!(verdict_on(&good(), FileState::Whole).why(), "");
+}
+
+#[test]
+fn every_check_has_its_words_and_its_two_limits() {
+    use Grade::{Bad, Good, Suspect};
+    is(|q| q.dropped = 1, Suspect, &["cam: 1 of 211 samples dropped on the way to the file (limit 0 %)"]);
+    is(|q| q.dropped = 30, Bad, &["cam: 30 of 240 samples dropped on the way to the file (limit 5 %)"]);
+    is(|q| q.lost = 2, Good, &[]);
+    is(|q| q.lost = 3, Suspect, &["cam: 3 of 213 samples lost by the device (limit 1 %)"]);
+    is(|q| q.damaged = 11, Bad, &["cam: 11 of 210 samples damaged (limit 5 %)"]);
+    is(
+        |q| (q.damaged, q.truncated) = (4, 3),
+        Suspect,
+        &["cam: 4 of 210 samples damaged, 3 of them not whole pictures (limit 1 %)"],
+    );
+    is(|q| (q.damaged, q.truncated) = (4, 4), Suspect, &["cam: 4 of 210 samples not whole pictures (limit 1 %)"]);
+    is(
+        |q| q.duplicates = 1,
+        Suspect,
+        &["cam: 1 of 210 samples whose number or capture time does not go on (limit 0.1 %)"],
+    );
+    is(|q| q.repeated = 105, Suspect, &["cam: 105 of 210 samples byte for byte the one before (limit 10 %)"]);
+    is(
+        |q| (q.frozen, q.frozen_samples, q.repeated) = (0.8, 24, 24),
+        Suspect,
+        &["cam: frozen for 800 ms: 25 samples byte for byte the same (limit 500 ms)"],
+    );
+    is(
+        |q| (q.frozen, q.frozen_samples, q.repeated) = (5.0, 150, 150),
+        Bad,
+        &["cam: frozen for 5.0 s: 151 samples byte for byte the same (limit 2.0 s)"],
+    );
+    is(
+        |q| q.late = 3,
+        Suspect,
+        &["cam: 3 of 210 samples too late for their frame, up to 240 ms after capture (limit 1 %)"],
+    );
+    is(|q| q.longest_gap = 3.0, Suspect, &["cam: no sample for 3.0 s while present (limit 500 ms)"]);
+    is(|q| q.longest_gap = 5.5, Bad, &["cam: no sample for 5.5 s while present (limit 5.0 s)"]);
+    is(
+        |q| q.clock_drift = Some(-30.0),
+        Suspect,
+        &["cam: its clock ran ahead of this machine's by 30 ms (limit 10 ms)"],
+    );
+    is(|q| q.clock_drift = Some(150.0), Bad, &["cam: its clock fell behind this machine's by 150 ms (limit 100 ms)"]);
+    is(|q| q.clock_ahead = 12.0, Suspect, &["cam: captured up to 12 ms after it was received (limit 10 ms)"]);
+    is(|q| q.hz = Some(15.04), Suspect, &["cam: 15.0 samples a second while present, of 30 (limit 90 %)"]);
+    is(|q| q.hz = Some(14.9), Bad, &["cam: 14.9 samples a second while present, of 30 (limit 50 %)"]);
+    // The gap tells of the low rate too, unless that is the graver of the two.
+    is(
+        |q| (q.longest_gap, q.hz) = (3.0, Some(20.0)),
+        Suspect,
+        &["cam: no sample for 3.0 s while present (limit 500 ms)"],
+    );
+    // Too short to have a rate.
+    is(|q| (q.present, q.hz) = (0.9, Some(3.0)), Good, &[]);
+}
+
+#[test]
+fn a_modality_that_was_there_and_sent_nothing_is_bad_and_one_that_was_not_is_not_missed() {
+    let silent = |present: f64| Quality { samples: 0, present, longest_gap: present, hz: Some(0.0), ..good() };
+    let both = |quiet: &Quality| {
+        let talks = good();
+        let modalities = [
+            Judged { name: "cam", quality: &talks, limits: limits() },
+            Judged { name: "tof", quality: quiet, limits: limits() },
+        ];
+        let facts = Facts {
+            modalities: &modalities,
+            masks_dropped: 0,
+            events_missed: 0,
+            losses: Losses::Apart,
+            file: FileState::Whole,
+        };
+        judge(&facts)
+    };
+    let said = both(&silent(3.0));
+    assert_eq!(said.reasons, ["tof: nothing was received, although it was present for 3.0 s"]);
+    assert_eq!(said.grade, Grade::Bad);
+    // Plugged in a moment before the end; never plugged in.
+    assert_eq!(both(&silent(0.3)).grade, Grade::Good);
+    assert_eq!(both(&silent(0.0)).grade, Grade::Good);
+    // Nobody said anything at all.
+    let nobody = verdict_on(&silent(0.0), FileState::Whole);
+    assert_eq!((nobody.grade, nobody.why().as_str()), (Grade::Bad, "nothing was received from any modality"));
+}
+
+#[test]
+fn the_file_and_what_is_missing_in_it_count_and_the_gravest_comes_first() {
+    let quality = Quality { lost: 5, ..good() };
+    let modalities = [Judged { name: "cam", quality: &quality, limits: limits() }];
+    let facts =
+        |file| Facts { modalities: &modalities, masks_dropped: 2, events_missed: 1, losses: Losses::Apart, file };
+    let said = judge(&facts(FileState::NotWhole("it was recovered")));
+    let lost = "cam: 5 of 215 samples lost by the device (limit 1 %)";
+    let missing =
+        ["2 publications of the mask are not in the file (limit 0)", "1 events are not in the file (limit 0)"];
+    assert_eq!(said.reasons, ["the file is not whole: it was recovered", lost, missing[0], missing[1]]);
+    assert_eq!(said.grade, Grade::Suspect);
+    let said = judge(&facts(FileState::Failed("no space left on device")));
+    assert_eq!(said.reasons[0], "the file could not be written: no space left on device");
+    assert_eq!(said.grade, Grade::Bad);
+    let together = Quality { dropped: 5, ..good() };
+    let modalities = [Judged { name: "cam", quality: &together, limits: limits() }];
+    let facts = Facts {
+        modalities: &modalities,
+        masks_dropped: 0,
+        events_missed: 0,
+        losses: Losses::Together,
+        file: FileState::Whole,
+    };
+    let why = judge(&facts).why();
+    assert_eq!(why, "cam: 5 of 215 samples missing, lost by the device or dropped on the way to the file (limit 0 %)");
+}
+
+#[test]
+fn a_check_that_is_off_says_nothing() {
+    let off = Limits {
+        lost: None,
+        dropped: None,
+        damaged: None,
+        duplicate: None,
+        repeated: None,
+        frozen: None,
+        late: None,
+        gap: None,
+        clock: None,
+        rate: None,
+    };
+    let quality = Quality {
+        lost: 50,
+        dropped: 50,
+        damaged: 50,
+        duplicates: 50,
+        repeated: 50,
+        frozen: 9.0,
+        late: 50,
+        longest_gap: 9.0,
+        clock_drift: Some(999.0),
+        clock_ahead: 999.0,
+        hz: Some(1.0),
+        ..good()
+    };
+    let limits = VerdictSpec { suspect: off, bad: off, hz: Some(30.0) };
+    let modalities = [Judged { name: "cam", quality: &quality, limits }];
+    let facts = Facts {
+        modalities: &modalities,
+        masks_dropped: 0,
+        events_missed: 0,
+        losses: Losses::Apart,
+        file: FileState::Whole,
+    };
+    assert_eq!(judge(&facts), Verdict::default());
+}
+
+proptest! {
+    /// More of a fault never makes a better episode, and a word other than GOOD has a reason.
+    #[test]
+    fn worse_is_never_better(counts in prop::array::uniform6(0_u64..300), more in prop::array::uniform6(0_u64..300), gap in 0.0_f64..9.0) {
+        let with = |add: [u64; 6], gap: f64| Quality {
+            lost: counts[0] + add[0],
+            dropped: counts[1] + add[1],
+            damaged: counts[2] + add[2],
+            duplicates: counts[3] + add[3],
+            repeated: counts[4] + add[4],
+            late: counts[5] + add[5],
+            longest_gap: gap,
+            ..good()
+        };
+        let mild = verdict_on(&with([0; 6], gap), FileState::Whole);
+        for which in 0..6 {
+            let mut add = [0; 6];
+            add[which] = more[which];
+            // More samples are also expected where some are missing: other shares fall with it.
+            if which >= 2 {
+                let worse = verdict_on(&with(add, gap + 1.0), FileState::Whole);
+                prop_assert!(worse.grade >= mild.grade, "{mild:?} {worse:?}");
+            }
+        }
+        prop_assert_eq!(mild.grade == Grade::Good, mild.reasons.is_empty());
+        prop_assert!(mild.reasons.iter().all(|reason| reason.starts_with("cam: ") && reason.contains("limit")));
+    }
+}

@@ -1,0 +1,174 @@
+//! Finding the program that an entry names.
+//!
+//! 1. An absolute path is taken as it is.
+//! 2. A name is looked for beside the registry's file, then in the absolute directories of `PATH`.
+//!
+//! Invariant: as root, a program that others could change is refused.
+
+use std::ffi::OsString;
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+
+use crate::registry::diagnostic::nearest;
+use crate::registry::section::printable;
+use crate::registry::trust::distrust;
+
+/// Files beside the registry that are compared with a name that is not found.
+const MOST_COMPARED: usize = 1000;
+
+/// Where programs are looked for.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Programs<'a> {
+    /// Beside this file and on `PATH`.
+    Beside(&'a Path),
+    /// Nowhere: nothing will be run, any name is right.
+    Nowhere,
+}
+
+/// What is wrong, and the fix.
+type Wrong = (String, String);
+
+impl Programs<'_> {
+    /// The program of this name.
+    pub(super) fn find(self, name: &str) -> Result<PathBuf, Wrong> {
+        let Self::Beside(file) = self else { return Ok(PathBuf::from(name)) };
+        let found = if Path::new(name).is_absolute() {
+            Some(PathBuf::from(name)).filter(|path| path.exists())
+        } else {
+            if name.is_empty() || name.contains(['/', '\0']) || name == "." || name == ".." {
+                let message = format!("node {name:?} is not the name of a program");
+                return Err((message, "write its name, for a program beside this file, or its absolute path".into()));
+            }
+            let beside = folder_of(file);
+            let path = std::env::var_os("PATH").unwrap_or_default();
+            std::iter::once(beside)
+                .chain(directories(&path))
+                .map(|folder| folder.join(name))
+                .find(|path| path.is_file())
+        };
+        let path = found.ok_or_else(|| self.missing(name))?;
+        check(&path)?;
+        Ok(path)
+    }
+
+    fn missing(self, name: &str) -> Wrong {
+        let message = format!("node {name:?} is neither built in nor a program");
+        let near = match self {
+            Self::Beside(file) => executables(&folder_of(file)),
+            Self::Nowhere => Vec::new(),
+        };
+        let known = super::device::BUILT_IN.iter().map(|(name, _)| *name).chain(near.iter().map(String::as_str));
+        let fix = match nearest(name, known) {
+            Some(name) => format!("did you mean {name:?}?"),
+            None => "built in are \"camera\" and \"serial\"; a program must lie beside this file or on PATH, or be \
+                     written with its absolute path"
+                .to_owned(),
+        };
+        (message, fix)
+    }
+}
+
+/// The folder of the registry's file, as an absolute path: it must hold wherever a child runs.
+fn folder_of(file: &Path) -> PathBuf {
+    let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned())
+}
+
+/// A relative directory on `PATH` would mean another program in each directory `rapid` is started in.
+fn directories(path: &OsString) -> Vec<PathBuf> {
+    std::env::split_paths(path).filter(|folder| folder.is_absolute()).collect()
+}
+
+fn executables(folder: &Path) -> Vec<String> {
+    let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
+    let runs = |entry: &std::fs::DirEntry| {
+        entry.metadata().is_ok_and(|meta| meta.is_file() && meta.permissions().mode() & 0o111 != 0)
+    };
+    let names = entries.flatten().take(MOST_COMPARED).filter(runs);
+    names.filter_map(|entry| entry.file_name().into_string().ok()).collect()
+}
+
+/// Can it be run, and may it be?
+fn check(path: &Path) -> Result<(), Wrong> {
+    let label = printable(&path.display().to_string());
+    let wrong = |message: &str, fix: String| Err((format!("the program {label} {message}"), fix));
+    let meta = match path.metadata() {
+        Ok(meta) => meta,
+        Err(error) => return wrong(&format!("cannot be looked at: {error}"), "name another program".to_owned()),
+    };
+    if !meta.is_file() {
+        return wrong("is not a file", "name the program itself".to_owned());
+    }
+    if rustix::fs::access(path, rustix::fs::Access::EXEC_OK).is_err() {
+        return wrong("may not be run by this user", format!("chmod +x {label}"));
+    }
+    trusted(path, &label)
+}
+
+/// Whoever may write the program, or exchange it in its folder, decides what root runs.
+fn trusted(path: &Path, label: &str) -> Result<(), Wrong> {
+    if !rustix::process::geteuid().is_root() {
+        return Ok(());
+    }
+    match distrust(path) {
+        Ok(None) => Ok(()),
+        Ok(Some(reason)) => Err((format!("the program {label}: {reason}"), reason.fix())),
+        Err(error) => {
+            Err((format!("the program {label}: cannot be looked at: {error}"), "name another program".to_owned()))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs::{create_dir, set_permissions, write};
+
+    use super::*;
+
+    fn allow(path: &Path, mode: u32) {
+        set_permissions(path, PermissionsExt::from_mode(mode)).unwrap();
+    }
+
+    #[test]
+    fn a_program_is_found_beside_the_file_and_by_its_path() {
+        let dir = tempfile::tempdir().unwrap();
+        let (file, program) = (dir.path().join("devices.toml"), dir.path().join("tactile_publisher"));
+        write(&program, "#!/bin/sh\n").unwrap();
+        let programs = Programs::Beside(&file);
+        let message = |name: &str| programs.find(name).unwrap_err();
+        assert!(message("tactile_publisher").0.ends_with("tactile_publisher may not be run by this user"));
+        allow(&program, 0o755);
+        assert_eq!(programs.find("tactile_publisher").unwrap(), program);
+        assert_eq!(programs.find(program.to_str().unwrap()).unwrap(), program);
+        assert!(programs.find("sh").unwrap().is_absolute(), "on PATH");
+        assert_eq!(message("tactile_publishr").1, "did you mean \"tactile_publisher\"?");
+        assert_eq!(message("camra").1, "did you mean \"camera\"?");
+        assert!(message("/no/such/program").0.contains("neither built in nor a program"));
+        create_dir(dir.path().join("folder")).unwrap();
+        for name in ["", "a/b", "..", "./x", "a\0b"] {
+            assert!(message(name).0.contains("is not the name of a program"), "{name:?}");
+        }
+        assert!(message("folder").0.contains("neither built in nor a program"));
+        assert_eq!(Programs::Nowhere.find("anything").unwrap(), Path::new("anything"));
+    }
+
+    #[test]
+    fn root_runs_only_what_no_other_could_have_changed() {
+        let dir = tempfile::tempdir().unwrap();
+        allow(dir.path(), 0o755);
+        let program = dir.path().join("p");
+        write(&program, "").unwrap();
+        allow(&program, 0o755);
+        // Anybody else runs what that user may run anyway.
+        let refused = || trusted(&program, "p").is_err();
+        let is_root = rustix::process::geteuid().is_root();
+        assert!(!refused());
+        allow(&program, 0o775);
+        assert_eq!(refused(), is_root);
+        allow(&program, 0o755);
+        allow(dir.path(), 0o777);
+        assert_eq!(refused(), is_root);
+        allow(dir.path(), 0o1777);
+        assert!(!refused());
+    }
+}

@@ -1,0 +1,284 @@
+//! Trust: may anybody but root and this user change what a path leads to?
+//!
+//! A file can be exchanged by whoever may write to it, to a folder on the way to it, or to a link on
+//! that way. What root reads or runs must not depend on such a file: it would lend root's rights to
+//! whoever wrote it. The same rule as OpenSSH's for its key files (`StrictModes`, `safe_path()`).
+//!
+//! As root only root is trusted; otherwise root and this user. A folder anybody may write to is as
+//! good as another if it is sticky, as /tmp is: there only the owner of an entry, or of the folder,
+//! can take the entry away. An access control list shows in the bits of the group (acl(5)).
+//!
+//! Invariant: a path without an objection cannot be changed between the look at it and its use, by
+//! anybody who is not trusted.
+
+use std::collections::VecDeque;
+use std::ffi::OsString;
+use std::fmt;
+use std::fs::Metadata;
+use std::io;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Component, Path, PathBuf};
+
+/// Links on one way before it is taken for a circle; as in Linux, see `path_resolution(7)`.
+const MOST_LINKS: usize = 40;
+
+/// Why what a path leads to cannot be trusted. As text, the reason without the file's own name.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Distrust {
+    /// What others can change.
+    place: Place,
+    /// Its path.
+    path: PathBuf,
+    why: Why,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Place {
+    File,
+    Folder,
+    Link,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Why {
+    /// Its owner may change it.
+    Owner(u32),
+    /// Its mode lets others write.
+    Mode(u32),
+}
+
+impl Distrust {
+    /// What to do about it, in words for a shell.
+    #[must_use]
+    pub fn fix(&self) -> String {
+        let path = shown(&self.path);
+        match (self.place, self.why) {
+            (Place::Link, _) => "name the real file instead of the link".to_owned(),
+            (Place::File, Why::Owner(_)) => format!("chown {} {path}", rustix::process::geteuid().as_raw()),
+            (Place::Folder, Why::Owner(_)) => "copy the file into a folder of your own and name it there".to_owned(),
+            (Place::File | Place::Folder, Why::Mode(_)) => format!("chmod go-w {path}"),
+        }
+    }
+}
+
+impl fmt::Display for Distrust {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let path = shown(&self.path);
+        let gain = if rustix::process::geteuid().is_root() { "could change what root runs" } else { "could change it" };
+        match (self.place, self.why) {
+            (Place::File, Why::Owner(uid)) => write!(f, "it belongs to user {uid}, who {gain}"),
+            (Place::File, Why::Mode(mode)) => write!(f, "other users may write to it (mode {mode:04o})"),
+            (Place::Folder, Why::Owner(uid)) => write!(f, "the folder {path} belongs to user {uid}, who {gain}"),
+            (Place::Folder, Why::Mode(mode)) => {
+                write!(f, "other users may write to the folder {path} (mode {mode:04o}) and {gain}")
+            }
+            (Place::Link, Why::Owner(uid)) => write!(f, "the link {path} belongs to user {uid}, who {gain}"),
+            // The mode of a link means nothing.
+            (Place::Link, Why::Mode(_)) => write!(f, "others {gain}"),
+        }
+    }
+}
+
+/// Looks at a file and at everything on the way to it: the first reason not to trust it, if any.
+///
+/// To be asked of a registry and of every program it names: as root an objection is a refusal, for
+/// another user a warning.
+///
+/// # Errors
+/// When there is no such file, or its folder may not be looked at.
+pub fn distrust(path: &Path) -> io::Result<Option<Distrust>> {
+    let euid = rustix::process::geteuid().as_raw();
+    let mut rest: VecDeque<OsString> = VecDeque::new();
+    let mut here = if path.is_absolute() { PathBuf::from("/") } else { std::env::current_dir()? };
+    // The way to the working folder is part of the way.
+    if !path.is_absolute() {
+        push_front(&mut rest, &here);
+        here = PathBuf::from("/");
+    }
+    push_back(&mut rest, path);
+    let mut links = 0;
+    let root = std::fs::symlink_metadata(&here)?;
+    if let Some(why) = judge(Place::Folder, &root, euid) {
+        return Ok(Some(Distrust { place: Place::Folder, path: here, why }));
+    }
+    while let Some(name) = rest.pop_front() {
+        if name == ".." {
+            here.pop();
+            continue;
+        }
+        let next = here.join(&name);
+        let metadata = std::fs::symlink_metadata(&next)?;
+        let place = match metadata.file_type() {
+            kind if kind.is_symlink() => Place::Link,
+            kind if kind.is_dir() => Place::Folder,
+            _ => Place::File,
+        };
+        if let Some(why) = judge(place, &metadata, euid) {
+            return Ok(Some(Distrust { place, path: next, why }));
+        }
+        if place != Place::Link {
+            here = next;
+            continue;
+        }
+        links += 1;
+        if links > MOST_LINKS {
+            return Err(rustix::io::Errno::LOOP.into());
+        }
+        let target = std::fs::read_link(&next)?;
+        if target.is_absolute() {
+            here = PathBuf::from("/");
+        }
+        push_front(&mut rest, &target);
+    }
+    Ok(None)
+}
+
+fn names(path: &Path) -> impl DoubleEndedIterator<Item = OsString> + '_ {
+    path.components().filter_map(|component| match component {
+        Component::Normal(name) => Some(name.to_owned()),
+        Component::ParentDir => Some(OsString::from("..")),
+        Component::RootDir | Component::CurDir | Component::Prefix(_) => None,
+    })
+}
+
+fn push_front(rest: &mut VecDeque<OsString>, path: &Path) {
+    names(path).rev().for_each(|name| rest.push_front(name));
+}
+
+fn push_back(rest: &mut VecDeque<OsString>, path: &Path) {
+    rest.extend(names(path));
+}
+
+fn judge(place: Place, metadata: &Metadata, euid: u32) -> Option<Why> {
+    judge_bits(place, Bits { mode: metadata.mode() & 0o7777, owner: metadata.uid(), group: metadata.gid() }, euid)
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Bits {
+    mode: u32,
+    owner: u32,
+    group: u32,
+}
+
+fn judge_bits(place: Place, bits: Bits, euid: u32) -> Option<Why> {
+    let Bits { mode, owner, group } = bits;
+    if owner != 0 && owner != euid {
+        return Some(Why::Owner(owner));
+    }
+    if place == Place::Link || (place == Place::Folder && mode & 0o1000 != 0) {
+        return None;
+    }
+    // A user's own group, numbered like the user, has no other members; files are 0664 where each
+    // user has one.
+    let own_group = euid != 0 && group == owner;
+    let others = if own_group { 0o002 } else { 0o022 };
+    (mode & others != 0).then_some(Why::Mode(mode))
+}
+
+fn shown(path: &Path) -> String {
+    path.display().to_string().escape_debug().to_string()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+    use std::os::unix::fs::{PermissionsExt, chown, lchown, symlink};
+
+    use super::*;
+
+    #[test]
+    fn who_may_write_is_told_by_owner_and_mode() {
+        use Place::{File, Folder, Link};
+        let why = |place, mode, owner, group, euid| judge_bits(place, Bits { mode, owner, group }, euid);
+        for (place, mode, owner, group, euid, expected) in [
+            (File, 0o644, 0, 0, 0, None),
+            (File, 0o664, 0, 0, 0, Some(Why::Mode(0o664))),
+            (File, 0o646, 0, 0, 0, Some(Why::Mode(0o646))),
+            (File, 0o600, 1000, 1000, 0, Some(Why::Owner(1000))),
+            (File, 0o664, 1000, 1000, 1000, None),
+            (File, 0o664, 1000, 100, 1000, Some(Why::Mode(0o664))),
+            (File, 0o666, 1000, 1000, 1000, Some(Why::Mode(0o666))),
+            (File, 0o644, 0, 0, 1000, None),
+            (File, 0o644, 1001, 0, 1000, Some(Why::Owner(1001))),
+            (File, 0o1666, 0, 0, 0, Some(Why::Mode(0o1666))),
+            (Folder, 0o1777, 0, 0, 0, None),
+            (Folder, 0o777, 0, 0, 0, Some(Why::Mode(0o777))),
+            (Folder, 0o755, 1000, 1000, 0, Some(Why::Owner(1000))),
+            (Link, 0o777, 0, 0, 0, None),
+            (Link, 0o777, 1000, 1000, 0, Some(Why::Owner(1000))),
+        ] {
+            assert_eq!(why(place, mode, owner, group, euid), expected, "{place:?} {mode:o} {owner} {group} {euid}");
+        }
+    }
+
+    struct Tree(tempfile::TempDir);
+
+    impl Tree {
+        /// `a/b/file`, which nobody else may change.
+        fn new() -> (Self, PathBuf) {
+            let dir = tempfile::tempdir().unwrap();
+            fs::create_dir_all(dir.path().join("a/b")).unwrap();
+            let file = dir.path().join("a/b/file");
+            fs::write(&file, "").unwrap();
+            for path in ["a", "a/b"] {
+                fs::set_permissions(dir.path().join(path), PermissionsExt::from_mode(0o755)).unwrap();
+            }
+            fs::set_permissions(&file, PermissionsExt::from_mode(0o644)).unwrap();
+            (Self(dir), file)
+        }
+
+        fn at(&self, path: &str) -> PathBuf {
+            self.0.path().join(path)
+        }
+    }
+
+    fn found(path: &Path) -> Option<(Place, PathBuf)> {
+        distrust(path).unwrap().map(|found| (found.place, found.path))
+    }
+
+    #[test]
+    fn every_folder_on_the_way_counts_and_every_link() {
+        let (tree, file) = Tree::new();
+        assert_eq!(found(&file), None);
+        fs::set_permissions(tree.at("a"), PermissionsExt::from_mode(0o777)).unwrap();
+        assert_eq!(found(&file), Some((Place::Folder, tree.at("a"))));
+        // A detour through a good folder does not help, nor one through `..`.
+        symlink("a", tree.at("link")).unwrap();
+        assert_eq!(found(&tree.at("link/b/file")), Some((Place::Folder, tree.at("a"))));
+        assert_eq!(found(&tree.at("a/b/../b/file")), Some((Place::Folder, tree.at("a"))));
+        fs::set_permissions(tree.at("a"), PermissionsExt::from_mode(0o1777)).unwrap();
+        assert_eq!(found(&tree.at("link/b/file")), None);
+        fs::set_permissions(&file, PermissionsExt::from_mode(0o666)).unwrap();
+        symlink(&file, tree.at("absolute")).unwrap();
+        assert_eq!(found(&tree.at("absolute")), Some((Place::File, file.clone())));
+        let said = distrust(&tree.at("absolute")).unwrap().unwrap();
+        assert_eq!(said.to_string(), "other users may write to it (mode 0666)");
+        assert_eq!(said.fix(), format!("chmod go-w {}", file.display()));
+    }
+
+    #[test]
+    fn a_circle_of_links_and_a_missing_file_are_errors() {
+        let (tree, _) = Tree::new();
+        symlink("two", tree.at("one")).unwrap();
+        symlink("one", tree.at("two")).unwrap();
+        assert!(distrust(&tree.at("one")).is_err());
+        assert_eq!(distrust(&tree.at("none")).unwrap_err().kind(), io::ErrorKind::NotFound);
+    }
+
+    #[test]
+    fn what_belongs_to_another_user_is_not_trusted() {
+        const OTHER: u32 = 12_345;
+        let (tree, file) = Tree::new();
+        if chown(&file, Some(OTHER), None).is_err() {
+            eprintln!("NOT CHECKED: only root can give files away");
+            return;
+        }
+        assert_eq!(found(&file), Some((Place::File, file.clone())));
+        chown(&file, Some(0), None).unwrap();
+        symlink(&file, tree.at("link")).unwrap();
+        lchown(tree.at("link"), Some(OTHER), None).unwrap();
+        assert_eq!(found(&tree.at("link")), Some((Place::Link, tree.at("link"))));
+        chown(tree.at("a"), Some(OTHER), None).unwrap();
+        assert_eq!(found(&file), Some((Place::Folder, tree.at("a"))));
+    }
+}

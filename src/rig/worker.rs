@@ -1,0 +1,234 @@
+//! A worker: a program that reads a device, and the samples it publishes.
+//!
+//! A stream opens a worker as it would a driver. The program is started, kept and ended by a task of
+//! its own (`keeper`); what it prints goes to the log (`output`); what it publishes is judged
+//! (`intake`) and lent to the stream, which publishes it under a header of ours.
+//!
+//! Invariant: nobody waits for a program to end, except its successor on the same entry.
+//! Invariant: no word of a program's header is passed on unchecked.
+//! Invariant: once the stream is told to stop, no sample of its program counts, however long the
+//! program lives.
+
+mod intake;
+mod keeper;
+mod output;
+
+use std::ffi::OsString;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::{Mutex, oneshot};
+use tokio::time::timeout;
+use tokio_util::sync::{CancellationToken, DropGuard};
+use tokio_util::task::TaskTracker;
+
+use crate::bus::{Bus, Given, Ingress, Membership, Watch};
+use crate::driver::process::{Launch, Spawner};
+use crate::driver::{DriverError, Reading};
+use crate::registry::{Attachment, DeviceSpec, NodeSpec, ProcessSpec, Registry};
+use crate::sample::Epoch;
+use crate::status::{Board, Level, What};
+use crate::time::Stamp;
+use intake::{Intake, Judged};
+use keeper::{Keeper, TERM_LIMIT};
+
+/// A program that is silent for this many heartbeats is started again.
+pub(super) const MOST_SILENT_BEATS: u32 = 5;
+/// Beyond the time a program has to end, what the kernel and a busy machine may take.
+const MARGIN: Duration = Duration::from_secs(2);
+
+/// All programs of the rig.
+#[derive(Debug, Clone)]
+pub(super) struct Workers {
+    spawner: Spawner,
+    membership: Membership,
+    board: Arc<Board>,
+    keepers: TaskTracker,
+    /// Programs that are being ended get no more time.
+    hurry: CancellationToken,
+}
+
+impl Workers {
+    /// `None` where no entry needs a program.
+    pub(super) fn new(registry: &Registry, bus: &Bus, board: &Arc<Board>) -> Option<Self> {
+        registry.devices.iter().any(|device| matches!(device.node, NodeSpec::Process(_))).then(|| Self {
+            spawner: Spawner::start(),
+            membership: bus.membership(),
+            board: Arc::clone(board),
+            keepers: TaskTracker::new(),
+            hurry: CancellationToken::new(),
+        })
+    }
+
+    /// Where the program of one entry works; `None` if the entry has none.
+    pub(super) fn seat(&self, spec: &DeviceSpec, bus: &Bus) -> Option<Seat> {
+        let ingress = bus.ingress(spec.id)?;
+        Some(Seat { workers: self.clone(), ingress, turn: Arc::default() })
+    }
+
+    /// Cancelled, it takes from every program what is left of its time to end.
+    pub(super) fn hurry(&self) -> CancellationToken {
+        self.hurry.clone()
+    }
+
+    /// Waits until every program has ended; they have been told to.
+    pub(super) async fn ended(&self) {
+        self.keepers.close();
+        if timeout(TERM_LIMIT + MARGIN, self.keepers.wait()).await.is_err() {
+            tracing::warn!(programs = self.keepers.len(), "did not end even when killed and are abandoned");
+        }
+    }
+}
+
+/// The place of an entry's programs, one after the other.
+#[derive(Debug, Clone)]
+pub(super) struct Seat {
+    workers: Workers,
+    ingress: Arc<Ingress>,
+    /// Held as long as a program of this entry lives.
+    turn: Arc<Mutex<()>>,
+}
+
+/// A running program, as its stream sees it. Dropped, it tells the program to end.
+#[derive(Debug)]
+pub(super) struct Worker {
+    name: String,
+    board: Arc<Board>,
+    ingress: Arc<Ingress>,
+    watch: Watch,
+    intake: Intake,
+    /// The sample that is lent.
+    given: Option<(Given, Judged)>,
+    /// Told how the program ended.
+    ended: oneshot::Receiver<String>,
+    /// How it ended; what it published before is still to be read.
+    reason: Option<String>,
+    description: String,
+    _stop: DropGuard,
+}
+
+impl Worker {
+    /// Starts the program of an entry, once its predecessor is gone.
+    pub(super) async fn open(
+        seat: &Seat,
+        spec: &DeviceSpec,
+        process: &ProcessSpec,
+        attachment: &Attachment,
+        epoch: Epoch,
+    ) -> Result<Self, DriverError> {
+        let watch = seat.ingress.watch().map_err(|error| DriverError::Retry(error.to_string()))?;
+        if seat.turn.try_lock().is_err() {
+            let text = format!("{}: waits for its previous process to end", spec.name);
+            seat.workers.board.announce(What::Log { level: Level::Info, text });
+        }
+        let wait = timeout(TERM_LIMIT + MARGIN, Arc::clone(&seat.turn).lock_owned());
+        let turn = wait.await.map_err(|_| DriverError::Retry("its previous process has not ended".to_owned()))?;
+        // What the predecessor left.
+        seat.ingress.clear();
+
+        let stop = CancellationToken::new();
+        let (started, has_started) = oneshot::channel();
+        let (ending, ended) = oneshot::channel();
+        let workers = &seat.workers;
+        let keeper = Keeper {
+            name: spec.name.clone(),
+            workers: workers.clone(),
+            stop: stop.clone(),
+            turn,
+            started,
+            ended: ending,
+        };
+        let launch = Launch {
+            program: process.program.clone(),
+            args: process.args.clone(),
+            env: environment(spec, attachment, epoch, &seat.ingress, &workers.membership),
+        };
+        workers.keepers.spawn(keeper.keep(launch));
+        let stop = stop.drop_guard();
+        let pid = has_started.await.unwrap_or_else(|_| Err(DriverError::Retry("its keeper ended".to_owned())))?;
+        let program = process.program.file_name().unwrap_or_default().to_string_lossy();
+        Ok(Self {
+            name: spec.name.clone(),
+            board: Arc::clone(&workers.board),
+            ingress: Arc::clone(&seat.ingress),
+            watch,
+            intake: Intake::new(spec.id, epoch, process),
+            given: None,
+            ended,
+            reason: None,
+            description: format!("{program}, process {pid}, on {}", attachment.node.label()),
+            _stop: stop,
+        })
+    }
+
+    pub(super) fn description(&self) -> String {
+        self.description.clone()
+    }
+
+    /// The next sample that can be passed on. Cancel-safe.
+    pub(super) async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
+        self.given = None;
+        let next = self.next().await?;
+        let (given, judged) = self.given.insert(next);
+        Ok(Reading {
+            bytes: given.bytes(),
+            encoding: judged.encoding,
+            captured: judged.captured,
+            flags: judged.flags,
+            width: judged.width,
+            height: judged.height,
+            lost: judged.lost,
+        })
+    }
+
+    async fn next(&mut self) -> Result<(Given, Judged), DriverError> {
+        loop {
+            // A program that publishes faster than we read must not keep this task from its stop.
+            tokio::task::consume_budget().await;
+            let given = self.ingress.take().map_err(|error| DriverError::Retry(error.to_string()))?;
+            if let Some(given) = given {
+                let judged = self.intake.judge(given.header(), given.bytes(), Stamp::now());
+                if let Some(text) = self.intake.complaint() {
+                    let text = format!("{}: {text}", self.name);
+                    self.board.announce(What::Log { level: Level::Warn, text });
+                }
+                if let Some(judged) = judged {
+                    return Ok((given, judged));
+                }
+                continue;
+            }
+            if let Some(reason) = &self.reason {
+                return Err(DriverError::Retry(reason.clone()));
+            }
+            tokio::select! {
+                biased;
+                reason = &mut self.ended => {
+                    self.reason = Some(reason.unwrap_or_else(|_| "its keeper ended".to_owned()));
+                }
+                () = self.watch.wait() => {}
+            }
+        }
+    }
+}
+
+/// What a program is told of its device and of the bus.
+fn environment(
+    spec: &DeviceSpec,
+    attachment: &Attachment,
+    epoch: Epoch,
+    ingress: &Ingress,
+    membership: &Membership,
+) -> Vec<(&'static str, Option<OsString>)> {
+    let text = |text: &str| Some(OsString::from(text));
+    vec![
+        ("DEVICE_NAME", text(&spec.name)),
+        ("DEVICE_NODE", text(&attachment.node.label())),
+        // No such variable rather than one that holds what cannot be said in it.
+        ("DEVICE_SERIAL", attachment.usb.serial.as_deref().filter(|serial| !serial.contains('\0')).and_then(text)),
+        ("DEVICE_ADDR", text(&attachment.usb.port)),
+        ("RAPID_TOPIC", text(ingress.topic())),
+        ("RAPID_EPOCH", text(&epoch.0.to_string())),
+        ("RAPID_BIT", text(&spec.id.to_string())),
+        ("RAPID_BUS_PREFIX", text(&membership.prefix())),
+    ]
+}

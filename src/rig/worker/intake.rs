@@ -1,0 +1,173 @@
+//! Judging what a program publishes: its header is hearsay.
+//!
+//! 1. Modality and epoch must be ours: the sample of an earlier process is not one of this device.
+//! 2. The payload must be what the entry says, or the sample is refused.
+//! 3. A capture time that cannot be is replaced by the time of arrival; time never goes back.
+//! 4. A hole in `seq` is a loss; a counter that jumps or begins again is none.
+//!
+//! Invariant: pure; nothing a program can write makes this panic, or lets a number through that a
+//! driver of ours would not have given.
+
+use std::time::Duration;
+
+use crate::modality::{ModalityId, ModalityKind};
+use crate::registry::ProcessSpec;
+use crate::sample::{Encoding, Epoch, FLAG_DEVICE_TIME, FLAG_ERROR, SampleHeader};
+use crate::time::Stamp;
+
+/// A sample that says it is older than this is not believed.
+const OLDEST: Duration = Duration::from_secs(10);
+/// A larger hole is a counter that was set.
+const LARGEST_HOLE: u64 = 1_000_000;
+
+/// What of a sample is passed on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Judged {
+    pub(super) encoding: Encoding,
+    pub(super) captured: Stamp,
+    pub(super) flags: u32,
+    pub(super) width: u32,
+    pub(super) height: u32,
+    /// Samples missing before this one.
+    pub(super) lost: u64,
+}
+
+/// Why a sample is refused.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+enum Refusal {
+    #[error("its samples say modality {0}, not {1}: a program must send RAPID_BIT as id")]
+    Id(u32, u32),
+    #[error("its samples say epoch {0}, not {1}: a program must send RAPID_EPOCH as epoch")]
+    Epoch(u32, u32),
+    #[error("its samples have encoding {0}, which is none of {1}")]
+    Encoding(u32, &'static str),
+    #[error("its samples have {0} bytes, not {1}: correct the program or the entry")]
+    Size(usize, usize),
+    #[error("its pictures are {0}x{1}, not {2}x{3}: correct the program or the entry")]
+    Picture(u32, u32, u32, u32),
+    #[error("its pictures are not JPEG as they say")]
+    NotJpeg,
+}
+
+/// What the entry says of a sample.
+#[derive(Debug, Clone, Copy)]
+enum Expected {
+    Scalars { channels: u32 },
+    Image { width: u32, height: u32 },
+    Bytes,
+}
+
+/// See the module's comment.
+#[derive(Debug)]
+pub(super) struct Intake {
+    id: u32,
+    epoch: u32,
+    expected: Expected,
+    last: Option<u64>,
+    newest: Stamp,
+    /// A complaint that has not been fetched, and whether there was one of its kind before.
+    complaint: Option<String>,
+    has_refused: bool,
+    has_doubted: bool,
+}
+
+impl Intake {
+    pub(super) fn new(id: ModalityId, epoch: Epoch, process: &ProcessSpec) -> Self {
+        let expected = match (process.kind, process.shape.as_slice()) {
+            (ModalityKind::Scalars, [channels]) => Expected::Scalars { channels: *channels },
+            (ModalityKind::Image, [height, width]) => Expected::Image { width: *width, height: *height },
+            _ => Expected::Bytes,
+        };
+        Self {
+            id: u32::from(id.bit()),
+            epoch: epoch.0,
+            expected,
+            last: None,
+            newest: Stamp::default(),
+            complaint: None,
+            has_refused: false,
+            has_doubted: false,
+        }
+    }
+
+    /// `None` if the sample is refused.
+    pub(super) fn judge(&mut self, header: &SampleHeader, payload: &[u8], now: Stamp) -> Option<Judged> {
+        let (encoding, width, height) = match self.check(header, payload) {
+            Ok(checked) => checked,
+            Err(refusal) => {
+                if !std::mem::replace(&mut self.has_refused, true) {
+                    self.complaint = Some(format!("samples are refused: {refusal}"));
+                }
+                return None;
+            }
+        };
+        let said = Stamp(header.capture_ns);
+        let is_possible = said <= now && now.since(said) <= OLDEST;
+        // Zero is how a program says that it does not know.
+        if !is_possible && said != Stamp::default() && !std::mem::replace(&mut self.has_doubted, true) {
+            self.complaint =
+                Some("its capture times are not those of CLOCK_MONOTONIC; the time of arrival is used".to_owned());
+        }
+        let mut flags = header.flags & (FLAG_ERROR | FLAG_DEVICE_TIME);
+        if !is_possible {
+            flags &= !FLAG_DEVICE_TIME;
+        }
+        let captured = if is_possible { said } else { now }.max(self.newest);
+        self.newest = captured;
+        let hole = self.last.and_then(|last| header.seq.checked_sub(last)?.checked_sub(1));
+        self.last = Some(header.seq);
+        let lost = hole.filter(|hole| *hole <= LARGEST_HOLE).unwrap_or(0);
+        Some(Judged { encoding, captured, flags, width, height, lost })
+    }
+
+    /// What the user should know, the first time it is to be known.
+    pub(super) fn complaint(&mut self) -> Option<String> {
+        self.complaint.take()
+    }
+
+    fn check(&self, header: &SampleHeader, payload: &[u8]) -> Result<(Encoding, u32, u32), Refusal> {
+        if header.id != self.id {
+            return Err(Refusal::Id(header.id, self.id));
+        }
+        if header.epoch != self.epoch {
+            return Err(Refusal::Epoch(header.epoch, self.epoch));
+        }
+        let encoding = Encoding::from_raw(header.encoding);
+        match (self.expected, encoding) {
+            (Expected::Scalars { channels }, Some(Encoding::F64)) => {
+                exact(payload, 8 * u64::from(channels))?;
+                Ok((Encoding::F64, channels, 0))
+            }
+            (
+                Expected::Image { width, height },
+                Some(encoding @ (Encoding::Mjpeg | Encoding::Yuyv | Encoding::Grey)),
+            ) => {
+                let says = (header.width, header.height);
+                if says != (width, height) && says != (0, 0) {
+                    return Err(Refusal::Picture(says.0, says.1, width, height));
+                }
+                let pixels = u64::from(width) * u64::from(height);
+                match encoding {
+                    Encoding::Yuyv => exact(payload, 2 * pixels)?,
+                    Encoding::Grey => exact(payload, pixels)?,
+                    // Start of image: ITU-T T.81, B.1.1.3.
+                    _ if !payload.starts_with(&[0xff, 0xd8]) => return Err(Refusal::NotJpeg),
+                    _ => {}
+                }
+                Ok((encoding, width, height))
+            }
+            (Expected::Bytes, Some(Encoding::Bytes)) => Ok((Encoding::Bytes, 0, 0)),
+            (Expected::Scalars { .. }, _) => Err(Refusal::Encoding(header.encoding, "4 (f64)")),
+            (Expected::Image { .. }, _) => Err(Refusal::Encoding(header.encoding, "1 (mjpeg), 2 (yuyv), 3 (grey)")),
+            (Expected::Bytes, _) => Err(Refusal::Encoding(header.encoding, "0 (bytes)")),
+        }
+    }
+}
+
+fn exact(payload: &[u8], wished: u64) -> Result<(), Refusal> {
+    let wished = usize::try_from(wished).unwrap_or(usize::MAX);
+    if payload.len() == wished { Ok(()) } else { Err(Refusal::Size(payload.len(), wished)) }
+}
+
+#[cfg(test)]
+mod tests;

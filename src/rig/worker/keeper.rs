@@ -1,0 +1,152 @@
+//! The task of one child process: starts it, waits for its end or ends it, and reaps it.
+//!
+//! Told to stop, the group of the child gets SIGTERM, 5 s, then SIGKILL; what outlives its leader gets
+//! SIGKILL at once.
+
+use std::os::unix::process::ExitStatusExt;
+use std::process::ExitStatus;
+use std::time::Duration;
+
+use tokio::sync::{OwnedMutexGuard, oneshot};
+use tokio::time::{sleep, timeout};
+use tokio_util::sync::CancellationToken;
+
+use super::Workers;
+use super::output::Output;
+use crate::driver::DriverError;
+use crate::driver::process::{Child, Launch};
+use crate::status::{Level, What};
+
+/// How long a child has to end after SIGTERM.
+pub(super) const TERM_LIMIT: Duration = Duration::from_secs(5);
+/// How long what a child published last is left for its reader.
+const LAST_SAMPLES: Duration = Duration::from_secs(1);
+
+/// Everything the task owns.
+#[derive(Debug)]
+pub(super) struct Keeper {
+    pub(super) name: String,
+    pub(super) workers: Workers,
+    /// The child is to end.
+    pub(super) stop: CancellationToken,
+    /// The entry's turn: given back when the child is gone.
+    pub(super) turn: OwnedMutexGuard<()>,
+    /// Told the process id, or why there is none.
+    pub(super) started: oneshot::Sender<Result<u32, DriverError>>,
+    /// Told how the child ended.
+    pub(super) ended: oneshot::Sender<String>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum End {
+    /// By itself, or on SIGTERM.
+    Own,
+    Killed,
+}
+
+impl Keeper {
+    /// From the start of the child to its end.
+    pub(super) async fn keep(self, launch: Launch) {
+        let Self { name, workers, stop, turn, started, ended } = self;
+        let mut child = match workers.spawner.spawn(launch).await {
+            Ok(child) => child,
+            Err(error) => {
+                let _ = started.send(Err(error));
+                return;
+            }
+        };
+        let id = child.id();
+        // Where the stream has been told to stop meanwhile, nobody listens, here and below.
+        let _ = started.send(Ok(id));
+        let mut output = Output::new(&name, &workers.board);
+        let end = tokio::select! {
+            biased;
+            end = until_end(&child, &stop, &workers.hurry) => end,
+            () = output.follow(&child.stdout, &child.stderr) => End::Own,
+        };
+        output.finish(&child.stdout, &child.stderr);
+        let reason = match child.reap() {
+            Ok(status) => describe(status),
+            Err(error) => format!("its process {id} cannot be reaped: {error}"),
+        };
+        if end == End::Killed {
+            let text = format!("{name}: process {id} did not end on SIGTERM and was killed");
+            workers.board.announce(What::Log { level: Level::Warn, text });
+        }
+        tracing::debug!(device = %name, process = id, "{reason}");
+        let _ = ended.send(reason);
+        // What the child published last goes with its memory.
+        let _ = timeout(LAST_SAMPLES, stop.cancelled()).await;
+        let membership = workers.membership.clone();
+        // A panic in there is said by the runtime and leaves only files behind.
+        let _ = tokio::task::spawn_blocking(move || membership.sweep()).await;
+        drop(turn);
+    }
+}
+
+/// Waits for the child's end, and brings it about when told to.
+async fn until_end(child: &Child, stop: &CancellationToken, hurry: &CancellationToken) -> End {
+    tokio::select! {
+        biased;
+        () = child.ended() => return End::Own,
+        () = stop.cancelled() => child.terminate(),
+    }
+    tokio::select! {
+        biased;
+        () = child.ended() => return End::Own,
+        () = hurry.cancelled() => {}
+        () = sleep(TERM_LIMIT) => {}
+    }
+    child.kill();
+    child.ended().await;
+    End::Killed
+}
+
+/// How a process ended, for people.
+fn describe(status: ExitStatus) -> String {
+    match (status.code(), status.signal()) {
+        (Some(code), _) => format!("its process ended with code {code}"),
+        (None, Some(signal)) => match rustix::process::Signal::from_named_raw(signal).and_then(name) {
+            Some(name) => format!("its process was ended by {name}"),
+            None => format!("its process was ended by signal {signal}"),
+        },
+        (None, None) => format!("its process ended: {status}"),
+    }
+}
+
+/// Names of the signals that end programs.
+fn name(signal: rustix::process::Signal) -> Option<&'static str> {
+    use rustix::process::Signal;
+    const NAMES: [(Signal, &str); 10] = [
+        (Signal::SEGV, "SIGSEGV"),
+        (Signal::ABORT, "SIGABRT"),
+        (Signal::BUS, "SIGBUS"),
+        (Signal::FPE, "SIGFPE"),
+        (Signal::ILL, "SIGILL"),
+        (Signal::PIPE, "SIGPIPE"),
+        (Signal::INT, "SIGINT"),
+        (Signal::HUP, "SIGHUP"),
+        (Signal::TERM, "SIGTERM"),
+        (Signal::KILL, "SIGKILL"),
+    ];
+    NAMES.iter().find(|(named, _)| *named == signal).map(|(_, name)| *name)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_end_is_told_in_words() {
+        // As wait(2) encodes them: the code in the second byte, a signal in the first.
+        for (raw, told) in [
+            (0, "its process ended with code 0"),
+            (3 << 8, "its process ended with code 3"),
+            (11, "its process was ended by SIGSEGV"),
+            (128 + 6, "its process was ended by SIGABRT"),
+            (34, "its process was ended by signal 34"),
+        ] {
+            assert_eq!(describe(ExitStatus::from_raw(raw)), told);
+        }
+    }
+}

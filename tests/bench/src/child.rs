@@ -1,0 +1,193 @@
+//! What the bench runs in processes of its own, so that the kernel accounts for each alike.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use clap::Subcommand;
+use mcap::WriteOptions;
+use mcap::records::MessageHeader;
+use mcap::write::NoSeek;
+use rapid::driver::Driver;
+use rapid::registry::DeviceNode;
+use rapid::registry::scenario::SimDevice;
+use rapid::time::Stamp;
+use rustix::time::{ClockId, clock_gettime};
+use serde::{Deserialize, Serialize};
+
+use crate::Failure;
+use crate::feed::{self, Feed};
+use crate::process::Running;
+
+/// Bytes of a chunk, as the recorder has it.
+pub(crate) const CHUNK_BYTES: u64 = 1 << 20;
+const BUFFER_BYTES: usize = 64 << 10;
+/// What a child may take beside what it is told to.
+const LIMIT: Duration = Duration::from_secs(120);
+
+/// See the module's comment. Not for use by hand.
+#[derive(Debug, Subcommand)]
+#[command(hide = true)]
+pub(crate) enum Child {
+    /// The mcap crate writes the messages of the full load
+    #[command(hide = true)]
+    Mcap {
+        /// Where to
+        folder: PathBuf,
+        /// How many seconds of them
+        seconds: u64,
+    },
+    /// The simulated devices of the full load are read, and nothing is done with it
+    #[command(hide = true)]
+    Devices {
+        /// How long
+        seconds: u64,
+    },
+}
+
+/// What a child says it took.
+#[derive(Debug, Default, Clone, Copy, Serialize, Deserialize)]
+pub(crate) struct Spent {
+    /// Time on processors, s.
+    pub cpu_s: f64,
+    /// Wall time, s.
+    pub seconds: f64,
+    /// Peak of resident memory, bytes; filled in by who watches.
+    #[serde(default)]
+    pub resident: u64,
+}
+
+impl Spent {
+    /// Runs a child and reads what it says.
+    pub(crate) fn of(command: &mut Command) -> Result<Self, Failure> {
+        let usage = Running::start(command)?.finish(LIMIT, || {})?;
+        let spent: Self = serde_json::from_str(&usage.output)?;
+        Ok(Self { resident: spent.resident.max(usage.resident), ..spent })
+    }
+}
+
+impl Child {
+    /// Does it and says what it took.
+    pub(crate) fn run(&self) -> Result<(), Failure> {
+        let spent = match self {
+            Self::Mcap { folder, seconds } => mcap_alone(folder, *seconds)?,
+            Self::Devices { seconds } => devices_alone(*seconds)?,
+        };
+        Ok(writeln!(std::io::stdout(), "{}", serde_json::to_string(&spent)?)?)
+    }
+}
+
+/// Options of a file as the recorder has them.
+pub(crate) fn options() -> WriteOptions {
+    WriteOptions::new().compression(None).chunk_size(Some(CHUNK_BYTES)).disable_seeking(true)
+}
+
+/// Time this process was on processors, s.
+pub(crate) fn process_cpu_s() -> f64 {
+    seconds_of(ClockId::ProcessCPUTime)
+}
+
+/// Time this thread was on a processor, s.
+pub(crate) fn thread_cpu_s() -> f64 {
+    seconds_of(ClockId::ThreadCPUTime)
+}
+
+fn seconds_of(clock: ClockId) -> f64 {
+    let time = clock_gettime(clock);
+    time.tv_sec as f64 + time.tv_nsec as f64 / 1e9
+}
+
+/// A file of the `mcap` crate with the channels of a feed.
+pub(crate) struct Plain {
+    writer: mcap::Writer<NoSeek<BufWriter<File>>>,
+    channels: Vec<u16>,
+    numbers: Vec<u32>,
+}
+
+impl Plain {
+    /// Begins the file.
+    pub(crate) fn create(path: &Path, feed: &Feed, options: WriteOptions) -> Result<Self, Failure> {
+        let sink = NoSeek::new(BufWriter::with_capacity(BUFFER_BYTES, File::create(path)?));
+        let mut writer = mcap::Writer::with_options(sink, options)?;
+        let mut channels = Vec::new();
+        for lane in feed.lanes.iter() {
+            let schema = feed::schema_of(lane);
+            let schema = writer.add_schema(schema.name, "protobuf", schema.data)?;
+            channels.push(writer.add_channel(schema, &lane.name, "protobuf", &BTreeMap::new())?);
+        }
+        Ok(Self { numbers: vec![0; channels.len()], channels, writer })
+    }
+
+    /// Writes the next message of a lane.
+    pub(crate) fn write(&mut self, feed: &Feed, lane: usize) -> Result<(), Failure> {
+        let (sequence, channel_id) = (self.numbers[lane], self.channels[lane]);
+        let now = Stamp::now().0;
+        let header = MessageHeader { channel_id, sequence, log_time: now, publish_time: now };
+        let messages = &feed.lanes[lane].messages;
+        self.writer.write_to_known_channel(&header, &messages[sequence as usize % messages.len()])?;
+        self.numbers[lane] += 1;
+        Ok(())
+    }
+
+    /// Ends the file; the disk is not waited for.
+    pub(crate) fn finish(mut self) -> Result<(), Failure> {
+        self.writer.finish()?;
+        self.writer.into_inner().into_inner().flush()?;
+        Ok(())
+    }
+}
+
+fn mcap_alone(folder: &Path, seconds: u64) -> Result<Spent, Failure> {
+    let feed = Feed::full_load()?;
+    let path = folder.join("mcap-alone.mcap");
+    let (begun, cpu) = (Instant::now(), process_cpu_s());
+    let mut plain = Plain::create(&path, &feed, options())?;
+    for _ in 0..seconds {
+        for lane in feed.second.iter() {
+            plain.write(&feed, *lane)?;
+        }
+    }
+    plain.finish()?;
+    let spent = Spent { cpu_s: process_cpu_s() - cpu, seconds: begun.elapsed().as_secs_f64(), resident: peak() };
+    std::fs::remove_file(path)?;
+    Ok(spent)
+}
+
+/// Peak of this process's resident memory, bytes.
+fn peak() -> u64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
+    line.and_then(|line| line.split_whitespace().next()?.parse::<u64>().ok()).map_or(0, |kilobytes| kilobytes << 10)
+}
+
+fn devices_alone(seconds: u64) -> Result<Spent, Failure> {
+    let (registry, scenario) = feed::rig()?;
+    // As the program's own.
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
+    runtime.block_on(async {
+        let begun = Stamp::now();
+        let mut drivers = Vec::new();
+        for device in scenario.devices {
+            let spec = registry.named(&device.name).ok_or("a device without entry")?;
+            let node = DeviceNode::Sim(Arc::new(SimDevice::new(&device.name, device.source, begun)));
+            drivers.push(Driver::open(spec, &node).await?);
+        }
+        let (begun, cpu) = (Instant::now(), process_cpu_s());
+        let end = tokio::time::Instant::now() + Duration::from_secs(seconds);
+        let readers = drivers.into_iter().map(|mut driver| {
+            tokio::spawn(async move {
+                let work = async { while driver.read().await.is_ok() {} };
+                // Running out of time is how it ends.
+                let _ = tokio::time::timeout_at(end, work).await;
+            })
+        });
+        for reader in readers.collect::<Vec<_>>() {
+            reader.await?;
+        }
+        Ok(Spent { cpu_s: process_cpu_s() - cpu, seconds: begun.elapsed().as_secs_f64(), resident: 0 })
+    })
+}

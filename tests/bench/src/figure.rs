@@ -1,0 +1,201 @@
+//! Figures: what was measured, beside its baseline and its target, as a table or as JSON.
+//!
+//! Invariant: a figure that could not be measured is shown with the reason; nothing here fails on a value.
+
+use std::fmt::Write as _;
+
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+/// One figure; as JSON one object a line.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Figure {
+    /// `section/what`.
+    pub name: String,
+    /// Of value, baseline and target; may be empty.
+    #[serde(default)]
+    pub unit: String,
+    /// `None` if it was not measured; then the note says why.
+    pub value: Option<f64>,
+    /// The same of something simpler, measured in the same run.
+    #[serde(default)]
+    pub baseline: Option<f64>,
+    /// What is wanted of the value: `"< 200"`, `">= 0.9"`, `"= 0"`; a bare number is an upper bound.
+    #[serde(default)]
+    pub target: Option<Value>,
+    /// How it was measured, for people.
+    #[serde(default)]
+    pub note: String,
+    /// Does the value meet the target? `None` without either.
+    #[serde(default)]
+    pub met: Option<bool>,
+}
+
+impl Figure {
+    /// A measured figure.
+    pub(crate) fn new(name: impl Into<String>, unit: &str, value: Option<f64>) -> Self {
+        let (name, unit) = (name.into(), unit.to_owned());
+        Self { name, unit, value, baseline: None, target: None, note: String::new(), met: None }
+    }
+
+    /// A figure there is no value of.
+    pub(crate) fn missing(name: impl Into<String>, why: impl Into<String>) -> Self {
+        Self::new(name, "", None).note(why)
+    }
+
+    /// With its baseline.
+    #[must_use]
+    pub(crate) fn baseline(mut self, baseline: Option<f64>) -> Self {
+        self.baseline = baseline;
+        self
+    }
+
+    /// With its target, as [`Figure::target`] is written.
+    #[must_use]
+    pub(crate) fn target(mut self, target: &str) -> Self {
+        self.target = Some(Value::from(target));
+        self.judged()
+    }
+
+    /// With a note.
+    #[must_use]
+    pub(crate) fn note(mut self, note: impl Into<String>) -> Self {
+        self.note = note.into();
+        self
+    }
+
+    /// With `met` as value and target have it.
+    #[must_use]
+    pub(crate) fn judged(mut self) -> Self {
+        self.met = self.target.as_ref().and_then(|target| is_met(self.value?, &target_text(target)));
+        self
+    }
+
+    fn verdict(&self) -> &'static str {
+        match (self.value, self.met) {
+            (None, _) => "not measured",
+            (_, Some(true)) => "met",
+            (_, Some(false)) => "MISSED",
+            (_, None) => "",
+        }
+    }
+}
+
+fn target_text(target: &Value) -> String {
+    target.as_str().map_or_else(|| format!("<= {target}"), str::to_owned)
+}
+
+fn is_met(value: f64, target: &str) -> Option<bool> {
+    let bound = target.trim_start_matches(['<', '>', '=']);
+    let sign = &target[..target.len() - bound.len()];
+    let bound: f64 = bound.split_whitespace().next()?.parse().ok()?;
+    match sign {
+        "<" => Some(value < bound),
+        "<=" => Some(value <= bound),
+        ">" => Some(value > bound),
+        ">=" => Some(value >= bound),
+        "=" | "==" => Some((value - bound).abs() < f64::EPSILON),
+        _ => None,
+    }
+}
+
+/// The figures of one section as a table.
+pub(crate) fn table(title: &str, figures: &[Figure]) -> String {
+    let short = |figure: &Figure| figure.name.split_once('/').map_or(figure.name.as_str(), |(_, what)| what).to_owned();
+    let rows: Vec<[String; 6]> = figures
+        .iter()
+        .map(|figure| {
+            [
+                short(figure),
+                figure.unit.clone(),
+                figure.value.map_or_else(|| "-".to_owned(), number),
+                figure.baseline.map_or_else(|| "-".to_owned(), number),
+                figure.target.as_ref().map_or_else(|| "-".to_owned(), target_text),
+                figure.verdict().to_owned(),
+            ]
+        })
+        .collect();
+    let head = ["", "", "value", "baseline", "target", ""].map(str::to_owned);
+    let width = |column: usize| rows.iter().chain([&head]).map(|row| row[column].chars().count()).max().unwrap_or(0);
+    let widths: [usize; 6] = std::array::from_fn(width);
+    let line = |row: &[String; 6]| {
+        let [name, unit, value, baseline, target, verdict] = row;
+        let [a, b, c, d, e, _] = widths;
+        let text = format!("  {name:<a$}  {unit:<b$}  {value:>c$}  {baseline:>d$}  {target:>e$}  {verdict}");
+        text.trim_end().to_owned()
+    };
+    let mut text = format!("{title}\n{}\n", line(&head));
+    for (figure, row) in figures.iter().zip(&rows) {
+        let _ = writeln!(text, "{}", line(row));
+        if !figure.note.is_empty() {
+            let _ = writeln!(text, "      {}", figure.note);
+        }
+    }
+    text
+}
+
+/// Three digits that mean something, and no more than three after the point.
+fn number(value: f64) -> String {
+    let decimals = match value.abs() {
+        0.0 => 0,
+        large if large >= 100.0 => 0,
+        large if large >= 10.0 => 1,
+        large if large >= 1.0 => 2,
+        _ => 3,
+    };
+    if value.fract() == 0.0 { format!("{value:.0}") } else { format!("{value:.decimals$}") }
+}
+
+/// Reads what another program of the bench printed: lines that are figures; others are its own affair.
+pub(crate) fn read(text: &str) -> Vec<Figure> {
+    text.lines().filter_map(|line| serde_json::from_str::<Figure>(line).ok()).map(Figure::judged).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn targets_are_held_against_the_value() {
+        for (value, target, met) in [
+            (1.0, "< 1", Some(false)),
+            (1.0, "<= 1", Some(true)),
+            (0.9, ">= 0.9", Some(true)),
+            (2.0, "> 2", Some(false)),
+            (0.0, "= 0", Some(true)),
+            (1.0, "about 1", None),
+        ] {
+            assert_eq!(Figure::new("a/b", "ms", Some(value)).target(target).met, met, "{value} {target}");
+        }
+        assert_eq!(Figure::missing("a/b", "why").target("< 1").met, None);
+    }
+
+    #[test]
+    fn what_others_print_is_read_and_judged() {
+        let text = "booting\n{\"name\":\"cycles/p50\",\"unit\":\"ms\",\"value\":3,\"baseline\":null,\"target\":2,\"note\":\"n\"}\n{}";
+        let figures = read(text);
+        assert_eq!(figures.len(), 1);
+        assert_eq!((figures[0].met, figures[0].verdict()), (Some(false), "MISSED"));
+        let again = read(&serde_json::to_string(&figures[0]).unwrap());
+        assert_eq!(again, figures);
+    }
+
+    #[test]
+    fn a_table_says_what_was_met_missed_and_not_measured() {
+        let figures = [
+            Figure::new("load/cpu", "%", Some(12.345)).baseline(Some(3.0)).target("< 25").note("user and system"),
+            Figure::new("load/drops", "", Some(2.0)).target("= 0"),
+            Figure::missing("load/rss", "no /proc"),
+        ];
+        let expected = "\
+load
+                value  baseline  target
+  cpu    %       12.3         3    < 25  met
+      user and system
+  drops             2         -     = 0  MISSED
+  rss               -         -       -  not measured
+      no /proc
+";
+        assert_eq!(table("load", &figures), expected);
+    }
+}

@@ -1,0 +1,239 @@
+//! `rapid-bench`: figures of `rapid` on this machine, each beside a baseline measured in the same run.
+//!
+//! One file a section; `stats` computes, `figure` shows, `process` starts and watches children. A section that cannot be
+//! measured says why and the next one follows.
+//!
+//! Invariant: no value makes the program fail; only wrong arguments do.
+
+mod beat;
+mod child;
+mod feed;
+mod figure;
+mod frame;
+mod load;
+mod mask;
+mod others;
+mod process;
+mod replug;
+mod start;
+mod stats;
+mod sync;
+mod write;
+
+use std::io::{self, IsTerminal, Write};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::time::{Duration, Instant};
+
+use clap::{Parser, ValueEnum};
+use figure::Figure;
+
+/// What goes wrong in a section ends it, with its text as the reason.
+type Failure = Box<dyn std::error::Error>;
+
+/// Figures of rapid on this machine, each beside a baseline measured in the same run. Nothing passes or fails.
+#[derive(Debug, Parser)]
+#[command(
+    after_help = "Examples:\n  rapid-bench                     everything, some 15 minutes\n  rapid-bench --quick             \
+                        short runs: see that it works\n  rapid-bench --only sync write   two sections\n  rapid-bench --json            \
+                        one JSON object a figure and line"
+)]
+struct Cli {
+    /// One JSON object a line: name, unit, value, baseline, target, note, met
+    #[arg(long)]
+    json: bool,
+    /// Short runs, and few: the figures mean little
+    #[arg(long)]
+    quick: bool,
+    /// Only these sections
+    #[arg(long, num_args = 1.., value_name = "SECTION")]
+    only: Vec<Section>,
+    /// Runs of each measurement, of which the median is shown
+    #[arg(long, value_name = "N")]
+    runs: Option<usize>,
+    /// Length of one run under full load
+    #[arg(long, value_name = "SECONDS")]
+    load_seconds: Option<u64>,
+    /// The program measured; that of RAPID_BIN, or the one beside this, if not given
+    #[arg(long, value_name = "FILE")]
+    rapid: Option<PathBuf>,
+    /// Where episodes are written for the time of the run; a real disk, not memory
+    #[arg(long, value_name = "FOLDER")]
+    scratch: Option<PathBuf>,
+    #[command(subcommand)]
+    child: Option<child::Child>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Section {
+    Mask,
+    Frame,
+    Replug,
+    Load,
+    Write,
+    Sync,
+    Start,
+    Unplug,
+    Cycles,
+    Deaf,
+}
+
+impl Section {
+    /// In this order: what must not be disturbed comes before what leaves dirty pages behind.
+    const ALL: [Self; 10] = [
+        Self::Start,
+        Self::Sync,
+        Self::Frame,
+        Self::Replug,
+        Self::Unplug,
+        Self::Mask,
+        Self::Load,
+        Self::Write,
+        Self::Cycles,
+        Self::Deaf,
+    ];
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Mask => "mask",
+            Self::Frame => "frame",
+            Self::Replug => "replug",
+            Self::Load => "load",
+            Self::Write => "write",
+            Self::Sync => "sync",
+            Self::Start => "start",
+            Self::Unplug => "unplug",
+            Self::Cycles => "cycles",
+            Self::Deaf => "deaf",
+        }
+    }
+
+    fn measure(self, bench: &Bench) -> Result<Vec<Figure>, Failure> {
+        match self {
+            Self::Mask => mask::measure(bench),
+            Self::Frame => frame::measure(bench),
+            Self::Replug => replug::measure(bench),
+            Self::Load => load::measure(bench),
+            Self::Write => write::measure(bench),
+            Self::Sync => sync::measure(bench),
+            Self::Start => start::measure(bench),
+            Self::Unplug => others::unplug(bench),
+            Self::Cycles => others::cycles(bench),
+            Self::Deaf => others::deaf(bench),
+        }
+    }
+}
+
+/// What every section works with.
+#[derive(Debug)]
+pub(crate) struct Bench {
+    rapid: PathBuf,
+    /// Where this program and its siblings lie.
+    programs: PathBuf,
+    scratch: tempfile::TempDir,
+    quick: bool,
+    runs: usize,
+    load: Duration,
+}
+
+impl Bench {
+    fn new(cli: &Cli) -> io::Result<Self> {
+        let programs = std::env::current_exe()?.parent().unwrap_or(Path::new(".")).to_owned();
+        let named = || std::env::var_os("RAPID_BIN").map(PathBuf::from);
+        let rapid = cli.rapid.clone().or_else(named).unwrap_or_else(|| programs.join("rapid"));
+        if !rapid.is_file() {
+            let text = format!("{}: no such program: cargo build --release, or name it with --rapid", rapid.display());
+            return Err(io::Error::new(io::ErrorKind::NotFound, text));
+        }
+        let scratch = cli.scratch.clone().unwrap_or_else(|| programs.clone());
+        Ok(Self {
+            rapid,
+            programs,
+            scratch: tempfile::Builder::new().prefix("rapid-bench-").tempdir_in(scratch)?,
+            quick: cli.quick,
+            runs: cli.runs.unwrap_or(if cli.quick { 2 } else { 5 }).max(1),
+            load: Duration::from_secs(cli.load_seconds.unwrap_or(if cli.quick { 5 } else { 60 })),
+        })
+    }
+
+    /// One of two, by the length of the runs asked for.
+    fn choose<T>(&self, full: T, quick: T) -> T {
+        if self.quick { quick } else { full }
+    }
+
+    /// Tells on standard error how far a long measurement has come.
+    fn progress(&self, text: &str) {
+        let mut out = io::stderr();
+        let _ = if out.is_terminal() { write!(out, "\r\x1b[K{text}") } else { writeln!(out, "{text}") };
+        let _ = out.flush();
+    }
+
+    fn progress_done(&self) {
+        let mut out = io::stderr();
+        if out.is_terminal() {
+            let _ = write!(out, "\r\x1b[K");
+        }
+    }
+}
+
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    let done = match &cli.child {
+        Some(child) => child.run(),
+        None => run(&cli),
+    };
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            let _ = writeln!(io::stderr(), "rapid-bench: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(cli: &Cli) -> Result<(), Failure> {
+    let bench = Bench::new(cli)?;
+    let sections: Vec<Section> =
+        Section::ALL.into_iter().filter(|section| cli.only.is_empty() || cli.only.contains(section)).collect();
+    show(cli, "host", &host(&bench, "at the beginning"))?;
+    for (place, section) in sections.iter().enumerate() {
+        let name = section.name();
+        bench.progress(&format!("{}/{} {name} ...", place + 1, sections.len()));
+        let begun = Instant::now();
+        let load = process::host_load(Duration::ZERO).map_or(0.0, |(average, _)| average);
+        let figures = match section.measure(&bench) {
+            Ok(figures) => figures,
+            Err(error) => vec![Figure::missing(format!("{name}/all"), error.to_string())],
+        };
+        bench.progress_done();
+        let title = format!("{name}   ({:.0} s, load average before {load:.2})", begun.elapsed().as_secs_f64());
+        show(cli, &title, &figures)?;
+    }
+    show(cli, "host", &host(&bench, "at the end"))
+}
+
+fn show(cli: &Cli, title: &str, figures: &[Figure]) -> Result<(), Failure> {
+    let mut out = io::stdout().lock();
+    if cli.json {
+        for figure in figures {
+            writeln!(out, "{}", serde_json::to_string(figure)?)?;
+        }
+    } else {
+        writeln!(out, "{}", figure::table(title, figures))?;
+    }
+    Ok(out.flush()?)
+}
+
+/// What else the machine does, which every figure stands under.
+fn host(bench: &Bench, when: &str) -> Vec<Figure> {
+    let processors = std::thread::available_parallelism().map_or(0, usize::from);
+    let kernel = std::fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
+    let length = bench.choose("full runs", "short runs: figures mean little");
+    let load = process::host_load(Duration::from_secs(1));
+    let note = format!("{processors} processors, Linux {}, {length}, medians of {} runs", kernel.trim(), bench.runs);
+    vec![
+        Figure::new(format!("host/load average {when}"), "", load.map(|(average, _)| average)).note(note),
+        Figure::new(format!("host/busy {when}"), "%", load.map(|(_, busy)| busy))
+            .note("of all processors over one second in which the bench itself slept"),
+    ]
+}

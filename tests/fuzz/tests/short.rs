@@ -1,0 +1,76 @@
+//! Every target over its seeds, over what once broke it, and over mutations of both: the same ones in
+//! every run. `make fuzz` looks further.
+
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use fuzz::mutate::{Random, mutate};
+use fuzz::{TARGETS, Target};
+use proptest::prelude::*;
+
+/// Mutations a target gets at most.
+const CASES: usize = 3000;
+/// A slow machine gets fewer.
+const LONGEST: Duration = Duration::from_millis(700);
+
+fn inputs(target: &Target) -> Vec<(String, Vec<u8>)> {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("cases").join(target.name);
+    let mut paths: Vec<PathBuf> =
+        std::fs::read_dir(&folder).into_iter().flatten().flatten().map(|e| e.path()).collect();
+    paths.sort();
+    let cases = paths.iter().map(|path| (path.display().to_string(), std::fs::read(path).unwrap()));
+    let seeds = (target.seeds)().into_iter().enumerate().map(|(number, seed)| (format!("seed {number}"), seed));
+    cases.chain(seeds).collect()
+}
+
+/// Runs a target; a panic of it names the input.
+fn feed(target: &Target, name: &str, input: &[u8]) {
+    if std::panic::catch_unwind(|| (target.run)(input)).is_err() {
+        let kept = std::env::temp_dir().join(format!("fuzz-{}-{}", target.name, std::process::id()));
+        std::fs::write(&kept, input).unwrap();
+        panic!(
+            "target {} broke on {name}: kept as {}; `cargo run -p fuzz --bin fuzz run {0} FILE` shows it again",
+            target.name,
+            kept.display()
+        );
+    }
+}
+
+#[test]
+fn no_reader_breaks_a_promise() {
+    for target in TARGETS {
+        let inputs = inputs(target);
+        assert!(!inputs.is_empty(), "{} has no seeds", target.name);
+        for (name, input) in &inputs {
+            feed(target, name, input);
+        }
+        let begun = Instant::now();
+        let mut random = Random(target.name.len() as u64);
+        let mut cases = 0;
+        while cases < CASES && begun.elapsed() < LONGEST {
+            let (name, seed) = &inputs[random.below(inputs.len())];
+            let (_, other) = &inputs[random.below(inputs.len())];
+            let mutation = mutate(&mut random, seed, other);
+            feed(target, &format!("a mutation of {name}"), &mutation);
+            cases += 1;
+        }
+        println!("{}: {} inputs, {cases} mutations", target.name, inputs.len());
+    }
+}
+
+#[test]
+fn every_folder_of_cases_belongs_to_a_target() {
+    for entry in std::fs::read_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join("cases")).unwrap() {
+        let name = entry.unwrap().file_name().into_string().unwrap();
+        assert!(name.starts_with('.') || fuzz::target(&name).is_some(), "cases/{name}: no such target");
+    }
+}
+
+proptest! {
+    /// Any text as the serial number of a registered device: in rules, descriptors and unit it is
+    /// that and nothing else.
+    #[test]
+    fn no_serial_number_says_more_than_itself(serial in prop_oneof![any::<String>(), "[ -~]{1,40}", "[*?\\[\\]!^a\"|\\\\$%-]{1,8}"]) {
+        fuzz::targets::strings(serial.as_bytes());
+    }
+}

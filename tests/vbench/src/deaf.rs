@@ -1,0 +1,109 @@
+//! Two devices read by programs, one of which ignores SIGTERM, are unplugged one after the other while a sampler reads the mask.
+//!
+//! Invariant: three spans of equal length are compared, of one guest: nothing happens, a program that ends promptly loses
+//! its device, a deaf one does.
+
+use serde_json::Value;
+
+use crate::emu::spec::DeviceSpec;
+use crate::outcome::Outcome;
+use crate::scenario::Scenario;
+
+/// Length of each span: SIGTERM has 5 s to work, and then the program is killed.
+pub const SPAN_MS: u64 = 7_000;
+const IDLE_MS: u64 = 2_000;
+const PROMPT_MS: u64 = 10_000;
+const DEAF_MS: u64 = 18_000;
+/// The timeline begins some seconds after the recording.
+const SECONDS: u32 = 40;
+const REGISTRY: &str = r#"
+[rig]
+name = "vbench"
+
+[device.prompt]
+vid = "0x2e8a"
+pid = "0x000a"
+serial = "P1"
+node = "process_node"
+bit = 0
+[device.prompt.process]
+kind = "scalars"
+channels = 2
+opens = "tty"
+
+[device.deaf]
+vid = "0x2e8a"
+pid = "0x000a"
+serial = "D1"
+node = "process_node"
+bit = 1
+[device.deaf.process]
+args = ["--ignore-sigterm"]
+kind = "scalars"
+channels = 2
+"#;
+
+/// What happens in a span.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Span {
+    /// Nothing.
+    Idle,
+    /// The device of the program that ends on SIGTERM is unplugged at its beginning.
+    Prompt,
+    /// The device of the program that does not.
+    Deaf,
+}
+
+/// How the mask beat in a span.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Rhythm {
+    /// Longest time in which a sampler that looks every 0.5 ms saw no new publication, ms.
+    pub longest_ms: f64,
+    /// Longest pause between two looks of the sampler itself, ms: what the guest's processors do to any program.
+    pub pause_ms: f64,
+    /// Publications.
+    pub publications: u64,
+    /// Tenths of a second in which the sampler looked often and saw no publication at all.
+    pub silent_tenths: usize,
+}
+
+/// The scenario.
+pub fn scenario() -> Scenario {
+    Scenario::new("deaf")
+        .device(DeviceSpec::acm(0x2e8a, 0x000a, 100.0).serial("P1"))
+        .device(DeviceSpec::acm(0x2e8a, 0x000a, 100.0).serial("D1"))
+        .registry(REGISTRY)
+        .node_program()
+        .record(SECONDS, &["prompt", "deaf"])
+        .watch_mask()
+        .at(PROMPT_MS, "unplug 0")
+        .at(DEAF_MS, "unplug 1")
+}
+
+/// The mask's rhythm in a span; `None` when the sampler saw nothing of it.
+pub fn rhythm(outcome: &Outcome, span: Span) -> Option<Rhythm> {
+    /// A sampler that looked this often in a tenth of a second had the processor, and so could the publisher.
+    const OFTEN: u64 = 10;
+    let offset = match span {
+        Span::Idle => IDLE_MS,
+        Span::Prompt => PROMPT_MS,
+        Span::Deaf => DEAF_MS,
+    };
+    let from = outcome.origins().first()?.mono_ns + offset * 1_000_000;
+    let until = from + SPAN_MS * 1_000_000;
+    let number = |line: &Value, key: &str| line[key].as_u64().unwrap_or_default();
+    // A line belongs to the span if it ended in it: so does the silence in it.
+    let inside = |line: &&Value| line["action"] == "beat" && (from..until).contains(&number(line, "mono_ns"));
+    let mut rhythm = None;
+    for line in outcome.mask.iter().filter(inside) {
+        let Rhythm { longest_ms, pause_ms, publications, silent_tenths } = rhythm.unwrap_or_default();
+        let is_silent = number(line, "looks") >= OFTEN && number(line, "publications") == 0;
+        rhythm = Some(Rhythm {
+            longest_ms: longest_ms.max(number(line, "longest_ns") as f64 / 1e6),
+            pause_ms: pause_ms.max(number(line, "pause_ns") as f64 / 1e6),
+            publications: publications + number(line, "publications"),
+            silent_tenths: silent_tenths + usize::from(is_silent),
+        });
+    }
+    rhythm
+}

@@ -1,0 +1,26 @@
+//! Text of `devices.toml` for the bench's devices.
+
+/// A registry of these entries.
+pub fn registry(entries: &[String]) -> String {
+    format!("[rig]\nname = \"vbench\"\n\n{}", entries.join("\n"))
+}
+
+/// A 30 fps MJPG camera of the model 046d:0825, by its serial number if it has one.
+pub fn camera(name: &str, topic: &str, bit: u32, serial: Option<&str>, (width, height): (u32, u32)) -> String {
+    let serial = serial.map(|serial| format!("serial = \"{serial}\"\n")).unwrap_or_default();
+    format!(
+        "[device.{name}]\nvid = \"0x046d\"\npid = \"0x0825\"\n{serial}node = \"camera\"\n\
+         topic = \"{topic}\"\nslot = \"top\"\nbit = {bit}\n\
+         [device.{name}.camera]\nwidth = {width}\nheight = {height}\nfps = 30\nformat = \"MJPG\"\n"
+    )
+}
+
+/// A serial line of the emulator's four numbers, of the model `vid:pid`.
+pub fn scalars(name: &str, topic: &str, bit: u32, model: &str, serial: &str) -> String {
+    let (vid, pid) = model.split_once(':').unwrap_or((model, ""));
+    format!(
+        "[device.{name}]\nvid = \"0x{vid}\"\npid = \"0x{pid}\"\nserial_number = \"{serial}\"\nnode = \"serial\"\n\
+         topic = \"{topic}\"\nslot = \"tip\"\nbit = {bit}\n\
+         [device.{name}.serial]\nbaud = 115200\nframing = \"line\"\nparse = \"csv\"\nchannels = 4\n"
+    )
+}

@@ -1,0 +1,102 @@
+//! A measured figure beside what it is to be judged by, as a line of a table or as a JSON object.
+
+use std::fmt;
+
+use serde_json::{Value, json};
+
+/// One figure.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Figure {
+    /// What was measured, in words of letters, digits and `_`.
+    pub name: String,
+    /// Unit of all three values.
+    pub unit: &'static str,
+    /// What was measured; `None` when there was nothing to measure.
+    pub value: Option<f64>,
+    /// The same of the plainest program there can be, measured in the same run.
+    pub baseline: Option<f64>,
+    /// What the value should not exceed, where there is such a wish.
+    pub target: Option<f64>,
+    /// What was measured how, for people.
+    pub note: String,
+}
+
+impl Figure {
+    /// A figure with neither baseline nor target.
+    pub fn new(name: impl Into<String>, unit: &'static str, value: Option<f64>) -> Self {
+        Self { name: name.into(), unit, value, baseline: None, target: None, note: String::new() }
+    }
+
+    /// With the plainest program's value.
+    #[must_use]
+    pub fn baseline(mut self, baseline: Option<f64>) -> Self {
+        self.baseline = baseline;
+        self
+    }
+
+    /// With what it should not exceed.
+    #[must_use]
+    pub fn target(mut self, target: f64) -> Self {
+        self.target = Some(target);
+        self
+    }
+
+    /// With a sentence.
+    #[must_use]
+    pub fn note(mut self, note: impl Into<String>) -> Self {
+        self.note = note.into();
+        self
+    }
+
+    /// As a JSON object: `name`, `unit`, `value`, `baseline`, `target` and `note`; what is not there is null.
+    pub fn json(&self) -> Value {
+        let rounded = |value: Option<f64>| value.map(|value| (value * 1e3).round() / 1e3);
+        json!({
+            "name": self.name,
+            "unit": self.unit,
+            "value": rounded(self.value),
+            "baseline": rounded(self.baseline),
+            "target": self.target,
+            "note": self.note,
+        })
+    }
+}
+
+impl fmt::Display for Figure {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let cell =
+            |value: Option<f64>, decimals| value.map_or_else(|| "-".into(), |value| format!("{value:.decimals$}"));
+        write!(
+            f,
+            "{:<34} {:>9} {:>9} {:>7} {:<5} {}",
+            self.name,
+            cell(self.value, 2),
+            cell(self.baseline, 2),
+            cell(self.target, 0),
+            self.unit,
+            self.note
+        )
+    }
+}
+
+/// The line above a table of figures.
+pub fn heading() -> String {
+    format!("{:<34} {:>9} {:>9} {:>7} {:<5} {}", "figure", "value", "baseline", "target", "unit", "what it is")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_figure_says_what_it_lacks() {
+        let figure = Figure::new("unplug_to_bit_p50", "ms", Some(12.345_67)).target(100.0).note("x");
+        assert_eq!(
+            figure.json(),
+            json!({"name": "unplug_to_bit_p50", "unit": "ms", "value": 12.346, "baseline": null, "target": 100.0, "note": "x"})
+        );
+        let line = figure.to_string();
+        assert_eq!(line.split_whitespace().collect::<Vec<_>>(), ["unplug_to_bit_p50", "12.35", "-", "100", "ms", "x"]);
+        assert_eq!(heading().find("unit"), line.find("ms"));
+    }
+}

@@ -1,0 +1,37 @@
+//! A program that ignores SIGTERM loses its device: the mask goes on as if nothing were.
+
+use vbench::deaf::{Span, rhythm, scenario};
+use vbench::recording::falls;
+
+#[test]
+fn a_deaf_program_does_not_hold_up_the_mask() {
+    let outcome = scenario().run().unwrap_or_else(|error| panic!("{error}"));
+    assert_eq!((outcome.code, outcome.rapid_code), (0, Some(0)));
+    assert!(outcome.emulator_errors().is_empty(), "{:?}", outcome.emulator_errors());
+
+    for span in [Span::Idle, Span::Prompt, Span::Deaf] {
+        let rhythm = rhythm(&outcome, span).expect("the sampler saw it");
+        println!("{span:?}: {rhythm:?}");
+        assert_eq!(rhythm.silent_tenths, 0, "{span:?}: {rhythm:?}");
+    }
+    let edges = outcome.episode().unwrap_or_else(|error| panic!("{error}")).mask_edges();
+    for (device, bit) in [(0, 0), (1, 1)] {
+        let unplugged = outcome.actions("unplug", device)[0].real_ns;
+        let fallen = falls(&edges, bit);
+        assert_eq!(fallen.len(), 1, "{fallen:?}");
+        assert!(fallen[0] >= unplugged, "the bit of device {device} fell before it was unplugged");
+    }
+
+    let says = |words: &str| {
+        let said = |line: &&serde_json::Value| line["text"].as_str().is_some_and(|text| text.contains(words));
+        outcome.rapid.iter().filter(said).count()
+    };
+    assert_eq!(says("prompt: reads /dev/ttyACM"), 1, "it is given the serial line");
+    assert_eq!(says("deaf: reads /dev/bus/usb/"), 1, "it is given the USB device");
+    assert_eq!(says("was killed"), 1, "only the deaf one");
+    let absent = |line: &&serde_json::Value| line["device"] == "deaf" && line["state"] == "absent";
+    let killed = |line: &&serde_json::Value| line["text"].as_str().is_some_and(|text| text.contains("was killed"));
+    let stamp = |line: Option<&serde_json::Value>| line.and_then(|line| line["stamp"].as_u64()).expect("a stamp");
+    let (absent, killed) = (stamp(outcome.rapid.iter().find(absent)), stamp(outcome.rapid.iter().find(killed)));
+    assert!(killed >= absent + 5_000_000_000, "the bit goes at once, the program after its 5 s");
+}
