@@ -9,16 +9,20 @@
 mod conductor;
 mod signals;
 
+use std::panic::AssertUnwindSafe;
 use std::path::{Path, PathBuf};
 use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
+use futures::FutureExt;
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
+use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
 use crate::bus::{Bus, BusError, TopicId};
+use crate::fault;
 use crate::headless::style::ColourChoice;
 use crate::headless::{self, HeadlessOptions};
 use crate::hotplug::script::Script;
@@ -114,7 +118,7 @@ pub enum AppError {
         /// Why.
         reason: String,
     },
-    /// A task of ours panicked.
+    /// A task or thread of ours panicked.
     #[error("{0} panicked; please report this")]
     Panicked(&'static str),
     /// A second signal came while the run was ending.
@@ -154,6 +158,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     let bus = Bus::open(&registry, options.instance.as_deref())?;
     let Some(mask_writer) = bus.writer(TopicId::Mask) else { return Err(AppError::Panicked("the bus")) };
     let presence = Presence::start(claim, mask_writer, Arc::clone(&board))?;
+    let mask_ended = presence.ended();
     let recorder = Recorder::spawn(bus.inbox()?, RecorderConfig::new(Arc::clone(&registry), Arc::clone(&board)))?;
     // Before the screen: what fails until here is said on an ordinary terminal.
     let hotplug: HotplugStream = match options.devices {
@@ -174,7 +179,10 @@ pub async fn run(options: Options) -> Result<(), AppError> {
         async move {
             // Dropped by a panic too.
             let _ended = ended;
-            let outcome = rig.run(hotplug, rig_asked, stop).await;
+            let outcome = tokio::select! {
+                outcome = rig.run(hotplug, rig_asked, stop) => outcome,
+                never = fault::strike("rig") => never,
+            };
             (rig, outcome)
         }
     });
@@ -188,6 +196,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     let mut conductor = Conductor {
         events: board.events(),
         board,
+        writer_ended: recorder.ended(),
         recorder,
         rig_commands,
         episode,
@@ -195,10 +204,21 @@ pub async fn run(options: Options) -> Result<(), AppError> {
         duration: options.duration,
         recording: false,
     };
-    let mut running = Running { rig, rig_ended, rig_stop, hurry, screen, screen_stop, signals, asked };
-    let outcome = conductor.conduct(&mut running).await;
+    let (kind, screen) = (options.screen, Some(screen));
+    let mut running =
+        Running { rig, rig_ended, rig_stop, hurry, mask_ended, kind, screen, screen_stop, signals, asked };
+    // A panic here ends the run like any other: what it leaves is taken down in order.
+    let conducted = AssertUnwindSafe(conductor.conduct(&mut running)).catch_unwind().await;
+    let outcome = conducted.unwrap_or(Err(AppError::Panicked("the main task")));
     finish(running, conductor, outcome).await
 }
+
+/// The screen has limits of its own for a reader that does not read. This one is for a screen that is
+/// stuck: crossterm 0.29 reads without end from a terminal that was hung up at the wrong moment.
+const LAST_OUTPUT: Duration = Duration::from_secs(10);
+/// After a second signal, what is still to be shown has this long: enough for a terminal to be given
+/// back.
+const LAST_OUTPUT_IN_A_HURRY: Duration = Duration::from_secs(1);
 
 type ScreenTask = JoinHandle<Result<(), AppError>>;
 
@@ -211,7 +231,19 @@ fn start_screen(
 ) -> ScreenTask {
     let board = Arc::clone(board);
     if screen == Screen::Monitor {
-        return tokio::spawn(async move { Ok(tui::run(board, commands, stop).await?) });
+        return tokio::spawn(async move {
+            tokio::select! {
+                outcome = tui::run(board, commands, stop) => match outcome {
+                    // As good as SIGHUP, which comes with it or a little later.
+                    Err(error @ TuiError::Gone(_)) => {
+                        tracing::warn!(%error, "the run ends");
+                        Ok(())
+                    }
+                    outcome => Ok(outcome?),
+                },
+                never = fault::strike("screen") => never,
+            }
+        });
     }
     let options = HeadlessOptions {
         json: screen == Screen::Json,
@@ -223,7 +255,10 @@ fn start_screen(
     tokio::spawn(async move {
         // Lines cannot ask for anything.
         drop(commands);
-        run.await.map_err(AppError::Output)
+        tokio::select! {
+            outcome = run => outcome.map_err(AppError::Output),
+            never = fault::strike("screen") => never,
+        }
     })
 }
 
@@ -233,10 +268,21 @@ struct Running {
     rig_ended: CancellationToken,
     rig_stop: CancellationToken,
     hurry: CancellationToken,
-    screen: ScreenTask,
+    mask_ended: CancellationToken,
+    kind: Screen,
+    /// Until its outcome was taken.
+    screen: Option<ScreenTask>,
     screen_stop: CancellationToken,
     signals: Signals,
     asked: mpsc::Receiver<Command>,
+}
+
+/// Waits for the end of the screen, whose outcome is taken; for ever if it was taken before.
+async fn screen_ended(screen: &mut Option<ScreenTask>) -> Result<(), AppError> {
+    let Some(task) = screen else { return std::future::pending().await };
+    let ended = task.await;
+    *screen = None;
+    ended.unwrap_or(Err(AppError::Panicked("the screen")))
 }
 
 /// Takes everything down, in the order of the module's comment. The first error is the run's.
@@ -270,18 +316,20 @@ async fn finish(
     let twice = tokio::select! {
         biased;
         () = &mut take_down => false,
-        () = running.signals.next() => true,
+        () = running.signals.second() => true,
     };
     if twice {
-        // The recorder's finish is the one thing that is never skipped.
+        // What the rig waits for is skipped, the recorder's finish never.
         running.hurry.cancel();
         take_down.as_mut().await;
     }
     drop(take_down);
     running.screen_stop.cancel();
-    if !running.screen.is_finished() {
-        let ended = (&mut running.screen).await;
-        keep_first(&mut outcome, ended.unwrap_or(Err(AppError::Panicked("the screen"))));
+    if running.screen.is_some() {
+        let limit = if twice { LAST_OUTPUT_IN_A_HURRY } else { LAST_OUTPUT };
+        if let Ok(ended) = timeout(limit, screen_ended(&mut running.screen)).await {
+            keep_first(&mut outcome, ended);
+        }
     }
     if twice { outcome.and(Err(AppError::InterruptedTwice)) } else { outcome }
 }

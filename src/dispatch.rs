@@ -3,6 +3,7 @@
 //! Invariant: every error is printed here, once.
 
 use std::io::{self, IsTerminal, Write};
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -70,6 +71,9 @@ enum Failure {
     Told,
     #[error("output: {0}")]
     Output(#[from] io::Error),
+    /// Whatever was done has been undone on the way here.
+    #[error("rapid panicked; please report this")]
+    Panicked,
 }
 
 impl From<InspectFailure> for Failure {
@@ -352,11 +356,11 @@ fn usual_places() -> Vec<PathBuf> {
 
 /// Runs `work` on a runtime of its own. When it is done nothing is waited for: a thread that is
 /// still opening a device that does not answer would hold up the end for as long as the kernel likes.
-fn block_on<T>(work: impl Future<Output = T>) -> io::Result<T> {
+fn block_on<T>(work: impl Future<Output = T>) -> Result<T, Failure> {
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().thread_name("worker").build()?;
-    let done = runtime.block_on(work);
+    let done = catch_unwind(AssertUnwindSafe(|| runtime.block_on(work)));
     runtime.shutdown_timeout(LAST_TASKS);
-    Ok(done)
+    done.map_err(|_| Failure::Panicked)
 }
 
 fn palette() -> Palette {

@@ -88,6 +88,7 @@ pub mod commands;
 pub mod dispatch;
 pub mod driver;
 pub mod episode_format;
+pub mod fault;
 pub mod flash;
 pub mod folder;
 pub mod headless;

@@ -21,7 +21,7 @@ use proc_macro2::{Delimiter, TokenStream, TokenTree};
 /// Modules by layer, lowest first. A module sees those of lower layers.
 const LAYERS: &[&[&str]] = &[
     &["modality", "mask", "sample", "time", "action", "provenance", "flash"],
-    &["registry", "status", "text", "outlet", "folder", "episode_format"],
+    &["registry", "status", "text", "outlet", "folder", "episode_format", "fault"],
     &["hotplug", "driver", "bus", "sync", "calibration"],
     &["rig", "record", "policy", "control"],
     &["app", "tui", "headless", "logging"],

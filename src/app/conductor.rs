@@ -6,8 +6,10 @@ use std::time::Duration;
 
 use tokio::sync::{broadcast, mpsc};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
+use tokio_util::sync::CancellationToken;
 
-use super::{AppError, Running};
+use super::{AppError, Running, Screen, screen_ended};
+use crate::fault;
 use crate::record::{EpisodeRequest, Recorder};
 use crate::rig::RigCommand;
 use crate::status::{Board, Command, Event, SlotState, What};
@@ -25,6 +27,7 @@ pub(super) struct Conductor {
     pub(super) board: Arc<Board>,
     pub(super) events: broadcast::Receiver<Event>,
     pub(super) recorder: Recorder,
+    pub(super) writer_ended: CancellationToken,
     pub(super) rig_commands: mpsc::Sender<RigCommand>,
     pub(super) episode: EpisodeRequest,
     pub(super) record: bool,
@@ -43,37 +46,40 @@ impl Conductor {
             _ => None,
         };
         let mut begin_episode = self.record;
-        let mut screen_ended = false;
+        // Nobody reads the output any more, and how that came.
+        let mut output = Ok(());
         loop {
             tokio::select! {
                 biased;
-                () = running.signals.next() => return Ok(()),
+                () = running.signals.next() => return output,
                 // Its outcome is taken when everything is taken down.
-                () = running.rig_ended.cancelled() => return Ok(()),
-                outcome = &mut running.screen, if !screen_ended => {
-                    outcome.unwrap_or(Err(AppError::Panicked("the screen")))?;
-                    // Nobody reads the output any more. An episode is worth more than its log lines.
-                    if !self.record {
-                        return Ok(());
-                    }
-                    screen_ended = true;
-                }
+                () = running.rig_ended.cancelled() => return output,
+                () = running.mask_ended.cancelled() => return Err(AppError::Panicked("thread `mask`")),
+                outcome = screen_ended(&mut running.screen) => match outcome {
+                    Err(panicked @ AppError::Panicked(_)) => return Err(panicked),
+                    // An episode is worth more than its log lines, and goes on without.
+                    outcome if self.record && running.kind != Screen::Monitor => output = outcome,
+                    outcome => return outcome,
+                },
                 Some(command) = running.asked.recv() => match command {
                     Command::ToggleRecording => self.toggle().await?,
                     // A rig that is so far behind will not get to it in time either.
                     Command::Restart(id) => { let _ = self.rig_commands.try_send(RigCommand::Restart(id)); }
-                    Command::Quit => return Ok(()),
+                    Command::Quit => return output,
                 },
                 event = self.events.recv() => {
-                    if self.episode_ended(event)? { return Ok(()); }
+                    if self.episode_ended(event)? { return output; }
                 }
+                // After the events: what became of its episode says more.
+                () = self.writer_ended.cancelled() => return Err(AppError::Panicked("thread `writer`")),
+                never = fault::strike("main") => never,
                 _ = look.tick(), if begin_episode => {
                     if self.has_settled(begun) {
                         begin_episode = false;
                         self.start().await?;
                     }
                 }
-                () = sleep_until(end.unwrap_or(begun)), if end.is_some() => return Ok(()),
+                () = sleep_until(end.unwrap_or(begun)), if end.is_some() => return output,
             }
         }
     }

@@ -2,27 +2,47 @@
 
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
-/// SIGINT, SIGTERM, and SIGHUP for a terminal that was closed: all of them end the run.
+/// SIGINT, SIGTERM, SIGQUIT, and SIGHUP for a terminal that was closed: all of them end the run.
+///
+/// Two that would end the process where it stands are taken: SIGPIPE by Rust's runtime, and SIGXFSZ
+/// here, so that a write beyond the limit for files (`ulimit -f`) is an error like any other.
 pub(super) struct Signals {
-    interrupt: Signal,
-    terminate: Signal,
-    hangup: Signal,
+    ends: [Signal; 4],
+    _too_large: Signal,
+    /// How many came.
+    asked: u32,
 }
 
 impl Signals {
     pub(super) fn listen() -> std::io::Result<Self> {
         Ok(Self {
-            interrupt: signal(SignalKind::interrupt())?,
-            terminate: signal(SignalKind::terminate())?,
-            hangup: signal(SignalKind::hangup())?,
+            ends: [
+                signal(SignalKind::interrupt())?,
+                signal(SignalKind::terminate())?,
+                signal(SignalKind::quit())?,
+                signal(SignalKind::hangup())?,
+            ],
+            _too_large: signal(SignalKind::from_raw(libc::SIGXFSZ))?,
+            asked: 0,
         })
     }
 
+    /// Waits for the next one.
     pub(super) async fn next(&mut self) {
+        let [interrupt, terminate, quit, hangup] = &mut self.ends;
         tokio::select! {
-            _ = self.interrupt.recv() => {}
-            _ = self.terminate.recv() => {}
-            _ = self.hangup.recv() => {}
+            _ = interrupt.recv() => {}
+            _ = terminate.recv() => {}
+            _ = quit.recv() => {}
+            _ = hangup.recv() => {}
+        }
+        self.asked += 1;
+    }
+
+    /// Waits for the second of the run: the first only asks for the end that may be coming anyway.
+    pub(super) async fn second(&mut self) {
+        while self.asked < 2 {
+            self.next().await;
         }
     }
 }

@@ -61,7 +61,7 @@ enum Progress {
 ///
 /// Events count from this call, not from the first poll. Cancel `shutdown` when everything else has
 /// ended, so that the last episode is in the summary. The future ends early, with `Ok`, when nobody
-/// reads the output any more (a closed pipe).
+/// reads the output any more (a closed pipe or terminal).
 ///
 /// # Errors
 /// When the output cannot be written.
@@ -84,10 +84,16 @@ pub fn run(
     async move {
         let outlet = Outlet::new("output", DEPTH, out)?;
         match printer.run(&board, events, &shutdown, outlet).await {
-            Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
+            Err(error) if is_gone(&error) => Ok(()),
             outcome => outcome,
         }
     }
+}
+
+/// Has the reader gone: a pipe was closed, or a terminal?
+fn is_gone(error: &io::Error) -> bool {
+    let errno = rustix::io::Errno::from_io_error(error);
+    matches!(errno, Some(rustix::io::Errno::PIPE | rustix::io::Errno::IO)) || error.kind() == io::ErrorKind::BrokenPipe
 }
 
 /// Turns events and snapshots into pieces of output.

@@ -1,6 +1,6 @@
 //! Recording: one episode, one MCAP file, with the mask and the frame index beside every sample.
 //!
-//! `recorder` runs the `writer` thread, which owns the file: it takes what the bus hands over
+//! `recorder` starts the `writer` thread, which owns the file: it takes what the bus hands over
 //! ([`Source`]), `session` decides what belongs to the episode and which frame it belongs to,
 //! `file` writes it. `inspect` reads such a file back.
 //!
@@ -31,6 +31,7 @@ mod streams;
 #[cfg(test)]
 mod tests;
 mod verdict;
+mod writer;
 
 use std::path::PathBuf;
 

@@ -1,49 +1,25 @@
-//! The `writer` thread and the handle to it.
-//!
-//! The thread takes samples from the bus all the time, so that an episode begins with an empty
-//! queue; while there is no episode it throws them away.
-//!
-//! Invariant: an episode in progress is finished whatever ends the thread: the last handle dropped,
-//! an error of the disk, a panic.
+//! The handle to the `writer` thread, and what it is made with.
 
-use std::any::Any;
 use std::fs::File;
 use std::io;
-use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::mpsc::{self, Receiver, Sender, TryRecvError};
+use std::sync::mpsc::{self, Sender};
 use std::thread::JoinHandle;
-use std::time::Duration;
 
-use tokio::sync::broadcast::{self, error::TryRecvError as EventError};
 use tokio::sync::oneshot;
+use tokio_util::sync::CancellationToken;
 
 use super::RecordError;
-use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest, PARTIAL};
+use super::episode::{EpisodeReport, EpisodeRequest};
 use super::file::Sink;
-use super::provenance::Attached;
-use super::session::{Beginning, Session};
 use super::source::Source;
-use super::space::{Asker, Disk, Finding, Space};
-use super::streams::Streams;
+use super::space::{Asker, Disk};
+use super::writer::{Order, Reply, Writer};
 use crate::registry::Registry;
-use crate::status::{Board, Event, Level, RecordingStatus, What};
-use crate::time::{ClockWatch, Stamp, WallClock};
+use crate::status::Board;
+use crate::time::WallClock;
 
-/// Longest wait for samples: what an order, an event or a due frame may have to wait.
-const TURN: Duration = Duration::from_millis(20);
-/// How often what was written is handed to the kernel. A kill may take a second at most: half of it
-/// is for what lies on the bus and for frames that are not due yet.
-const FLUSH_EVERY: Duration = Duration::from_millis(500);
-/// How often the board is told.
-const STATUS_EVERY: Duration = Duration::from_millis(200);
-/// How often it is looked whether the wall clock was set.
-const CLOCK_EVERY: Duration = Duration::from_millis(100);
-/// Least distance of two complaints about the bus.
-const COMPLAIN_EVERY: Duration = Duration::from_secs(5);
-
-type Reply<T> = oneshot::Sender<Result<T, RecordError>>;
 type Opener = Box<dyn FnMut(File) -> Box<dyn Sink> + Send>;
 
 /// What the thread works with.
@@ -75,17 +51,13 @@ impl RecorderConfig {
     }
 }
 
-enum Order {
-    Start(EpisodeRequest, Reply<PathBuf>),
-    Stop(Reply<EpisodeReport>),
-}
-
 /// The handle. Dropping it ends an episode in progress and waits for its file, some 150 ms and
 /// what the disk takes.
 #[derive(Debug)]
 pub struct Recorder {
     orders: Option<Sender<Order>>,
     thread: Option<JoinHandle<()>>,
+    ended: CancellationToken,
 }
 
 impl Recorder {
@@ -96,10 +68,20 @@ impl Recorder {
     pub fn spawn(source: impl Source + 'static, config: RecorderConfig) -> io::Result<Self> {
         let (orders, inbox) = mpsc::channel();
         let events = config.board.events();
+        let ended = CancellationToken::new();
+        let guard = ended.clone().drop_guard();
         let thread = std::thread::Builder::new().name("writer".to_owned()).spawn(move || {
+            // Dropped by a panic too.
+            let _guard = guard;
             Writer::new(config, inbox, events).run(source);
         })?;
-        Ok(Self { orders: Some(orders), thread: Some(thread) })
+        Ok(Self { orders: Some(orders), thread: Some(thread), ended })
+    }
+
+    /// Cancelled when the thread has ended: before the handle is dropped, by a panic.
+    #[must_use]
+    pub fn ended(&self) -> CancellationToken {
+        self.ended.clone()
     }
 
     /// Begins an episode; returns the name its file will have.
@@ -135,257 +117,4 @@ impl Drop for Recorder {
             let _ = thread.join();
         }
     }
-}
-
-/// The thread's own state.
-struct Writer {
-    config: RecorderConfig,
-    inbox: Receiver<Order>,
-    events: broadcast::Receiver<Event>,
-    streams: Streams,
-    attached: Attached,
-    session: Option<Session>,
-    /// Room for the session's file.
-    space: Option<Space>,
-    clock: ClockWatch,
-    clock_looked: Stamp,
-    waiting: Vec<Reply<EpisodeReport>>,
-    flushed: Stamp,
-    reported: Stamp,
-    complained: Option<Stamp>,
-}
-
-enum Turn {
-    Again,
-    Last,
-}
-
-impl Writer {
-    fn new(mut config: RecorderConfig, inbox: Receiver<Order>, events: broadcast::Receiver<Event>) -> Self {
-        let clock = ClockWatch::new((config.clock)());
-        Self {
-            config,
-            inbox,
-            events,
-            streams: Streams::new(),
-            attached: Attached::default(),
-            session: None,
-            space: None,
-            clock,
-            clock_looked: Stamp::default(),
-            waiting: Vec::new(),
-            flushed: Stamp::default(),
-            reported: Stamp::default(),
-            complained: None,
-        }
-    }
-
-    fn run(mut self, mut source: impl Source) {
-        loop {
-            // Unwinding leaves a session whole: it is only ever replaced or taken as a whole, and
-            // what of it was half written is for its file to refuse.
-            match catch_unwind(AssertUnwindSafe(|| self.turn(&mut source))) {
-                Ok(Turn::Again) => {}
-                Ok(Turn::Last) => return,
-                Err(panic) => {
-                    let text = format!("the writer thread panicked: {}", panic_text(panic.as_ref()));
-                    self.complain(Level::Error, text.clone());
-                    self.finish(Stamp::now(), Some(text));
-                    return;
-                }
-            }
-        }
-    }
-
-    fn turn(&mut self, source: &mut impl Source) -> Turn {
-        if let Err(error) = source.wait(TURN) {
-            self.complain_about_bus(&error);
-            // What cannot be waited on is looked at regularly instead.
-            std::thread::sleep(TURN);
-        }
-        // Read before the drain: what was received by then has been taken after it.
-        let now = Stamp::now();
-        let Self { streams, session, .. } = self;
-        let drained =
-            source.drain(&mut |topic, header, payload| streams.take(session.as_mut(), topic, header, payload));
-        if let Err(error) = drained {
-            self.complain_about_bus(&error);
-        }
-        self.take_events();
-        let open = self.take_orders();
-        self.watch_clock(now);
-        self.advance(now);
-        match (open, &self.session) {
-            (false, None) => Turn::Last,
-            _ => Turn::Again,
-        }
-    }
-
-    fn take_events(&mut self) {
-        loop {
-            match self.events.try_recv() {
-                Ok(event) => {
-                    self.attached.take(&event);
-                    if let Some(session) = &mut self.session {
-                        session.event(&event);
-                    }
-                }
-                Err(EventError::Lagged(count)) => {
-                    if let Some(session) = &mut self.session {
-                        session.missed_events(count);
-                    }
-                }
-                Err(EventError::Empty | EventError::Closed) => return,
-            }
-        }
-    }
-
-    /// Does what is asked; says whether a handle is left to ask more.
-    fn take_orders(&mut self) -> bool {
-        loop {
-            match self.inbox.try_recv() {
-                Ok(Order::Start(request, reply)) => {
-                    let started = self.start(&request);
-                    // Whoever asked may have gone.
-                    let _ = reply.send(started);
-                }
-                Ok(Order::Stop(reply)) => match &mut self.session {
-                    Some(session) => {
-                        session.end_at(Stamp::now());
-                        self.waiting.push(reply);
-                    }
-                    None => {
-                        let _ = reply.send(Err(RecordError::Idle));
-                    }
-                },
-                Err(TryRecvError::Empty) => return true,
-                Err(TryRecvError::Disconnected) => {
-                    if let Some(session) = &mut self.session {
-                        session.end_at(Stamp::now());
-                    }
-                    return false;
-                }
-            }
-        }
-    }
-
-    fn start(&mut self, request: &EpisodeRequest) -> Result<PathBuf, RecordError> {
-        if let Some(session) = &self.session {
-            return Err(RecordError::Busy(session.name().to_owned()));
-        }
-        let clock = (self.config.clock)();
-        let begin = Stamp::now();
-        let (path, file) = EpisodePath::create(&request.out, &request.task, clock.wall_ns(begin))?;
-        let (finished, partial) = (path.finished.clone(), path.partial.clone());
-        // Nothing was recorded into it, and it was made a moment ago.
-        let refuse = |error| {
-            let _ = std::fs::remove_file(&partial);
-            error
-        };
-        let failed = |source| refuse(RecordError::Io { path: partial.clone(), source });
-        let (handle, watched) = (file.try_clone().map_err(failed)?, file.try_clone().map_err(failed)?);
-        let reserve = self.config.registry.rig.disk_reserve;
-        let space = Space::begin(watched, &request.out, reserve, begin, &mut self.config.disk).map_err(refuse)?;
-        let beginning = Beginning {
-            registry: Arc::clone(&self.config.registry),
-            board: Arc::clone(&self.config.board),
-            request,
-            path,
-            sink: (self.config.sink)(file),
-            handle,
-            attached: &self.attached,
-            clock,
-            begin,
-        };
-        let session = Session::begin(beginning, &self.streams.masks).map_err(failed)?;
-        self.config.board.set_recording(Some(session.status(begin)));
-        self.config.board.announce(What::Recording { file: finished.clone() });
-        self.session = Some(session);
-        self.space = Some(space);
-        (self.flushed, self.reported) = (begin, begin);
-        Ok(finished)
-    }
-
-    fn advance(&mut self, now: Stamp) {
-        let Some(session) = &mut self.session else { return };
-        session.advance(now, &self.streams.masks);
-        if now.since(self.flushed) >= FLUSH_EVERY {
-            session.flush();
-            self.flushed = now;
-        }
-        if session.is_over(now) {
-            self.finish(now, None);
-            return;
-        }
-        if now.since(self.reported) >= STATUS_EVERY && !session.is_ending(now) {
-            let room = self.space.as_ref().and_then(Space::left);
-            self.config.board.set_recording(Some(RecordingStatus { room, ..session.status(now) }));
-            self.reported = now;
-        }
-        self.watch_space(now);
-    }
-
-    fn watch_space(&mut self, now: Stamp) {
-        let found = self.space.as_mut().and_then(|space| space.look(now, &mut self.config.disk));
-        let Some((found, session)) = found.zip(self.session.as_ref()) else { return };
-        match found {
-            Finding::Low { free, left } => {
-                let folder = session.name().parent().map(Path::to_owned).unwrap_or_default();
-                self.config.board.announce(What::DiskLow { folder, free, seconds: left.as_secs() });
-            }
-            Finding::Removed => {
-                let file = session.name().display();
-                let text =
-                    format!("{file}: removed while it is recorded; it will be written again when the episode ends");
-                self.complain(Level::Error, text);
-            }
-            // Without waiting for what may still be on its way: it would need room.
-            Finding::Spent(reason) => self.finish(now, Some(reason)),
-        }
-    }
-
-    fn watch_clock(&mut self, now: Stamp) {
-        if now.since(self.clock_looked) < CLOCK_EVERY {
-            return;
-        }
-        self.clock_looked = now;
-        if let Some(step_ns) = self.clock.look((self.config.clock)()) {
-            self.config.board.announce(What::ClockStep { seconds: step_ns as f64 / 1e9 });
-        }
-    }
-
-    fn finish(&mut self, now: Stamp, reason: Option<String>) {
-        let Some(session) = self.session.take() else { return };
-        let report = session.finish(now, &self.streams.masks, reason);
-        if let Some(space) = self.space.take() {
-            space.release();
-        }
-        let board = &self.config.board;
-        board.set_recording(None);
-        if report.file.extension().is_none_or(|extension| extension != PARTIAL) {
-            board.set_last_episode(report.file.clone(), report.verdict.clone());
-        }
-        let EpisodeReport { file, seconds, messages, bytes, dropped, error, verdict } = report.clone();
-        board.announce(What::Episode { file, seconds, messages, bytes, dropped, error, verdict });
-        for reply in self.waiting.drain(..) {
-            let _ = reply.send(Ok(report.clone()));
-        }
-    }
-
-    fn complain_about_bus(&mut self, error: &str) {
-        let now = Stamp::now();
-        if self.complained.is_none_or(|at| now.since(at) >= COMPLAIN_EVERY) {
-            self.complained = Some(now);
-            self.complain(Level::Error, format!("recorder: {error}"));
-        }
-    }
-
-    fn complain(&self, level: Level, text: String) {
-        self.config.board.announce(What::Log { level, text });
-    }
-}
-
-fn panic_text(panic: &(dyn Any + Send)) -> &str {
-    let text = panic.downcast_ref::<&str>().copied();
-    text.or_else(|| panic.downcast_ref::<String>().map(String::as_str)).unwrap_or("no message")
 }

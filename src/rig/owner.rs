@@ -251,6 +251,12 @@ impl Rig {
                 self.show(id);
                 self.board.announce(What::Opened { device, bit: id, provenance });
             }
+            Report::Silent(limit) => {
+                modality.detail = format!("{}; it has sent nothing for {} s", modality.detail, limit.as_secs());
+                let text = format!("{}: open, but it has sent nothing for {} s", modality.spec.name, limit.as_secs());
+                self.show(id);
+                self.board.announce(What::Log { level: Level::Warn, text });
+            }
             Report::Started => self.apply(id, Input::Started(epoch)),
             Report::Stalled => self.apply(id, Input::Stalled(epoch)),
             Report::Resumed => self.apply(id, Input::Resumed(epoch)),
@@ -300,6 +306,10 @@ impl Rig {
             let wait = deadline.since(now).as_secs_f64();
             let reason = if before == SlotState::Absent { "cooldown" } else { modality.detail.as_str() };
             modality.detail = format!("{reason}; starts in {wait:.1} s");
+        }
+        if changed && state == SlotState::Failed && before == SlotState::Absent {
+            "attached, though its driver said again and again that it is gone: replug it, or restart it"
+                .clone_into(&mut modality.detail);
         }
         if let Some((epoch, attachment)) = start {
             modality.detail = attachment.node.label();

@@ -11,7 +11,7 @@
 //!
 //! (*) When the stream is the first to notice an unplug, the slot is Absent at once while hot-plug
 //! has yet to confirm it. If no removal comes within the cooldown, the device was never gone and is
-//! started again.
+//! started again, which counts as a restart: its driver cannot say so for ever.
 //!
 //! Invariant: what carries an older epoch changes nothing.
 //! Invariant: a cooldown delays an attachment and never drops it.
@@ -190,21 +190,25 @@ impl<A: Clone> Slot<A> {
             End::Gone => {
                 self.removed = Some(now);
                 self.enter(SlotState::Absent);
-                self.deadline = Some(now.after(self.cooldown));
+                let wait = self.backoff(now).map_or(self.cooldown, |backoff| backoff.max(self.cooldown));
+                self.deadline = Some(now.after(wait));
             }
             End::Fatal => self.enter(SlotState::Failed),
-            End::Retry => {
-                self.restarts.retain(|restart| now.since(*restart) < RESTART_WINDOW);
-                if self.restarts.len() == MAX_RESTARTS {
-                    self.enter(SlotState::Failed);
-                } else {
-                    let backoff = FIRST_BACKOFF * (1 << self.restarts.len());
+            End::Retry => match self.backoff(now) {
+                Some(backoff) => {
                     self.restarts.push(now);
                     self.wait_until(now.after(backoff));
                 }
-            }
+                None => self.enter(SlotState::Failed),
+            },
         }
         Effects::NONE
+    }
+
+    /// How long the next restart is delayed; `None` when there were too many of late.
+    fn backoff(&mut self, now: Stamp) -> Option<Duration> {
+        self.restarts.retain(|restart| now.since(*restart) < RESTART_WINDOW);
+        (self.restarts.len() < MAX_RESTARTS).then(|| FIRST_BACKOFF * (1 << self.restarts.len()))
     }
 
     fn restart_by_hand(&mut self, now: Stamp) -> Effects<A> {
@@ -226,6 +230,14 @@ impl<A: Clone> Slot<A> {
             return Effects::NONE;
         }
         self.deadline = None;
+        // Said to be gone by its driver, and attached all the same.
+        if self.state == SlotState::Absent && self.attached.is_some() {
+            if self.backoff(now).is_none() {
+                self.enter(SlotState::Failed);
+                return Effects::NONE;
+            }
+            self.restarts.push(now);
+        }
         self.start()
     }
 

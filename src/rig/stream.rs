@@ -16,6 +16,7 @@ use super::slot::End;
 use super::worker::{MOST_SILENT_BEATS, Seat, Worker};
 use crate::bus::Writer;
 use crate::driver::{Driver, DriverError, Reading};
+use crate::fault;
 use crate::provenance::Negotiated;
 use crate::registry::scenario::SimSource;
 use crate::registry::{Attachment, DeviceNode, DeviceSpec, NodeSpec};
@@ -26,11 +27,20 @@ use crate::time::{Stamp, nanoseconds};
 /// A device that does not open within this time is tried again.
 const OPEN_LIMIT: Duration = Duration::from_secs(10);
 
+/// A device that is open and has sent nothing for this long is said to be silent, once an epoch. It
+/// stays Opening: what sends only when something happens may do so at any time.
+const SILENT_AFTER: Duration = Duration::from_secs(2);
+/// A camera always sends: one that has sent nothing for this long is opened again. Six of these and the
+/// delays between them fit into the minute in which five restarts are allowed.
+const CAMERA_LIMIT: Duration = Duration::from_secs(5);
+
 /// What a stream tells the rig while it runs.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Report {
     /// The node is open; what was agreed with the device, for people and for the recording.
     Opened(String, Box<Provenance>),
+    /// Open for so long, and no sample yet.
+    Silent(Duration),
     /// The first sample was published.
     Started,
     /// Nothing came for `DeviceSpec::stall_after`.
@@ -159,6 +169,8 @@ impl Stream {
         let mut refused = false;
         let stall = sleep_until(Instant::now() + self.spec.stall_after);
         tokio::pin!(stall);
+        let silent = self.silence();
+        tokio::pin!(silent);
         // The timer is looked at when it fires, not set anew at every sample.
         let mut newest = Instant::now();
         loop {
@@ -182,6 +194,7 @@ impl Stream {
                         self.report(report).await;
                     }
                 }
+                reason = &mut silent, if pulse == Pulse::Silent => return (End::Retry, reason),
                 () = &mut stall => {
                     let due = newest + self.spec.stall_after;
                     if due > Instant::now() {
@@ -201,6 +214,21 @@ impl Stream {
         }
     }
 
+    /// Says that the device sends nothing; ends, with the reason, when it is to be opened again.
+    async fn silence(&self) -> String {
+        let opened = Instant::now();
+        let say = SILENT_AFTER.max(self.spec.stall_after);
+        let Some(at) = opened.checked_add(say) else { return std::future::pending().await };
+        sleep_until(at).await;
+        self.report(Report::Silent(say)).await;
+        if !matches!(self.spec.node, NodeSpec::Camera(_)) || is_recording(&self.attachment.node) {
+            return std::future::pending().await;
+        }
+        let limit = CAMERA_LIMIT.max(2 * say);
+        sleep_until(opened + limit).await;
+        format!("open, but sent nothing for {} s", limit.as_secs())
+    }
+
     fn provenance(&self, source: &Source) -> Provenance {
         let mut negotiated = source.negotiated();
         negotiated.driver = negotiated.driver.or_else(|| self.attachment.driver.as_deref().cloned());
@@ -216,6 +244,7 @@ impl Stream {
 
     /// One copy, from the driver's buffer into shared memory.
     fn publish(&self, reading: &Reading<'_>) -> Result<(), String> {
+        fault::point("stream");
         let (seq, lost) = self.numbers.take(reading.lost);
         let header = SampleHeader {
             seq,

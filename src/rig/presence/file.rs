@@ -12,7 +12,7 @@ use rustix::io::Errno;
 
 use crate::folder::FolderError;
 use crate::mask::{MaskRecord, MaskRecordError, PhysicalMask, RECORD_LEN};
-use crate::time::Stamp;
+use crate::time::{Stamp, realtime_ns};
 
 /// A publisher that dies between making and locking a file leaves the next one to try again.
 const TRIES: usize = 10;
@@ -124,6 +124,8 @@ impl MaskFile {
 
 impl Drop for MaskFile {
     fn drop(&mut self) {
+        // For readers that hold it open.
+        let _ = self.publish(PhysicalMask::EMPTY, realtime_ns());
         // While the lock is held, so that nobody else's file is removed.
         let _ = std::fs::remove_file(&self.path);
     }

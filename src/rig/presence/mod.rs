@@ -22,7 +22,10 @@ use thread_priority::unix::{
 };
 use thread_priority::{ThreadPriority, ThreadPriorityValue};
 
+use tokio_util::sync::CancellationToken;
+
 use crate::bus::Writer;
+use crate::fault;
 use crate::mask::PhysicalMask;
 use crate::sample::{Encoding, SampleHeader};
 use crate::status::Board;
@@ -45,6 +48,7 @@ const FIFO_PRIORITY: u8 = 40;
 pub struct Presence {
     shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
+    ended: CancellationToken,
     json: PathBuf,
     json_failed: AtomicBool,
 }
@@ -82,11 +86,23 @@ impl Presence {
         let Claim { path, file } = claim;
         let shared = Arc::new(Shared::default());
         let beat = Beat { shared: Arc::clone(&shared), file, writer, board };
+        let ended = CancellationToken::new();
+        let guard = ended.clone().drop_guard();
         let thread = std::thread::Builder::new()
             .name("mask".to_owned())
-            .spawn(move || beat.run())
+            .spawn(move || {
+                // Dropped by a panic too.
+                let _guard = guard;
+                beat.run();
+            })
             .map_err(|error| PresenceError::Io { path: path.clone(), error })?;
-        Ok(Self { shared, thread: Some(thread), json: json_path(&path), json_failed: AtomicBool::new(false) })
+        Ok(Self { shared, thread: Some(thread), ended, json: json_path(&path), json_failed: AtomicBool::new(false) })
+    }
+
+    /// Cancelled when the thread has ended: before this is dropped, by a panic.
+    #[must_use]
+    pub fn ended(&self) -> CancellationToken {
+        self.ended.clone()
     }
 
     /// Publishes `mask` at once, and from then on at every beat. Does not wait.
@@ -113,8 +129,8 @@ impl Drop for Presence {
         self.shared.stop.store(true, Ordering::Release);
         if let Some(thread) = self.thread.take() {
             thread.thread().unpark();
-            // The thread never waits for anything but its deadline. A panic of its own was reported
-            // by the hook; there is nothing to add here.
+            // The thread never waits for anything but its deadline. Whoever holds `ended` knows of a
+            // panic of its own.
             let _ = thread.join();
         }
         // Another user's file stays: it may not be removed where everybody may write.
@@ -144,6 +160,7 @@ impl Beat {
         let mut published = None;
         let mut failed = false;
         loop {
+            fault::point("mask");
             let stop = self.shared.stop.load(Ordering::Acquire);
             let mask = PhysicalMask(self.shared.mask.load(Ordering::Acquire));
             let now = Stamp::now();

@@ -173,6 +173,31 @@ fn a_stream_that_was_wrong_about_an_unplug_is_started_again() {
 }
 
 #[test]
+fn a_stream_that_is_wrong_about_an_unplug_again_and_again_fails_until_a_replug() {
+    let mut slot = slot_in(Opening);
+    let mut now = 0;
+    for (n, wait) in [2000, 2000, 2000, 4000, 8000].into_iter().enumerate() {
+        let epoch = Epoch(u32::try_from(n).expect("small") + 1);
+        slot.apply(Input::Ended(epoch, End::Gone), ms(now));
+        assert_eq!((slot.state(), slot.deadline()), (Absent, Some(ms(now + wait))));
+        now += wait;
+        assert_eq!(slot.apply(Input::Timer, ms(now)), start(epoch.0 + 1, 'a'));
+    }
+    slot.apply(Input::Ended(Epoch(6), End::Gone), ms(now));
+    assert_eq!((slot.state(), slot.deadline()), (Absent, Some(ms(now + 2000))));
+    assert_eq!(slot.apply(Input::Timer, ms(now + 2000)), Effects::NONE);
+    assert_eq!((slot.state(), slot.deadline()), (Failed, None));
+    let mut by_hand = slot.clone();
+    assert_eq!(by_hand.apply(Input::Restart, ms(now + 2001)), start(7, 'a'));
+    slot.apply(Input::Detached, ms(now + 3000));
+    slot.apply(Input::Attached('b'), ms(now + 3100));
+    assert_eq!(slot.apply(Input::Timer, ms(now + 5000)), start(7, 'b'));
+    // A stream that held for a minute is believed again.
+    slot.apply(Input::Ended(Epoch(7), End::Gone), ms(now + 70_000));
+    assert_eq!(slot.deadline(), Some(ms(now + 72_000)));
+}
+
+#[test]
 fn restarts_back_off_and_give_up_after_five_in_a_minute() {
     let mut slot = slot_in(Opening);
     let mut now = 0;
@@ -303,6 +328,11 @@ proptest! {
             slot.apply(input, now);
         }
         settle(&mut slot, &mut now);
+        // Given up by drivers that said too often that it is gone: that is the user's to end.
+        if slot.state() == Failed {
+            slot.apply(Input::Restart, now);
+            settle(&mut slot, &mut now);
+        }
         prop_assert_eq!(slot.attached().copied(), attached);
         prop_assert_eq!(slot.state(), if attached.is_some() { Streaming } else { Absent });
     }

@@ -1,0 +1,259 @@
+//! How a run ends: whatever ends it, the episode is closed and whole, the mask is gone, and the exit
+//! code says how it went.
+
+#![allow(clippy::expect_used, reason = "what fails here fails a test")]
+
+mod support;
+
+use std::fs::File;
+use std::io::Read;
+use std::os::fd::OwnedFd;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use rustix::process::{Pid, Signal, kill_process};
+use support::{Episode, PATIENCE, Place};
+
+const RECORD: [&str; 6] = ["--sim", "--headless", "--json", "--record", "--out", "out"];
+
+/// The one episode in `out`, read strictly.
+fn whole_episode(place: &Place, what: &str) -> Episode {
+    let files = place.files("out");
+    assert!(files.len() == 1 && files[0].ends_with("_001.mcap"), "{what}: {files:?}");
+    Episode::read(&place.path("out").join(&files[0]))
+}
+
+fn until(what: &str, mut holds: impl FnMut() -> bool) {
+    let begun = Instant::now();
+    while !holds() {
+        assert!(begun.elapsed() < PATIENCE, "{what} does not come true");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+fn signal(child: &Child, signal: Signal) {
+    let pid = Pid::from_raw(child.id().cast_signed()).expect("pid");
+    kill_process(pid, signal).expect("signal");
+}
+
+#[test]
+fn a_panic_anywhere_ends_the_run_with_a_whole_file_and_names_its_place() {
+    for (at, named) in [
+        ("writer", "the writer thread panicked"),
+        ("mask", "thread `mask` panicked"),
+        ("rig", "the rig panicked"),
+        ("screen", "the screen panicked"),
+        ("main", "the main task panicked"),
+    ] {
+        let place = Place::new();
+        let order = place.path("now");
+        let output = File::create(place.path("output.txt")).expect("output file");
+        let child = place
+            .command(&RECORD)
+            .env("RAPID_FAULT", format!("{at}:{}", order.display()))
+            .stdout(output)
+            .spawn()
+            .expect("rapid runs");
+        until("an episode", || {
+            std::fs::read_to_string(place.path("output.txt")).is_ok_and(|text| text.contains("\"event\":\"recording\""))
+        });
+        File::create(order).expect("order");
+        let ended = child.wait_with_output().expect("end");
+        let said = String::from_utf8_lossy(&ended.stderr).into_owned();
+        assert_eq!(ended.status.code(), Some(1), "{at}: {said}");
+        let error = said.lines().rfind(|line| line.starts_with("error: ")).unwrap_or_default();
+        assert!(error.contains(named), "{at}: {said}");
+        assert!(!place.mask_file().exists(), "{at}");
+        assert!(whole_episode(&place, at).topic("/rapid/mask").count() > 0, "{at}");
+    }
+}
+
+#[test]
+fn a_panic_in_one_device_is_its_own() {
+    let place = Place::new();
+    let order = place.path("now");
+    let log = File::create(place.path("output.txt")).expect("output file");
+    let mut command = place.command(&RECORD);
+    command.env("RAPID_FAULT", format!("stream:{}", order.display())).stdout(log);
+    let child = command.spawn().expect("rapid runs");
+    let output = || std::fs::read_to_string(place.path("output.txt")).unwrap_or_default();
+    until("an episode", || output().contains("\"event\":\"recording\""));
+    File::create(&order).expect("order");
+    until("a panic", || output().contains("its reader panicked"));
+    std::fs::remove_file(&order).expect("order");
+    let panicked = output().len();
+    until("a restart", || output()[panicked..].contains("\"state\":\"streaming\""));
+    signal(&child, Signal::INT);
+    assert_eq!(child.wait_with_output().expect("end").status.code(), Some(0));
+    whole_episode(&place, "stream");
+}
+
+#[test]
+fn a_small_disk_that_fills_up_ends_the_run_with_a_whole_file_and_says_so() {
+    const MOUNT: &str = "mount -t tmpfs -o size=8m tmpfs out && \"$@\"; code=$?; cp out/* saved; exit $code";
+    let may = Command::new("unshare").args(["-Urm", "true"]).output().is_ok_and(|output| output.status.success());
+    if !may {
+        eprintln!("SKIPPED: no disk can be mounted here (unshare -Urm)");
+        return;
+    }
+    let place = Place::new();
+    for folder in ["out", "saved"] {
+        std::fs::create_dir(place.path(folder)).expect("folder");
+    }
+    let command = place.command(&RECORD);
+    let mut inside = Command::new("unshare");
+    inside.args(["-Urm", "sh", "-c", MOUNT, "sh"]).arg(command.get_program()).args(command.get_args());
+    inside.current_dir(place.folder.path()).stdin(Stdio::null()).env("HOME", place.folder.path());
+    let ended = inside.output().expect("rapid runs");
+    let (shown, said) = (String::from_utf8_lossy(&ended.stdout), String::from_utf8_lossy(&ended.stderr));
+    assert_eq!(ended.status.code(), Some(1), "{said}");
+    assert!(shown.contains("\"event\":\"disk_low\""), "{shown}");
+    let files = place.files("saved");
+    assert!(files.len() == 1 && files[0].ends_with("_001.mcap"), "{files:?} {said}");
+    assert!(said.contains(&format!("error: out/{}: ", files[0])) && said.contains("--out"), "{said}");
+    let episode = Episode::read(&place.path("saved").join(&files[0]));
+    let bytes: usize = episode.messages.iter().map(|message| message.data.len()).sum();
+    assert!(bytes > 1 << 20, "{bytes} bytes recorded before the end");
+}
+
+#[test]
+fn two_signals_exit_with_130_and_the_file_is_whole() {
+    let place = Place::new();
+    let running = place.start(&RECORD, "\"event\":\"recording\"");
+    running.signal(Signal::INT);
+    running.signal(Signal::TERM);
+    let (code, _, said) = running.end();
+    assert_eq!(code, Some(130), "{said}");
+    whole_episode(&place, "interrupted twice");
+    assert!(!place.mask_file().exists());
+}
+
+#[test]
+fn one_interrupt_while_a_run_ends_by_itself_is_not_two() {
+    let place = Place::new();
+    let child = place.command(&[&RECORD[..], &["--duration", "1s"]].concat()).spawn().expect("rapid runs");
+    // The run ends because its episode has; its output is waited for as long as nobody reads.
+    until("a whole file", || place.files("out").iter().any(|file| file.ends_with(".mcap")));
+    signal(&child, Signal::INT);
+    let ended = child.wait_with_output().expect("end");
+    assert_eq!(ended.status.code(), Some(0), "{}", String::from_utf8_lossy(&ended.stderr));
+    whole_episode(&place, "ended by itself");
+}
+
+/// A terminal, and `rapid` in a session of its own on it.
+struct OnTerminal {
+    /// What the terminal shows is read from here; closing it closes the terminal.
+    master: Option<OwnedFd>,
+    child: Child,
+}
+
+impl OnTerminal {
+    /// `fault` is for `RAPID_FAULT`.
+    fn start(place: &Place, arguments: &[&str], fault: &str) -> Self {
+        use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+        let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).expect("terminal");
+        grantpt(&master).expect("terminal");
+        unlockpt(&master).expect("terminal");
+        let size = rustix::termios::Winsize { ws_row: 40, ws_col: 120, ws_xpixel: 0, ws_ypixel: 0 };
+        rustix::termios::tcsetwinsize(&master, size).expect("its size");
+        let name = ptsname(&master, Vec::new()).expect("its name").into_string().expect("text");
+        let open = || File::options().read(true).write(true).open(&name).expect("its other end");
+        let command = place.command(arguments);
+        let mut session = Command::new("setsid");
+        session.arg("--ctty").arg(command.get_program()).args(command.get_args());
+        session
+            .current_dir(place.folder.path())
+            .env("HOME", place.folder.path())
+            .env("TERM", "xterm")
+            .env("RAPID_FAULT", fault);
+        let child = session.stdin(open()).stdout(open()).stderr(open()).spawn().expect("setsid runs rapid");
+        Self { master: Some(master), child }
+    }
+
+    /// Reads what is shown until this appears.
+    fn read_until(&mut self, word: &str) {
+        let mut file = File::from(self.master.as_ref().expect("open").try_clone().expect("clone"));
+        let (mut shown, mut piece) = (Vec::new(), [0; 4096]);
+        while !String::from_utf8_lossy(&shown).contains(word) {
+            let count = file.read(&mut piece).expect("output");
+            shown.extend_from_slice(&piece[..count]);
+        }
+    }
+}
+
+impl Drop for OnTerminal {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+#[test]
+fn a_terminal_that_is_closed_ends_the_run_with_a_whole_file() {
+    let monitor: &[&str] = &["--sim", "--record", "--out", "out"];
+    let headless: &[&str] = &["--sim", "--headless", "--record", "--out", "out"];
+    for arguments in [monitor, headless] {
+        let place = Place::new();
+        let mut run = OnTerminal::start(&place, arguments, "");
+        run.read_until(if arguments == monitor { "REC" } else { "recording" });
+        until("a file", || place.files("out").iter().any(|file| file.ends_with(".partial")));
+        // Closing the master hangs the terminal up.
+        run.master = None;
+        until("the end", || run.child.try_wait().expect("wait").is_some());
+        assert_eq!(run.child.wait().expect("wait").code(), Some(0), "{arguments:?}");
+        whole_episode(&place, "hung up");
+        assert!(!place.mask_file().exists());
+    }
+}
+
+#[test]
+fn the_monitor_gives_the_terminal_back_after_a_panic() {
+    let place = Place::new();
+    for at in ["screen", "writer", "mask"] {
+        let order = place.path(&format!("now-{at}"));
+        let mut run = OnTerminal::start(&place, &["--sim", "--out", "out"], &format!("{at}:{}", order.display()));
+        run.read_until("cam_wrist");
+        assert!(!echoes(&run), "{at}");
+        File::create(&order).expect("order");
+        let mut shown = File::from(run.master.as_ref().expect("open").try_clone().expect("clone"));
+        let reading = std::thread::spawn(move || {
+            let (mut text, mut piece) = (Vec::new(), [0; 4096]);
+            while let Ok(count @ 1..) = shown.read(&mut piece) {
+                text.extend_from_slice(&piece[..count]);
+            }
+            String::from_utf8_lossy(&text).into_owned()
+        });
+        let mut status = None;
+        until("the end", || {
+            status = run.child.try_wait().expect("wait");
+            status.is_some()
+        });
+        assert_eq!(status.and_then(|status| status.code()), Some(1), "{at}");
+        assert!(echoes(&run), "{at}: still raw");
+        run.master = None;
+        let text = reading.join().expect("text");
+        assert!(text.contains("\x1b[?1049l") && text.contains("\x1b[?25h"), "{at}: {text}");
+        assert!(text.contains(&format!("fault ordered for {at}")) && text.contains("error:"), "{at}: {text}");
+        assert!(!place.mask_file().exists(), "{at}");
+    }
+}
+
+/// Does the terminal show what is typed? Not while a monitor has it.
+fn echoes(run: &OnTerminal) -> bool {
+    use rustix::termios::{LocalModes, tcgetattr};
+    let master = run.master.as_ref().expect("open");
+    tcgetattr(master).expect("modes").local_modes.contains(LocalModes::ECHO)
+}
+
+#[test]
+fn an_output_that_is_full_costs_the_output_and_not_the_episode() {
+    let place = Place::new();
+    let full = File::options().write(true).open("/dev/full").expect("/dev/full");
+    let mut command = place.command(&[&RECORD[..], &["--duration", "2s"]].concat());
+    let ended = command.stdout(full).output().expect("rapid runs");
+    let said = String::from_utf8_lossy(&ended.stderr).into_owned();
+    assert_eq!(ended.status.code(), Some(1), "{said}");
+    assert!(said.contains("error: output: "), "{said}");
+    let episode = whole_episode(&place, "full");
+    assert!(episode.topic("/rapid/frame").count() >= 59, "30 Hz for 2 s");
+}
