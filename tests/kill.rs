@@ -71,7 +71,7 @@ struct Killed {
 }
 
 fn kill(place: &Place, moment: Moment) -> Killed {
-    let mut running: Running = place.start(&RECORD, "\"event\":\"recording\"");
+    let running: Running = place.start(&RECORD, "\"event\":\"recording\"");
     let name = wait_for("partial file", || place.files("out").into_iter().find(|name| name.ends_with(".partial")));
     let partial = place.path("out").join(name);
     let grow = |times: usize| {
@@ -202,7 +202,8 @@ fn recover_says_of_each_file_what_is_there_and_what_is_not() {
         assert!(errors.contains(files[0]) && errors.starts_with("error: "), "{errors}");
     }
     // One that is being recorded is left alone, by a recover and by another run.
-    let running = place.start(&["--sim", "--headless", "--json", "--record", "--out", "live"], "\"event\":\"recording\"");
+    let running =
+        place.start(&["--sim", "--headless", "--json", "--record", "--out", "live"], "\"event\":\"recording\"");
     let live = wait_for("partial", || place.files("live").into_iter().find(|name| name.ends_with(".partial")));
     let output = place.run(&["recover", &format!("live/{live}")]);
     assert_eq!(output.status.code(), Some(1));

@@ -116,5 +116,8 @@ fn after_a_kill_the_next_run_takes_over_and_leaves_nothing_of_the_dead_one() {
         .find(|file| file.ends_with("_001.mcap") || file.ends_with("_002.mcap"))
         .expect("the second run's episode");
     assert!(Episode::read(&place.path("out").join(whole)).topic("/rapid/mask").count() > 0);
-    assert!(!files.iter().any(|file| file.ends_with(".mcap.partial")), "the killed run's file is looked after: {files:?}");
+    assert!(
+        !files.iter().any(|file| file.ends_with(".mcap.partial")),
+        "the killed run's file is looked after: {files:?}"
+    );
 }

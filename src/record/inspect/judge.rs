@@ -155,7 +155,11 @@ impl Judge {
             masks_dropped: said("masks_dropped"),
             events_missed: said("events_missed"),
             // A repaired file's summary counts what is there.
-            losses: if counted.is_some() && ending.summary.contains_key("lost") { Losses::Apart } else { Losses::Together },
+            losses: if counted.is_some() && ending.summary.contains_key("lost") {
+                Losses::Apart
+            } else {
+                Losses::Together
+            },
             file: file_state(ending.file, ending.repaired),
         };
         judge(&facts)

@@ -67,7 +67,12 @@ fn one(count: u8, ticks: u64) -> Result<(f64, f64), Failure> {
     let modalities: Vec<SyncModality> = ids
         .iter()
         .enumerate()
-        .map(|(place, id)| SyncModality { id: *id, when_stale: WhenStale::Hold, capacity: rate(place).1 })
+        .map(|(place, id)| SyncModality {
+            id: *id,
+            when_stale: WhenStale::Hold,
+            capacity: rate(place).1,
+            latency: Duration::ZERO,
+        })
         .collect();
     let mut sync = Synchronizer::new(&modalities, WINDOW);
     let mut pushed = vec![0_u64; ids.len()];
