@@ -2,7 +2,7 @@
 //! code says how it went.
 
 #![allow(clippy::expect_used, reason = "what fails here fails a test")]
-
+#![allow(clippy::case_sensitive_file_extension_comparisons, reason = "names that rapid itself writes")]
 mod support;
 
 use std::fs::File;

@@ -31,7 +31,7 @@ pub fn brightness(encoding: Encoding, bytes: &[u8]) -> Result<f64, BrightnessErr
         // Y0 U Y1 V: every other byte is luminance.
         Encoding::Yuyv => mean(bytes.iter().step_by(2)),
         Encoding::Mjpeg => {
-            // Cameras that leave out the Huffman tables mean those of the standard; the decoder knows.
+            let bytes = &with_mark(bytes);
             let options = DecoderOptions::default()
                 .jpeg_set_out_colorspace(ColorSpace::Luma)
                 .set_max_width(LARGEST)
@@ -42,6 +42,13 @@ pub fn brightness(encoding: Encoding, bytes: &[u8]) -> Result<f64, BrightnessErr
         }
         Encoding::Bytes | Encoding::F64 | Encoding::Mask => Err(BrightnessError::NoPicture),
     }
+}
+
+/// The picture with the mark (segment APP0) that motion JPEG has in AVI files. Cameras leave out the Huffman tables
+/// and mean those of the standard (ITU-T T.81 K.3); the decoder takes these for what is missing when it finds the mark.
+fn with_mark(jpeg: &[u8]) -> Vec<u8> {
+    let (start, rest) = jpeg.split_at(jpeg.len().min(2));
+    [start, &[0xff, 0xe0, 0, 8], b"AVI1\0\0", rest].concat()
 }
 
 fn mean<'a>(luminance: impl Iterator<Item = &'a u8>) -> Result<f64, BrightnessError> {

@@ -4,8 +4,11 @@ use super::testing::{episode, layouts, mutated, mutations};
 use super::walk::{FileEnd, MAGIC, Trust, Walk, Walked, op, walk};
 use proptest::prelude::*;
 
+/// A record's opcode, content, and what it is worth.
+type Shown = (u8, Vec<u8>, Trust);
+
 /// The records of `bytes`, and what the walk found.
-fn walked(bytes: &[u8]) -> Option<(Vec<(u8, Vec<u8>, Trust)>, Walked)> {
+fn walked(bytes: &[u8]) -> Option<(Vec<Shown>, Walked)> {
     let mut walk = Walk::new(bytes, bytes.len() as u64).unwrap()?;
     let mut records = Vec::new();
     while let Some(record) = walk.next().unwrap() {

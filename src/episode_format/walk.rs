@@ -88,6 +88,7 @@ pub(crate) struct Record<'a> {
 }
 
 /// A file being read.
+#[allow(clippy::struct_excessive_bools, reason = "each is a fact of its own about the file")]
 pub(crate) struct Walk<R> {
     file: R,
     size: u64,

@@ -116,14 +116,12 @@ fn late_is_what_misses_the_deadline_of_the_nearest_tick() {
 fn an_absence_is_no_gap_and_no_loss_of_rate() {
     let mut measures = measures(ModalityKind::Scalars);
     measures.mask(BEGIN - MS, PhysicalMask(0b1001));
-    let mut seq = 0;
-    for at in (0..1000).step_by(10).chain((4000..5000).step_by(10)) {
+    for (seq, at) in (0..).zip((0..1000).step_by(10).chain((4000..5000).step_by(10))) {
         if at == 4000 {
             measures.mask(BEGIN + 4000 * MS, PhysicalMask(0b1001));
         }
         measures.sample(id(0), &seen(seq, at, 1, b""));
         measures.settle();
-        seq += 1;
         if at == 990 {
             measures.mask(BEGIN + 1000 * MS, PhysicalMask(0b1000));
         }
@@ -204,8 +202,11 @@ fn frames_say_how_far_samples_lie_from_their_tick_and_from_one_another() {
     assert!((skew.max - 10.0).abs() < 1e-9 && skew.p50 < 1e-9, "{skew:?}");
 }
 
+/// Samples (time, modality, offset) and masks (time, bits).
+type Made = (Vec<(u64, u8, u64)>, Vec<(u64, u64)>);
+
 /// Any samples and masks, in the order of their times.
-fn episode() -> impl Strategy<Value = (Vec<(u64, u8, u64)>, Vec<(u64, u64)>)> {
+fn episode() -> impl Strategy<Value = Made> {
     let samples = prop::collection::vec((0_u64..3000, 0_u8..3, 0_u64..300), 0..60);
     let masks = prop::collection::vec((0_u64..3000, 0_u64..4), 0..12);
     (samples, masks).prop_map(|(mut samples, mut masks)| {
@@ -248,7 +249,7 @@ proptest! {
             longest = longest.max(run);
         }
         prop_assert!((said.present - present as f64 / 1e3).abs() < 1e-6, "{} {present}", said.present);
-        prop_assert!((said.longest_gap - longest as f64 / 1e3).abs() < 1e-6, "{} {longest}", said.longest_gap);
+        prop_assert!((said.longest_gap - f64::from(longest) / 1e3).abs() < 1e-6, "{} {longest}", said.longest_gap);
     }
 
     /// Hostile numbers: nothing panics, no count exceeds what came.

@@ -348,7 +348,7 @@ fn what_is_no_file_is_said_and_not_touched() {
     fs::write(&partial, &bytes[..bytes.len() / 2]).unwrap();
     std::os::unix::fs::symlink(at("target"), at("a.mcap.recovering")).unwrap();
     repaired(&partial);
-    fs::write(&partial, &bytes[..bytes.len() / 2 + 1]).unwrap();
+    fs::write(&partial, &bytes[..=bytes.len() / 2]).unwrap();
     fs::hard_link(at("target"), at("a.mcap.recovering")).unwrap();
     repaired(&partial);
     assert_eq!(fs::read(at("target")).unwrap(), bytes);
