@@ -134,7 +134,8 @@ pub fn dispatch(cli: Cli) -> ExitCode {
 
 /// Everything that prints and ends.
 fn print(global: &Global, before: SimArgs, command: Command) -> Result<(), Failure> {
-    let out = &mut io::stdout().lock();
+    // Not locked: a command may write from another thread.
+    let out = &mut io::stdout();
     let format = if global.json { Format::Json } else { Format::Text };
     match command {
         Command::Check => {

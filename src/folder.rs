@@ -56,6 +56,9 @@ pub enum FolderError {
         /// Its owner.
         owner: u32,
     },
+    /// A part of the path is something else.
+    #[error("{}: not a folder", .0.display())]
+    NoFolder(PathBuf),
     /// The system refuses.
     #[error("{}: {error}", path.display())]
     Io {
@@ -71,6 +74,7 @@ impl From<FolderError> for io::Error {
         match error {
             FolderError::Io { error, .. } => error,
             link @ FolderError::Link { .. } => Self::other(link),
+            file @ FolderError::NoFolder(_) => Self::new(io::ErrorKind::NotADirectory, file),
         }
     }
 }
@@ -310,7 +314,10 @@ impl Walk {
     }
 
     fn io(&self, error: Errno) -> FolderError {
-        FolderError::Io { path: self.shown.clone(), error: error.into() }
+        match error {
+            Errno::NOTDIR => FolderError::NoFolder(self.shown.clone()),
+            error => FolderError::Io { path: self.shown.clone(), error: error.into() },
+        }
     }
 }
 

@@ -1,9 +1,11 @@
 //! What strangers wrote: names a device gives itself, files another user planted.
 
 #![allow(clippy::expect_used, reason = "what fails here fails a test")]
+#![allow(clippy::print_stderr, reason = "a check that cannot be made here is said")]
 
 mod support;
 
+use std::fmt::Write;
 use std::fs;
 use std::os::unix::fs::{PermissionsExt, chown, symlink};
 use std::os::unix::process::CommandExt;
@@ -46,10 +48,10 @@ fn hostile(place: &Place) -> String {
     let long = "0123456789".repeat(1000);
     let mut scenario = String::new();
     for (name, serial) in [("by_port", CURSED), ("by_serial", AWKWARD), ("any_unit", &long)] {
-        scenario += &format!("[[device]]\nname = \"{name}\"\nserial = {}\n", toml_text(serial));
+        let _ = writeln!(scenario, "[[device]]\nname = \"{name}\"\nserial = {}", toml_text(serial));
     }
     let stranger = "[[device]]\nname = \"stranger\"\nlike = \"any_unit\"\npid = \"beef\"\nserial = ";
-    scenario += &format!("{stranger}{}\n", toml_text(CURSED));
+    let _ = writeln!(scenario, "{stranger}{}", toml_text(CURSED));
     place.write("hostile.toml", &scenario);
     place.write("devices.toml", &REGISTRY.replace("SERIAL", &toml_text(AWKWARD)));
     long

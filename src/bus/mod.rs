@@ -131,7 +131,10 @@ impl Bus {
     /// When a topic is in use with another layout, or shared memory is not to be had.
     pub fn open(registry: &Registry, instance: Option<&str>) -> Result<Self, BusError> {
         let config = config(instance)?;
-        place::check(&PathBuf::from(config.global.root_path().to_string()))?;
+        place::check(
+            // Its path ends in a slash, behind which a link could not be told from what it means.
+            &PathBuf::from(config.global.root_path().to_string()).components().collect::<PathBuf>(),
+        )?;
         let node = NodeBuilder::new()
             .config(&config)
             // Signals belong to the program, not to a library.

@@ -75,13 +75,20 @@ pub(super) struct Episode {
 impl Episode {
     pub(super) fn open(path: &Path) -> Result<Self, DriverError> {
         let (mut file, size) = episode_format::open(path).map_err(|error| DriverError::Fatal(error.to_string()))?;
-        let mut end = [0; MAGIC.len()];
+        if size < MAGIC.len() as u64 {
+            return Err(fatal(path, NO_MCAP));
+        }
         let from_end = i64::try_from(MAGIC.len()).unwrap_or(0);
-        let is_closed = size >= MAGIC.len() as u64 && {
-            let read = file.seek(SeekFrom::End(-from_end)).and_then(|_| file.read_exact(&mut end));
-            read.and_then(|()| file.rewind()).map_err(|error| fatal(path, error))?;
-            end == MAGIC
+        let mut magic_at = |place| {
+            let mut read = [0; MAGIC.len()];
+            file.seek(place).and_then(|_| file.read_exact(&mut read)).map_err(|error| fatal(path, error))?;
+            Ok(read == MAGIC)
         };
+        let is_closed = magic_at(SeekFrom::End(-from_end))?;
+        if !magic_at(SeekFrom::Start(0))? {
+            return Err(fatal(path, NO_MCAP));
+        }
+        file.rewind().map_err(|error| fatal(path, error))?;
         if !is_closed {
             return Err(fatal(path, format!("was not closed, and cannot be played; {}", fix(path))));
         }
@@ -110,13 +117,15 @@ impl Episode {
     }
 }
 
+const NO_MCAP: &str = "not an MCAP file";
+
 fn fix(path: &Path) -> String {
     format!("`rapid recover {}` makes it whole, `rapid inspect` reads what is there", path.display())
 }
 
 fn begin(path: &Path, file: File, size: u64) -> Result<Walk<BufReader<File>>, DriverError> {
     let walk = Walk::new(BufReader::with_capacity(BUFFER_BYTES, file), size).map_err(|error| fatal(path, error))?;
-    walk.ok_or_else(|| fatal(path, "not an MCAP file"))
+    walk.ok_or_else(|| fatal(path, NO_MCAP))
 }
 
 /// Reads `bytes`, which may be any, as replay reads a file: what they hold and every message that a
