@@ -43,13 +43,8 @@ pub(super) struct Screen {
 impl Screen {
     /// Takes the terminal.
     pub(super) fn open() -> io::Result<Self> {
-        if !io::stdout().is_terminal() {
-            return Err(io::Error::other("standard output is not a terminal"));
-        }
         let outlet = Outlet::new("screen", 1, io::stdout())?;
-        hook();
-        enable_raw_mode()?;
-        UP.store(true, Ordering::SeqCst);
+        take()?;
         let frame = Frame::default();
         let outlet = Some(outlet);
         let mut screen = match Terminal::new(CrosstermBackend::new(frame.clone())) {
@@ -97,9 +92,20 @@ impl Drop for Screen {
     }
 }
 
+/// Takes the terminal, until [`give_back`]: keys come as they are typed.
+pub(super) fn take() -> io::Result<()> {
+    if !io::stdout().is_terminal() {
+        return Err(io::Error::other("standard output is not a terminal"));
+    }
+    hook();
+    enable_raw_mode()?;
+    UP.store(true, Ordering::SeqCst);
+    Ok(())
+}
+
 /// Restores the terminal and prints what was held back. Errors are passed over: there is no terminal
 /// left to tell them to.
-fn give_back() {
+pub(super) fn give_back() {
     if !UP.swap(false, Ordering::SeqCst) {
         return;
     }
