@@ -64,15 +64,16 @@ const LATENCY: &str = "\
 How: stop a running rapid (the camera must be free), darken the room, and point the camera at this
 terminal from near by, so that the terminal fills most of its picture; full screen and full
 brightness are best. Then start this: the terminal flashes white and black in a pattern that fits at
-one delay only, up to three times a second. What comes out is the line for the camera's entry.
+one delay only, up to three times a second. It ends with the line for the camera's entry.
 Switch automatic exposure off (`controls` of the entry) if the pictures do not follow.
 
-An LED has no delay of its own. --led takes one of /sys/class/leds (needs the right to write there).
+What comes out includes what the terminal and its screen take, often 10 to 40 ms. An LED takes next
+to nothing: --led takes one of /sys/class/leds (needs the right to write there).
 
 Examples:
   rapid calibrate latency --device cam_wrist
   rapid calibrate latency --device cam_wrist --light-delay 15ms
-  sudo rapid calibrate latency --led input3::capslock --duration 1m
+  sudo rapid calibrate latency --device cam_wrist --led ACT --duration 1m
   rapid calibrate latency --sim --device cam_wrist          how it goes, without a camera";
 
 const RUN: &str = "Options of a run";
@@ -367,8 +368,9 @@ mod tests {
         }
         let commands: Vec<_> = Cli::command().get_subcommands().map(|command| command.get_name().to_owned()).collect();
         for command in commands {
-            let command = if command == "calibrate" { "calibrate latency".to_owned() } else { command };
-            let help = printed(&format!("{command} --help"));
+            // What it measures is said one word further.
+            let words = if command == "calibrate" { "calibrate latency" } else { command.as_str() };
+            let help = printed(&format!("{words} --help"));
             assert!(help.lines().count() <= 40, "{help}");
             assert_snapshot!(format!("help_of_{command}"), help);
         }

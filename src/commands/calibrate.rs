@@ -13,6 +13,7 @@ use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use serde::Serialize;
+use tokio::task::JoinHandle;
 use tokio::time::{Instant, timeout, timeout_at};
 
 use self::light::{Chosen, Shared};
@@ -29,6 +30,9 @@ pub use self::light::LightError;
 const PATIENCE: Duration = Duration::from_secs(5);
 /// Pictures are looked at for so long after the last change: the longest latency there can be.
 const AFTERWARDS: Duration = Duration::from_secs(1);
+
+/// A terminal that takes nothing is left after so long.
+const GIVEN_BACK: Duration = Duration::from_secs(1);
 
 /// What to measure, and how.
 #[derive(Debug, Clone)]
@@ -135,6 +139,10 @@ pub async fn latency(
 ) -> Result<(), CalibrateError> {
     let (spec, node) = choose(registry, attached, options.device.as_deref())?;
     let light = Chosen::of(options.led.as_deref())?;
+    if let (Chosen::Led(led), Format::Text) = (&light, format) {
+        let length = humantime::format_duration(options.duration);
+        writeln!(out, "Flashing {} for {length}; ctrl-C ends.", text::plain(&led.to_string_lossy()))?;
+    }
     let (flips, seen) = look(spec, node, &light, options.duration).await?;
     let refused = |source| CalibrateError::Refused { name: spec.name.clone(), source };
     let estimate = calibration::estimate(&flips, &seen).map_err(refused)?;
@@ -205,34 +213,36 @@ async fn look(
     loop {
         tokio::select! {
             biased;
-            () = signals.next() => {
-                shared.stop.cancel();
-                if played.is_none() {
-                    // The terminal is given back before anything is said.
-                    let _ = playing.await;
-                }
-                return Err(CalibrateError::Interrupted);
-            }
+            () = signals.next() => return Err(ended(&shared, playing, CalibrateError::Interrupted).await),
             done = &mut playing, if played.is_none() => {
                 played = Some(done.map_err(|_| CalibrateError::Panicked)??.ok_or(CalibrateError::Interrupted)?);
                 until = Some(Instant::now() + AFTERWARDS);
             }
             picture = camera.next(until) => match picture {
                 Ok(Some(picture)) => {
-                    shared.brightness.store(picture.brightness.round().clamp(0.0, 255.0) as u8, Ordering::Relaxed);
+                    shared.brightness.store(whole(picture.brightness), Ordering::Relaxed);
                     seen.push(picture);
                 }
                 Ok(None) => return Ok((played.unwrap_or_default(), seen)),
-                Err(error) => {
-                    shared.stop.cancel();
-                    if played.is_none() {
-                        let _ = playing.await;
-                    }
-                    return Err(error);
-                }
+                Err(error) => return Err(ended(&shared, playing, error).await),
             },
         }
     }
+}
+
+/// `error`, once the light is given back: before, nothing could be read on the terminal.
+async fn ended<T>(shared: &Shared, playing: JoinHandle<T>, error: CalibrateError) -> CalibrateError {
+    shared.stop.cancel();
+    if !playing.is_finished() {
+        // A panic there changes nothing here.
+        let _ = timeout(GIVEN_BACK, playing).await;
+    }
+    error
+}
+
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to what a u8 holds")]
+fn whole(brightness: f64) -> u8 {
+    brightness.round().clamp(0.0, 255.0) as u8
 }
 
 /// A camera that has sent a picture.
@@ -294,27 +304,27 @@ impl Measured {
 
     fn print(&self, registry: &Registry, spec: &DeviceSpec, out: &mut dyn Write) -> io::Result<()> {
         let Estimate { latency_ms, uncertainty_ms, correlation, contrast, pictures, flips } = self.estimate;
-        writeln!(out, "{}: latency {latency_ms:.1} ms, 95 % within {uncertainty_ms:.1} ms of it", self.device)?;
-        writeln!(
-            out,
-            "  from {pictures} pictures and {flips} changes of the light; correlation {correlation:.2}, contrast \
-             {contrast:.0} of 255"
-        )?;
+        writeln!(out, "{}: latency {latency_ms:.1} ms ± {uncertainty_ms:.1} ms (95 %)", self.device)?;
+        writeln!(out, "  {pictures} pictures, {flips} changes of the light")?;
+        writeln!(out, "  correlation {correlation:.2}, contrast {contrast:.0} of 255")?;
         let delay = self.light_delay_ms;
         match self.light {
-            "led" => writeln!(out, "  An LED is lit within a fraction of a millisecond: the figure is the camera's.")?,
-            _ if delay > 0.0 => writeln!(
-                out,
-                "  The {delay:.0} ms that the terminal and its screen take (--light-delay) are taken off."
-            )?,
+            _ if delay > 0.0 => writeln!(out, "  {delay:.1} ms of the light itself (--light-delay) are taken off.")?,
+            "led" => {
+                writeln!(out, "  It includes what the LED takes to light: below 1 ms on a board, a few ms over USB.")?
+            }
             _ => writeln!(
                 out,
-                "  It includes what the terminal and its screen take to show a change, often 10 to 40 ms: measure\n  \
-                 with --led to be without it, or say how much it is with --light-delay."
+                "  It includes what the terminal and its screen take to show a change, often 10\n  to 40 ms. Give \
+                 that with --light-delay if you know it; with --led it is not there."
             )?,
         }
         if latency_ms < -uncertainty_ms {
-            writeln!(out, "  Below zero: --light-delay is too long, or the camera stamps its pictures too early.")?;
+            writeln!(
+                out,
+                "  Below zero: --light-delay is too long, or the pictures are stamped before they\n  are taken. The \
+                 registry takes nothing below zero."
+            )?;
         }
         let file = registry.path.as_ref().map_or("devices.toml".to_owned(), |path| path.display().to_string());
         let now = match spec.latency {

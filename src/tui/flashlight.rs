@@ -2,7 +2,8 @@
 //!
 //! Invariant: the terminal is given back as it was found, however this ends.
 
-use std::io::{self, IsTerminal, Write};
+use std::fmt;
+use std::io::{self, Write};
 use std::time::Duration;
 
 use crossterm::cursor::{Hide, MoveTo};
@@ -12,19 +13,25 @@ use crossterm::terminal::{
     BeginSynchronizedUpdate, DisableLineWrap, EndSynchronizedUpdate, EnterAlternateScreen, size,
 };
 
-use super::terminal::{give_back, take};
+use super::terminal::{give_back, take, writer};
 use crate::text;
 
 /// The terminal while it is a light.
-#[derive(Debug)]
 pub struct Flashlight {
+    terminal: Box<dyn Write>,
     lit: bool,
+}
+
+impl fmt::Debug for Flashlight {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Flashlight").field("lit", &self.lit).finish_non_exhaustive()
+    }
 }
 
 /// Is there a terminal that could be one?
 #[must_use]
 pub fn is_there() -> bool {
-    io::stdout().is_terminal()
+    writer().is_ok()
 }
 
 impl Flashlight {
@@ -33,9 +40,10 @@ impl Flashlight {
     /// # Errors
     /// When there is none, or it cannot be written to.
     pub fn open() -> io::Result<Self> {
+        let terminal = writer()?;
         take()?;
-        let mut light = Self { lit: false };
-        crossterm::execute!(io::stdout(), EnterAlternateScreen, DisableLineWrap, Hide)?;
+        let mut light = Self { terminal, lit: false };
+        crossterm::execute!(light.terminal, EnterAlternateScreen, DisableLineWrap, Hide)?;
         light.switch(false, "")?;
         Ok(light)
     }
@@ -57,7 +65,7 @@ impl Flashlight {
             crossterm::queue!(bytes, MoveTo(0, row), Print(&blank))?;
         }
         self.put(&mut bytes, line, (columns, rows))?;
-        write(&bytes)
+        self.write(&bytes)
     }
 
     /// Writes another line of text at the bottom.
@@ -69,7 +77,12 @@ impl Flashlight {
         crossterm::queue!(bytes, BeginSynchronizedUpdate)?;
         colours(&mut bytes, self.lit)?;
         self.put(&mut bytes, line, size()?)?;
-        write(&bytes)
+        self.write(&bytes)
+    }
+
+    fn write(&mut self, bytes: &[u8]) -> io::Result<()> {
+        self.terminal.write_all(bytes)?;
+        self.terminal.flush()
     }
 
     fn put(&self, bytes: &mut Vec<u8>, line: &str, (columns, rows): (u16, u16)) -> io::Result<()> {
@@ -104,10 +117,4 @@ fn colours(bytes: &mut Vec<u8>, lit: bool) -> io::Result<()> {
     let (plain, level) = if lit { (Color::White, 255) } else { (Color::Black, 0) };
     let exact = Color::Rgb { r: level, g: level, b: level };
     crossterm::queue!(bytes, SetBackgroundColor(plain), SetBackgroundColor(exact))
-}
-
-fn write(bytes: &[u8]) -> io::Result<()> {
-    let mut out = io::stdout();
-    out.write_all(bytes)?;
-    out.flush()
 }

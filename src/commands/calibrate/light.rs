@@ -24,10 +24,10 @@ const LOOK: Duration = Duration::from_millis(50);
 /// Why there is no light.
 #[derive(Debug, thiserror::Error)]
 pub enum LightError {
-    /// Standard output is no terminal.
+    /// It was not started on a terminal.
     #[error(
-        "no terminal to flash: standard output is not one; run it in a terminal that the camera looks at, or name an \
-         LED of this machine with --led"
+        "there is no terminal to flash: run it in one that the camera looks at, or name an LED of this machine with \
+         --led"
     )]
     NoTerminal,
     /// The terminal cannot be taken, or went away.
