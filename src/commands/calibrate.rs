@@ -308,17 +308,14 @@ impl Measured {
         writeln!(out, "  {pictures} pictures, {flips} changes of the light")?;
         writeln!(out, "  correlation {correlation:.2}, contrast {contrast:.0} of 255")?;
         let delay = self.light_delay_ms;
-        match self.light {
-            _ if delay > 0.0 => writeln!(out, "  {delay:.1} ms of the light itself (--light-delay) are taken off.")?,
-            "led" => {
-                writeln!(out, "  It includes what the LED takes to light: below 1 ms on a board, a few ms over USB.")?
-            }
-            _ => writeln!(
-                out,
-                "  It includes what the terminal and its screen take to show a change, often 10\n  to 40 ms. Give \
-                 that with --light-delay if you know it; with --led it is not there."
-            )?,
-        }
+        let included = match self.light {
+            _ if delay > 0.0 => format!("{delay:.1} ms of the light itself (--light-delay) are taken off."),
+            "led" => "It includes what the LED takes to light: below 1 ms on a board, a few ms over USB.".to_owned(),
+            _ => "It includes what the terminal and its screen take to show a change, often 10\n  to 40 ms. Give that \
+                  with --light-delay if you know it; with --led it is not there."
+                .to_owned(),
+        };
+        writeln!(out, "  {included}")?;
         if latency_ms < -uncertainty_ms {
             writeln!(
                 out,
