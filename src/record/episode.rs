@@ -143,6 +143,7 @@ pub fn open_folder(out: &Path) -> Result<Folder, RecordError> {
         FolderError::Io { error, .. } if error.kind() == io::ErrorKind::NotFound => {
             RecordError::NoFolder(out.to_owned())
         }
+        FolderError::NoFolder(path) => RecordError::NotAFolder(path),
         error => RecordError::Folder(error),
     })
 }

@@ -52,6 +52,9 @@ pub enum RecordError {
     /// The folder to write to is not there, and neither is the one above it.
     #[error("{}: no such folder, and none above it to make it in: create it or choose another with --out", .0.display())]
     NoFolder(PathBuf),
+    /// What is there is no folder.
+    #[error("{}: not a folder; choose another with --out", .0.display())]
+    NotAFolder(PathBuf),
     /// The folder or a file in it cannot be used.
     #[error("{}: {source}", path.display())]
     Io {
@@ -61,7 +64,7 @@ pub enum RecordError {
         source: std::io::Error,
     },
     /// The folder lies behind a link of somebody else, or cannot be entered.
-    #[error("{0}; or choose another with --out")]
+    #[error("{0}, or choose another with --out")]
     Folder(crate::folder::FolderError),
     /// There is no room for an episode.
     #[error(

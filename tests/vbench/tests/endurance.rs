@@ -73,6 +73,8 @@ agreed() {
   emu say agreed
   emu_done 10
 }
+# One arena: what the allocator keeps for each thread that ever was is none of what a cycle loses.
+export MALLOC_ARENA_MAX=1
 rapid_start --headless --record --duration 10m --out $out/rec --config /tmp/bench/devices.toml --json
 await_rapid 60 '"event":"recording"' || fail 'not recording'
 wait_for 30 test -e /dev/shm/rapid_hardware_mask.json
