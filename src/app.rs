@@ -7,7 +7,7 @@
 //! Invariant: whatever ends the run, an episode in progress is finished first.
 
 mod conductor;
-mod signals;
+pub(crate) mod signals;
 
 use std::panic::AssertUnwindSafe;
 use std::path::{Path, PathBuf};

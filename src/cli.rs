@@ -60,6 +60,22 @@ Examples:
   rapid recover episodes
   rapid recover copied/20260101_place-block_001.mcap";
 
+const LATENCY: &str = "\
+How: stop a running rapid (the camera must be free), darken the room, and point the camera at this
+terminal from near by, so that the terminal fills most of its picture; full screen and full
+brightness are best. Then start this: the terminal flashes white and black in a pattern that fits at
+one delay only, up to three times a second. It ends with the line for the camera's entry.
+Switch automatic exposure off (`controls` of the entry) if the pictures do not follow.
+
+What comes out includes what the terminal and its screen take, often 10 to 40 ms. An LED takes next
+to nothing: --led takes one of /sys/class/leds (needs the right to write there).
+
+Examples:
+  rapid calibrate latency --device cam_wrist
+  rapid calibrate latency --device cam_wrist --light-delay 15ms
+  sudo rapid calibrate latency --device cam_wrist --led ACT --duration 1m
+  rapid calibrate latency --sim --device cam_wrist          how it goes, without a camera";
+
 const RUN: &str = "Options of a run";
 const GENERAL: &str = "General options";
 
@@ -146,6 +162,12 @@ pub enum Command {
         #[arg(long, value_name = "DIR", default_value = "udev", value_hint = ValueHint::DirPath)]
         to: PathBuf,
     },
+    /// Measures a property of a sensor
+    Calibrate {
+        /// Which property.
+        #[command(subcommand)]
+        what: Calibration,
+    },
     /// Prints the Physical Mask that a running rapid publishes
     Mask {
         /// Print every change until interrupted
@@ -185,6 +207,30 @@ pub enum Command {
     },
 }
 
+/// What can be measured.
+#[derive(Debug, Subcommand)]
+pub enum Calibration {
+    /// Measures how late a camera's pictures are, by flashing a light in front of it
+    #[command(after_help = LATENCY)]
+    Latency {
+        /// Entry of the camera [default: the only one that is plugged in]
+        #[arg(long, value_name = "NAME")]
+        device: Option<String>,
+        /// How long to flash: 5s to 10m
+        #[arg(long, value_name = "TIME", default_value = "20s", value_parser = flashing)]
+        duration: Duration,
+        /// Flash an LED instead of this terminal: its name, or its folder
+        #[arg(long, value_name = "NAME|DIR", value_hint = ValueHint::DirPath)]
+        led: Option<PathBuf>,
+        /// How late the light itself is, if you know; taken off
+        #[arg(long, value_name = "TIME", default_value = "0ms", value_parser = light_delay)]
+        light_delay: Duration,
+        /// Where devices come from.
+        #[command(flatten)]
+        simulation: SimArgs,
+    },
+}
+
 impl Cli {
     /// Reads what was typed, the name of the program first.
     ///
@@ -214,6 +260,7 @@ impl Cli {
         {
             let fix = match name {
                 "devices" => "write `rapid devices --sim`",
+                "calibrate" => "write `rapid calibrate latency --sim`",
                 _ => "leave --sim out, or name a scenario file",
             };
             let text = format!("--sim takes {name:?} for the name of a scenario file: {fix}");
@@ -228,7 +275,8 @@ fn stray(matches: &ArgMatches, command: &str) -> Option<String> {
     let run = RunArgs::augment_args(clap::Command::new("run"));
     let simulation = SimArgs::augment_args(clap::Command::new("run"));
     // `rapid --sim --json devices` is understood.
-    let known = run.get_arguments().chain(simulation.get_arguments().filter(|_| command != "devices"));
+    let known =
+        run.get_arguments().chain(simulation.get_arguments().filter(|_| !matches!(command, "devices" | "calibrate")));
     let typed = |id: &str| matches.value_source(id) == Some(ValueSource::CommandLine);
     known.map(|argument| argument.get_id().as_str()).find(|id| typed(id)).map(str::to_owned)
 }
@@ -255,6 +303,21 @@ fn duration(text: &str) -> Result<Duration, String> {
         Ok(Duration::ZERO) => Err("must be longer than nothing".to_owned()),
         Ok(duration) => Ok(duration),
         Err(_) => Err("write a number and a unit, for example 30s, 500ms or 2m".to_owned()),
+    }
+}
+
+fn flashing(text: &str) -> Result<Duration, String> {
+    match duration(text)? {
+        length if (Duration::from_secs(5)..=Duration::from_mins(10)).contains(&length) => Ok(length),
+        _ => Err("must lie between 5s and 10m".to_owned()),
+    }
+}
+
+fn light_delay(text: &str) -> Result<Duration, String> {
+    match humantime::parse_duration(text) {
+        Ok(delay) if delay <= Duration::from_secs(1) => Ok(delay),
+        Ok(_) => Err("must be 1s at most".to_owned()),
+        Err(_) => Err("write a number and a unit, for example 15ms".to_owned()),
     }
 }
 
@@ -305,7 +368,9 @@ mod tests {
         }
         let commands: Vec<_> = Cli::command().get_subcommands().map(|command| command.get_name().to_owned()).collect();
         for command in commands {
-            let help = printed(&format!("{command} --help"));
+            // What it measures is said one word further.
+            let words = if command == "calibrate" { "calibrate latency" } else { command.as_str() };
+            let help = printed(&format!("{words} --help"));
             assert!(help.lines().count() <= 40, "{help}");
             assert_snapshot!(format!("help_of_{command}"), help);
         }

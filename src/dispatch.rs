@@ -14,7 +14,8 @@ use clap::CommandFactory;
 use tokio_util::sync::CancellationToken;
 
 use crate::app::{self, AppError, Devices, Options, Screen, mask_path};
-use crate::cli::{Cli, Command, Global, RunArgs, SimArgs};
+use crate::cli::{Calibration, Cli, Command, Global, RunArgs, SimArgs};
+use crate::commands::calibrate::LatencyOptions;
 use crate::commands::devices::{Entries, Formats};
 use crate::commands::inspect::InspectFailure;
 use crate::commands::{self, Format, Outcome, mask::MaskOptions};
@@ -24,7 +25,7 @@ use crate::hotplug::udev;
 use crate::record::inspect::{self, InspectError};
 use crate::record::{self, EpisodeRequest, RecordError};
 use crate::registry::scenario::Scenario;
-use crate::registry::{Registry, RegistryErrors};
+use crate::registry::{Attachment, Registry, RegistryErrors};
 use crate::rig::presence::{PresenceError, json_path, read_mask};
 use crate::text;
 
@@ -57,6 +58,8 @@ enum Failure {
     Artifacts(#[from] commands::artifacts::ArtifactsError),
     #[error(transparent)]
     Mask(#[from] commands::mask::MaskError),
+    #[error(transparent)]
+    Calibrate(#[from] commands::calibrate::CalibrateError),
     /// Not every file was repaired; which and why has been printed.
     #[error("")]
     Recover(commands::recover::Outcome),
@@ -102,6 +105,7 @@ impl Failure {
             {
                 2
             }
+            Self::Calibrate(error) if error.is_bad_argument() => 2,
             Self::Recover(outcome) if outcome.is_bad_argument() => 2,
             _ => 1,
         }
@@ -163,6 +167,12 @@ fn print(global: &Global, before: SimArgs, command: Command) -> Result<(), Failu
             Ok(commands::artifacts::write(&registry, &to, out)?)
         }
         Command::Mask { watch } => mask(global, watch),
+        Command::Calibrate { what: Calibration::Latency { device, duration, led, light_delay, simulation } } => {
+            let source = Source::of(if simulation.sim.is_some() { simulation } else { before });
+            let (registry, attached) = plugged(global, source)?;
+            let options = LatencyOptions { device, duration, led, light_delay };
+            Ok(block_on(commands::calibrate::latency(&registry, &attached, &options, format, out))??)
+        }
         Command::Inspect { paths } => match commands::inspect::inspect(&paths, format, columns(), paint(), out)? {
             Outcome::Done => Ok(()),
             Outcome::BadConfiguration => Err(Failure::Told),
@@ -197,9 +207,8 @@ fn devices(
     format: Format,
     out: &mut dyn Write,
 ) -> Result<(), Failure> {
-    if let Source::Scenario(file) = source {
-        let registry = registry_or_builtin(global)?;
-        let attached = crate::hotplug::script::attached(&scenario(file.as_deref(), &registry)?);
+    if let Source::Scenario(_) = source {
+        let (registry, attached) = plugged(global, source)?;
         let plugged = commands::devices::list(Entries::Of(&registry), &attached, formats);
         return Ok(commands::devices::print(&plugged, Some(&registry), format, out)?);
     }
@@ -216,6 +225,14 @@ fn devices(
     let plugged = commands::devices::list(known, &udev::enumerate()?, formats);
     commands::devices::print(&plugged, entries.as_ref(), format, out)?;
     wrong.map_or(Ok(()), Err)
+}
+
+/// A registry that can be used, and what is plugged in.
+fn plugged(global: &Global, source: Source) -> Result<(Registry, Vec<Attachment>), Failure> {
+    let Source::Scenario(file) = source else { return Ok((load(&registry_path(global)?)?, udev::enumerate()?)) };
+    let registry = registry_or_builtin(global)?;
+    let attached = crate::hotplug::script::attached(&scenario(file.as_deref(), &registry)?);
+    Ok((registry, attached))
 }
 
 fn mask(global: &Global, watch: bool) -> Result<(), Failure> {

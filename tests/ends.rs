@@ -7,12 +7,11 @@ mod support;
 
 use std::fs::File;
 use std::io::Read;
-use std::os::fd::OwnedFd;
 use std::process::{Child, Command, Stdio};
-use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
-use support::{Episode, PATIENCE, Place};
+use support::terminal::OnTerminal;
+use support::{Episode, Place, until};
 
 const RECORD: [&str; 6] = ["--sim", "--headless", "--json", "--record", "--out", "out"];
 
@@ -21,14 +20,6 @@ fn whole_episode(place: &Place, what: &str) -> Episode {
     let files = place.files("out");
     assert!(files.len() == 1 && files[0].ends_with("_001.mcap"), "{what}: {files:?}");
     Episode::read(&place.path("out").join(&files[0]))
-}
-
-fn until(what: &str, mut holds: impl FnMut() -> bool) {
-    let begun = Instant::now();
-    while !holds() {
-        assert!(begun.elapsed() < PATIENCE, "{what} does not come true");
-        std::thread::sleep(Duration::from_millis(5));
-    }
 }
 
 fn signal(child: &Child, signal: Signal) {
@@ -140,54 +131,6 @@ fn one_interrupt_while_a_run_ends_by_itself_is_not_two() {
     whole_episode(&place, "ended by itself");
 }
 
-/// A terminal, and `rapid` in a session of its own on it.
-struct OnTerminal {
-    /// What the terminal shows is read from here; closing it closes the terminal.
-    master: Option<OwnedFd>,
-    child: Child,
-}
-
-impl OnTerminal {
-    /// `fault` is for `RAPID_FAULT`.
-    fn start(place: &Place, arguments: &[&str], fault: &str) -> Self {
-        use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
-        let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).expect("terminal");
-        grantpt(&master).expect("terminal");
-        unlockpt(&master).expect("terminal");
-        let size = rustix::termios::Winsize { ws_row: 40, ws_col: 120, ws_xpixel: 0, ws_ypixel: 0 };
-        rustix::termios::tcsetwinsize(&master, size).expect("its size");
-        let name = ptsname(&master, Vec::new()).expect("its name").into_string().expect("text");
-        let open = || File::options().read(true).write(true).open(&name).expect("its other end");
-        let command = place.command(arguments);
-        let mut session = Command::new("setsid");
-        session.arg("--ctty").arg(command.get_program()).args(command.get_args());
-        session
-            .current_dir(place.folder.path())
-            .env("HOME", place.folder.path())
-            .env("TERM", "xterm")
-            .env("RAPID_FAULT", fault);
-        let child = session.stdin(open()).stdout(open()).stderr(open()).spawn().expect("setsid runs rapid");
-        Self { master: Some(master), child }
-    }
-
-    /// Reads what is shown until this appears.
-    fn read_until(&mut self, word: &str) {
-        let mut file = File::from(self.master.as_ref().expect("open").try_clone().expect("clone"));
-        let (mut shown, mut piece) = (Vec::new(), [0; 4096]);
-        while !String::from_utf8_lossy(&shown).contains(word) {
-            let count = file.read(&mut piece).expect("output");
-            shown.extend_from_slice(&piece[..count]);
-        }
-    }
-}
-
-impl Drop for OnTerminal {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
-
 #[test]
 fn a_terminal_that_is_closed_ends_the_run_with_a_whole_file() {
     let monitor: &[&str] = &["--sim", "--record", "--out", "out"];
@@ -213,7 +156,7 @@ fn the_monitor_gives_the_terminal_back_after_a_panic() {
         let order = place.path(&format!("now-{at}"));
         let mut run = OnTerminal::start(&place, &["--sim", "--out", "out"], &format!("{at}:{}", order.display()));
         run.read_until("cam_wrist");
-        assert!(!echoes(&run), "{at}");
+        assert!(!run.echoes(), "{at}");
         File::create(&order).expect("order");
         let mut shown = File::from(run.master.as_ref().expect("open").try_clone().expect("clone"));
         let reading = std::thread::spawn(move || {
@@ -229,20 +172,13 @@ fn the_monitor_gives_the_terminal_back_after_a_panic() {
             status.is_some()
         });
         assert_eq!(status.and_then(|status| status.code()), Some(1), "{at}");
-        assert!(echoes(&run), "{at}: still raw");
+        assert!(run.echoes(), "{at}: still raw");
         run.master = None;
         let text = reading.join().expect("text");
         assert!(text.contains("\x1b[?1049l") && text.contains("\x1b[?25h"), "{at}: {text}");
         assert!(text.contains(&format!("fault ordered for {at}")) && text.contains("error:"), "{at}: {text}");
         assert!(!place.mask_file().exists(), "{at}");
     }
-}
-
-/// Does the terminal show what is typed? Not while a monitor has it.
-fn echoes(run: &OnTerminal) -> bool {
-    use rustix::termios::{LocalModes, tcgetattr};
-    let master = run.master.as_ref().expect("open");
-    tcgetattr(master).expect("modes").local_modes.contains(LocalModes::ECHO)
 }
 
 #[test]

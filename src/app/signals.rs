@@ -6,7 +6,7 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 ///
 /// Two that would end the process where it stands are taken: SIGPIPE by Rust's runtime, and SIGXFSZ
 /// here, so that a write beyond the limit for files (`ulimit -f`) is an error like any other.
-pub(super) struct Signals {
+pub(crate) struct Signals {
     ends: [Signal; 4],
     _too_large: Signal,
     /// How many came.
@@ -14,7 +14,7 @@ pub(super) struct Signals {
 }
 
 impl Signals {
-    pub(super) fn listen() -> std::io::Result<Self> {
+    pub(crate) fn listen() -> std::io::Result<Self> {
         Ok(Self {
             ends: [
                 signal(SignalKind::interrupt())?,
@@ -28,7 +28,7 @@ impl Signals {
     }
 
     /// Waits for the next one.
-    pub(super) async fn next(&mut self) {
+    pub(crate) async fn next(&mut self) {
         let [interrupt, terminate, quit, hangup] = &mut self.ends;
         tokio::select! {
             _ = interrupt.recv() => {}

@@ -274,7 +274,8 @@ impl Scene {
         let deviation = (square - mean * mean).max(0.0).sqrt();
         Estimate {
             latency_ms: (near + mean) * 1e3,
-            uncertainty_ms: (1.96 * deviation + step / 2.0) * 1e3,
+            // Latencies within a step of one another are not told apart.
+            uncertainty_ms: (1.96 * deviation + step) * 1e3,
             correlation: best.correlation.min(1.0),
             contrast: best.contrast,
             pictures: 0,

@@ -1,6 +1,7 @@
 //! Subcommands that need no rig: each writes to a given stream and says how it ended.
 
 pub mod artifacts;
+pub mod calibrate;
 pub mod check;
 pub mod completions;
 pub mod devices;

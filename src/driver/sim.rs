@@ -16,7 +16,7 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
-use self::pictures::{PICTURES, Pictures, encode, fill, write_picture};
+use self::pictures::{PICTURES, Pictures, Scene, encode, fill, write_picture};
 use super::{DriverError, Reading, unblock};
 use crate::provenance::{Format, Negotiated};
 use crate::registry::scenario::{self, SimDevice, SimSource};
@@ -62,7 +62,8 @@ impl Sim {
     pub async fn open(device: Arc<SimDevice>) -> Result<Self, DriverError> {
         let (content, rate, backlog) = match device.source {
             SimSource::Camera { width, height, fps, seed, bytes } => {
-                let pictures = unblock(move || Pictures::new(width, height, seed, bytes)).await?;
+                let scene = if device.light.is_there() { Scene::Light } else { Scene::Usual };
+                let pictures = unblock(move || Pictures::new(width, height, seed, bytes, scene)).await?;
                 (Content::Pictures(pictures), fps, CAMERA_BACKLOG)
             }
             SimSource::Serial { channels, hz, seed } => {
@@ -118,7 +119,10 @@ impl Sim {
         let elapsed = captured.since(self.device.begun);
         if self.payload.is_empty() || faults.freeze_at.is_none_or(|freeze| elapsed < freeze) {
             match &self.content {
-                Content::Pictures(pictures) => pictures.write(sequence, &mut self.payload),
+                Content::Pictures(pictures) => {
+                    let lit = pictures.shows_light() && self.device.light.was_lit(captured.before(faults.latency));
+                    pictures.write(sequence, lit, &mut self.payload);
+                }
                 Content::Values { channels, seed } => write_values(*channels, *seed, sequence, &mut self.payload),
             }
         }

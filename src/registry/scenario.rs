@@ -7,10 +7,12 @@
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use super::attachment::UsbIdentity;
 use crate::provenance::KernelDriver;
+use crate::time::Stamp;
 
 /// A whole scenario.
 #[derive(Debug, Clone, PartialEq)]
@@ -51,6 +53,8 @@ pub struct SimFaults {
     pub lose_every: Option<u64>,
     /// Samples arrive so long after their capture.
     pub delay: Duration,
+    /// A camera's pictures show the light as it was so long before their capture time.
+    pub latency: Duration,
     /// Its clock runs fast by so many parts in a million, slow if negative.
     pub clock_ppm: i64,
 }
@@ -137,17 +141,48 @@ pub struct SimDevice {
     /// What it does wrong.
     pub faults: SimFaults,
     /// The scenario's moment zero.
-    pub begun: crate::time::Stamp,
+    pub begun: Stamp,
     unplugged: AtomicBool,
     silent: AtomicBool,
     /// Next sequence number; it goes on over a replug, as a device with its own counter would.
     pub sequence: AtomicU32,
+    /// What a camera looks at.
+    pub light: SimLight,
+}
+
+/// A light in front of a simulated camera, and how it was switched. Without a first change there is
+/// none.
+#[derive(Debug, Default)]
+pub struct SimLight(Mutex<Vec<(Stamp, bool)>>);
+
+impl SimLight {
+    /// It is lit from this moment on, or dark; moments come in the order of time.
+    pub fn switch(&self, at: Stamp, lit: bool) {
+        self.changes().push((at, lit));
+    }
+
+    /// Was it lit at this moment? Dark before the first change.
+    #[must_use]
+    pub fn was_lit(&self, at: Stamp) -> bool {
+        self.changes().iter().rev().find(|(since, _)| *since <= at).is_some_and(|(_, lit)| *lit)
+    }
+
+    /// Is there one?
+    #[must_use]
+    pub fn is_there(&self) -> bool {
+        !self.changes().is_empty()
+    }
+
+    /// Whole values: a poisoned lock guards nothing broken.
+    fn changes(&self) -> MutexGuard<'_, Vec<(Stamp, bool)>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
 }
 
 impl SimDevice {
     /// A device just plugged in.
     #[must_use]
-    pub fn new(name: &str, source: SimSource, begun: crate::time::Stamp) -> Self {
+    pub fn new(name: &str, source: SimSource, begun: Stamp) -> Self {
         Self {
             name: name.to_owned(),
             source,
@@ -156,6 +191,7 @@ impl SimDevice {
             unplugged: AtomicBool::new(false),
             silent: AtomicBool::new(false),
             sequence: AtomicU32::new(0),
+            light: SimLight::default(),
         }
     }
 

@@ -8,6 +8,7 @@
 //! their own and left out while it is behind.
 
 mod devices;
+pub mod flashlight;
 mod footer;
 mod header;
 mod help;

@@ -4,6 +4,7 @@
 //! a supervisor survives must not end the picture. So messages of panics are held back, told to the
 //! log, and printed once the terminal is given back.
 
+use std::fs::File;
 use std::io::{self, IsTerminal, Write};
 use std::panic::PanicHookInfo;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -47,9 +48,7 @@ impl Screen {
             return Err(io::Error::other("standard output is not a terminal"));
         }
         let outlet = Outlet::new("screen", 1, io::stdout())?;
-        hook();
-        enable_raw_mode()?;
-        UP.store(true, Ordering::SeqCst);
+        take()?;
         let frame = Frame::default();
         let outlet = Some(outlet);
         let mut screen = match Terminal::new(CrosstermBackend::new(frame.clone())) {
@@ -97,15 +96,34 @@ impl Drop for Screen {
     }
 }
 
+/// What writes to the terminal: standard output, or if that leads elsewhere the terminal that the
+/// program was started on.
+pub(super) fn writer() -> io::Result<Box<dyn Write>> {
+    if io::stdout().is_terminal() {
+        return Ok(Box::new(io::stdout()));
+    }
+    Ok(Box::new(File::options().read(true).write(true).open("/dev/tty")?))
+}
+
+/// Takes the terminal, until [`give_back`]: keys come as they are typed.
+pub(super) fn take() -> io::Result<()> {
+    hook();
+    enable_raw_mode()?;
+    UP.store(true, Ordering::SeqCst);
+    Ok(())
+}
+
 /// Restores the terminal and prints what was held back. Errors are passed over: there is no terminal
 /// left to tell them to.
-fn give_back() {
+pub(super) fn give_back() {
     if !UP.swap(false, Ordering::SeqCst) {
         return;
     }
     let (done, is_done) = mpsc::channel();
     let leave = move || {
-        let _ = crossterm::execute!(io::stdout(), EnableLineWrap, LeaveAlternateScreen, Show);
+        if let Ok(mut terminal) = writer() {
+            let _ = crossterm::execute!(terminal, EnableLineWrap, LeaveAlternateScreen, Show);
+        }
         let _ = done.send(());
     };
     // A terminal that is stopped takes nothing: the program ends all the same.

@@ -3,6 +3,8 @@
 #![allow(dead_code, reason = "each test binary uses its own part of this module")]
 #![allow(clippy::expect_used, reason = "what fails here fails a test")]
 
+pub(crate) mod terminal;
+
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -11,6 +13,15 @@ use std::time::{Duration, Instant};
 /// How long a condition may take to come true before a test gives up. It is no requirement: a slow
 /// machine only makes the test slow.
 pub(crate) const PATIENCE: Duration = Duration::from_mins(1);
+
+/// Waits for a condition.
+pub(crate) fn until(what: &str, mut holds: impl FnMut() -> bool) {
+    let begun = Instant::now();
+    while !holds() {
+        assert!(begun.elapsed() < PATIENCE, "{what} does not come true");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
 
 /// A folder and an instance name of a test's own.
 pub(crate) struct Place {

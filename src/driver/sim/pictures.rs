@@ -15,22 +15,39 @@ pub(super) struct Pictures {
     pub(super) height: u32,
     seed: u64,
     encoded: Vec<Vec<u8>>,
+    /// What it sees while the light in front of it is lit.
+    lit: Option<Vec<u8>>,
+}
+
+/// What is in front of a simulated camera.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Scene {
+    /// What its pictures show by themselves.
+    Usual,
+    /// A light that is switched.
+    Light,
 }
 
 impl Pictures {
-    pub(super) fn new(width: u32, height: u32, seed: u64, bytes: usize) -> Result<Self, DriverError> {
+    pub(super) fn new(width: u32, height: u32, seed: u64, bytes: usize, scene: Scene) -> Result<Self, DriverError> {
+        let lit = (scene == Scene::Light).then(|| white(width, height)).transpose()?;
         let picture = |index| Ok(fill(encode(width, height, seed, index)?, bytes, seed, index));
         let encoded = (0..PICTURES).map(picture).collect::<Result<_, DriverError>>()?;
-        Ok(Self { width, height, seed, encoded })
+        Ok(Self { width, height, seed, encoded, lit })
     }
 
     pub(super) fn largest(&self) -> usize {
         // 64 bytes hold the comment at its longest.
-        self.encoded.iter().map(Vec::len).max().unwrap_or(0) + 64
+        self.encoded.iter().chain(&self.lit).map(Vec::len).max().unwrap_or(0) + 64
     }
 
-    pub(super) fn write(&self, sequence: u32, payload: &mut Vec<u8>) {
-        let picture = self.encoded.get((sequence % PICTURES) as usize).map_or(&[][..], Vec::as_slice);
+    pub(super) fn shows_light(&self) -> bool {
+        self.lit.is_some()
+    }
+
+    pub(super) fn write(&self, sequence: u32, lit: bool, payload: &mut Vec<u8>) {
+        let usual = || self.encoded.get((sequence % PICTURES) as usize);
+        let picture = self.lit.as_ref().filter(|_| lit).or_else(usual).map_or(&[][..], Vec::as_slice);
         write_picture(picture, self.seed, sequence, payload);
     }
 }
@@ -84,6 +101,23 @@ pub(super) fn fill(picture: Vec<u8>, bytes: usize, seed: u64, index: u32) -> Vec
 
 /// A gradient tinted by the seed, with a bright square that moves from picture to picture.
 pub(super) fn encode(width: u32, height: u32, seed: u64, index: u32) -> Result<Vec<u8>, DriverError> {
+    let side = (width.min(height) / 4).max(1);
+    let left = (width - side.min(width)) * index / PICTURES;
+    let top = height / 3;
+    let tint = seed.to_le_bytes()[0];
+    jpeg(width, height, |x, y| {
+        let inside = (left..left + side).contains(&x) && (top..top + side).contains(&y);
+        let [across, down] = [x * 255 / width, y * 255 / height].map(|share| share.to_le_bytes()[0]);
+        if inside { [255, 240, 32] } else { [across, down, tint] }
+    })
+}
+
+/// The light fills the picture.
+fn white(width: u32, height: u32) -> Result<Vec<u8>, DriverError> {
+    jpeg(width, height, |_, _| [255; 3])
+}
+
+fn jpeg(width: u32, height: u32, colour: impl Fn(u32, u32) -> [u8; 3]) -> Result<Vec<u8>, DriverError> {
     let unmade = || DriverError::Fatal(format!("a simulated picture cannot be {width}x{height}: use 1..=8192 pixels"));
     let (Ok(narrow_width), Ok(narrow_height)) = (u16::try_from(width), u16::try_from(height)) else {
         return Err(unmade());
@@ -91,17 +125,10 @@ pub(super) fn encode(width: u32, height: u32, seed: u64, index: u32) -> Result<V
     if !(1..=8192).contains(&width) || !(1..=8192).contains(&height) {
         return Err(unmade());
     }
-    let side = (width.min(height) / 4).max(1);
-    let left = (width - side.min(width)) * index / PICTURES;
-    let top = height / 3;
-    let tint = seed.to_le_bytes()[0];
     let mut pixels = Vec::with_capacity((width * height * 3) as usize);
     for y in 0..height {
-        let down = (y * 255 / height).to_le_bytes()[0];
         for x in 0..width {
-            let inside = (left..left + side).contains(&x) && (top..top + side).contains(&y);
-            let across = (x * 255 / width).to_le_bytes()[0];
-            pixels.extend_from_slice(&if inside { [255, 240, 32] } else { [across, down, tint] });
+            pixels.extend_from_slice(&colour(x, y));
         }
     }
     let mut encoded = Vec::new();

@@ -111,6 +111,7 @@ fn faults_are_those_of_the_device_above() {
         freeze_at = "3s"
         truncate_every = 10
         clock_ppm = -20
+        latency = "35ms"
         [[device]]
         name = "motor_state"
         "#,
@@ -120,6 +121,7 @@ fn faults_are_those_of_the_device_above() {
         freeze_at: Some(Duration::from_secs(3)),
         truncate_every: Some(10),
         clock_ppm: -20,
+        latency: Duration::from_millis(35),
         ..SimFaults::default()
     };
     assert_eq!(scenario.devices[0].faults, expected);

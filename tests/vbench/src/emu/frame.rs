@@ -3,12 +3,23 @@
 //! MJPEG: a COM segment right after SOI with the text `rapid-vbench FRAMENO SEND_NS`. YUYV: the same numbers in the first 16 bytes.
 //! Invariant: frames are encoded once; sending one copies bytes and never encodes.
 
+use std::path::Path;
+
 use jpeg_encoder::{ColorType, Encoder, EncodingError};
 
 const COM_TAG: &str = "rapid-vbench";
 const YUYV_TAG: &[u8; 4] = b"RVBF";
 /// Different pictures a camera cycles through, so that a frozen picture can be told from a live one.
 pub const PICTURES: usize = 6;
+
+/// A folder like one of `/sys/class/leds`: while it is there, cameras that send YUYV look at this light.
+const LIGHT: &str = "/tmp/bench/light";
+
+/// Is the light lit? `None` without one.
+pub fn light() -> Option<bool> {
+    let brightness = std::fs::read(Path::new(LIGHT).join("brightness")).ok()?;
+    Some(brightness.first().is_some_and(|first| *first != b'0'))
+}
 
 /// Number and send time (CLOCK_MONOTONIC) of a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -55,9 +66,19 @@ pub fn stamp_jpeg(jpeg: &[u8], id: FrameId, out: &mut Vec<u8>) {
     out.extend_from_slice(&jpeg[2..]);
 }
 
-/// A YUYV frame of one shade with its identity in front, written over `out`.
-pub fn stamp_yuyv(width: u16, height: u16, id: FrameId, out: &mut Vec<u8>) {
-    let shade = id.number.to_le_bytes()[0];
+/// A YUYV frame of one shade with its identity in front, written over `out`. The shade is that of the light in front
+/// of the camera, if there is one, and otherwise follows from the number.
+pub fn stamp_yuyv(width: u16, height: u16, id: FrameId, light: Option<bool>, out: &mut Vec<u8>) {
+    let shade = match light {
+        Some(lit) => {
+            if lit {
+                230
+            } else {
+                20
+            }
+        }
+        None => id.number.to_le_bytes()[0],
+    };
     out.clear();
     out.resize(usize::from(width) * usize::from(height) * 2, shade);
     out[0..4].copy_from_slice(YUYV_TAG);
@@ -122,7 +143,7 @@ mod tests {
             frame.truncate(frame.len() - 1);
             assert!(!is_whole_jpeg(&frame));
         }
-        stamp_yuyv(64, 48, id, &mut frame);
+        stamp_yuyv(64, 48, id, None, &mut frame);
         assert_eq!((frame.len(), identity(&frame)), (64 * 48 * 2, Some(id)));
     }
 

@@ -148,7 +148,7 @@ impl Uvc {
         let id = FrameId { number: self.next_frame, sent_ns };
         match mode.format {
             Format::Mjpg => frame::stamp_jpeg(&pictures[id.number as usize % pictures.len()], id, out),
-            Format::Yuyv => frame::stamp_yuyv(mode.width, mode.height, id, out),
+            Format::Yuyv => frame::stamp_yuyv(mode.width, mode.height, id, frame::light(), out),
         }
     }
 

@@ -1,0 +1,53 @@
+use super::*;
+
+fn registry(latency: &str) -> Registry {
+    let text = format!(
+        "[device.cam]\nvid = \"046d\"\npid = \"0825\"\nserial = \"A\"\nbit = 0\nnode = \"camera\"\nlatency = \"{latency}\"\n\
+         [device.cam.camera]\nwidth = 64\nheight = 48\nfps = 30\n"
+    );
+    Registry::parse(&text, Some("/etc/rapid/devices.toml".as_ref())).unwrap().registry
+}
+
+const ESTIMATE: Estimate =
+    Estimate { latency_ms: 48.26, uncertainty_ms: 0.83, correlation: 0.987, contrast: 131.4, pictures: 571, flips: 57 };
+
+fn printed(estimate: Estimate, light: &Chosen, delay_ms: u64, stands: &str) -> String {
+    let registry = registry(stands);
+    let spec = &registry.devices[0];
+    let mut out = Vec::new();
+    let measured = Measured::new(spec, light, Duration::from_millis(delay_ms), estimate);
+    measured.print(&registry, spec, &mut out).unwrap();
+    String::from_utf8(out).unwrap()
+}
+
+#[test]
+fn the_result_says_what_is_in_it_and_which_line_to_write() {
+    assert_eq!(
+        printed(ESTIMATE, &Chosen::Terminal, 0, "0ms"),
+        "cam: latency 48.3 ms ± 0.8 ms (95 %)\n  \
+           571 pictures, 57 changes of the light\n  \
+           correlation 0.99, contrast 131 of 255\n  \
+           It includes what the terminal and its screen take to show a change, often 10\n  \
+           to 40 ms. Give that with --light-delay if you know it; with --led it is not there.\n\n\
+         In /etc/rapid/devices.toml, under [device.cam]:\n\n    \
+             latency = \"48ms\"\n"
+    );
+    let led = Chosen::of(Some("ACT".as_ref())).unwrap();
+    assert!(matches!(&led, Chosen::Led(folder) if folder.as_os_str() == "/sys/class/leds/ACT"));
+    let text = printed(ESTIMATE, &led, 0, "36500us");
+    assert!(
+        text.contains("what the LED takes") && text.contains("latency = \"48ms\"  # instead of 36.5ms\n"),
+        "{text}"
+    );
+}
+
+#[test]
+fn what_the_light_is_late_by_is_taken_off_and_nothing_below_zero_is_written() {
+    let text = printed(ESTIMATE, &Chosen::Terminal, 15, "0ms");
+    assert!(
+        text.contains("latency 33.3 ms") && text.contains("15.0 ms of the light") && text.contains("\"33ms\""),
+        "{text}"
+    );
+    let text = printed(ESTIMATE, &Chosen::Terminal, 60, "0ms");
+    assert!(text.contains("latency -11.7 ms") && text.contains("Below zero: ") && text.contains("= \"0ms\""), "{text}");
+}

@@ -1,0 +1,70 @@
+//! A terminal of a test's own.
+
+use std::fs::File;
+use std::io::{Read, Write};
+use std::os::fd::OwnedFd;
+use std::process::{Child, Command};
+
+use super::Place;
+
+/// A terminal, and `rapid` in a session of its own on it.
+pub(crate) struct OnTerminal {
+    /// What the terminal shows is read from here; closing it closes the terminal.
+    pub(crate) master: Option<OwnedFd>,
+    pub(crate) child: Child,
+}
+
+impl OnTerminal {
+    /// `fault` is for `RAPID_FAULT`.
+    pub(crate) fn start(place: &Place, arguments: &[&str], fault: &str) -> Self {
+        use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+        let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).expect("terminal");
+        grantpt(&master).expect("terminal");
+        unlockpt(&master).expect("terminal");
+        let size = rustix::termios::Winsize { ws_row: 40, ws_col: 120, ws_xpixel: 0, ws_ypixel: 0 };
+        rustix::termios::tcsetwinsize(&master, size).expect("its size");
+        let name = ptsname(&master, Vec::new()).expect("its name").into_string().expect("text");
+        let open = || File::options().read(true).write(true).open(&name).expect("its other end");
+        let command = place.command(arguments);
+        let mut session = Command::new("setsid");
+        session.arg("--ctty").arg(command.get_program()).args(command.get_args());
+        session
+            .current_dir(place.folder.path())
+            .env("HOME", place.folder.path())
+            .env("TERM", "xterm")
+            .env("RAPID_FAULT", fault);
+        let child = session.stdin(open()).stdout(open()).stderr(open()).spawn().expect("setsid runs rapid");
+        Self { master: Some(master), child }
+    }
+
+    /// Reads what is shown until this appears, and returns it.
+    pub(crate) fn read_until(&mut self, word: &str) -> String {
+        let mut file = File::from(self.master.as_ref().expect("open").try_clone().expect("clone"));
+        let (mut shown, mut piece) = (Vec::new(), [0; 4096]);
+        while !String::from_utf8_lossy(&shown).contains(word) {
+            let count = file.read(&mut piece).expect("output");
+            shown.extend_from_slice(&piece[..count]);
+        }
+        String::from_utf8_lossy(&shown).into_owned()
+    }
+
+    /// Types this.
+    pub(crate) fn type_in(&self, text: &str) {
+        let mut file = File::from(self.master.as_ref().expect("open").try_clone().expect("clone"));
+        file.write_all(text.as_bytes()).expect("input");
+    }
+
+    /// Does the terminal show what is typed? Not while a program has it for itself.
+    pub(crate) fn echoes(&self) -> bool {
+        use rustix::termios::{LocalModes, tcgetattr};
+        let master = self.master.as_ref().expect("open");
+        tcgetattr(master).expect("modes").local_modes.contains(LocalModes::ECHO)
+    }
+}
+
+impl Drop for OnTerminal {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
