@@ -202,7 +202,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
         episode,
         record: options.record,
         duration: options.duration,
-        recording: false,
+        begin_episode: options.record,
     };
     let (kind, screen) = (options.screen, Some(screen));
     let mut running =
