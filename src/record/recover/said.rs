@@ -118,3 +118,36 @@ impl Repaired {
 fn counted(count: u64, what: &str) -> String {
     format!("{} {what}{}", text::count(count), if count == 1 { "" } else { "s" })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_is_said_as_one() {
+        let said = |count| {
+            let repaired = Repaired {
+                to: "a.mcap".into(),
+                original: None,
+                end: FileEnd::Torn,
+                messages: count,
+                last: String::new(),
+                seconds: 1.0,
+                unread_bytes: count,
+                damaged_chunks: count,
+                refused_records: count,
+            };
+            repaired.sentence()
+        };
+        assert_eq!(
+            said(1),
+            "repaired, 1.0 s, 1 message; the last second may be missing: 1 byte at the end was torn; \
+             1 damaged chunk is left out; 1 record that makes no sense is left out"
+        );
+        assert_eq!(
+            said(2000),
+            "repaired, 1.0 s, 2,000 messages; the last second may be missing: 2,000 bytes at the end were torn; \
+             2,000 damaged chunks are left out; 2,000 records that make no sense are left out"
+        );
+    }
+}
