@@ -194,7 +194,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     // In the background: nothing of this run waits for what an earlier one left behind.
     let may_record = options.record || options.screen == Screen::Monitor;
     let _repairs = may_record.then(|| {
-        let repairs = Repairs::start(episode.out.clone(), Arc::clone(&board));
+        let repairs = Repairs::start(episode.out.clone(), registry.rig.disk_reserve, Arc::clone(&board));
         repairs.inspect_err(|error| tracing::warn!(%error, "unfinished episodes are not repaired")).ok()
     });
     let mut conductor = Conductor {

@@ -73,6 +73,12 @@ impl Disk {
         })
     }
 
+    /// Would `bytes` more leave so little that an episode being recorded is warned of, or closed?
+    /// `reserve` is the registry's `disk_reserve`.
+    pub(super) fn lacks_room_beside_an_episode(self, bytes: u64, reserve: Option<u64>) -> bool {
+        self.free < self.reserve(reserve).saturating_mul(2).saturating_add(bytes)
+    }
+
     fn reserve(self, wanted: Option<u64>) -> u64 {
         wanted.unwrap_or_else(|| RESERVE.min(self.size / SHARE))
     }

@@ -1,9 +1,9 @@
 //! A folder of episodes: which of them were not finished, and their repair in the background.
 //!
 //! Invariant: nobody waits for a repair in the background, which works half of the time at most and
-//! leaves room on the disk for what is being recorded.
+//! leaves so much room on the disk that an episode being recorded is neither closed nor warned of.
 
-use std::fs::{self, DirEntry};
+use std::fs::{self, DirEntry, File};
 use std::io;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
@@ -15,11 +15,10 @@ use std::time::{Duration, Instant, SystemTime};
 use rustix::process::setpriority_process;
 
 use super::{Outcome, RecoverError, Recovered, recover};
+use crate::record::space::Disk;
 use crate::status::{Board, Level, What};
 use crate::text;
 
-/// Bytes a repair in the background leaves free.
-const LEAVE_FREE: u64 = 1 << 30;
 /// How soon a repair in the background notices that it is to end.
 const NOTICE: Duration = Duration::from_millis(20);
 /// How long the end of a run waits for it: it may be in the middle of writing to the disk.
@@ -53,17 +52,18 @@ pub struct Repairs {
 }
 
 impl Repairs {
-    /// Repairs what an earlier run left unfinished in `folder`, and says so on `board`.
+    /// Repairs what an earlier run left unfinished in `folder`, and says so on `board`; `reserve` is the
+    /// registry's `disk_reserve`.
     ///
     /// # Errors
     /// When the system gives no thread.
-    pub fn start(folder: PathBuf, board: Arc<Board>) -> io::Result<Self> {
+    pub fn start(folder: PathBuf, reserve: Option<u64>, board: Arc<Board>) -> io::Result<Self> {
         let stop = Arc::new(AtomicBool::new(false));
         let (tell, ended) = mpsc::channel();
         let asked = Arc::clone(&stop);
         let begun = SystemTime::now();
         std::thread::Builder::new().name("recover".to_owned()).spawn(move || {
-            repair_all(&folder, begun, &board, &asked);
+            repair_all(&folder, reserve, begun, &board, &asked);
             // Whoever waited may have gone.
             let _ = tell.send(());
         })?;
@@ -79,7 +79,7 @@ impl Drop for Repairs {
     }
 }
 
-fn repair_all(folder: &Path, begun: SystemTime, board: &Board, stop: &AtomicBool) {
+fn repair_all(folder: &Path, reserve: Option<u64>, begun: SystemTime, board: &Board, stop: &AtomicBool) {
     // Of this thread alone; refused, it is a neighbour like any other.
     let _ = setpriority_process(None, NICE);
     let log = |level, text| board.announce(What::Log { level, text });
@@ -97,29 +97,38 @@ fn repair_all(folder: &Path, begun: SystemTime, board: &Board, stop: &AtomicBool
         }
         let path = entry.path();
         let size = metadata.map_or(0, |metadata| metadata.len());
-        if let Some(free) = free_bytes(folder).filter(|free| *free < size.saturating_add(LEAVE_FREE)) {
+        let room = |size| {
+            let disk = File::open(folder).and_then(|folder| Disk::of(&folder)).ok()?;
+            disk.lacks_room_beside_an_episode(size, reserve).then_some(disk.free)
+        };
+        let refused = |free| {
             let (size, free) = (text::size(size), text::size(free));
-            log(
-                Level::Warn,
-                format!(
-                    "{}: not repaired: it takes {size} and {free} are free; make room and run `rapid recover`",
-                    path.display()
-                ),
-            );
+            let why = format!("it takes {size} and {free} are free; make room and run `rapid recover`");
+            log(Level::Warn, format!("{}: not repaired: {why}", path.display()));
+        };
+        if let Some(free) = room(size) {
+            refused(free);
             continue;
         }
         let mut worked = Instant::now();
-        let mut watch = |_, _| {
+        let mut full = None;
+        let mut watch = |done, size: u64| {
             rest(worked.elapsed(), stop);
             worked = Instant::now();
-            if stop.load(Ordering::Relaxed) { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+            // What is being recorded takes its part meanwhile.
+            full = room(size.saturating_sub(done));
+            if full.is_some() || stop.load(Ordering::Relaxed) {
+                ControlFlow::Break(())
+            } else {
+                ControlFlow::Continue(())
+            }
         };
         match recover(&path, &mut watch) {
             Ok(recovered) => board.announce(event(recovered)),
             Err(RecoverError::Busy(_)) => {
                 log(Level::Info, format!("{}: another rapid writes or repairs it; left alone", path.display()));
             }
-            Err(RecoverError::Interrupted(_)) => {}
+            Err(RecoverError::Interrupted(_)) => full.into_iter().for_each(refused),
             Err(RecoverError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {}
             Err(error) => log(Level::Warn, format!("{error}; it stays as it is")),
         }
@@ -135,11 +144,6 @@ fn rest(time: Duration, stop: &AtomicBool) {
         }
         std::thread::sleep(left.min(NOTICE));
     }
-}
-
-fn free_bytes(folder: &Path) -> Option<u64> {
-    let disk = rustix::fs::statvfs(folder).ok()?;
-    Some(disk.f_bavail.saturating_mul(disk.f_frsize))
 }
 
 fn event(recovered: Recovered) -> What {

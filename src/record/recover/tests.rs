@@ -10,8 +10,8 @@ use proptest::prelude::*;
 use super::copy::{About, Error};
 use super::*;
 use crate::episode_format::testing::{self, Message, metadata, mutated, mutations, strictly};
-use crate::record::Sink;
 use crate::record::tests::{Bench, registry};
+use crate::record::{Disk, Sink};
 use crate::status::{Board, Grade, Level, What};
 
 fn go_on(_: u64, _: u64) -> ControlFlow<()> {
@@ -389,7 +389,7 @@ async fn in_the_background_a_folder_is_repaired_and_it_is_said() {
     held.lock().unwrap();
     let board = Arc::new(Board::new(&registry()));
     let mut events = board.events();
-    let repairs = Repairs::start(folder.path().to_owned(), Arc::clone(&board)).unwrap();
+    let repairs = Repairs::start(folder.path().to_owned(), Some(1 << 20), Arc::clone(&board)).unwrap();
     let mut said = Vec::new();
     for _ in 0..3 {
         said.push(events.recv().await.unwrap().what);
@@ -402,5 +402,27 @@ async fn in_the_background_a_folder_is_repaired_and_it_is_said() {
     drop(repairs);
     // A finished file is nobody's business.
     assert_eq!(names(folder.path()), ["a_001.mcap", "a_003.mcap.partial", "a_004.mcap"]);
-    assert!(Repairs::start(folder.path().join("missing"), board).is_ok());
+    assert!(Repairs::start(folder.path().join("missing"), None, board).is_ok());
+}
+
+#[tokio::test]
+async fn a_repair_in_the_background_leaves_the_room_of_an_episode() {
+    let (folder, bytes) = recorded().await;
+    let partial = put(&folder, "a_001.mcap.partial", &bytes[..bytes.len() / 2]);
+    let free = Disk::of(&File::open(folder.path()).unwrap()).unwrap().free;
+    let board = Arc::new(Board::new(&registry()));
+    let mut events = board.events();
+    // Three quarters of what is free: a repair would fit, and an episode be warned of.
+    let _repairs = Repairs::start(folder.path().to_owned(), Some(free / 4 * 3), board).unwrap();
+    let What::Log { text, .. } = events.recv().await.unwrap().what else { panic!() };
+    assert!(text.contains("a_001.mcap.partial: not repaired: it takes ") && text.contains("; make room and"), "{text}");
+    assert!(partial.exists());
+}
+
+#[test]
+fn room_beside_an_episode_is_twice_the_reserve() {
+    let disk = Disk { free: 1000, size: 4000 };
+    assert!(!disk.lacks_room_beside_an_episode(200, Some(400)) && disk.lacks_room_beside_an_episode(201, Some(400)));
+    // A twentieth of the disk.
+    assert!(!disk.lacks_room_beside_an_episode(600, None) && disk.lacks_room_beside_an_episode(601, None));
 }

@@ -10,6 +10,7 @@ use std::time::Duration;
 use rustix::fs::{FlockOperation, Mode, OFlags};
 use rustix::io::Errno;
 
+use super::json::{self, json_path};
 use crate::folder::FolderError;
 use crate::mask::{MaskRecord, MaskRecordError, PhysicalMask, RECORD_LEN};
 use crate::time::{Stamp, realtime_ns};
@@ -89,7 +90,12 @@ pub(super) struct MaskFile {
 impl MaskFile {
     /// Makes the file, or takes over one whose process died.
     pub(super) fn create(path: &Path, device_count: u8) -> Result<Self, PresenceError> {
+        // First what says whose the rig is, if somebody's.
         let file = take(path)?;
+        json::claim(&json_path(path)).inspect_err(|_| {
+            // Under its lock, and empty or of a dead process.
+            let _ = std::fs::remove_file(path);
+        })?;
         let record = MaskRecord { device_count, generation: 0, mask: PhysicalMask::EMPTY, realtime_ns: 0, sequence: 0 };
         let io = |error| PresenceError::Io { path: path.to_owned(), error };
         // A whole record of the dead process stays readable until it is overwritten.
@@ -126,7 +132,9 @@ impl Drop for MaskFile {
     fn drop(&mut self) {
         // For readers that hold it open.
         let _ = self.publish(PhysicalMask::EMPTY, realtime_ns());
-        // While the lock is held, so that nobody else's file is removed.
+        // While the lock is held, so that nobody else's files are removed. Another user's stays: it may not
+        // be removed where everybody may write.
+        let _ = std::fs::remove_file(json_path(&self.path));
         let _ = std::fs::remove_file(&self.path);
     }
 }

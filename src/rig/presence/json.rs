@@ -77,7 +77,7 @@ pub(super) fn claim(path: &Path) -> Result<(), PresenceError> {
     match std::fs::symlink_metadata(path) {
         Ok(there) if !there.is_file() => foreign("it is not an ordinary file".to_owned()),
         Ok(there) if there.uid() != rustix::process::geteuid().as_raw() => {
-            foreign(format!("it belongs to user {}", there.uid()))
+            foreign(format!("it belongs to user {}: another user's rapid left it behind", there.uid()))
         }
         _ => Ok(()),
     }

@@ -22,7 +22,7 @@ use thread_priority::unix::{
 };
 use thread_priority::{ThreadPriority, ThreadPriorityValue};
 
-use tokio_util::sync::CancellationToken;
+use tokio_util::sync::{CancellationToken, DropGuard};
 
 use crate::bus::Writer;
 use crate::fault;
@@ -72,7 +72,6 @@ impl Claim {
     /// # Errors
     /// When another live process publishes there (its pid is named), or the file cannot be made.
     pub fn new(path: &Path, device_count: u8) -> Result<Self, PresenceError> {
-        json::claim(&json_path(path))?;
         Ok(Self { path: path.to_owned(), file: MaskFile::create(path, device_count)? })
     }
 }
@@ -85,16 +84,11 @@ impl Presence {
     pub fn start(claim: Claim, writer: Arc<Writer>, board: Arc<Board>) -> Result<Self, PresenceError> {
         let Claim { path, file } = claim;
         let shared = Arc::new(Shared::default());
-        let beat = Beat { shared: Arc::clone(&shared), file, writer, board };
         let ended = CancellationToken::new();
-        let guard = ended.clone().drop_guard();
+        let beat = Beat { _ended: ended.clone().drop_guard(), shared: Arc::clone(&shared), file, writer, board };
         let thread = std::thread::Builder::new()
             .name("mask".to_owned())
-            .spawn(move || {
-                // Dropped by a panic too.
-                let _guard = guard;
-                beat.run();
-            })
+            .spawn(move || beat.run())
             .map_err(|error| PresenceError::Io { path: path.clone(), error })?;
         Ok(Self { shared, thread: Some(thread), ended, json: json_path(&path), json_failed: AtomicBool::new(false) })
     }
@@ -115,6 +109,10 @@ impl Presence {
 
     /// Writes the file for people, whole. Why it cannot be is logged, once until it can again.
     pub fn write_json(&self, mask: PhysicalMask, sequence: u64, devices: &[JsonDevice]) {
+        // The thread's panic has freed the name for another rapid.
+        if self.ended.is_cancelled() {
+            return;
+        }
         let written = json::write(&self.json, mask, sequence, devices);
         let failed_before = self.json_failed.swap(written.is_err(), Ordering::Relaxed);
         if let (Err(error), false) = (written, failed_before) {
@@ -133,13 +131,13 @@ impl Drop for Presence {
             // panic of its own.
             let _ = thread.join();
         }
-        // Another user's file stays: it may not be removed where everybody may write.
-        let _ = std::fs::remove_file(&self.json);
     }
 }
 
 /// What the thread owns.
 struct Beat {
+    /// Dropped by a panic too, and before the file: nobody writes beside it once it is gone.
+    _ended: DropGuard,
     shared: Arc<Shared>,
     file: MaskFile,
     writer: Arc<Writer>,
