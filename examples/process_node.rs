@@ -10,8 +10,9 @@
 //!     channels = 2
 //!
 //! `rapid` starts it when the device is plugged and ends it with SIGTERM when it is pulled. It
-//! publishes what it reads, here a counter, on the topic it is given; any language with an iceoryx2
-//! binding will do. What it prints goes to the log of `rapid`.
+//! publishes what it reads, here a counter, on the topic it is given, `/rapid/ingress/` and that of the
+//! device; `rapid` takes it from there and publishes it on the topic of the device. Any language with
+//! an iceoryx2 binding will do. What it prints goes to the log of `rapid`.
 //!
 //! Options: `--rate HZ`, `--channels N`; and to try what happens when a program misbehaves:
 //! `--ignore-sigterm`, `--crash-after SAMPLES`, `--silent-after SAMPLES`, `--flood-stderr`.

@@ -30,6 +30,7 @@ use crate::hotplug::udev::UdevMonitor;
 use crate::hotplug::{HotplugError, HotplugStream};
 use crate::logging::{self, LoggingError, Stderr};
 use crate::mask::MASK_PATH;
+use crate::panics;
 use crate::record::recover::Repairs;
 use crate::record::{EpisodeRequest, RecordError, Recorder, RecorderConfig};
 use crate::registry::Registry;
@@ -150,6 +151,9 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     };
     // Lines still on their way to standard error are waited for when this goes.
     let _log = logging::init(Arc::clone(&board), std::env::var("RAPID_LOG").ok().as_deref(), stderr)?;
+    if options.screen != Screen::Monitor {
+        panics::to_log();
+    }
     let signals = Signals::listen()?;
 
     // First of all: are we the only one? A registry has at most 64 devices.
@@ -202,7 +206,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
         episode,
         record: options.record,
         duration: options.duration,
-        recording: false,
+        begin_episode: options.record,
     };
     let (kind, screen) = (options.screen, Some(screen));
     let mut running =

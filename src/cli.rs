@@ -12,7 +12,7 @@ use clap::{ArgAction, ArgMatches, Args, CommandFactory, FromArgMatches, Parser, 
 #[derive(Debug, Parser)]
 #[command(
     version, long_version = LONG_VERSION, max_term_width = 100, after_help = EXAMPLES, override_usage = "rapid [OPTIONS]\n       rapid <COMMAND> [OPTIONS]",
-    disable_help_flag = true, disable_version_flag = true, disable_help_subcommand = true
+    disable_help_flag = true, disable_version_flag = true
 )]
 pub struct Cli {
     /// What to do instead of running the rig.
@@ -36,7 +36,7 @@ pub struct Cli {
 const LONG_VERSION: &str = concat!(env!("CARGO_PKG_VERSION"), "\n", env!("RAPID_BUILT_WITH"));
 
 const EXAMPLES: &str = "\
-Without a command, rapid runs the rig and shows the monitor: it finds the sensors that devices.toml
+Without a command, rapid runs the rig and shows the monitor: it finds the sensors that devices.toml \
 names, streams them, publishes the Physical Mask and records episodes (space starts and ends one).
 
 Examples:
@@ -53,8 +53,8 @@ Exit codes: 0 done, 1 failed while running, 2 bad configuration or arguments,
 const RECOVER: &str = "\
 A run that may record does this by itself, in the background, for what it finds in its --out folder.
 
-X.mcap.partial becomes X.mcap, and is kept as X.mcap.damaged if not all of it could be read. Of a cut or
-damaged X.mcap a whole X.recovered.mcap is made beside it. A file being written is left alone.
+X.mcap.partial becomes X.mcap, and is kept as X.mcap.damaged if not all of it could be read. \
+Of a cut or damaged X.mcap a whole X.recovered.mcap is made beside it. A file being written is left alone.
 
 Examples:
   rapid recover episodes

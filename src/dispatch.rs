@@ -22,6 +22,7 @@ use crate::commands::{self, Format, Outcome, mask::MaskOptions};
 use crate::driver::{DriverError, replay};
 use crate::headless::style::{ColourChoice, Palette, Terminal};
 use crate::hotplug::udev;
+use crate::outlet;
 use crate::record::inspect::{self, InspectError};
 use crate::record::{self, EpisodeRequest, RecordError};
 use crate::registry::scenario::Scenario;
@@ -31,6 +32,8 @@ use crate::text;
 
 /// Tasks that are left at the end have this long to go.
 const LAST_TASKS: Duration = Duration::from_millis(500);
+/// The reader of standard error has this long to take why a command failed: it may never read.
+const LAST_WORDS: Duration = Duration::from_secs(2);
 /// The mask's JSON file holds 64 devices at most; anything larger is not it.
 const LARGEST_JSON: u64 = 1 << 20;
 
@@ -129,7 +132,8 @@ pub fn dispatch(cli: Cli) -> ExitCode {
             let text: Vec<_> = failure.to_string().lines().map(|line| text::plain(line).into_owned()).collect();
             let text = text.join("\n");
             if !text.is_empty() {
-                let _ = writeln!(io::stderr(), "{} {text}", stderr_palette().bad("error:"));
+                let said = format!("{} {text}\n", stderr_palette().bad("error:"));
+                outlet::write_within(io::stderr(), said, LAST_WORDS);
             }
             ExitCode::from(failure.code())
         }

@@ -23,6 +23,7 @@
 //!       status                                   the board every stage reports on
 //!       text   outlet                            words and lines for people
 //!       folder                                   files others cannot lead astray
+//!       panics                                   where their messages go
 //!       episode_format                           an episode's file, record by record
 //!  L0   modality   mask   sample   time   provenance   flash     nouns
 //! ```
@@ -72,8 +73,8 @@
 //! * Nothing downstream is re-wired on plug and unplug: topics live as long as the run.
 //! * A simulated device is a device: it enters as a hot-plug event and is opened as a driver, and
 //!   nothing beyond can tell.
-//! * Between two samples a stream allocates nothing, locks nothing and logs nothing of its own;
-//!   iceoryx2 makes one small allocation a sample.
+//! * Between two samples a stream allocates nothing, nor does iceoryx2 for it; it locks nothing and
+//!   logs nothing of its own.
 //! * Capture times are `CLOCK_MONOTONIC`; the wall clock is derived from it once an episode.
 //! * A screen sees [`status::Snapshot`]s and sends [`status::Command`]s; it holds no handle into a
 //!   stage.
@@ -97,6 +98,7 @@ pub mod logging;
 pub mod mask;
 pub mod modality;
 pub mod outlet;
+pub mod panics;
 pub mod provenance;
 pub mod record;
 pub mod registry;

@@ -6,6 +6,7 @@
 //! `RAPID_LOG` chooses what is logged, in the syntax of `tracing_subscriber::EnvFilter`, for example
 //! `RAPID_LOG=debug` or `RAPID_LOG=rapid::rig=trace,warn`. Without it the board gets what [`DEFAULT`]
 //! says, and standard error only warnings and errors: state changes are printed as events already.
+//! Messages of panics are logged whatever it says.
 //!
 //! Invariant: who logs never waits for standard error: a reader that is behind loses lines, and is told.
 //! Invariant: a line has no control characters and no line breaks, and at most [`LONGEST`] characters.
@@ -20,7 +21,7 @@ use std::time::Duration;
 use tracing::field::{Field, Visit};
 use tracing::span::{Attributes, Id, Record};
 use tracing::{Event, Subscriber};
-use tracing_subscriber::filter::{EnvFilter, LevelFilter};
+use tracing_subscriber::filter::{EnvFilter, LevelFilter, ParseError};
 use tracing_subscriber::layer::{Context, SubscriberExt};
 use tracing_subscriber::registry::LookupSpan;
 use tracing_subscriber::util::SubscriberInitExt;
@@ -28,6 +29,7 @@ use tracing_subscriber::{Layer, Registry};
 
 use crate::headless::ERASE_LINE;
 use crate::headless::style::{ColourChoice, Terminal};
+use crate::panics;
 use crate::status::{Board, Level, LogLine};
 use crate::text;
 use crate::time::realtime_ns;
@@ -58,7 +60,7 @@ pub enum Stderr {
 pub enum LoggingError {
     /// `RAPID_LOG` is not a filter.
     #[error("RAPID_LOG: {0}; for example RAPID_LOG=debug or RAPID_LOG=rapid::rig=trace,warn")]
-    Filter(#[from] tracing_subscriber::filter::ParseError),
+    Filter(#[from] ParseError),
     /// There is a log already.
     #[error("logging was started twice")]
     Twice(#[from] tracing_subscriber::util::TryInitError),
@@ -112,7 +114,7 @@ fn spawn_writer(mut out: impl Write + Send + 'static) -> io::Result<SyncSender<P
 /// When the filter is wrong, or when called twice in a process.
 pub fn init(board: Arc<Board>, filter: Option<&str>, stderr: Stderr) -> Result<Log, LoggingError> {
     let chosen = filter.filter(|filter| !filter.is_empty());
-    let filter = EnvFilter::try_new(chosen.unwrap_or(DEFAULT))?;
+    let filter = filter_of(chosen.unwrap_or(DEFAULT))?;
     let least = if chosen.is_some() { LevelFilter::TRACE } else { LevelFilter::WARN };
     let pieces = match stderr {
         Stderr::Nothing => None,
@@ -121,6 +123,10 @@ pub fn init(board: Arc<Board>, filter: Option<&str>, stderr: Stderr) -> Result<L
     let printed = pieces.clone().map(|pieces| Lines { sink: StderrSink::new(stderr, pieces) }.with_filter(least));
     Registry::default().with(filter).with(Lines { sink: board }).with(printed).try_init()?;
     Ok(Log(pieces))
+}
+
+fn filter_of(chosen: &str) -> Result<EnvFilter, ParseError> {
+    Ok(EnvFilter::try_new(chosen)?.add_directive(format!("{}=error", panics::TARGET).parse()?))
 }
 
 /// Where formatted lines go.
@@ -290,8 +296,7 @@ mod tests {
 
     fn lines(filter: &str, log: impl FnOnce()) -> Vec<(Level, String)> {
         let kept = Kept::default();
-        let subscriber =
-            Registry::default().with(EnvFilter::try_new(filter).unwrap()).with(Lines { sink: kept.clone() });
+        let subscriber = Registry::default().with(filter_of(filter).unwrap()).with(Lines { sink: kept.clone() });
         tracing::subscriber::with_default(subscriber, log);
         let lines = kept.0.lock().unwrap();
         lines.iter().map(|line| (line.level, line.text.clone())).collect()
@@ -326,6 +331,14 @@ mod tests {
         });
         let texts: Vec<_> = got.into_iter().map(|(_, text)| text).collect();
         assert_eq!(texts, ["one", "two", "three"]);
+    }
+
+    #[test]
+    fn a_panic_is_logged_whatever_the_filter() {
+        for filter in ["off", "rapid::rig=trace", DEFAULT, "error,rapid=off"] {
+            let got = lines(filter, || tracing::error!(target: panics::TARGET, "thread 'mask' panicked"));
+            assert_eq!(got, [(Level::Error, "thread 'mask' panicked".to_owned())], "{filter}");
+        }
     }
 
     #[test]

@@ -88,6 +88,14 @@ impl Outlet {
     }
 }
 
+/// Writes one text, and waits at most `within` for its reader.
+pub fn write_within(out: impl Write + Send + 'static, text: String, within: Duration) {
+    // Without a thread, or with a reader that is gone, there is nowhere left to say it.
+    let Ok(outlet) = Outlet::new("outlet", 1, out) else { return };
+    let _ = outlet.try_send(text.into_bytes());
+    outlet.finish_blocking(within);
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

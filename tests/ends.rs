@@ -8,10 +8,11 @@ mod support;
 use std::fs::File;
 use std::io::Read;
 use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
 use support::terminal::OnTerminal;
-use support::{Episode, Place, until};
+use support::{Episode, PATIENCE, Place, until};
 
 const RECORD: [&str; 6] = ["--sim", "--headless", "--json", "--record", "--out", "out"];
 
@@ -54,8 +55,50 @@ fn a_panic_anywhere_ends_the_run_with_a_whole_file_and_names_its_place() {
         assert_eq!(ended.status.code(), Some(1), "{at}: {said}");
         let error = said.lines().rfind(|line| line.starts_with("error: ")).unwrap_or_default();
         assert!(error.contains(named), "{at}: {said}");
+        assert!(said.contains(&format!("fault ordered for {at}")) && said.contains("src/fault.rs:"), "{at}: {said}");
         assert!(!place.mask_file().exists(), "{at}");
         assert!(whole_episode(&place, at).topic("/rapid/mask").count() > 0, "{at}");
+    }
+}
+
+/// The end to write to of a pipe that has no room left, and the end to read from.
+fn full_pipe() -> (std::io::PipeReader, std::io::PipeWriter) {
+    use rustix::fs::{OFlags, fcntl_setfl};
+    let (reader, mut writer) = std::io::pipe().expect("pipe");
+    fcntl_setfl(&writer, OFlags::NONBLOCK).expect("flags");
+    for piece in [4096, 1] {
+        while std::io::Write::write(&mut writer, &vec![b'x'; piece]).is_ok() {}
+    }
+    fcntl_setfl(&writer, OFlags::empty()).expect("flags");
+    (reader, writer)
+}
+
+#[test]
+fn a_panic_ends_a_run_whose_standard_error_nobody_reads() {
+    for at in ["mask", "main"] {
+        let place = Place::new();
+        let order = place.path("now");
+        let (_reader, writer) = full_pipe();
+        let output = File::create(place.path("output.txt")).expect("output file");
+        let mut command = place.command(&RECORD);
+        command.env("RAPID_FAULT", format!("{at}:{}", order.display())).stdout(output).stderr(writer);
+        let mut child = command.spawn().expect("rapid runs");
+        until("an episode", || {
+            std::fs::read_to_string(place.path("output.txt")).is_ok_and(|text| text.contains("\"event\":\"recording\""))
+        });
+        File::create(order).expect("order");
+        let mut status = None;
+        let begun = Instant::now();
+        while status.is_none() && begun.elapsed() < PATIENCE {
+            status = child.try_wait().expect("wait");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        // A run that does not end is not to outlive its test.
+        let _ = child.kill();
+        let _ = child.wait();
+        assert_eq!(status.and_then(|status| status.code()), Some(1), "{at}");
+        assert!(!place.mask_file().exists(), "{at}");
+        whole_episode(&place, at);
     }
 }
 

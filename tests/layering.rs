@@ -21,7 +21,7 @@ use proc_macro2::{Delimiter, TokenStream, TokenTree};
 /// Modules by layer, lowest first. A module sees those of lower layers.
 const LAYERS: &[&[&str]] = &[
     &["modality", "mask", "sample", "time", "action", "provenance", "flash"],
-    &["registry", "status", "text", "outlet", "folder", "episode_format", "fault"],
+    &["registry", "status", "text", "outlet", "folder", "episode_format", "fault", "panics"],
     &["hotplug", "driver", "bus", "sync", "calibration"],
     &["rig", "record", "policy", "control"],
     &["app", "tui", "headless", "logging"],
@@ -41,9 +41,9 @@ const SIDEWAYS: &[(&str, &[&str])] = &[
 
 /// Modules that see less than their layer would let them: besides layer 0 only these.
 const NARROW: &[(&str, &[&str], &str)] = &[
-    ("tui", &["status", "registry", "text", "outlet"], "a screen knows snapshots and commands, no stage"),
+    ("tui", &["status", "registry", "text", "outlet", "panics"], "a screen knows snapshots and commands, no stage"),
     ("headless", &["status", "registry", "text", "outlet"], "a screen knows snapshots and commands, no stage"),
-    ("logging", &["status", "text", "outlet"], "the log goes to the board and knows no stage"),
+    ("logging", &["status", "text", "outlet", "panics"], "the log goes to the board and knows no stage"),
 ];
 
 /// The homes of third-party crates: modules, or files of them (`driver/camera`).

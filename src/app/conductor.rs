@@ -1,18 +1,21 @@
 //! The conductor: does what the user, the command line and the clock ask for, until one of them asks
 //! for the end.
+//!
+//! Invariant: whether an episode is in progress is known to the recorder alone, and asked of it.
 
 use std::sync::Arc;
 use std::time::Duration;
 
+use tokio::sync::broadcast::error::{RecvError, TryRecvError};
 use tokio::sync::{broadcast, mpsc};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
 use tokio_util::sync::CancellationToken;
 
 use super::{AppError, Running, Screen, screen_ended};
 use crate::fault;
-use crate::record::{EpisodeRequest, Recorder};
+use crate::record::{EpisodeRequest, RecordError, Recorder};
 use crate::rig::RigCommand;
-use crate::status::{Board, Command, Event, SlotState, What};
+use crate::status::{Board, Command, EpisodeEnd, Event, SlotState, What};
 
 /// An episode asked for at the start begins when every attached device delivers, at the latest
 /// after this time.
@@ -32,7 +35,8 @@ pub(super) struct Conductor {
     pub(super) episode: EpisodeRequest,
     pub(super) record: bool,
     pub(super) duration: Option<Duration>,
-    pub(super) recording: bool,
+    /// An episode is still to begin, as soon as every device delivers.
+    pub(super) begin_episode: bool,
 }
 
 impl Conductor {
@@ -45,7 +49,6 @@ impl Conductor {
             (false, Some(duration)) => Some(begun + duration),
             _ => None,
         };
-        let mut begin_episode = self.record;
         // Nobody reads the output any more, and how that came.
         let mut output = Ok(());
         loop {
@@ -61,22 +64,23 @@ impl Conductor {
                     outcome if self.record && running.kind != Screen::Monitor => output = outcome,
                     outcome => return outcome,
                 },
+                // Before what is asked: how the last episode ended comes before the next one.
+                event = self.events.recv() => {
+                    if self.episode_ended(event)? { return output; }
+                }
                 Some(command) = running.asked.recv() => match command {
                     Command::ToggleRecording => self.toggle().await?,
                     // A rig that is so far behind will not get to it in time either.
                     Command::Restart(id) => { let _ = self.rig_commands.try_send(RigCommand::Restart(id)); }
                     Command::Quit => return output,
                 },
-                event = self.events.recv() => {
-                    if self.episode_ended(event)? { return output; }
-                }
                 // After the events: what became of its episode says more.
                 () = self.writer_ended.cancelled() => return Err(AppError::Panicked("thread `writer`")),
                 never = fault::strike("main") => never,
-                _ = look.tick(), if begin_episode => {
+                _ = look.tick(), if self.begin_episode => {
                     if self.has_settled(begun) {
-                        begin_episode = false;
-                        self.start().await?;
+                        self.begin_episode = false;
+                        self.recorder.start(self.episode.clone()).await?;
                     }
                 }
                 () = sleep_until(end.unwrap_or(begun)), if end.is_some() => return output,
@@ -91,60 +95,58 @@ impl Conductor {
         waited >= SETTLE_LIMIT || (waited >= SETTLE_LEAST && !opening)
     }
 
+    /// Ends the episode in progress, or begins one: also that which is to begin when all deliver.
     async fn toggle(&mut self) -> Result<(), AppError> {
-        if self.recording {
-            // What became of it is announced as an event and shown by the screen.
-            let _ = self.recorder.stop().await;
-            self.recording = false;
-            return Ok(());
+        self.begin_episode = false;
+        // What became of an episode is announced as an event and shown by the screen.
+        let Err(RecordError::Idle) = self.recorder.stop().await else { return Ok(()) };
+        if let Err(error) = self.recorder.start(self.episode.clone()).await {
+            // In the monitor, a full disk is no reason to leave: it is said and can be mended.
+            tracing::error!(%error, "the episode was not begun");
         }
-        match self.start().await {
-            Err(AppError::Record(error)) => {
-                // In the monitor, a full disk is no reason to leave: it is said and can be mended.
-                tracing::error!(%error, "the episode was not begun");
-                Ok(())
-            }
-            outcome => outcome,
-        }
-    }
-
-    async fn start(&mut self) -> Result<(), AppError> {
-        self.recorder.start(self.episode.clone()).await?;
-        self.recording = true;
         Ok(())
     }
 
     /// Ends the episode in progress, if there is one; an error if its file is not whole.
     pub(super) async fn finish_episode(&mut self) -> Result<(), AppError> {
-        if !std::mem::take(&mut self.recording) {
-            return Ok(());
-        }
         if let Ok(report) = self.recorder.stop().await {
             return match report.error {
                 Some(reason) => Err(AppError::Episode { file: report.file, reason }),
                 None => Ok(()),
             };
         }
-        // It ended by itself while the run did: how, is among the events that nobody took.
-        while let Ok(event) = self.events.try_recv() {
-            if let What::Episode { file, error: Some(reason), .. } = event.what {
+        // It may have ended by itself while the run did: how, is among the events that nobody took.
+        loop {
+            let event = match self.events.try_recv() {
+                Ok(event) => Ok(event),
+                Err(TryRecvError::Lagged(count)) => Err(RecvError::Lagged(count)),
+                Err(TryRecvError::Empty | TryRecvError::Closed) => return Ok(()),
+            };
+            if let Some(EpisodeEnd { file, error: Some(reason) }) = self.end_in(event) {
                 return Err(AppError::Episode { file, reason });
             }
         }
-        Ok(())
     }
 
     /// True when the episode the run was for has ended.
-    fn episode_ended(&mut self, event: Result<Event, broadcast::error::RecvError>) -> Result<bool, AppError> {
-        let Ok(Event { what: What::Episode { file, error, .. }, .. }) = event else { return Ok(false) };
-        self.recording = false;
-        if !self.record {
-            return Ok(false);
-        }
+    fn episode_ended(&mut self, event: Result<Event, RecvError>) -> Result<bool, AppError> {
+        let Some(EpisodeEnd { file, error }) = self.end_in(event).filter(|_| self.record) else { return Ok(false) };
         match error {
             Some(reason) => Err(AppError::Episode { file, reason }),
             // The first episode was asked for on the command line; with a duration it was all.
             None => Ok(self.duration.is_some()),
         }
     }
+
+    /// The end of an episode that this event tells of, or that events which were missed may have.
+    fn end_in(&self, event: Result<Event, RecvError>) -> Option<EpisodeEnd> {
+        match event {
+            Ok(Event { what: What::Episode { file, error, .. }, .. }) => Some(EpisodeEnd { file, error }),
+            Err(RecvError::Lagged(_)) => self.board.last_end(),
+            Ok(_) | Err(RecvError::Closed) => None,
+        }
+    }
 }
+
+#[cfg(test)]
+mod tests;

@@ -289,7 +289,7 @@ impl<'a> Section<'a> {
 
     pub(super) fn size(&self, problems: &mut Problems<'_>, key: &str, range: RangeInclusive<u64>) -> Option<u64> {
         let bounds = format!("{} to {}", show_size(*range.start()), show_size(*range.end()));
-        let example = format!("write {bounds} with a unit (B, KiB, MiB, GiB), for example {key} = \"4MiB\"");
+        let example = format!("write {bounds} with a unit (B, KiB, MiB, GiB, TiB), for example {key} = \"4MiB\"");
         match self.field(key)?.get_ref() {
             DeValue::String(text) => match parse_size(text) {
                 Some(size) if range.contains(&size) => return Some(size),

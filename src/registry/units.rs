@@ -5,14 +5,16 @@ use std::time::Duration;
 const DURATIONS: [(&str, f64); 7] =
     [("ns", 1e-9), ("us", 1e-6), ("ms", 1e-3), ("s", 1.0), ("min", 60.0), ("m", 60.0), ("h", 3600.0)];
 
-const SIZES: [(&str, u64); 7] = [
+const SIZES: [(&str, u64); 9] = [
     ("B", 1),
     ("kB", 1_000),
     ("MB", 1_000_000),
     ("GB", 1_000_000_000),
+    ("TB", 1_000_000_000_000),
     ("KiB", 1 << 10),
     ("MiB", 1 << 20),
     ("GiB", 1 << 30),
+    ("TiB", 1 << 40),
 ];
 
 /// `25ms`, `1.5s`, `2 min`. `None` without a unit, or when it is no duration.
@@ -60,7 +62,7 @@ pub fn show_duration(duration: Duration) -> String {
 /// A size in the largest binary unit of which it is at least one, to one decimal.
 #[must_use]
 pub fn show_size(bytes: u64) -> String {
-    for (unit, shift) in [("GiB", 30), ("MiB", 20), ("KiB", 10)] {
+    for (unit, shift) in [("TiB", 40), ("GiB", 30), ("MiB", 20), ("KiB", 10)] {
         let one = 1_u64 << shift;
         if bytes >= one {
             let whole = bytes.is_multiple_of(one);
@@ -107,6 +109,8 @@ mod tests {
             ("2MB", Some(2_000_000)),
             ("1.5GiB", Some(3 << 29)),
             ("4096B", Some(4096)),
+            ("1TiB", Some(1 << 40)),
+            ("0.5TB", Some(500_000_000_000)),
             ("4096", None),
             ("MiB", None),
             ("99999999999999GiB", None),
@@ -123,6 +127,7 @@ mod tests {
         }
         assert_eq!(show_size(512 << 20), "512MiB");
         assert_eq!(show_size(614_400), "600KiB");
+        assert_eq!((show_size(1 << 40), show_size(0)), ("1TiB".to_owned(), "0B".to_owned()));
         assert_eq!(show_size(1_500_000), "1.4MiB");
     }
 }

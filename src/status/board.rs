@@ -53,6 +53,15 @@ impl StreamCounters {
     }
 }
 
+/// The end of an episode: its file, and why that is not whole, if it is not.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct EpisodeEnd {
+    /// As in `What::Episode`.
+    pub file: PathBuf,
+    /// As in `What::Episode`.
+    pub error: Option<String>,
+}
+
 #[derive(Debug, Clone, Default)]
 struct Slot {
     state: SlotState,
@@ -72,6 +81,7 @@ pub struct Board {
     mask_sequence: AtomicU64,
     recording: Mutex<Option<RecordingStatus>>,
     last_episode: Mutex<Option<(PathBuf, Verdict)>>,
+    last_end: Mutex<Option<EpisodeEnd>>,
     log: Mutex<VecDeque<LogLine>>,
     events: broadcast::Sender<Event>,
 }
@@ -92,6 +102,7 @@ impl Board {
             mask_sequence: AtomicU64::new(0),
             recording: Mutex::new(None),
             last_episode: Mutex::new(None),
+            last_end: Mutex::new(None),
             log: Mutex::new(VecDeque::with_capacity(LOG_LINES)),
             events: broadcast::channel(EVENT_DEPTH).0,
         }
@@ -150,8 +161,17 @@ impl Board {
         if let Some((level, text)) = what.sentence() {
             self.log(LogLine { wall_ns: realtime_ns(), level, text });
         }
+        if let What::Episode { file, error, .. } = &what {
+            *lock(&self.last_end) = Some(EpisodeEnd { file: file.clone(), error: error.clone() });
+        }
         // An error only says that nobody listens.
         let _ = self.events.send(Event { stamp: Stamp::now(), what });
+    }
+
+    /// How the last episode ended that was announced: for who missed events.
+    #[must_use]
+    pub fn last_end(&self) -> Option<EpisodeEnd> {
+        lock(&self.last_end).clone()
     }
 
     /// All events from now on.

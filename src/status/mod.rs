@@ -21,7 +21,7 @@ use crate::modality::ModalityId;
 use crate::sample::Epoch;
 use crate::time::Stamp;
 
-pub use board::Board;
+pub use board::{Board, EpisodeEnd};
 pub use event::{Event, Provenance, What};
 pub use verdict::{Grade, Verdict};
 

@@ -1,12 +1,11 @@
 //! The terminal: taken for the screen, given back as it was found.
 //!
 //! A panic anywhere while the screen is up would write its message into the picture, and a panic that
-//! a supervisor survives must not end the picture. So messages of panics are held back, told to the
-//! log, and printed once the terminal is given back.
+//! a supervisor survives must not end the picture. So messages of panics are kept, and printed once
+//! the terminal is given back.
 
 use std::fs::File;
 use std::io::{self, IsTerminal, Write};
-use std::panic::PanicHookInfo;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
 use std::time::Duration;
@@ -22,17 +21,13 @@ use super::model::Model;
 use super::theme::Theme;
 use super::view;
 use crate::outlet::Outlet;
+use crate::panics;
 
 /// How long a terminal that is behind may take for the last frame before it is left.
 const LAST_FRAME: Duration = Duration::from_millis(500);
 
 /// The screen is up.
 static UP: AtomicBool = AtomicBool::new(false);
-/// The panic hook is in place: it stays for the life of the process, as a hook cannot be taken out
-/// from between others.
-static HOOKED: AtomicBool = AtomicBool::new(false);
-/// Messages of panics while the screen was up.
-static HELD_BACK: Mutex<Vec<String>> = Mutex::new(Vec::new());
 
 /// The terminal while it shows the monitor.
 pub(super) struct Screen {
@@ -107,13 +102,13 @@ pub(super) fn writer() -> io::Result<Box<dyn Write>> {
 
 /// Takes the terminal, until [`give_back`]: keys come as they are typed.
 pub(super) fn take() -> io::Result<()> {
-    hook();
     enable_raw_mode()?;
+    panics::keep();
     UP.store(true, Ordering::SeqCst);
     Ok(())
 }
 
-/// Restores the terminal and prints what was held back. Errors are passed over: there is no terminal
+/// Restores the terminal and prints what was kept. Errors are passed over: there is no terminal
 /// left to tell them to.
 pub(super) fn give_back() {
     if !UP.swap(false, Ordering::SeqCst) {
@@ -130,33 +125,12 @@ pub(super) fn give_back() {
     let left = std::thread::Builder::new().name("screen".to_owned()).spawn(leave).is_ok()
         && is_done.recv_timeout(LAST_FRAME).is_ok();
     let _ = disable_raw_mode();
-    let messages = std::mem::take(&mut *lock(&HELD_BACK));
+    let messages = panics::release();
     if left {
         for message in messages {
             let _ = writeln!(io::stderr(), "{message}");
         }
     }
-}
-
-fn hook() {
-    if HOOKED.swap(true, Ordering::SeqCst) {
-        return;
-    }
-    let previous = std::panic::take_hook();
-    std::panic::set_hook(Box::new(move |info: &PanicHookInfo<'_>| {
-        if !UP.load(Ordering::SeqCst) {
-            return previous(info);
-        }
-        if cfg!(panic = "abort") {
-            // Nothing is dropped any more.
-            give_back();
-            return previous(info);
-        }
-        let thread = std::thread::current();
-        let message = format!("thread '{}' {info}", thread.name().unwrap_or("unnamed"));
-        tracing::error!("{message}");
-        lock(&HELD_BACK).push(message);
-    }));
 }
 
 /// The bytes of the frame being drawn.

@@ -86,24 +86,68 @@ impl Recovered {
 
 impl Repaired {
     fn sentence(&self) -> String {
-        let mut said = format!("repaired, {:.1} s, {} messages", self.seconds, text::count(self.messages));
+        let mut said = format!("repaired, {:.1} s, {}", self.seconds, counted(self.messages, "message"));
         let mut but = |text: String| {
             said.push_str("; ");
             said.push_str(&text);
         };
-        let bytes = text::count(self.unread_bytes);
+        let unread = counted(self.unread_bytes, "byte");
         match self.end {
             FileEnd::Finished => {}
             FileEnd::Unfinished => but("the last second may be missing".to_owned()),
-            FileEnd::Torn => but(format!("the last second may be missing: {bytes} bytes at the end were torn")),
-            FileEnd::Damaged => but(format!("the last {bytes} bytes cannot be read")),
+            FileEnd::Torn => {
+                let were = if self.unread_bytes == 1 { "was" } else { "were" };
+                but(format!("the last second may be missing: {unread} at the end {were} torn"));
+            }
+            FileEnd::Damaged => but(format!("the last {unread} cannot be read")),
         }
-        if self.damaged_chunks > 0 {
-            but(format!("{} damaged chunks are left out", text::count(self.damaged_chunks)));
+        match self.damaged_chunks {
+            0 => {}
+            1 => but("1 damaged chunk is left out".to_owned()),
+            chunks => but(format!("{} damaged chunks are left out", text::count(chunks))),
         }
-        if self.refused_records > 0 {
-            but(format!("{} records that make no sense are left out", text::count(self.refused_records)));
+        match self.refused_records {
+            0 => {}
+            1 => but("1 record that makes no sense is left out".to_owned()),
+            records => but(format!("{} records that make no sense are left out", text::count(records))),
         }
         said
+    }
+}
+
+fn counted(count: u64, what: &str) -> String {
+    format!("{} {what}{}", text::count(count), if count == 1 { "" } else { "s" })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_is_said_as_one() {
+        let said = |count| {
+            let repaired = Repaired {
+                to: "a.mcap".into(),
+                original: None,
+                end: FileEnd::Torn,
+                messages: count,
+                last: String::new(),
+                seconds: 1.0,
+                unread_bytes: count,
+                damaged_chunks: count,
+                refused_records: count,
+            };
+            repaired.sentence()
+        };
+        assert_eq!(
+            said(1),
+            "repaired, 1.0 s, 1 message; the last second may be missing: 1 byte at the end was torn; \
+             1 damaged chunk is left out; 1 record that makes no sense is left out"
+        );
+        assert_eq!(
+            said(2000),
+            "repaired, 1.0 s, 2,000 messages; the last second may be missing: 2,000 bytes at the end were torn; \
+             2,000 damaged chunks are left out; 2,000 records that make no sense are left out"
+        );
     }
 }

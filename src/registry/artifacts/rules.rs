@@ -80,7 +80,8 @@ const fn subsystem(device: &DeviceSpec) -> &'static str {
     }
 }
 
-const fn opens(device: &DeviceSpec) -> Opens {
+/// Which node of its device an entry is read from.
+pub(super) const fn opens(device: &DeviceSpec) -> Opens {
     match &device.node {
         NodeSpec::Camera(_) => Opens::Video,
         NodeSpec::Serial(_) => Opens::Tty,

@@ -77,6 +77,24 @@ fn a_unit_is_named_by_serial_by_port_or_as_the_only_one_of_its_model() {
 }
 
 #[test]
+fn the_service_may_open_usb_devices_only_where_a_program_does() {
+    let program = "[device.a]\nvid = \"1\"\npid = \"1\"\nnode = \"p\"\n";
+    let tty = format!("{program}[device.a.process]\nopens = \"tty\"\n");
+    for (text, usb) in [(program, true), (tty.as_str(), false), (crate::registry::BUILTIN, false)] {
+        let all = artifacts(&Registry::parse(text, None).unwrap().registry);
+        let (rules, unit) = (text_of(&all, "99-rapid.rules"), text_of(&all, "rapid.service"));
+        let lines: Vec<_> = unit.lines().collect();
+        assert_eq!(rules.contains("GROUP=\"plugdev\""), usb, "{rules}");
+        assert_eq!(lines.contains(&"DeviceAllow=char-usb_device rw"), usb, "{unit}");
+        let groups = lines.iter().find_map(|line| line.strip_prefix("SupplementaryGroups=")).unwrap();
+        assert_eq!(groups.split(' ').any(|group| group == "plugdev"), usb, "{unit}");
+        let user = format!("--groups {} rapid", groups.replace(' ', ","));
+        assert!(lines.iter().any(|line| line.ends_with(&user)), "{unit}");
+        assert_eq!(unit.contains("groupadd --system --force plugdev"), usb, "{unit}");
+    }
+}
+
+#[test]
 fn a_serial_number_that_no_rule_can_match_gets_a_comment() {
     let rules = text_of(&artifacts(&with_serial("a\", RUN+=\"reboot")), "99-rapid.rules");
     assert_eq!(rule_lines(&rules).len(), 2);

@@ -1,7 +1,7 @@
 //! `rapid.service`: records without a screen from boot to shutdown.
 
-use super::HEADER;
-use crate::registry::spec::Registry;
+use super::{HEADER, rules};
+use crate::registry::spec::{Opens, Registry};
 
 /// Where the unit expects the registry.
 pub const SYSTEM_REGISTRY: &str = "/etc/rapid/devices.toml";
@@ -10,10 +10,20 @@ pub const SYSTEM_REGISTRY: &str = "/etc/rapid/devices.toml";
 /// digits, `-`, `_` and `.`, none of which systemd interprets.
 pub(super) fn unit(registry: &Registry) -> String {
     let rig = &registry.rig.name;
+    // Programs that open the USB device itself; the group is that of the rules.
+    let usb = registry.devices.iter().any(|device| rules::opens(device) == Opens::Usb);
+    let (make_group, group, allow) = if usb {
+        ("#   groupadd --system --force plugdev\n", " plugdev", "DeviceAllow=char-usb_device rw\n")
+    } else {
+        ("", "", "")
+    };
+    let groups = format!("video dialout{group}");
+    let listed = groups.replace(' ', ",");
+    let touched = if usb { "cameras, serial lines, USB devices" } else { "cameras, serial lines" };
     format!(
         r"{HEADER}
 # Before the first start:
-#   useradd --system --no-create-home --groups video,dialout rapid
+{make_group}#   useradd --system --no-create-home --groups {listed} rapid
 #   install -D -m 644 devices.toml {SYSTEM_REGISTRY}
 [Unit]
 Description=rapid: sensors and recording of rig {rig}
@@ -25,7 +35,7 @@ ConditionPathExists={SYSTEM_REGISTRY}
 Type=exec
 ExecStart=/usr/local/bin/rapid --headless --record --config {SYSTEM_REGISTRY} --out /var/lib/rapid
 User=rapid
-SupplementaryGroups=video dialout
+SupplementaryGroups={groups}
 StateDirectory=rapid
 # SIGINT ends the episode in progress and closes its file; that takes one fsync.
 KillSignal=SIGINT
@@ -33,17 +43,16 @@ KillMode=mixed
 TimeoutStopSec=30
 Restart=on-failure
 RestartSec=2
-# The mask and control threads ask for real-time scheduling; shared memory is locked in place.
+# The thread `mask` asks for real-time scheduling.
 LimitRTPRIO=80
-LimitMEMLOCK=infinity
 
-# What it may touch: cameras, serial lines, its recordings, and the bus that other programs
+# What it may touch: {touched}, its recordings, and the bus that other programs
 # subscribe to in /tmp and /dev/shm (which is why /tmp is not private).
 DevicePolicy=closed
 DeviceAllow=char-video4linux rw
 DeviceAllow=char-ttyACM rw
 DeviceAllow=char-ttyUSB rw
-ReadWritePaths=/tmp /dev/shm
+{allow}ReadWritePaths=/tmp /dev/shm
 ProtectSystem=strict
 ProtectHome=yes
 ProtectKernelModules=yes

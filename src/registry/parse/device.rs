@@ -1,5 +1,6 @@
 //! One `[device.NAME]` table.
 
+use std::path::Path;
 use std::time::Duration;
 
 use super::program::Programs;
@@ -109,6 +110,14 @@ impl Draft<'_> {
             NodeSpec::Serial(_) => Opens::Tty,
             NodeSpec::Process(process) => process.opens,
         })
+    }
+
+    /// The program that reads it, if one does.
+    pub(super) fn program(&self) -> Option<&Path> {
+        match self.node.as_ref()? {
+            NodeSpec::Process(process) => Some(&process.program),
+            NodeSpec::Camera(_) | NodeSpec::Serial(_) => None,
+        }
     }
 
     pub(super) fn is_camera(&self) -> bool {

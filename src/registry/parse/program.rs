@@ -3,14 +3,15 @@
 //! 1. An absolute path is taken as it is.
 //! 2. A name is looked for beside the registry's file, then in the absolute directories of `PATH`.
 //!
-//! Invariant: as root, a program that others could change is refused.
+//! Invariant: a program that others could change is refused as root, and warned of otherwise.
 
 use std::ffi::OsString;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
-use crate::registry::diagnostic::nearest;
-use crate::registry::section::printable;
+use super::device::Draft;
+use crate::registry::diagnostic::{Diagnostic, nearest};
+use crate::registry::section::{Problems, printable};
 use crate::registry::trust::distrust;
 
 /// Files beside the registry that are compared with a name that is not found.
@@ -119,6 +120,15 @@ fn trusted(path: &Path, label: &str) -> Result<(), Wrong> {
     }
 }
 
+/// A warning for a program that others could change. As root it has been refused.
+pub(super) fn distrusted(draft: &Draft<'_>, problems: &Problems<'_>) -> Option<Diagnostic> {
+    let path = draft.program()?;
+    // What is not looked for, as nothing will be run, is not there either.
+    let reason = distrust(path).ok().flatten()?;
+    let message = format!("the program {}: {reason}", printable(&path.display().to_string()));
+    Some(problems.diagnostic(draft.section.at_of("node"), &draft.section.entry, message, reason.fix()))
+}
+
 #[cfg(test)]
 mod tests {
     use std::fs::{create_dir, set_permissions, write};
@@ -150,6 +160,29 @@ mod tests {
         }
         assert!(message("folder").0.contains("neither built in nor a program"));
         assert_eq!(Programs::Nowhere.find("anything").unwrap(), Path::new("anything"));
+    }
+
+    #[test]
+    fn a_program_that_others_could_change_is_refused_as_root_and_warned_of_otherwise() {
+        use crate::registry::Registry;
+        let dir = tempfile::tempdir().unwrap();
+        allow(dir.path(), 0o755);
+        let (file, program) = (dir.path().join("devices.toml"), dir.path().join("p"));
+        write(&program, "").unwrap();
+        let text = "[device.a]\nvid = \"1\"\npid = \"2\"\nbit = 0\nnode = \"p\"\n";
+        let told = |mode| {
+            allow(&program, mode);
+            match Registry::parse(text, Some(&file)) {
+                Ok(loaded) => (loaded.warnings, false),
+                Err(errors) => (errors.diagnostics, true),
+            }
+        };
+        assert_eq!(told(0o755), (Vec::new(), false));
+        let (diagnostics, refused) = told(0o777);
+        assert_eq!(refused, rustix::process::geteuid().is_root());
+        assert_eq!(diagnostics.len(), 1, "{diagnostics:?}");
+        assert!(diagnostics[0].message.ends_with("p: other users may write to it (mode 0777)"), "{diagnostics:?}");
+        assert_eq!((diagnostics[0].entry.as_deref(), diagnostics[0].line), (Some("device.a"), 5));
     }
 
     #[test]

@@ -95,7 +95,7 @@ chown $(key User): /var/lib/rapid
 mount -o remount,bind,ro /
 touch /etc/written 2>/dev/null && { echo 'the system is not read-only'; exit 1; }
 cd /
-exec prlimit --rtprio=$(key LimitRTPRIO) --memlock=unlimited env -i PATH=/usr/bin --default-signal=INT \
+exec prlimit --rtprio=$(key LimitRTPRIO) env -i PATH=/usr/bin --default-signal=INT \
   setpriv --reuid=$(key User) --regid=$(key User) --groups="$(getent group $(key SupplementaryGroups) | cut -d: -f3 | paste -sd,)" \
   --inh-caps=-all --bounding-set=-all --no-new-privs $(key ExecStart) --json
 END

@@ -1,0 +1,225 @@
+use std::fs::File;
+use std::io;
+
+use tokio::task::JoinHandle;
+
+use super::super::Signals;
+use super::*;
+use crate::bus::TopicId;
+use crate::record::{RecorderConfig, Sink, Source};
+use crate::registry::Registry;
+use crate::sample::{Epoch, SampleHeader};
+use crate::status::{Level, Verdict};
+
+/// How long a condition may take to come true.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+/// A bus on which nothing is published.
+struct Quiet;
+
+impl Source for Quiet {
+    fn wait(&mut self, _: Duration) -> Result<(), String> {
+        std::thread::sleep(Duration::from_millis(1));
+        Ok(())
+    }
+
+    fn drain(&mut self, _: &mut dyn FnMut(TopicId, &SampleHeader, &[u8])) -> Result<(), String> {
+        Ok(())
+    }
+}
+
+/// A file that its disk loses at the end.
+struct Lost(File);
+
+impl io::Write for Lost {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0.write(bytes)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.0.flush()
+    }
+}
+
+impl Sink for Lost {
+    fn sync(&mut self) -> io::Result<()> {
+        Err(io::Error::other("lost"))
+    }
+}
+
+/// A conductor whose rig and screen do nothing.
+struct Bench {
+    conductor: Conductor,
+    running: Running,
+    keys: mpsc::Sender<Command>,
+    board: Arc<Board>,
+    out: tempfile::TempDir,
+}
+
+impl Bench {
+    fn new(record: bool, duration: Option<Duration>, sink: fn(File) -> Box<dyn Sink>) -> Self {
+        let registry = Arc::new(Registry::builtin());
+        let board = Arc::new(Board::new(&registry));
+        let out = tempfile::tempdir().unwrap();
+        let config = RecorderConfig { sink: Box::new(sink), ..RecorderConfig::new(registry, Arc::clone(&board)) };
+        let recorder = Recorder::spawn(Quiet, config).unwrap();
+        let (keys, asked) = mpsc::channel(16);
+        let episode =
+            EpisodeRequest { out: out.path().to_owned(), task: "test".to_owned(), tags: Vec::new(), duration: None };
+        let conductor = Conductor {
+            events: board.events(),
+            board: Arc::clone(&board),
+            writer_ended: recorder.ended(),
+            recorder,
+            rig_commands: mpsc::channel(1).0,
+            episode,
+            record,
+            duration,
+            begin_episode: record,
+        };
+        let running = Running {
+            rig: never(),
+            rig_ended: CancellationToken::new(),
+            rig_stop: CancellationToken::new(),
+            hurry: CancellationToken::new(),
+            mask_ended: CancellationToken::new(),
+            kind: Screen::Monitor,
+            screen: Some(never()),
+            screen_stop: CancellationToken::new(),
+            signals: Signals::listen().unwrap(),
+            asked,
+        };
+        Self { conductor, running, keys, board, out }
+    }
+
+    /// Files of episodes, finished or not.
+    fn files(&self) -> Vec<String> {
+        let entries = std::fs::read_dir(self.out.path()).unwrap();
+        let mut names: Vec<_> = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    }
+}
+
+fn never<T: Send + 'static>() -> JoinHandle<T> {
+    tokio::spawn(std::future::pending())
+}
+
+/// Waits until the file being recorded, if any, is as it should be.
+async fn until(board: &Board, what: &str, holds: impl Fn(Option<&str>) -> bool) {
+    let begun = std::time::Instant::now();
+    loop {
+        let recording = board.snapshot().recording;
+        if holds(recording.as_ref().and_then(|recording| recording.file.to_str())) {
+            return;
+        }
+        assert!(begun.elapsed() < PATIENCE, "{what} does not come true: {recording:?}");
+        std::thread::sleep(Duration::from_millis(1));
+        tokio::task::yield_now().await;
+    }
+}
+
+/// Lets everything else do what it can: the clock of the tests goes on when nobody has anything to do.
+async fn idle() {
+    tokio::time::sleep(2 * SETTLE_LIMIT).await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn keys_that_come_while_an_episode_ends_are_obeyed_one_after_the_other() {
+    let mut bench = Bench::new(false, None, |file| Box::new(file));
+    let keys = async {
+        let press = async |count: usize| {
+            for _ in 0..count {
+                bench.keys.send(Command::ToggleRecording).await.unwrap();
+            }
+        };
+        press(1).await;
+        until(&bench.board, "the first", |file| file.is_some()).await;
+        press(2).await;
+        until(&bench.board, "the second", |file| file.is_some_and(|file| file.ends_with("_002.mcap"))).await;
+        idle().await;
+        press(1).await;
+        until(&bench.board, "the end of the second", |file| file.is_none()).await;
+        bench.keys.send(Command::Quit).await.unwrap();
+    };
+    let (outcome, ()) = tokio::join!(bench.conductor.conduct(&mut bench.running), keys);
+    outcome.unwrap();
+    bench.conductor.finish_episode().await.unwrap();
+    let files = bench.files();
+    assert!(files.len() == 2 && !files.iter().any(|file| file.contains("partial")), "{files:?}");
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_key_while_devices_settle_begins_the_one_episode() {
+    let mut bench = Bench::new(true, None, |file| Box::new(file));
+    let silent = Registry::builtin().devices[0].id;
+    bench.board.set_slot(silent, SlotState::Opening, Epoch(1), "");
+    let keys = async {
+        bench.keys.send(Command::ToggleRecording).await.unwrap();
+        until(&bench.board, "an episode", |file| file.is_some()).await;
+        idle().await;
+        bench.keys.send(Command::Quit).await.unwrap();
+    };
+    let (outcome, ()) = tokio::join!(bench.conductor.conduct(&mut bench.running), keys);
+    outcome.unwrap();
+    bench.conductor.finish_episode().await.unwrap();
+    assert_eq!(bench.files().len(), 1, "{:?}", bench.files());
+}
+
+#[tokio::test]
+async fn the_last_episode_whose_file_fails_is_an_error_of_the_run() {
+    let mut bench = Bench::new(false, None, |file| Box::new(Lost(file)));
+    for _ in 0..3 {
+        bench.conductor.toggle().await.unwrap();
+    }
+    let error = bench.conductor.finish_episode().await.unwrap_err().to_string();
+    assert!(error.contains("_002.mcap.partial") && error.contains("lost"), "{error}");
+}
+
+fn ended(error: Option<&str>) -> What {
+    What::Episode {
+        file: "a.mcap".into(),
+        seconds: 1.0,
+        messages: 1,
+        bytes: 1,
+        dropped: 0,
+        error: error.map(str::to_owned),
+        verdict: Verdict::default(),
+    }
+}
+
+/// More events than wait for a reader.
+fn flood(board: &Board) {
+    for _ in 0..10_000 {
+        board.announce(What::Log { level: Level::Info, text: String::new() });
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn an_end_among_missed_events_ends_the_run_all_the_same() {
+    for error in [None, Some("torn")] {
+        let mut bench = Bench::new(true, Some(Duration::from_secs(1)), |file| Box::new(file));
+        bench.conductor.begin_episode = false;
+        bench.board.announce(ended(error));
+        flood(&bench.board);
+        let conducted = tokio::time::timeout(PATIENCE, bench.conductor.conduct(&mut bench.running)).await;
+        let said = conducted.expect("an end").err().map(|error| error.to_string());
+        assert_eq!(said.as_deref(), error.map(|_| "a.mcap: torn"));
+    }
+}
+
+#[tokio::test]
+async fn an_end_that_came_while_the_run_ended_is_found_before_and_after_missed_events() {
+    for end_first in [true, false] {
+        let mut bench = Bench::new(true, None, |file| Box::new(file));
+        if end_first {
+            bench.board.announce(ended(Some("torn")));
+            flood(&bench.board);
+        } else {
+            flood(&bench.board);
+            bench.board.announce(ended(Some("torn")));
+        }
+        let error = bench.conductor.finish_episode().await.unwrap_err();
+        assert_eq!(error.to_string(), "a.mcap: torn");
+    }
+}

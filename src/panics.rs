@@ -1,0 +1,83 @@
+//! Panics: where their messages go while the rig runs.
+//!
+//! The hook that Rust brings writes to standard error and waits for its reader, before anything is
+//! unwound: with a pipe that nobody reads, the thread would stand still and nobody would learn that it
+//! has panicked. So messages go to the log, which waits for nobody. While a screen has the terminal
+//! they are kept as well, to be printed once it is given back.
+//!
+//! Invariant: only this module sets the hook; it stays for the life of the process, as a hook cannot
+//! be taken out from between others.
+
+use std::backtrace::{Backtrace, BacktraceStatus};
+use std::panic::PanicHookInfo;
+use std::sync::{Mutex, MutexGuard, Once, PoisonError};
+
+/// The target of the log lines made here.
+pub const TARGET: &str = "rapid::panics";
+
+/// Where messages go.
+#[derive(Debug)]
+enum Goes {
+    /// To standard error, as Rust does it.
+    Stderr,
+    /// To the log.
+    Log,
+    /// To the log and here.
+    Kept(Vec<String>),
+}
+
+static GOES: Mutex<Goes> = Mutex::new(Goes::Stderr);
+static HOOK: Once = Once::new();
+
+/// From now on messages go to the log.
+pub fn to_log() {
+    set(Goes::Log);
+}
+
+/// From now on messages go to the log and are kept.
+pub fn keep() {
+    set(Goes::Kept(Vec::new()));
+}
+
+/// The messages kept. From now on they go to standard error.
+#[must_use]
+pub fn release() -> Vec<String> {
+    match std::mem::replace(&mut *goes(), Goes::Stderr) {
+        Goes::Kept(messages) => messages,
+        Goes::Stderr | Goes::Log => Vec::new(),
+    }
+}
+
+fn set(to: Goes) {
+    HOOK.call_once(|| {
+        let rust = std::panic::take_hook();
+        std::panic::set_hook(Box::new(move |info| {
+            if matches!(*goes(), Goes::Stderr) {
+                return rust(info);
+            }
+            tell(info);
+        }));
+    });
+    *goes() = to;
+}
+
+fn tell(info: &PanicHookInfo<'_>) {
+    let thread = std::thread::current();
+    let message = format!("thread '{}' {info}", thread.name().unwrap_or("unnamed"));
+    tracing::error!(target: TARGET, "{message}");
+    // Only if RUST_BACKTRACE asks for it; a line of the log is no place for all of it.
+    let backtrace = Backtrace::capture();
+    if backtrace.status() == BacktraceStatus::Captured {
+        for line in backtrace.to_string().lines() {
+            tracing::error!(target: TARGET, "{line}");
+        }
+    }
+    if let Goes::Kept(messages) = &mut *goes() {
+        messages.push(message);
+    }
+}
+
+/// A poisoned lock here guards whole values: go on with them.
+fn goes() -> MutexGuard<'static, Goes> {
+    GOES.lock().unwrap_or_else(PoisonError::into_inner)
+}
