@@ -13,7 +13,7 @@ use super::RecordError;
 use super::lock::{self, Lock};
 use crate::folder::{Folder, FolderError, Links, Missing};
 use crate::status::Verdict;
-use crate::time;
+use crate::{text, time};
 
 /// Extension of a file that is not finished.
 pub(super) const PARTIAL: &str = "partial";
@@ -42,6 +42,7 @@ pub struct EpisodeRequest {
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct EpisodeReport {
     /// The file; `.partial` remains at its end if it could not be finished.
+    #[serde(serialize_with = "text::lossy")]
     pub file: PathBuf,
     /// Length in seconds.
     pub seconds: f64,
@@ -82,7 +83,7 @@ impl EpisodePath {
         let first = next_number(&folder, &stem).map_err(refused)?;
         for number in first..first.saturating_add(ATTEMPTS) {
             let name = format!("{stem}{number:03}.mcap");
-            let partial = format!("{name}.partial");
+            let partial = format!("{name}.{PARTIAL}");
             if folder.has(&name) {
                 continue;
             }

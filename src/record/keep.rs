@@ -88,9 +88,16 @@ fn whereabouts(path: &EpisodePath, file: &File) -> io::Result<Whereabouts> {
     // proc(5): the name the file has now.
     let there = fs::read_link(format!("/proc/self/fd/{}", file.as_raw_fd()))?;
     if is_ours(&there) {
-        return Ok(Whereabouts::Moved(there));
+        return Ok(if is_hidden(&there) { Whereabouts::Removed } else { Whereabouts::Moved(there) });
     }
     Err(io::Error::new(io::ErrorKind::NotFound, "the file is in none of the folders that can be seen"))
+}
+
+/// Is it the name a file system without open files that have none gives to one that was removed, until
+/// it is closed (NFS, libfuse)?
+fn is_hidden(path: &Path) -> bool {
+    let name = path.file_name().unwrap_or_default().as_encoded_bytes();
+    [&b".nfs"[..], b".fuse_hidden"].iter().any(|hidden| name.starts_with(hidden))
 }
 
 /// Copies the open file to its folder, which is made again, or to that for temporary files.
@@ -123,6 +130,8 @@ fn write_into(out: &Path, stem: &str, content: Content, file: &File) -> io::Resu
             made => made?,
         };
         let (finished, partial) = (out.join(finished), out.join(partial));
+        // Before there is anything in it that somebody could repair.
+        let Some(locked) = lock(&copy, &partial)? else { continue };
         let mut source = file;
         let copied = source.seek(SeekFrom::Start(0)).and_then(|_| io::copy(&mut source, &mut copy));
         if let Err(error) = copied.and_then(|_| copy.sync_all()) {
@@ -133,7 +142,6 @@ fn write_into(out: &Path, stem: &str, content: Content, file: &File) -> io::Resu
         if content == Content::Partial {
             return Ok(partial);
         }
-        let Some(locked) = lock(&copy, &partial)? else { continue };
         let path = EpisodePath { folder, finished, partial, locked };
         path.publish()?;
         return Ok(path.finished);

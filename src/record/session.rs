@@ -192,7 +192,16 @@ impl Session {
         if !self.holds(event.stamp, Duration::ZERO) || self.failed.is_some() {
             return;
         }
-        self.failed = self.write_event(event).err();
+        // What is no JSON is an event less, and no reason to lose the episode.
+        let json = match serde_json::to_value(event) {
+            Ok(json) => json,
+            Err(error) => {
+                tracing::error!(%error, ?event, "an event is not recorded");
+                self.events_missed += 1;
+                return;
+            }
+        };
+        self.failed = self.write_event(event, &json).err();
         self.events += 1;
     }
 
@@ -268,6 +277,7 @@ impl Session {
             qualities: &qualities,
             skew: self.measures.skew(),
             verdict: verdict(state),
+            cut_short: reason.as_deref(),
             units: &self.units,
             begin: self.begin,
         };
@@ -278,8 +288,9 @@ impl Session {
             }
             Some(error) => Err(error),
         };
+        let whole = ending.verdict;
         let (file, error, verdict) = match closed {
-            Ok(file) => (file, reason, ending.verdict),
+            Ok(file) => (file, reason, whole),
             Err(error) => {
                 let file = keep::partial(&self.path, &self.handle);
                 let text = match reason {
@@ -341,8 +352,7 @@ impl Session {
         self.next_tick += 1;
     }
 
-    fn write_event(&mut self, event: &Event) -> io::Result<()> {
-        let json = serde_json::to_value(event)?;
+    fn write_event(&mut self, event: &Event, json: &serde_json::Value) -> io::Result<()> {
         let field = |name| json.get(name).and_then(serde_json::Value::as_str).unwrap_or_default();
         let text = describe(&event.what);
         let said = EventText { kind: field("event"), device: field("device"), text: &text, json: &json.to_string() };

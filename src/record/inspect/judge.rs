@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use serde_json::Value;
 
+use super::super::metadata::CUT_SHORT;
 use super::super::quality::{Frames, Measured, Measures, Seen, Spread};
 use super::super::session::SETTLE;
 use super::super::verdict::{Facts, FileState, Judged, Losses, judge};
@@ -160,16 +161,23 @@ impl Judge {
             } else {
                 Losses::Together
             },
-            file: file_state(ending.file, ending.repaired),
+            file: file_state(ending),
         };
         judge(&facts)
     }
 }
 
-fn file_state(walked: Walked, repaired: bool) -> FileState<'static> {
+fn file_state<'a>(ending: &Ending<'a>) -> FileState<'a> {
+    let Ending { file: walked, summary, repaired, .. } = ending;
+    let cut_short = summary.get(CUT_SHORT);
     match walked.end {
-        FileEnd::Finished if repaired => FileState::NotWhole("it was repaired, and what came last may be missing"),
-        FileEnd::Finished if walked.damaged_chunks == 0 => FileState::Whole,
+        FileEnd::Finished if *repaired => FileState::NotWhole("it was repaired, and what came last may be missing"),
+        FileEnd::Finished if walked.damaged_chunks == 0 => match cut_short {
+            Some(why) => FileState::NotWhole(why),
+            // Whoever wrote the footer: what the recorder ends, it sums up.
+            None if summary.is_empty() => FileState::NotWhole("the recorder has not finished it"),
+            None => FileState::Whole,
+        },
         FileEnd::Finished => FileState::NotWhole("parts of it are damaged"),
         FileEnd::Unfinished => FileState::NotWhole("the recorder has not finished it"),
         FileEnd::Torn => FileState::NotWhole("its last record is cut"),
