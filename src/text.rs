@@ -54,7 +54,6 @@ pub fn lossy<S: Serializer>(path: &impl AsRef<Path>, serializer: S) -> Result<S:
 ///
 /// # Errors
 /// Those of the serializer.
-#[expect(clippy::ref_option, reason = "what serde gives")]
 pub fn lossy_option<S: Serializer>(path: &Option<PathBuf>, serializer: S) -> Result<S::Ok, S::Error> {
     match path {
         Some(path) => lossy(path, serializer),

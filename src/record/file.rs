@@ -211,8 +211,8 @@ impl EpisodeFile {
     }
 
     /// Hands everything written so far to the kernel: from then on it survives the end of this
-    /// process. It does not wait for the disk, which may take seconds; a loss of power can take
-    /// what the kernel has not written back yet.
+    /// process. It does not wait for the disk, which may take seconds: what the kernel has not written
+    /// back yet a loss of power can take.
     pub(super) fn flush(&mut self) -> io::Result<()> {
         self.writer.flush().map_err(io_error)
     }

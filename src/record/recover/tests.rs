@@ -243,7 +243,6 @@ fn what_an_ended_repair_could_not_read_is_kept_by_the_next() {
     let topic = damaged.windows(10).position(|window| window == b"/rapid/tof").unwrap();
     let mask = damaged[topic..].windows(10).position(|window| window == b"/rapid/mas").unwrap() + topic;
     damaged[mask] = b'X';
-    damaged.truncate(damaged.len() - 30);
     let partial = put(&folder, "a_001.mcap.partial", &damaged);
     let first = repaired(&partial);
     assert!(first.damaged_chunks > 0 && first.original.is_some());
