@@ -107,8 +107,7 @@ impl Session {
         }
         // Killed in the next moment, it is an episode all the same, of a known task and rig.
         file.flush()?;
-        let writeback = Writeback::start(Arc::clone(&path.file));
-        let writeback = writeback.map_err(|error| tracing::warn!(%error, "no writeback while recording")).ok();
+        let writeback = Writeback::start(Arc::clone(&path.file), &path.folder);
         let modalities: Vec<SyncModality> = registry
             .devices
             .iter()
@@ -208,10 +207,8 @@ impl Session {
         };
         self.failed = self.write_event(event, &json).err();
         self.events += 1;
-        match &event.what {
-            What::Attach { bit, .. } => self.measures.plugged(*bit, event.stamp.0, true),
-            What::Detach { bit, .. } => self.measures.plugged(*bit, event.stamp.0, false),
-            _ => {}
+        if let What::Attach { bit, .. } | What::Detach { bit, .. } = &event.what {
+            self.measures.plugged(*bit, event.stamp.0, matches!(event.what, What::Attach { .. }));
         }
     }
 

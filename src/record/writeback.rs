@@ -8,9 +8,12 @@
 
 use std::fs::File;
 use std::io;
+use std::os::fd::OwnedFd;
 use std::sync::Arc;
 use std::sync::mpsc::{self, SyncSender, TrySendError};
 use std::thread::JoinHandle;
+
+use crate::folder::Folder;
 
 /// See the module's comment.
 pub(super) struct Writeback {
@@ -19,12 +22,21 @@ pub(super) struct Writeback {
 }
 
 impl Writeback {
-    /// Starts the thread for `file`.
-    ///
-    /// # Errors
-    /// When the system gives none.
-    pub(super) fn start(file: Arc<File>) -> io::Result<Self> {
-        Self::with(move || file.sync_data())
+    /// Starts the thread for `file`, whose name is in `folder`; `None` if the system gives none.
+    pub(super) fn start(file: Arc<File>, folder: &Folder) -> Option<Self> {
+        let started = folder.descriptor().try_clone().and_then(|folder| Self::of(file, folder));
+        started.map_err(|error| tracing::warn!(%error, "no writeback while recording")).ok()
+    }
+
+    fn of(file: Arc<File>, folder: OwnedFd) -> io::Result<Self> {
+        let mut folder = Some(folder);
+        Self::with(move || {
+            // Once, for the name; not every file system can be asked for that.
+            if let Some(Err(error)) = folder.take().map(rustix::fs::fsync) {
+                tracing::debug!(%error, "folder not synced");
+            }
+            file.sync_data()
+        })
     }
 
     fn with(mut sync: impl FnMut() -> io::Result<()> + Send + 'static) -> io::Result<Self> {
