@@ -87,17 +87,18 @@ async fn nothing_is_written_behind_a_write_that_failed() {
     assert_eq!(inspect::inspect(&file).unwrap().end, inspect::FileEnd::Torn);
 }
 
-/// A disk whose cable is pulled in the middle of a write, of which nothing reaches it, and put back.
+/// A disk whose cable is pulled between two writes, and put back. Of that its writer, which only
+/// remembers what went wrong in a write of its own, knows nothing.
 struct Loose(File, u32);
 
 impl Write for Loose {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        self.1 += 1;
-        if self.1 == 3 { Err(io::Error::other("cable pulled")) } else { self.0.write(bytes) }
+        self.0.write(bytes)
     }
 
     fn flush(&mut self) -> io::Result<()> {
-        self.0.flush()
+        self.1 += 1;
+        if self.1 == 2 { Err(io::Error::other("cable pulled")) } else { self.0.flush() }
     }
 }
 
