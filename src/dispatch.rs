@@ -278,8 +278,8 @@ fn recover(paths: &[PathBuf], format: Format) -> Result<(), Failure> {
             _ = tokio::signal::ctrl_c() => Err(Failure::App(AppError::InterruptedTwice)),
         }
     })??;
-    let outcome = told.map_err(|_| Failure::App(AppError::Panicked("the repair")))??;
-    if outcome.is_done() { Ok(()) } else { Err(Failure::Recover(outcome)) }
+    let (outcome, written) = told.map_err(|_| Failure::App(AppError::Panicked("the repair")))?;
+    if outcome.is_done() { Ok(written?) } else { Err(Failure::Recover(outcome)) }
 }
 
 /// The rig: on this machine, simulated, or played from an episode.

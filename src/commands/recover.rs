@@ -5,10 +5,11 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use serde::Serialize;
 use serde_json::json;
 
 use super::Format;
-use crate::record::recover::{RecoverError, left_behind, recover};
+use crate::record::recover::{RecoverError, Recovered, left_behind, recover};
 use crate::text;
 
 /// How it went, of all files together.
@@ -36,8 +37,8 @@ impl Outcome {
 /// goes to `out`, what failed and, if wanted, the progress to `err`. `stop` interrupts the file in work
 /// and leaves out the rest.
 ///
-/// # Errors
-/// When `out` cannot be written.
+/// A reader that has gone is no reason to leave a file unrepaired: beside the outcome, whether all that
+/// was to be said could be written to `out`.
 pub fn run(
     paths: &[PathBuf],
     format: Format,
@@ -45,75 +46,98 @@ pub fn run(
     stop: &AtomicBool,
     out: &mut impl Write,
     err: &mut impl Write,
-) -> io::Result<Outcome> {
-    let mut outcome = Outcome::default();
+) -> (Outcome, io::Result<()>) {
+    let mut teller = Teller { outcome: Outcome::default(), format, out, written: Ok(()), err };
     for path in paths {
         let files = match unfinished(path) {
             Some(Ok(files)) if files.is_empty() => {
                 if format == Format::Text {
-                    writeln!(out, "{}: nothing to repair", path.display())?;
+                    teller.line(&format!("{}: nothing to repair", path.display()));
                 }
                 continue;
             }
             Some(Ok(files)) => files,
             Some(Err(source)) => {
-                let error = RecoverError::Io { path: path.clone(), source };
-                tell(&mut outcome, path, &error, format, out, err)?;
+                teller.failed(path, &RecoverError::Io { path: path.clone(), source });
                 continue;
             }
             None => vec![path.clone()],
         };
         for file in files {
             if stop.load(Ordering::Relaxed) {
-                tell(&mut outcome, &file, &RecoverError::Interrupted(file.clone()), format, out, err)?;
+                teller.failed(&file, &RecoverError::Interrupted(file.clone()));
                 continue;
             }
             let mut bar = Progress { file: &file, shown: None };
             let mut watch = |done, size| {
                 if progress {
-                    bar.show(done, size, err);
+                    bar.show(done, size, teller.err);
                 }
                 if stop.load(Ordering::Relaxed) { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
             };
             let recovered = recover(&file, &mut watch);
-            bar.clear(err);
+            bar.clear(teller.err);
             match recovered {
-                Ok(recovered) if format == Format::Json => {
-                    serde_json::to_writer(&mut *out, &recovered)?;
-                    writeln!(out)?;
-                }
-                Ok(recovered) => writeln!(out, "{}", text::plain(&recovered.sentence().1))?,
-                Err(error) => tell(&mut outcome, &file, &error, format, out, err)?,
+                Ok(recovered) => teller.done(&recovered),
+                Err(error) => teller.failed(&file, &error),
             }
         }
     }
-    out.flush()?;
-    Ok(outcome)
+    teller.end()
+}
+
+/// What is said of each file, and how it went so far.
+struct Teller<'a, O, E> {
+    outcome: Outcome,
+    format: Format,
+    out: &'a mut O,
+    /// The first error of `out`: nothing more is written to it.
+    written: io::Result<()>,
+    err: &'a mut E,
+}
+
+impl<O: Write, E: Write> Teller<'_, O, E> {
+    fn done(&mut self, recovered: &Recovered) {
+        match self.format {
+            Format::Json => self.json(recovered),
+            Format::Text => self.line(&text::plain(&recovered.sentence().1)),
+        }
+    }
+
+    fn failed(&mut self, file: &Path, error: &RecoverError) {
+        match error {
+            error if error.is_bad_argument() => self.outcome.bad_arguments += 1,
+            _ => self.outcome.failed += 1,
+        }
+        if self.format == Format::Json {
+            self.json(&json!({"file": file.to_string_lossy(), "outcome": "failed", "error": error.to_string()}));
+        }
+        // Standard error may be closed.
+        let _ = writeln!(self.err, "error: {}", text::plain(&error.to_string()));
+    }
+
+    fn json(&mut self, value: &impl Serialize) {
+        match text::json(value) {
+            Ok(line) => self.line(&line),
+            Err(error) => self.written = Err(error.into()),
+        }
+    }
+
+    fn line(&mut self, line: &str) {
+        if self.written.is_ok() {
+            self.written = writeln!(self.out, "{line}");
+        }
+    }
+
+    fn end(self) -> (Outcome, io::Result<()>) {
+        let Self { outcome, out, written, .. } = self;
+        (outcome, written.and_then(|()| out.flush()))
+    }
 }
 
 /// What of a folder is to be repaired; `None`: it is none.
 fn unfinished(path: &Path) -> Option<io::Result<Vec<PathBuf>>> {
     path.is_dir().then(|| left_behind(path))
-}
-
-fn tell(
-    outcome: &mut Outcome,
-    file: &Path,
-    error: &RecoverError,
-    format: Format,
-    out: &mut impl Write,
-    err: &mut impl Write,
-) -> io::Result<()> {
-    match error {
-        error if error.is_bad_argument() => outcome.bad_arguments += 1,
-        _ => outcome.failed += 1,
-    }
-    if format == Format::Json {
-        writeln!(out, "{}", json!({"file": file, "outcome": "failed", "error": error.to_string()}))?;
-    }
-    // Standard error may be closed.
-    let _ = writeln!(err, "error: {}", text::plain(&error.to_string()));
-    Ok(())
 }
 
 /// One line that is written over, whenever the percentage changes.
@@ -137,6 +161,40 @@ impl Progress<'_> {
         if self.shown.take().is_some() {
             let _ = write!(err, "\r\x1b[K");
             let _ = err.flush();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    struct Gone;
+
+    impl Write for Gone {
+        fn write(&mut self, _: &[u8]) -> io::Result<usize> {
+            Err(io::ErrorKind::BrokenPipe.into())
+        }
+
+        fn flush(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn a_reader_that_has_gone_leaves_no_file_unrepaired() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let file = |name: &str| folder.path().join(name);
+        for name in ["a_001.mcap.partial", "b_001.mcap.partial", "c_001.mcap.partial"] {
+            std::fs::write(file(name), "").expect("a file");
+        }
+        let paths = [file("none.mcap"), folder.path().to_owned()];
+        let (stop, mut err) = (AtomicBool::new(false), Vec::new());
+        for format in [Format::Text, Format::Json] {
+            let (outcome, written) = run(&paths, format, false, &stop, &mut Gone, &mut err);
+            assert!(outcome.is_bad_argument(), "{outcome:?}");
+            assert_eq!(written.expect_err("nobody reads").kind(), io::ErrorKind::BrokenPipe);
+            assert_eq!(std::fs::read_dir(folder.path()).expect("a folder").count(), 0);
         }
     }
 }

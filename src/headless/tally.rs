@@ -52,6 +52,7 @@ impl Presence {
 /// An episode that was closed.
 #[derive(Debug, Clone, Serialize)]
 struct Episode {
+    #[serde(serialize_with = "text::lossy")]
     file: PathBuf,
     seconds: f64,
     messages: u64,

@@ -5,6 +5,7 @@
 use std::fs::File;
 use std::io;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
 use serde::Serialize;
@@ -13,7 +14,7 @@ use super::RecordError;
 use super::lock::{self, Lock};
 use crate::folder::{Folder, FolderError, Links, Missing};
 use crate::status::Verdict;
-use crate::time;
+use crate::{text, time};
 
 /// Extension of a file that is not finished.
 pub(super) const PARTIAL: &str = "partial";
@@ -42,6 +43,7 @@ pub struct EpisodeRequest {
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct EpisodeReport {
     /// The file; `.partial` remains at its end if it could not be finished.
+    #[serde(serialize_with = "text::lossy")]
     pub file: PathBuf,
     /// Length in seconds.
     pub seconds: f64,
@@ -67,22 +69,21 @@ pub(super) struct EpisodePath {
     pub(super) finished: PathBuf,
     /// While it is written.
     pub(super) partial: PathBuf,
-    /// Holds the lock.
-    #[expect(dead_code, reason = "held for its lock")]
-    pub(super) locked: File,
+    /// The open file itself, whatever becomes of its names; it holds the lock.
+    pub(super) file: Arc<File>,
 }
 
 impl EpisodePath {
     /// Takes the next free number in `out` for `task` on the day of `wall_ns` (UTC) and creates the
     /// partial file.
-    pub(super) fn create(out: &Path, task: &str, wall_ns: u64) -> Result<(Self, File), RecordError> {
+    pub(super) fn create(out: &Path, task: &str, wall_ns: u64) -> Result<Self, RecordError> {
         let refused = |source| RecordError::Io { path: out.to_owned(), source };
         let folder = open_folder(out)?;
         let stem = format!("{}_{}_", date(wall_ns), slug(task));
         let first = next_number(&folder, &stem).map_err(refused)?;
         for number in first..first.saturating_add(ATTEMPTS) {
             let name = format!("{stem}{number:03}.mcap");
-            let partial = format!("{name}.partial");
+            let partial = format!("{name}.{PARTIAL}");
             if folder.has(&name) {
                 continue;
             }
@@ -90,9 +91,9 @@ impl EpisodePath {
                 Ok(file) => {
                     let (finished, partial) = (out.join(name), out.join(partial));
                     match lock(&file, &partial) {
-                        Ok(Some(locked)) => return Ok((Self { folder, finished, partial, locked }, file)),
+                        Ok(true) => return Ok(Self { folder, finished, partial, file: Arc::new(file) }),
                         // Somebody took the empty file for one that was left behind.
-                        Ok(None) => {}
+                        Ok(false) => {}
                         Err(source) => return Err(RecordError::Io { path: partial, source }),
                     }
                 }
@@ -126,12 +127,9 @@ fn rename(folder: &Folder, file: &Path, name: &Path) -> io::Result<()> {
     Ok(())
 }
 
-/// Locks a partial file just made; a handle that holds the lock, `None` if somebody else has it.
-pub(super) fn lock(file: &File, partial: &Path) -> io::Result<Option<File>> {
-    match lock::take(file, partial)? {
-        Lock::Ours | Lock::Unknown => file.try_clone().map(Some),
-        Lock::Others | Lock::Gone => Ok(None),
-    }
+/// Locks a partial file just made; false if somebody else has it.
+pub(super) fn lock(file: &File, partial: &Path) -> io::Result<bool> {
+    Ok(matches!(lock::take(file, partial)?, Lock::Ours | Lock::Unknown))
 }
 
 /// Opens the folder for episodes; makes it if the one above it exists.
@@ -234,21 +232,21 @@ mod tests {
     fn numbers_go_up_and_no_file_is_touched() {
         let folder = tempfile::tempdir().unwrap();
         let out = folder.path().join("made");
-        let (first, _) = EpisodePath::create(&out, "t", WALL).unwrap();
+        let first = EpisodePath::create(&out, "t", WALL).unwrap();
         assert_eq!(first.finished.file_name().unwrap(), "20231114_t_001.mcap");
-        let (second, _) = EpisodePath::create(&out, "t", WALL).unwrap();
+        let second = EpisodePath::create(&out, "t", WALL).unwrap();
         assert_eq!(second.partial.file_name().unwrap(), "20231114_t_002.mcap.partial");
         first.publish().unwrap();
         fs::write(out.join("20231114_t_041.mcap"), "kept").unwrap();
         fs::write(out.join("20231114_t_nonsense.mcap"), "kept").unwrap();
-        let (third, _) = EpisodePath::create(&out, "t", WALL).unwrap();
+        let third = EpisodePath::create(&out, "t", WALL).unwrap();
         assert_eq!(third.finished.file_name().unwrap(), "20231114_t_042.mcap");
         for (number, ending) in [(50, "partial"), (60, "recovering"), (70, "damaged"), (80, "empty")] {
             fs::write(out.join(format!("20231114_t_0{number}.mcap.{ending}")), "kept").unwrap();
-            let (next, _) = EpisodePath::create(&out, "t", WALL).unwrap();
+            let next = EpisodePath::create(&out, "t", WALL).unwrap();
             assert_eq!(next.finished.file_name().unwrap(), format!("20231114_t_0{}.mcap", number + 1).as_str());
         }
-        let (other, _) = EpisodePath::create(&out, "other", WALL).unwrap();
+        let other = EpisodePath::create(&out, "other", WALL).unwrap();
         assert_eq!(other.finished.file_name().unwrap(), "20231114_other_001.mcap");
         // A file that took the name meanwhile stays as it is.
         fs::write(&third.finished, "kept").unwrap();
@@ -272,7 +270,7 @@ mod tests {
         let fifo = rustix::fs::FileType::Fifo;
         rustix::fs::mknodat(rustix::fs::CWD, out.join("20231114_t_004.mcap.partial"), fifo, 0o666.into(), 0).unwrap();
         fs::write(out.join("20231114_t_4294967295.mcap"), "").unwrap();
-        let (path, _) = EpisodePath::create(&out, "t", WALL).unwrap();
+        let path = EpisodePath::create(&out, "t", WALL).unwrap();
         assert_eq!(path.finished.file_name().unwrap(), "20231114_t_005.mcap");
         // Planted in the middle of the episode, under the name it was to get.
         symlink(&nowhere, &path.finished).unwrap();

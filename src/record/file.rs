@@ -4,10 +4,13 @@
 //! modality that never appears is still named.
 //! Invariant: only whole chunks reach the file: what a crash leaves ends between two records, save
 //! for a write that the crash cut in two.
+//! Invariant: only [`EpisodeFile::finish`] gives a file its end; after an error it never gets one.
 
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use mcap::records::{MessageHeader, Metadata};
 use mcap::write::NoSeek;
@@ -38,12 +41,6 @@ pub trait Sink: Write + Send {
     fn sync(&mut self) -> io::Result<()>;
 }
 
-impl Sink for Box<dyn Sink> {
-    fn sync(&mut self) -> io::Result<()> {
-        (**self).sync()
-    }
-}
-
 impl Sink for File {
     fn sync(&mut self) -> io::Result<()> {
         self.sync_all()
@@ -52,7 +49,10 @@ impl Sink for File {
 
 /// See the module's comment.
 pub(super) struct EpisodeFile {
-    writer: Writer<NoSeek<BufWriter<Box<dyn Sink>>>>,
+    /// Before the writer, which writes an end of its own when it is dropped.
+    #[expect(dead_code, reason = "held to be dropped")]
+    shut: Shut,
+    writer: Writer<NoSeek<BufWriter<Latch>>>,
     clock: WallClock,
     message: Vec<u8>,
     tracks: Vec<Option<Track>>,
@@ -64,6 +64,53 @@ pub(super) struct EpisodeFile {
     pub(super) messages: u64,
     /// Payload bytes of samples written.
     pub(super) bytes: u64,
+}
+
+/// Shuts its [`Latch`] when it is dropped.
+#[derive(Default)]
+struct Shut(Arc<AtomicBool>);
+
+impl Drop for Shut {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+}
+
+/// A sink that takes nothing more after its first error, or once it is shut: the writer and the
+/// buffer before it try again when they are dropped, and a footer behind a hole makes a file look
+/// whole.
+struct Latch {
+    sink: Box<dyn Sink>,
+    shut: Arc<AtomicBool>,
+}
+
+impl Latch {
+    fn take<T>(&mut self, work: impl FnOnce(&mut dyn Sink) -> io::Result<T>) -> io::Result<T> {
+        if self.shut.load(Ordering::Relaxed) {
+            return Err(io::Error::other("given up after an error"));
+        }
+        let taken = work(&mut *self.sink);
+        if taken.as_ref().is_err_and(|error| error.kind() != io::ErrorKind::Interrupted) {
+            self.shut.store(true, Ordering::Relaxed);
+        }
+        taken
+    }
+}
+
+impl Write for Latch {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.take(|sink| sink.write(bytes))
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.take(|sink| sink.flush())
+    }
+}
+
+impl Sink for Latch {
+    fn sync(&mut self) -> io::Result<()> {
+        self.take(|sink| sink.sync())
+    }
 }
 
 /// The channels of one modality: one, unless its device sends what the registry did not announce.
@@ -83,7 +130,8 @@ impl EpisodeFile {
         begin: Stamp,
         metadata: BTreeMap<String, String>,
     ) -> io::Result<Self> {
-        let mut writer = writer(sink)?;
+        let shut = Shut::default();
+        let mut writer = writer(Latch { sink, shut: Arc::clone(&shut.0) })?;
         writer.write_metadata(&Metadata { name: ABOUT.to_owned(), metadata }).map_err(io_error)?;
         let wall_ns = clock.wall_ns(begin);
         writer
@@ -104,7 +152,7 @@ impl EpisodeFile {
         let mut tracks = Vec::new();
         tracks.resize_with(MAX_MODALITIES, || None);
         let mut file =
-            Self { writer, clock, message: Vec::new(), tracks, mask, frame, event, log, messages: 0, bytes: 0 };
+            Self { shut, writer, clock, message: Vec::new(), tracks, mask, frame, event, log, messages: 0, bytes: 0 };
         for device in &registry.devices {
             let kind = serde_json::to_value(device.modality().kind).ok();
             let kind = kind.as_ref().and_then(|kind| kind.as_str()).unwrap_or_default().to_owned();
@@ -163,20 +211,21 @@ impl EpisodeFile {
     }
 
     /// Hands everything written so far to the kernel: from then on it survives the end of this
-    /// process. It does not wait for the disk, which may take seconds; a loss of power can take
-    /// what the kernel has not written back yet.
+    /// process. It does not wait for the disk, which may take seconds: what the kernel has not written
+    /// back yet a loss of power can take.
     pub(super) fn flush(&mut self) -> io::Result<()> {
         self.writer.flush().map_err(io_error)
     }
 
-    /// Ends the file with the summary and waits for the disk.
+    /// Ends the file with the summary and waits for the disk. A file that is dropped instead, or
+    /// that cannot be ended, stays as it is: nothing more is written to it.
     pub(super) fn finish(mut self, summary: BTreeMap<String, String>) -> io::Result<()> {
         let summary = Metadata { name: SUMMARY.to_owned(), metadata: summary };
         self.writer.write_metadata(&summary).map_err(io_error)?;
         self.writer.finish().map_err(io_error)?;
         let buffered = self.writer.into_inner().into_inner();
-        let mut sink = buffered.into_inner().map_err(io::IntoInnerError::into_error)?;
-        sink.sync()
+        let mut latch = buffered.into_inner().map_err(io::IntoInnerError::into_error)?;
+        latch.sync()
     }
 
     fn write(&mut self, channel_id: u16, sequence: u64, log_time: u64, published: Stamp) -> io::Result<()> {
@@ -203,11 +252,7 @@ pub(super) fn writer<S: Sink>(sink: S) -> io::Result<Writer<NoSeek<BufWriter<S>>
 }
 
 impl Track {
-    fn channel(
-        &mut self,
-        writer: &mut Writer<NoSeek<BufWriter<Box<dyn Sink>>>>,
-        schema: SampleSchema,
-    ) -> io::Result<u16> {
+    fn channel(&mut self, writer: &mut Writer<NoSeek<BufWriter<Latch>>>, schema: SampleSchema) -> io::Result<u16> {
         if let Some(Some(channel)) = self.channels.get(schema.index()) {
             return Ok(*channel);
         }
@@ -220,7 +265,7 @@ impl Track {
 }
 
 fn add_channel(
-    writer: &mut Writer<NoSeek<BufWriter<Box<dyn Sink>>>>,
+    writer: &mut Writer<NoSeek<BufWriter<Latch>>>,
     schema: Schema,
     topic: &str,
     metadata: &BTreeMap<String, String>,

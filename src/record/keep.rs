@@ -10,6 +10,7 @@ use std::io::{self, Seek, SeekFrom};
 use std::os::fd::AsRawFd;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use super::episode::{EpisodePath, PARTIAL, lock};
 use crate::folder::{Folder, Links, Missing};
@@ -21,8 +22,8 @@ const ATTEMPTS: u32 = 100;
 ///
 /// # Errors
 /// When it keeps its partial name, or cannot be kept.
-pub(super) fn publish(path: &EpisodePath, file: &File) -> io::Result<PathBuf> {
-    match whereabouts(path, file)? {
+pub(super) fn publish(path: &EpisodePath) -> io::Result<PathBuf> {
+    match whereabouts(path)? {
         Whereabouts::Here => {
             path.publish()?;
             Ok(path.finished.clone())
@@ -35,13 +36,13 @@ pub(super) fn publish(path: &EpisodePath, file: &File) -> io::Result<PathBuf> {
                 return Ok(partial);
             }
             let folder = open(partial.parent().unwrap_or(Path::new("")), Missing::Refused)?;
-            let moved =
-                EpisodePath { folder, finished: partial.with_extension(""), partial, locked: file.try_clone()? };
+            let (finished, file) = (partial.with_extension(""), Arc::clone(&path.file));
+            let moved = EpisodePath { folder, finished, partial, file };
             moved.publish()?;
             Ok(moved.finished)
         }
         Whereabouts::Removed => {
-            let file = write_again(path, file, Content::Whole)?;
+            let file = write_again(path, Content::Whole)?;
             tracing::warn!(file = %file.display(), "the episode was removed while it was recorded, and is written again");
             Ok(file)
         }
@@ -49,11 +50,11 @@ pub(super) fn publish(path: &EpisodePath, file: &File) -> io::Result<PathBuf> {
 }
 
 /// Where a file is that could not be finished; one that was removed is written again.
-pub(super) fn partial(path: &EpisodePath, file: &File) -> PathBuf {
-    let found = whereabouts(path, file).and_then(|whereabouts| match whereabouts {
+pub(super) fn partial(path: &EpisodePath) -> PathBuf {
+    let found = whereabouts(path).and_then(|whereabouts| match whereabouts {
         Whereabouts::Here => Ok(path.partial.clone()),
         Whereabouts::Moved(partial) => Ok(partial),
-        Whereabouts::Removed => write_again(path, file, Content::Partial),
+        Whereabouts::Removed => write_again(path, Content::Partial),
     });
     found.unwrap_or_else(|error| {
         tracing::error!(file = %path.partial.display(), %error, "the episode is lost");
@@ -74,8 +75,8 @@ enum Whereabouts {
     Removed,
 }
 
-fn whereabouts(path: &EpisodePath, file: &File) -> io::Result<Whereabouts> {
-    let open = file.metadata()?;
+fn whereabouts(path: &EpisodePath) -> io::Result<Whereabouts> {
+    let open = path.file.metadata()?;
     if open.nlink() == 0 {
         return Ok(Whereabouts::Removed);
     }
@@ -86,20 +87,27 @@ fn whereabouts(path: &EpisodePath, file: &File) -> io::Result<Whereabouts> {
         return Ok(Whereabouts::Here);
     }
     // proc(5): the name the file has now.
-    let there = fs::read_link(format!("/proc/self/fd/{}", file.as_raw_fd()))?;
+    let there = fs::read_link(format!("/proc/self/fd/{}", path.file.as_raw_fd()))?;
     if is_ours(&there) {
-        return Ok(Whereabouts::Moved(there));
+        return Ok(if is_hidden(&there) { Whereabouts::Removed } else { Whereabouts::Moved(there) });
     }
     Err(io::Error::new(io::ErrorKind::NotFound, "the file is in none of the folders that can be seen"))
 }
 
+/// Is it the name a file system without open files that have none gives to one that was removed, until
+/// it is closed (NFS, libfuse)?
+fn is_hidden(path: &Path) -> bool {
+    let name = path.file_name().unwrap_or_default().as_encoded_bytes();
+    [&b".nfs"[..], b".fuse_hidden"].iter().any(|hidden| name.starts_with(hidden))
+}
+
 /// Copies the open file to its folder, which is made again, or to that for temporary files.
-fn write_again(path: &EpisodePath, file: &File, content: Content) -> io::Result<PathBuf> {
+fn write_again(path: &EpisodePath, content: Content) -> io::Result<PathBuf> {
     let name = path.finished.file_stem().unwrap_or_default();
     let mut first = None;
     let folder = path.finished.parent().map(Path::to_owned).unwrap_or_default();
     for folder in [folder, std::env::temp_dir()] {
-        match write_into(&folder, &name.to_string_lossy(), content, file) {
+        match write_into(&folder, &name.to_string_lossy(), content, &path.file) {
             Ok(written) => return Ok(written),
             Err(error) => {
                 tracing::error!(folder = %folder.display(), %error, "the episode cannot be written again here");
@@ -123,6 +131,10 @@ fn write_into(out: &Path, stem: &str, content: Content, file: &File) -> io::Resu
             made => made?,
         };
         let (finished, partial) = (out.join(finished), out.join(partial));
+        // Before there is anything in it that somebody could repair.
+        if !lock(&copy, &partial)? {
+            continue;
+        }
         let mut source = file;
         let copied = source.seek(SeekFrom::Start(0)).and_then(|_| io::copy(&mut source, &mut copy));
         if let Err(error) = copied.and_then(|_| copy.sync_all()) {
@@ -133,8 +145,7 @@ fn write_into(out: &Path, stem: &str, content: Content, file: &File) -> io::Resu
         if content == Content::Partial {
             return Ok(partial);
         }
-        let Some(locked) = lock(&copy, &partial)? else { continue };
-        let path = EpisodePath { folder, finished, partial, locked };
+        let path = EpisodePath { folder, finished, partial, file: Arc::new(copy) };
         path.publish()?;
         return Ok(path.finished);
     }

@@ -12,6 +12,9 @@ use crate::registry::{DeviceSpec, Registry, WhenStale};
 use crate::status::Verdict;
 use crate::time::{Stamp, WallClock, nanoseconds};
 
+/// Key of the record at the end: why the episode is not whole.
+pub(super) const CUT_SHORT: &str = "cut_short";
+
 /// The record at the beginning.
 ///
 /// JSON: `layout` `{name: bit}`, `modalities` `[{name, bit, topic, kind, shape, when_stale,
@@ -88,6 +91,8 @@ pub(super) struct Ending<'a> {
     pub(super) skew: Option<Spread>,
     /// The verdict.
     pub(super) verdict: Verdict,
+    /// Why the episode is not whole, if it is not.
+    pub(super) cut_short: Option<&'a str>,
     /// Everything that was attached or ran at some time.
     pub(super) units: &'a Units,
     /// When the episode began.
@@ -96,7 +101,8 @@ pub(super) struct Ending<'a> {
 
 /// The record at the end.
 ///
-/// `verdict` is GOOD, SUSPECT or BAD. JSON: `reasons` `["..."]`, why it is not GOOD; `modalities`
+/// `cut_short` says why the recorder ended the episode before its time, and is absent where it did
+/// not. `verdict` is GOOD, SUSPECT or BAD. JSON: `reasons` `["..."]`, why it is not GOOD; `modalities`
 /// `{name: {samples, bytes, lost, dropped, damaged, ...}}`, the fields of [`Quality`]; `skew_ms` `{p50,
 /// p95, p99, max}` between the earliest and the latest sample of a frame, or null; `serials` and
 /// `provenance` as at the beginning, of whatever was attached or ran at some time.
@@ -106,7 +112,7 @@ pub(super) fn end(ending: &Ending<'_>) -> BTreeMap<String, String> {
     let sum = |count: fn(&Quality) -> u64| {
         ending.qualities.iter().map(|(_, quality)| count(quality)).fold(0, u64::saturating_add).to_string()
     };
-    text_map([
+    let mut said = text_map([
         ("verdict", ending.verdict.grade.word().to_owned()),
         ("reasons", json!(ending.verdict.reasons).to_string()),
         ("duration_s", ending.seconds.to_string()),
@@ -121,7 +127,9 @@ pub(super) fn end(ending: &Ending<'_>) -> BTreeMap<String, String> {
         ("skew_ms", json!(ending.skew).to_string()),
         ("serials", ending.units.serials().to_string()),
         ("provenance", ending.units.epochs(ending.begin).to_string()),
-    ])
+    ]);
+    said.extend(ending.cut_short.map(|reason| (CUT_SHORT.to_owned(), reason.to_owned())));
+    said
 }
 
 fn text_map<const N: usize>(pairs: [(&str, String); N]) -> BTreeMap<String, String> {

@@ -10,6 +10,7 @@
 //! Invariant: what could not be recorded is counted and said.
 
 mod announce;
+mod describe;
 pub mod encode;
 mod episode;
 mod file;
@@ -31,6 +32,7 @@ mod streams;
 #[cfg(test)]
 mod tests;
 mod verdict;
+mod writeback;
 mod writer;
 
 use std::path::PathBuf;

@@ -45,6 +45,13 @@ impl Attached {
     }
 }
 
+impl Attached {
+    /// Is the device of this name plugged in?
+    pub(super) fn has(&self, device: &str) -> bool {
+        self.serials.contains_key(device)
+    }
+}
+
 /// Every unit and every epoch of an episode.
 #[derive(Debug)]
 pub(super) struct Units {

@@ -10,6 +10,7 @@
 mod drift;
 mod jpeg;
 mod meter;
+mod plugged;
 mod presence;
 mod tally;
 #[cfg(test)]
@@ -24,6 +25,7 @@ use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::registry::VerdictSpec;
 use crate::sync::Grid;
 use crate::time::{Stamp, nanoseconds};
+use plugged::Plugged;
 use presence::Presence;
 use tally::Tally;
 
@@ -96,6 +98,10 @@ pub struct Quality {
     pub presence: Option<f64>,
     /// Time in which it was present, seconds; all of it without a mask.
     pub present: f64,
+    /// Time in which its device was plugged in, seconds, as far as events tell.
+    pub plugged: f64,
+    /// Longest time in which it was plugged in and not present, seconds.
+    pub opening: f64,
     /// Samples a second while present; absent when it never was.
     pub hz: Option<f64>,
     /// Samples a second it should send, where something says so.
@@ -126,6 +132,7 @@ struct Lane {
     meter: Meter,
     longest_gap_ns: u64,
     pending: Vec<(u64, u64)>,
+    plugged: Plugged,
 }
 
 impl Measures {
@@ -140,6 +147,7 @@ impl Measures {
                     meter: Meter::new(frames.begin_ns, compares),
                     longest_gap_ns: 0,
                     pending: Vec::with_capacity(PENDING),
+                    plugged: Plugged::default(),
                 });
             }
         }
@@ -178,6 +186,13 @@ impl Measures {
     /// Takes a publication of the mask.
     pub(super) fn mask(&mut self, at_ns: u64, mask: PhysicalMask) {
         self.presence.push(at_ns, mask);
+    }
+
+    /// Takes that a device was plugged in, or out; one that was there before from the beginning.
+    pub(super) fn plugged(&mut self, id: ModalityId, at_ns: u64, there: bool) {
+        if let Some(Some(lane)) = self.lanes.get_mut(id.index()) {
+            lane.plugged.push(at_ns, there);
+        }
     }
 
     /// Takes a frame: of each modality its number, whether it is present, and the age in ns of its
@@ -222,13 +237,14 @@ impl Measures {
     /// What a modality was like in an episode that ended at `end_ns`; `None` of one that is not
     /// measured.
     pub(super) fn quality(&self, id: ModalityId, end_ns: u64) -> Option<Quality> {
-        let Lane { measured, meter, longest_gap_ns, pending } = self.lanes.get(id.index())?.as_ref()?;
+        let Lane { measured, meter, longest_gap_ns, pending, plugged } = self.lanes.get(id.index())?.as_ref()?;
         let gaps = pending.iter().copied().chain([(meter.latest_ns, end_ns)]);
         let longest_gap_ns = gaps
             .fold(*longest_gap_ns, |longest, (from, to)| longest.max(without_samples(&self.presence, id, from, to)));
         let length = end_ns.saturating_sub(self.begin_ns) as f64 / 1e9;
         let known = self.presence.is_known();
         let together: u64 = self.presence.spans(id, self.begin_ns, end_ns).map(|(from, to)| to - from).sum();
+        let plugged = plugged.time(&self.presence, id, self.begin_ns, end_ns);
         let present = if known { together as f64 / 1e9 } else { length };
         let Counts { samples, bytes, lost, dropped, damaged, truncated, duplicates, repeated, late } = meter.counts;
         Some(Quality {
@@ -249,6 +265,8 @@ impl Measures {
             offset: meter.offset.spread(),
             presence: (known && length > 0.0).then(|| (present / length).clamp(0.0, 1.0)),
             present,
+            plugged: plugged.plugged_ns as f64 / 1e9,
+            opening: if known { plugged.idle_ns as f64 / 1e9 } else { 0.0 },
             // To three decimals, which is all a mean over seconds can say.
             hz: (present > 0.0).then(|| (samples as f64 / present * 1e3).round() / 1e3),
             nominal_hz: measured.limits.hz,

@@ -18,12 +18,12 @@
 //!
 //! Invariant: every sample a frame names was written to the file before the frame.
 
-use std::fs::File;
 use std::io;
 use std::sync::Arc;
 use std::time::Duration;
 
 use super::announce::Announcer;
+use super::describe::describe;
 use super::encode::EventText;
 use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest};
 use super::file::{EpisodeFile, Sink};
@@ -34,6 +34,7 @@ use super::metadata::{self, Ending};
 use super::provenance::{Attached, Units};
 use super::quality::{Frames, Measured, Measures, Seen};
 use super::verdict::{Facts, FileState, Judged, Losses, judge};
+use super::writeback::Writeback;
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::registry::{DeviceSpec, Registry};
@@ -57,8 +58,8 @@ pub(super) struct Session {
     board: Arc<Board>,
     path: EpisodePath,
     file: EpisodeFile,
-    /// The open file itself, whatever becomes of its name.
-    handle: File,
+    /// None where there is no thread for it: then only the end of the episode waits for the disk.
+    writeback: Option<Writeback>,
     begin: Stamp,
     end: Option<Stamp>,
     grid: Grid,
@@ -83,7 +84,6 @@ pub(super) struct Beginning<'a> {
     pub(super) request: &'a EpisodeRequest,
     pub(super) path: EpisodePath,
     pub(super) sink: Box<dyn Sink>,
-    pub(super) handle: File,
     pub(super) attached: &'a Attached,
     pub(super) clock: WallClock,
     pub(super) begin: Stamp,
@@ -92,18 +92,22 @@ pub(super) struct Beginning<'a> {
 impl Session {
     /// Begins an episode and writes what stands at its beginning.
     pub(super) fn begin(beginning: Beginning<'_>, masks: &MaskHistory) -> io::Result<Self> {
-        let Beginning { registry, board, request, path, sink, handle, attached, clock, begin } = beginning;
+        let Beginning { registry, board, request, path, sink, attached, clock, begin } = beginning;
         let units = Units::new(attached);
         let said = metadata::beginning(&registry, request, &units, clock, begin);
         let mut file = EpisodeFile::begin(sink, &registry, clock, begin, said)?;
         let settle = SETTLE + registry.devices.iter().map(|device| device.latency).max().unwrap_or_default();
         let mut measures = Measures::new(&measured(&registry), frames(&registry, begin, settle));
+        for device in registry.devices.iter().filter(|device| attached.has(&device.name)) {
+            measures.plugged(device.id, begin.0, true);
+        }
         if let Some((header, mask, sequence)) = masks.at(begin) {
             file.mask(header, *mask, *sequence)?;
             measures.mask(header.capture_ns, *mask);
         }
         // Killed in the next moment, it is an episode all the same, of a known task and rig.
         file.flush()?;
+        let writeback = Writeback::start(Arc::clone(&path.file), &path.folder);
         let modalities: Vec<SyncModality> = registry
             .devices
             .iter()
@@ -122,7 +126,7 @@ impl Session {
             board,
             path,
             file,
-            handle,
+            writeback,
             begin,
             next_tick: 0,
             measures,
@@ -192,8 +196,20 @@ impl Session {
         if !self.holds(event.stamp, Duration::ZERO) || self.failed.is_some() {
             return;
         }
-        self.failed = self.write_event(event).err();
+        // What is no JSON is an event less, and no reason to lose the episode.
+        let json = match serde_json::to_value(event) {
+            Ok(json) => json,
+            Err(error) => {
+                tracing::error!(%error, ?event, "an event is not recorded");
+                self.events_missed += 1;
+                return;
+            }
+        };
+        self.failed = self.write_event(event, &json).err();
         self.events += 1;
+        if let What::Attach { bit, .. } | What::Detach { bit, .. } = &event.what {
+            self.measures.plugged(*bit, event.stamp.0, matches!(event.what, What::Attach { .. }));
+        }
     }
 
     /// Counts events that came faster than they were read.
@@ -228,16 +244,25 @@ impl Session {
         self.end.is_some_and(|end| now >= end)
     }
 
-    /// Hands what was written to the kernel.
+    /// Hands what was written to the kernel, and has that bring it to the disk without waiting for it.
     pub(super) fn flush(&mut self) {
         if self.failed.is_none() {
             self.failed = self.file.flush().err();
         }
+        if self.writeback.as_ref().is_some_and(|writeback| writeback.ask().is_none()) {
+            self.end_writeback();
+        }
+    }
+
+    fn end_writeback(&mut self) {
+        let ended = self.writeback.take().map_or(Ok(()), Writeback::end);
+        self.failed = self.failed.take().or(ended.err());
     }
 
     /// Writes what is left, ends the file and gives it its name. `reason` says why the episode is
     /// not whole although its file may be.
     pub(super) fn finish(mut self, now: Stamp, masks: &MaskHistory, reason: Option<String>) -> EpisodeReport {
+        self.end_writeback();
         let end = self.end.unwrap_or(now).min(now).max(self.begin);
         let ticks = self.grid.ticks_before(end);
         while self.failed.is_none() && self.next_tick < ticks {
@@ -256,7 +281,8 @@ impl Session {
             .collect();
         let (masks_dropped, events_missed) = (self.masks_dropped, self.events_missed);
         let verdict = |file: FileState<'_>| {
-            judge(&Facts { modalities: &judged, masks_dropped, events_missed, losses: Losses::Apart, file })
+            let losses = Losses::Apart;
+            judge(&Facts { modalities: &judged, masks_dropped, events_missed, seconds, losses, file })
         };
         let state = reason.as_deref().map_or(FileState::Whole, FileState::NotWhole);
         let ending = Ending {
@@ -268,20 +294,22 @@ impl Session {
             qualities: &qualities,
             skew: self.measures.skew(),
             verdict: verdict(state),
+            cut_short: reason.as_deref(),
             units: &self.units,
             begin: self.begin,
         };
         let closed = match self.failed {
             None => {
                 let finished = self.file.finish(metadata::end(&ending));
-                finished.and_then(|()| keep::publish(&self.path, &self.handle))
+                finished.and_then(|()| keep::publish(&self.path))
             }
             Some(error) => Err(error),
         };
+        let whole = ending.verdict;
         let (file, error, verdict) = match closed {
-            Ok(file) => (file, reason, ending.verdict),
+            Ok(file) => (file, reason, whole),
             Err(error) => {
-                let file = keep::partial(&self.path, &self.handle);
+                let file = keep::partial(&self.path);
                 let text = match reason {
                     Some(reason) => format!("{reason}; {}: {error}", file.display()),
                     None => format!("{}: {error}", file.display()),
@@ -341,8 +369,7 @@ impl Session {
         self.next_tick += 1;
     }
 
-    fn write_event(&mut self, event: &Event) -> io::Result<()> {
-        let json = serde_json::to_value(event)?;
+    fn write_event(&mut self, event: &Event, json: &serde_json::Value) -> io::Result<()> {
         let field = |name| json.get(name).and_then(serde_json::Value::as_str).unwrap_or_default();
         let text = describe(&event.what);
         let said = EventText { kind: field("event"), device: field("device"), text: &text, json: &json.to_string() };
@@ -368,30 +395,4 @@ fn measured(registry: &Registry) -> Vec<Measured> {
 /// When the frames of an episode are that begins at `begin`.
 fn frames(registry: &Registry, begin: Stamp, settle: Duration) -> Frames {
     Frames { begin_ns: begin.0, hz: registry.rig.observation_hz, wait: registry.rig.sync_window + settle }
-}
-
-/// An event for people.
-fn describe(what: &What) -> String {
-    match what {
-        What::Attach { device, node, usb, .. } => match &usb.serial {
-            Some(serial) => format!("{device} attached: {node}, port {}, serial {serial}", usb.port),
-            None => format!("{device} attached: {node}, port {}", usb.port),
-        },
-        What::Opened { device, provenance, .. } => {
-            let unit = provenance.usb.serial.as_deref().unwrap_or("without a serial number");
-            format!("{device} opened in epoch {}: unit {unit}", provenance.epoch.0)
-        }
-        What::Detach { device, witness, .. } => format!("{device} detached, told by {witness}"),
-        What::State { device, state, mask, detail, .. } => {
-            let state = format!("{state:?}").to_lowercase();
-            format!("{device} {state}, mask {mask}: {detail}")
-        }
-        What::Unregistered { device, reason } => format!("{device} not registered: {reason}"),
-        What::Recording { file } => format!("recording {}", file.display()),
-        What::Episode { file, .. } => format!("finished {}", file.display()),
-        What::Recovered { text, .. } | What::Log { text, .. } => text.clone(),
-        What::DiskLow { .. } | What::ClockStep { .. } => {
-            what.sentence().map_or_else(String::new, |(_, sentence)| sentence)
-        }
-    }
 }

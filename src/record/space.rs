@@ -16,6 +16,7 @@ use std::collections::VecDeque;
 use std::fs::File;
 use std::io;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
 use rustix::fs::{FallocateFlags, fallocate, fstat, fstatvfs, ftruncate};
@@ -119,7 +120,7 @@ pub(super) enum Finding {
 
 /// The room of one episode.
 pub(super) struct Space {
-    file: File,
+    file: Arc<File>,
     folder: PathBuf,
     reserve: u64,
     /// How much is set aside ahead of the end of the file; none where the file system cannot.
@@ -140,7 +141,7 @@ impl Space {
     /// # Errors
     /// When there is no room for an episode.
     pub(super) fn begin(
-        file: File,
+        file: Arc<File>,
         folder: &Path,
         reserve: Option<u64>,
         now: Stamp,
@@ -322,10 +323,10 @@ mod tests {
 
     #[test]
     fn what_is_set_aside_lies_behind_the_end_and_is_given_back() {
-        let file = tempfile::tempfile().unwrap();
+        let file = Arc::new(tempfile::tempfile().unwrap());
         let mut ask: Asker = Box::new(Disk::of);
         let blocks = |file: &File| fstat(file).unwrap().st_blocks;
-        let space = Space::begin(file.try_clone().unwrap(), Path::new("."), Some(0), Stamp(0), &mut ask).unwrap();
+        let space = Space::begin(Arc::clone(&file), Path::new("."), Some(0), Stamp(0), &mut ask).unwrap();
         assert_eq!(fstat(&file).unwrap().st_size, 0);
         if space.aside.is_none() {
             // A file system that cannot: nothing to be given back.

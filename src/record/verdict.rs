@@ -2,7 +2,8 @@
 //!
 //! 1. Each check of a modality has a limit for SUSPECT and one for BAD; the graver one that is
 //!    exceeded counts. An episode is as good as its worst check.
-//! 2. A modality that the mask says was not there is not missed.
+//! 2. A modality that the mask says was not there is not missed, unless its device was plugged in all
+//!    the same: longer than a limit, or for half the episode and nothing came of it.
 //! 3. Nothing received from a modality that was there: BAD. So is an episode in which nothing at all
 //!    was received.
 //! 4. A file that is not whole is SUSPECT; one that the disk did not take is BAD.
@@ -60,6 +61,8 @@ pub(super) struct Facts<'a> {
     pub(super) masks_dropped: u64,
     /// Events that are not in the file.
     pub(super) events_missed: u64,
+    /// Its length, seconds.
+    pub(super) seconds: f64,
     /// Whether losses are told apart.
     pub(super) losses: Losses,
     /// Its file.
@@ -79,7 +82,7 @@ pub(super) fn judge(facts: &Facts<'_>) -> Verdict {
         FileState::Failed(why) => found.push((Grade::Bad, format!("the file could not be written: {why}"))),
     }
     for judged in facts.modalities {
-        let of_it = modality(judged, facts.losses);
+        let of_it = modality(judged, facts);
         found.extend(of_it.into_iter().map(|(grade, text)| (grade, format!("{}: {text}", judged.name))));
     }
     let silent = facts.modalities.iter().all(|judged| judged.quality.samples == 0);
@@ -98,14 +101,15 @@ pub(super) fn judge(facts: &Facts<'_>) -> Verdict {
 }
 
 /// What speaks against a modality.
-fn modality(judged: &Judged<'_>, losses: Losses) -> Vec<(Grade, String)> {
+fn modality(judged: &Judged<'_>, facts: &Facts<'_>) -> Vec<(Grade, String)> {
     let Judged { quality, limits, .. } = judged;
     // As long as this a device that is there may be silent.
     let patience = limits.suspect.gap.map_or(0.0, |gap| gap.as_secs_f64());
     if quality.samples == 0 {
         let silent = quality.present > 0.0 && quality.present >= patience;
         let text = format!("nothing was received, although it was present for {}", seconds(quality.present));
-        return silent.then_some((Grade::Bad, text)).into_iter().collect();
+        let silent = silent.then_some((Grade::Bad, text));
+        return silent.or_else(|| never_ran(quality, limits, facts.seconds)).into_iter().collect();
     }
     let expected = quality.samples.saturating_add(quality.lost).saturating_add(quality.dropped);
     let share = |limit: fn(&Limits) -> Option<f64>, count: u64, what: &str| {
@@ -117,7 +121,7 @@ fn modality(judged: &Judged<'_>, losses: Losses) -> Vec<(Grade, String)> {
     let dropped = share(
         |limits| limits.dropped,
         quality.dropped,
-        match losses {
+        match facts.losses {
             Losses::Apart => "dropped on the way to the file",
             Losses::Together => "missing, lost by the device or dropped on the way to the file",
         },
@@ -141,11 +145,26 @@ fn modality(judged: &Judged<'_>, losses: Losses) -> Vec<(Grade, String)> {
     let gap = longer(limits, |limits| limits.gap, quality.longest_gap).map(|(grade, limit)| {
         (grade, format!("no sample for {} while present (limit {limit})", seconds(quality.longest_gap)))
     });
+    let opening = longer(limits, |limits| limits.opening, quality.opening).map(|(grade, limit)| {
+        (grade, format!("plugged in for {} without running (limit {limit})", seconds(quality.opening)))
+    });
     let rate = rate(quality, limits).filter(|rate| unless(rate, [&gap, &lost, &dropped]));
-    [dropped, lost, damaged, duplicate, repeated, frozen, late, gap, clock(quality, limits), rate]
+    [dropped, lost, damaged, duplicate, repeated, frozen, late, gap, opening, clock(quality, limits), rate]
         .into_iter()
         .flatten()
         .collect()
+}
+
+/// Of a modality that sent nothing and was present too little to be missed.
+fn never_ran(quality: &Quality, limits: &VerdictSpec, length: f64) -> Option<(Grade, String)> {
+    let found = longer(limits, |limits| limits.opening, quality.opening).or_else(|| {
+        // In a short episode too it is missed.
+        limits.suspect.opening?;
+        (quality.opening > length / 2.0).then(|| (Grade::Suspect, "half the episode".to_owned()))
+    });
+    found.map(|(grade, limit)| {
+        (grade, format!("plugged in for {} and sent nothing (limit {limit})", seconds(quality.plugged)))
+    })
 }
 
 fn clock(quality: &Quality, limits: &VerdictSpec) -> Option<(Grade, String)> {

@@ -193,7 +193,7 @@ impl Writer {
         }
         let clock = (self.config.clock)();
         let begin = Stamp::now();
-        let (path, file) = EpisodePath::create(&request.out, &request.task, clock.wall_ns(begin))?;
+        let path = EpisodePath::create(&request.out, &request.task, clock.wall_ns(begin))?;
         let (finished, partial) = (path.finished.clone(), path.partial.clone());
         // Nothing was recorded into it, and it was made a moment ago.
         let refuse = |error| {
@@ -201,7 +201,8 @@ impl Writer {
             error
         };
         let failed = |source| refuse(RecordError::Io { path: partial.clone(), source });
-        let (handle, watched) = (file.try_clone().map_err(failed)?, file.try_clone().map_err(failed)?);
+        // One descriptor for the names, the room and the writeback, another for the sink.
+        let (watched, file) = (Arc::clone(&path.file), path.file.try_clone().map_err(failed)?);
         let reserve = self.config.registry.rig.disk_reserve;
         let space = Space::begin(watched, &request.out, reserve, begin, &mut self.config.disk).map_err(refuse)?;
         let beginning = Beginning {
@@ -210,7 +211,6 @@ impl Writer {
             request,
             path,
             sink: (self.config.sink)(file),
-            handle,
             attached: &self.attached,
             clock,
             begin,

@@ -29,6 +29,8 @@ pub struct Limits {
     pub late: Option<f64>,
     /// Longest time without a sample while the device was there.
     pub gap: Option<Duration>,
+    /// Longest time in which the device was plugged in and did not run.
+    pub opening: Option<Duration>,
     /// Change of the stamps against this machine's clock over the episode, and how far they lie in
     /// the future.
     pub clock: Option<Duration>,
@@ -61,6 +63,8 @@ impl VerdictSpec {
     ///   images: numbers and bytes may well be constant.
     /// * late 1 %, 20 %: the frame went without them, although the file has them.
     /// * gap `stall_after`, ten times that: longer is what the monitor calls stalled.
+    /// * opening 5 s, off: two of them a replugged device is made to wait, and a slow camera takes
+    ///   another two. Longer is a node that does not start. How bad that is depends on the task.
     /// * clock 10 ms, 100 ms: less than half the usual window of 25 ms cannot move many samples into
     ///   another frame.
     /// * rate 90 %, 50 %: in poor light cameras expose longer and halve their rate.
@@ -76,6 +80,7 @@ impl VerdictSpec {
             frozen: image.then_some(Duration::from_millis(500)),
             late: Some(0.01),
             gap: Some(stall_after),
+            opening: Some(Duration::from_secs(5)),
             clock: Some(Duration::from_millis(10)),
             rate: Some(0.9),
         };
@@ -88,6 +93,7 @@ impl VerdictSpec {
             frozen: image.then_some(Duration::from_secs(2)),
             late: Some(0.2),
             gap: Some(stall_after.saturating_mul(10)),
+            opening: None,
             clock: Some(Duration::from_millis(100)),
             rate: Some(0.5),
         };

@@ -83,11 +83,13 @@ pub enum What {
     /// An episode began.
     Recording {
         /// The file being written, with its final name.
+        #[serde(serialize_with = "text::lossy")]
         file: PathBuf,
     },
     /// An episode ended and its file is closed.
     Episode {
         /// The file; `.partial` remains at its end if it could not be finished.
+        #[serde(serialize_with = "text::lossy")]
         file: PathBuf,
         /// Length in seconds.
         seconds: f64,
@@ -106,6 +108,7 @@ pub enum What {
     /// The disk of the episode in progress is nearly full; told once an episode.
     DiskLow {
         /// The folder.
+        #[serde(serialize_with = "text::lossy")]
         folder: PathBuf,
         /// What is free on its disk, bytes.
         free: u64,
@@ -120,6 +123,7 @@ pub enum What {
     /// An episode that an earlier run did not finish was repaired.
     Recovered {
         /// The repaired file.
+        #[serde(serialize_with = "text::lossy")]
         file: PathBuf,
         /// Length of what was recorded, in seconds.
         seconds: f64,

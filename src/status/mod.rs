@@ -19,6 +19,7 @@ use serde::Serialize;
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::sample::Epoch;
+use crate::text;
 use crate::time::Stamp;
 
 pub use board::{Board, EpisodeEnd};
@@ -88,6 +89,7 @@ pub struct DeviceStatus {
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RecordingStatus {
     /// The file being written.
+    #[serde(serialize_with = "text::lossy")]
     pub file: PathBuf,
     /// Since the episode began.
     pub elapsed: Duration,
@@ -157,6 +159,7 @@ pub struct Snapshot {
     /// The recording in progress.
     pub recording: Option<RecordingStatus>,
     /// The last file finished.
+    #[serde(serialize_with = "text::lossy_option")]
     pub last_episode: Option<PathBuf>,
     /// The verdict on it.
     pub last_verdict: Verdict,

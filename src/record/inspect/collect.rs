@@ -150,20 +150,22 @@ impl Collected {
     }
 
     fn event(&mut self, at: u64, message: &[u8]) {
-        if self.events.len() == MAX_EVENTS {
-            return;
-        }
         let mut event = EventReport { at: 0.0, kind: String::new(), device: String::new(), text: String::new() };
         for (field, value) in protobuf(message) {
             match field {
                 2 => event.kind = value.text(),
                 3 => event.device = value.text(),
                 4 => event.text = value.text(),
-                5 if event.kind == "opened" => self.opened.push((at, value.text())),
+                5 if event.kind == "opened" && self.opened.len() < MAX_EVENTS => self.opened.push((at, value.text())),
                 _ => {}
             }
         }
-        self.events.push((at, event));
+        if let (Some(judge), "attach" | "detach") = (&mut self.judge, event.kind.as_str()) {
+            judge.plugged(&event.device, at, event.kind == "attach");
+        }
+        if self.events.len() < MAX_EVENTS {
+            self.events.push((at, event));
+        }
     }
 
     /// What was gathered, as a report on the file at `path`.

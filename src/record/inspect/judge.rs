@@ -6,8 +6,9 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use serde_json::Value;
+use serde_json::{Map, Value};
 
+use super::super::metadata::CUT_SHORT;
 use super::super::quality::{Frames, Measured, Measures, Seen, Spread};
 use super::super::session::SETTLE;
 use super::super::verdict::{Facts, FileState, Judged, Losses, judge};
@@ -44,6 +45,8 @@ pub(super) struct Judge {
     measures: Measures,
     begin_ns: u64,
     limits: Vec<Option<VerdictSpec>>,
+    /// Modalities by name.
+    layout: BTreeMap<String, ModalityId>,
     /// Next number of each modality, and how many are missing.
     numbers: Vec<(Option<u32>, u64)>,
 }
@@ -65,7 +68,21 @@ impl Judge {
             }
         }
         let measures = Measures::new(&modalities, Frames { begin_ns, hz, wait });
-        Some(Self { measures, begin_ns, limits, numbers: vec![(None, 0); MAX_MODALITIES] })
+        let layout = objects(about, "layout")
+            .filter_map(|(name, bit)| Some((name, ModalityId::new(u8::try_from(bit.as_u64()?).ok()?)?)));
+        let layout = layout.collect();
+        let mut judge = Self { measures, begin_ns, limits, layout, numbers: vec![(None, 0); MAX_MODALITIES] };
+        for (device, _) in objects(about, "serials") {
+            judge.plugged(&device, begin_ns, true);
+        }
+        Some(judge)
+    }
+
+    /// Takes that a device was plugged in, or out.
+    pub(super) fn plugged(&mut self, device: &str, at_ns: u64, there: bool) {
+        if let Some(id) = self.layout.get(device) {
+            self.measures.plugged(*id, at_ns, there);
+        }
     }
 
     /// Takes the message of a sample.
@@ -154,27 +171,41 @@ impl Judge {
             modalities: &judged,
             masks_dropped: said("masks_dropped"),
             events_missed: said("events_missed"),
+            seconds: ending.seconds,
             // A repaired file's summary counts what is there.
             losses: if counted.is_some() && ending.summary.contains_key("lost") {
                 Losses::Apart
             } else {
                 Losses::Together
             },
-            file: file_state(ending.file, ending.repaired),
+            file: file_state(ending),
         };
         judge(&facts)
     }
 }
 
-fn file_state(walked: Walked, repaired: bool) -> FileState<'static> {
+fn file_state<'a>(ending: &Ending<'a>) -> FileState<'a> {
+    let Ending { file: walked, summary, repaired, .. } = ending;
+    let cut_short = summary.get(CUT_SHORT);
     match walked.end {
-        FileEnd::Finished if repaired => FileState::NotWhole("it was repaired, and what came last may be missing"),
-        FileEnd::Finished if walked.damaged_chunks == 0 => FileState::Whole,
+        FileEnd::Finished if *repaired => FileState::NotWhole("it was repaired, and what came last may be missing"),
+        FileEnd::Finished if walked.damaged_chunks == 0 => match cut_short {
+            Some(why) => FileState::NotWhole(why),
+            // Whoever wrote the footer: what the recorder ends, it sums up.
+            None if summary.is_empty() => FileState::NotWhole("the recorder has not finished it"),
+            None => FileState::Whole,
+        },
         FileEnd::Finished => FileState::NotWhole("parts of it are damaged"),
         FileEnd::Unfinished => FileState::NotWhole("the recorder has not finished it"),
         FileEnd::Torn => FileState::NotWhole("its last record is cut"),
         FileEnd::Damaged => FileState::NotWhole("from some place on it cannot be read"),
     }
+}
+
+/// The entries of an object that `about` holds as JSON; none if it is none.
+fn objects(about: &BTreeMap<String, String>, key: &str) -> impl Iterator<Item = (String, Value)> + use<> {
+    let object = about.get(key).and_then(|text| serde_json::from_str::<Map<String, Value>>(text).ok());
+    object.unwrap_or_default().into_iter()
 }
 
 /// What the recorder's summary says; `None` in a file that has no verdict.

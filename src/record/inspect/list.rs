@@ -5,14 +5,17 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
+use super::super::episode::PARTIAL;
 use super::render::{clean, colour, grade_colour, size};
 use super::{FileEnd, InspectError, Inspection, Paint, inspect};
 use crate::status::Verdict;
+use crate::text;
 
 /// An episode of a list. As JSON, one object a line.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Listed {
     /// The file.
+    #[serde(serialize_with = "text::lossy")]
     pub file: PathBuf,
     /// The verdict; absent if the file could not be read.
     #[serde(flatten)]
@@ -60,7 +63,7 @@ pub fn episodes(paths: &[PathBuf]) -> Result<Vec<PathBuf>, InspectError> {
 
 fn is_episode(path: &Path) -> bool {
     let name = match path.extension() {
-        Some(extension) if extension == "partial" => path.with_extension(""),
+        Some(extension) if extension == PARTIAL => path.with_extension(""),
         _ => path.to_owned(),
     };
     name.extension().is_some_and(|extension| extension == "mcap")

@@ -23,6 +23,7 @@ use super::quality::{Quality, Spread};
 use super::walk::walk;
 use crate::episode_format::{self, OpenError};
 use crate::status::Verdict;
+use crate::text;
 use collect::Collected;
 
 pub use super::walk::FileEnd;
@@ -52,6 +53,7 @@ pub enum InspectError {
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Inspection {
     /// The file.
+    #[serde(serialize_with = "text::lossy")]
     pub file: PathBuf,
     /// Its size in bytes.
     pub bytes: u64,

@@ -280,6 +280,8 @@ fn quality() -> Quality {
         offset: None,
         presence: Some(0.7),
         present: 7.0,
+        plugged: 7.0,
+        opening: 0.0,
         hz: Some(28.6),
         nominal_hz: Some(30.0),
         longest_gap: 0.0667,

@@ -74,6 +74,41 @@ fn damaged_is_what_the_driver_flagged_or_what_is_no_whole_picture_and_counts_onc
 }
 
 #[test]
+fn plugged_in_is_what_events_tell_and_opening_the_longest_of_it_that_the_mask_lacks() {
+    // Of ten seconds: events (ms, in or out), masks (ms, bit 0), plugged in, longest without the bit.
+    type Row<'a> = (&'a [(u64, bool)], &'a [(u64, u64)], u64, u64);
+    let table: &[Row<'_>] = &[
+        (&[], &[(0, 0)], 0, 0),
+        (&[(0, true)], &[(0, 0)], 10_000, 10_000),
+        (&[(0, true)], &[(0, 1)], 10_000, 0),
+        (&[(0, true), (4_000, false)], &[(0, 1), (4_000, 0)], 4_000, 0),
+        (&[(2_000, true)], &[(0, 0), (3_000, 1)], 8_000, 1_000),
+        // Restarted in between, and once more at the end.
+        (&[(0, true)], &[(0, 1), (2_000, 0), (5_000, 1), (9_000, 0)], 10_000, 3_000),
+        // Pulled out and put back: what it takes each time counts for itself.
+        (&[(0, true), (3_000, false), (5_000, true)], &[(0, 0), (1_000, 1), (3_000, 0), (7_000, 1)], 8_000, 2_000),
+        // Told twice, and out before it was in.
+        (&[(1_000, false), (2_000, true), (3_000, true)], &[(0, 0)], 8_000, 8_000),
+        // Without a mask nothing is known of its running.
+        (&[(0, true)], &[], 10_000, 0),
+        // Beyond the end.
+        (&[(11_000, true)], &[(0, 0)], 0, 0),
+    ];
+    for (events, masks, plugged, opening) in table {
+        let mut measures = measures(ModalityKind::Image);
+        for (at, mask) in *masks {
+            measures.mask(BEGIN + at * MS, PhysicalMask(*mask));
+        }
+        for (at, there) in *events {
+            measures.plugged(id(0), BEGIN + at * MS, *there);
+        }
+        let said = quality_at(&measures, 10_000);
+        let seconds = |ms: u64| ms as f64 / 1e3;
+        assert_eq!((said.plugged, said.opening), (seconds(*plugged), seconds(*opening)), "{events:?} {masks:?}");
+    }
+}
+
+#[test]
 fn a_number_or_a_time_that_does_not_go_on_is_a_duplicate() {
     let mut measures = measures(ModalityKind::Scalars);
     // A new number at an old time, an old number at a new time; a publisher that began anew is none.

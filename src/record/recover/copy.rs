@@ -47,12 +47,15 @@ pub(super) struct Damage {
     pub(super) unread_bytes: u64,
     pub(super) damaged_chunks: u64,
     pub(super) refused_records: u64,
+    /// The original is whole as a container.
+    pub(super) sound: bool,
 }
 
 impl Damage {
-    /// Does the original end too early, and nothing else is wrong with it?
-    pub(super) fn is_torn_alone(self) -> bool {
-        matches!(self.end, FileEnd::Unfinished | FileEnd::Torn) && self.damaged_chunks + self.refused_records == 0
+    /// Is nothing of the original left out but a torn end?
+    pub(super) fn is_lossless(self) -> bool {
+        let torn_at_most = self.sound || matches!(self.end, FileEnd::Unfinished | FileEnd::Torn);
+        torn_at_most && self.damaged_chunks == 0 && self.refused_records == 0
     }
 }
 
@@ -74,7 +77,7 @@ pub(super) fn summary(file: impl Read, size: u64, watch: &mut Watch<'_>) -> Resu
         }
         look(&walk, size, &mut watched, watch)?;
     }
-    summary.is_sound = walk.walked().sound;
+    summary.sound(walk.walked().sound);
     Ok(Some(summary))
 }
 
@@ -101,6 +104,7 @@ pub(super) fn copy(
         unread_bytes: size.saturating_sub(walked.bytes),
         damaged_chunks: walked.damaged_chunks,
         refused_records: copy.refused.saturating_add(walked.oversized),
+        sound: walked.sound,
     };
     let summary = copy.finish(damage, about, size)?;
     Ok(Some(Copied { summary, damage }))

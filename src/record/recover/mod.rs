@@ -37,13 +37,13 @@ use super::episode::publish;
 use super::lock::{self, Lock};
 use crate::episode_format::walk::MAGIC;
 use crate::episode_format::{self, OpenError};
-use crate::time;
+use crate::{text, time};
 
 pub use self::copy::recover_bytes;
 use self::copy::{Copied, Damage};
 pub use self::folder::{Repairs, left_behind};
 use self::names::{Names, set_aside};
-use self::summary::Summary;
+use self::summary::{Made, Summary};
 pub use super::walk::FileEnd;
 
 /// Why a file was not repaired. It is as it was.
@@ -93,6 +93,7 @@ impl RecoverError {
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Recovered {
     /// The file.
+    #[serde(serialize_with = "text::lossy")]
     pub file: PathBuf,
     /// What became of it.
     #[serde(flatten)]
@@ -108,21 +109,29 @@ pub enum Outcome {
     /// Nothing was missing but its name, which it has now; or nothing at all.
     Whole {
         /// Its name.
+        #[serde(serialize_with = "text::lossy")]
         to: PathBuf,
     },
-    /// An earlier repair was ended after its work was done; what was left of the original is removed.
+    /// An earlier repair was ended after its work was done; of the original nothing is left that the
+    /// repaired file does not hold.
     AlreadyRepaired {
         /// The repaired file.
+        #[serde(serialize_with = "text::lossy")]
         to: PathBuf,
+        /// The original, where it holds more than the repaired file.
+        #[serde(serialize_with = "text::lossy_option")]
+        kept: Option<PathBuf>,
     },
     /// Nothing was recorded in it.
     Empty {
         /// What it is called now; a file of no bytes is removed.
+        #[serde(serialize_with = "text::lossy_option")]
         kept: Option<PathBuf>,
     },
     /// It is no MCAP file.
     Unreadable {
         /// What it is called now.
+        #[serde(serialize_with = "text::lossy")]
         kept: PathBuf,
     },
 }
@@ -131,6 +140,7 @@ pub enum Outcome {
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Repaired {
     /// The repaired file.
+    #[serde(serialize_with = "text::lossy")]
     pub to: PathBuf,
     /// Seconds from the episode's beginning to the last message.
     pub seconds: f64,
@@ -147,6 +157,7 @@ pub struct Repaired {
     /// Time of the last message, RFC 3339.
     pub last: String,
     /// The original, where it holds more than the repaired file, or where it is no `.partial`.
+    #[serde(serialize_with = "text::lossy_option")]
     pub original: Option<PathBuf>,
 }
 
@@ -197,22 +208,28 @@ impl Source<'_> {
         }
         // A footer at the end: perhaps the whole episode, perhaps one that was repaired already.
         let known = if self.ends_with_magic()? { self.read(watch)?.unwrap_or_default() } else { Summary::default() };
-        if known.is_sound {
+        if known.is_whole() {
             match publish(self.path, &names.finished) {
                 Ok(()) => return Ok(Outcome::Whole { to: names.finished.clone() }),
                 Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
                 Err(error) => return Err(self.io(error)),
             }
         }
-        if self.is_repaired(&names.finished, watch)? {
-            fs::remove_file(self.path).map_err(|source| self.io(source))?;
-            return Ok(Outcome::AlreadyRepaired { to: names.finished.clone() });
-        }
         let path = self.path;
         let aside = |ending| {
             set_aside(path, &names.finished, ending)
                 .map_err(|source| RecoverError::Io { path: path.to_owned(), source })
         };
+        if let Some(made) = self.repaired(&names.finished, watch)? {
+            let kept = match made {
+                Made::OfAll => {
+                    fs::remove_file(path).map_err(|source| self.io(source))?;
+                    None
+                }
+                Made::OfParts => Some(aside("damaged")?),
+            };
+            return Ok(Outcome::AlreadyRepaired { to: names.finished.clone(), kept });
+        }
         let Some(copied) = self.copy(&names.recovering, &known, watch)? else {
             return Ok(Outcome::Unreadable { kept: aside("damaged")? });
         };
@@ -222,7 +239,7 @@ impl Source<'_> {
         }
         let to = self.publish(names)?;
         // Removed only where nothing is lost by it: what follows a torn end is less than one record.
-        let original = if copied.damage.is_torn_alone() {
+        let original = if copied.damage.is_lossless() {
             fs::remove_file(self.path).err().map(|error| {
                 tracing::warn!(file = %self.path.display(), %error, "repaired, but not removed");
                 self.path.to_owned()
@@ -235,11 +252,11 @@ impl Source<'_> {
 
     fn finished(&mut self, names: &Names, watch: &mut Watch<'_>) -> Result<Outcome, RecoverError> {
         let Some(known) = self.read(watch)? else { return Err(RecoverError::NotMcap(self.path.to_owned())) };
-        if known.is_sound {
+        if known.is_whole() {
             return Ok(Outcome::Whole { to: self.path.to_owned() });
         }
-        if self.is_repaired(&names.finished, watch)? {
-            return Ok(Outcome::AlreadyRepaired { to: names.finished.clone() });
+        if self.repaired(&names.finished, watch)?.is_some() {
+            return Ok(Outcome::AlreadyRepaired { to: names.finished.clone(), kept: None });
         }
         // Channels that a damaged chunk defines are repeated in the index, if that is left.
         let Some(copied) = self.copy(&names.recovering, &known, watch)? else {
@@ -286,10 +303,10 @@ impl Source<'_> {
     }
 
     /// Is `finished` a whole file that was made of this one?
-    fn is_repaired(&self, finished: &Path, watch: &mut Watch<'_>) -> Result<bool, RecoverError> {
-        let Ok((file, size)) = episode_format::open(finished) else { return Ok(false) };
-        let made = self.summary_of(&file, size, watch)?;
-        Ok(made.is_some_and(|made| made.is_sound && made.is_of(&self.name(), self.size)))
+    fn repaired(&self, finished: &Path, watch: &mut Watch<'_>) -> Result<Option<Made>, RecoverError> {
+        let Ok((file, size)) = episode_format::open(finished) else { return Ok(None) };
+        let summary = self.summary_of(&file, size, watch)?;
+        Ok(summary.and_then(|summary| summary.made_of(&self.name(), self.size)))
     }
 
     /// Gives the repaired file its name, another one if that is taken.
@@ -338,7 +355,7 @@ fn remove(recovering: &Path) {
 
 impl Copied {
     fn repaired(&self, to: PathBuf, original: Option<PathBuf>) -> Repaired {
-        let Damage { end, unread_bytes, damaged_chunks, refused_records } = self.damage;
+        let Damage { end, unread_bytes, damaged_chunks, refused_records, .. } = self.damage;
         Repaired {
             to,
             seconds: self.summary.seconds(),

@@ -5,7 +5,7 @@ use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
 
-use super::super::episode::publish;
+use super::super::episode::{PARTIAL, publish};
 
 /// Names tried when others are taken.
 const ATTEMPTS: u32 = 100;
@@ -26,7 +26,8 @@ pub(super) struct Names {
 impl Names {
     pub(super) fn of(path: &Path) -> Self {
         let name = path.file_name().unwrap_or_default();
-        let partial = name.to_str().and_then(|name| name.strip_suffix(".partial")).filter(|name| is_mcap(name));
+        let partial =
+            name.to_str().and_then(|name| name.strip_suffix(PARTIAL)?.strip_suffix('.')).filter(|name| is_mcap(name));
         let (base, finished) = match partial.map(|name| path.with_file_name(name)) {
             Some(finished) => (finished.clone(), finished),
             None => (path.to_owned(), beside(path, 1)),

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use serde_json::{Map, Value, json};
 
 use super::copy::{About, Damage};
-use super::summary::Summary;
+use super::summary::{LOSSLESS, Summary};
 use super::{FileEnd, Outcome, Recovered, Repaired};
 use crate::status::Level;
 use crate::text;
@@ -33,7 +33,7 @@ pub(super) fn end(summary: &Summary) -> BTreeMap<String, String> {
 /// The metadata record `rapid/recovered`: what was repaired when and by whom, what is there and what
 /// is not.
 pub(super) fn recovered(summary: &Summary, damage: Damage, about: &About<'_>, size: u64) -> BTreeMap<String, String> {
-    let Damage { end, unread_bytes, damaged_chunks, refused_records } = damage;
+    let Damage { end, unread_bytes, damaged_chunks, refused_records, .. } = damage;
     let end = serde_json::to_value(end).ok();
     text_map([
         ("software", concat!("rapid ", env!("CARGO_PKG_VERSION")).to_owned()),
@@ -47,6 +47,7 @@ pub(super) fn recovered(summary: &Summary, damage: Damage, about: &About<'_>, si
         ("unread_bytes", unread_bytes.to_string()),
         ("damaged_chunks", damaged_chunks.to_string()),
         ("refused_records", refused_records.to_string()),
+        (LOSSLESS, damage.is_lossless().to_string()),
     ])
 }
 
@@ -73,7 +74,11 @@ impl Recovered {
             }
             Outcome::Whole { to } if *to == self.file => (Level::Info, "whole; nothing to repair".to_owned()),
             Outcome::Whole { to } => (Level::Info, format!("whole; it only lacked its name, {}", name(to))),
-            Outcome::AlreadyRepaired { to } => (Level::Info, format!("already repaired: {}", name(to))),
+            Outcome::AlreadyRepaired { to, kept: None } => (Level::Info, format!("already repaired: {}", name(to))),
+            Outcome::AlreadyRepaired { to, kept: Some(kept) } => {
+                let (to, kept) = (name(to), name(kept));
+                (Level::Warn, format!("already repaired: {to}; what could not be read is kept in {kept}"))
+            }
             Outcome::Empty { kept: None } => (Level::Info, "of no bytes; removed".to_owned()),
             Outcome::Empty { kept: Some(kept) } => {
                 (Level::Info, format!("nothing was recorded in it; set aside as {}", name(kept)))

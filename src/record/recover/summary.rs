@@ -6,6 +6,8 @@ use super::super::walk::op;
 use super::super::wire::Fields;
 use crate::episode_format::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, RECOVERED, SUMMARY};
 
+/// Key of `rapid/recovered`: "true" where nothing of the original is left out but a torn end.
+pub(super) const LOSSLESS: &str = "lossless";
 /// Bytes of channels and schemas that are remembered: a hundred times what an episode of 64 devices
 /// has. What goes beyond it is not taken over from an index.
 const DEFINITIONS: usize = 16 << 20;
@@ -23,8 +25,8 @@ pub(super) struct Summary {
     pub(super) frames: u64,
     /// The recorder wrote its own summary.
     pub(super) has_end: bool,
-    /// The file is whole.
-    pub(super) is_sound: bool,
+    /// The file is whole, as a container.
+    is_sound: bool,
     /// Channels, by number.
     pub(super) channels: BTreeMap<u16, Channel>,
     /// When the episode began, as the recorder says.
@@ -33,9 +35,26 @@ pub(super) struct Summary {
     /// before it began.
     captured: u64,
     /// Name and size of the file this one was made of.
-    origin: Option<(String, u64)>,
+    origin: Option<Origin>,
     definitions: BTreeMap<(u8, u16), Vec<u8>>,
     defined_bytes: usize,
+}
+
+/// What a file was made of.
+#[derive(Debug)]
+struct Origin {
+    name: String,
+    bytes: u64,
+    lossless: bool,
+}
+
+/// How much of its original a repaired file holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Made {
+    /// All but a torn end.
+    OfAll,
+    /// Not what was damaged or made no sense.
+    OfParts,
 }
 
 /// A channel and what came on it.
@@ -81,9 +100,23 @@ impl Summary {
         self.definitions.get(&(opcode, id)).map(Vec::as_slice)
     }
 
-    /// Was it made by repair of a file of this name and size?
-    pub(super) fn is_of(&self, name: &str, bytes: u64) -> bool {
-        self.origin.as_ref().is_some_and(|origin| *origin == (name.to_owned(), bytes))
+    /// Was it made, to its end, by repair of a file of this name and size? Then, whether it holds all
+    /// that file held.
+    pub(super) fn made_of(&self, name: &str, bytes: u64) -> Option<Made> {
+        let origin = self.origin.as_ref().filter(|_| self.is_whole())?;
+        let same = origin.name == name && origin.bytes == bytes;
+        same.then_some(if origin.lossless { Made::OfAll } else { Made::OfParts })
+    }
+
+    /// Says whether every byte of the file was understood and is right.
+    pub(super) fn sound(&mut self, sound: bool) {
+        self.is_sound = sound;
+    }
+
+    /// Is the file whole, and an episode of ours to its end? A recorder that gave up has written no
+    /// summary, whatever became of the file's end.
+    pub(super) fn is_whole(&self) -> bool {
+        self.is_sound && (self.has_end || self.begin_ns.is_none())
     }
 
     fn define(&mut self, opcode: u8, mut fields: Fields<'_>) -> Option<()> {
@@ -133,7 +166,12 @@ impl Summary {
         match name {
             ABOUT => self.begin_ns = map.get("begin_wall_ns").and_then(|ns| ns.parse().ok()),
             SUMMARY => self.has_end = true,
-            _ => self.origin = map.remove("source").zip(map.get("source_bytes").and_then(|bytes| bytes.parse().ok())),
+            _ => {
+                let lossless = map.get(LOSSLESS).is_some_and(|said| said == "true");
+                let bytes = map.get("source_bytes").and_then(|bytes| bytes.parse().ok());
+                let origin = |(name, bytes)| Origin { name, bytes, lossless };
+                self.origin = map.remove("source").zip(bytes).map(origin);
+            }
         }
         Some(())
     }

@@ -151,7 +151,7 @@ fn whatever_happened_to_a_file_the_repaired_one_is_whole() {
                 strictly(&whole);
                 // Repaired once, it needs no repair.
                 let summary = copy::summary(&*whole, whole.len() as u64, &mut go_on).unwrap().unwrap();
-                prop_assert!(summary.is_sound);
+                prop_assert!(summary.is_whole());
             }
         });
     }
@@ -227,13 +227,32 @@ async fn a_repair_that_was_ended_is_made_again() {
     // By a kill between the two last steps: the repaired file has its name, the original is there too.
     fs::write(&partial, &many).unwrap();
     let again = recover(&partial, &mut go_on).unwrap();
-    assert_eq!(again.outcome, Outcome::AlreadyRepaired { to: first.to.clone() });
+    assert_eq!(again.outcome, Outcome::AlreadyRepaired { to: first.to.clone(), kept: None });
     assert_eq!(names(folder.path()), ["a_001.mcap"]);
     // A file of that name that is something else is not taken for it, nor replaced.
     fs::write(&partial, &many[..many.len() - 1]).unwrap();
     let other = repaired(&partial);
     assert_eq!(other.to, folder.path().join("a_001.recovered.mcap"));
     assert_eq!(names(folder.path()), ["a_001.mcap", "a_001.recovered.mcap"]);
+}
+
+#[test]
+fn what_an_ended_repair_could_not_read_is_kept_by_the_next() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut damaged = testing::episode(testing::options().compression(None));
+    let topic = damaged.windows(10).position(|window| window == b"/rapid/tof").unwrap();
+    let mask = damaged[topic..].windows(10).position(|window| window == b"/rapid/mas").unwrap() + topic;
+    damaged[mask] = b'X';
+    let partial = put(&folder, "a_001.mcap.partial", &damaged);
+    let first = repaired(&partial);
+    assert!(first.damaged_chunks > 0 && first.original.is_some());
+    // By a kill between the two last steps: the repaired file has its name, the original is not set aside.
+    fs::rename(first.original.unwrap(), &partial).unwrap();
+    let said = recover(&partial, &mut go_on).unwrap();
+    let kept = folder.path().join("a_001.mcap.damaged");
+    assert_eq!(said.outcome, Outcome::AlreadyRepaired { to: first.to, kept: Some(kept.clone()) });
+    assert_eq!((said.sentence().0, fs::read(&kept).unwrap()), (Level::Warn, damaged));
+    assert_eq!(names(folder.path()), ["a_001.mcap", "a_001.mcap.damaged"]);
 }
 
 /// A disk that takes so many bytes.
@@ -294,7 +313,7 @@ async fn of_a_damaged_finished_file_a_whole_one_is_made_beside_it() {
     assert_eq!(strictly(&fs::read(&made.to).unwrap()), original);
     assert_eq!(fs::read(&cut).unwrap(), bytes[..bytes.len() - 30]);
     let again = recover(&cut, &mut go_on).unwrap();
-    assert_eq!(again.outcome, Outcome::AlreadyRepaired { to: made.to.clone() });
+    assert_eq!(again.outcome, Outcome::AlreadyRepaired { to: made.to.clone(), kept: None });
     // The recorder had written its summary: that one is kept, and there is no second one.
     assert_eq!(metadata(&fs::read(&made.to).unwrap())["rapid/summary"], metadata(&bytes)["rapid/summary"]);
 

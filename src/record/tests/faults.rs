@@ -87,6 +87,84 @@ async fn nothing_is_written_behind_a_write_that_failed() {
     assert_eq!(inspect::inspect(&file).unwrap().end, inspect::FileEnd::Torn);
 }
 
+/// A disk whose cable is pulled between two writes, and put back. Of that its writer, which only
+/// remembers what went wrong in a write of its own, knows nothing.
+struct Loose(File, u32);
+
+impl Write for Loose {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0.write(bytes)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.1 += 1;
+        if self.1 == 2 { Err(io::Error::other("cable pulled")) } else { self.0.flush() }
+    }
+}
+
+impl Sink for Loose {
+    fn sync(&mut self) -> io::Result<()> {
+        self.0.sync_all()
+    }
+}
+
+#[tokio::test]
+async fn a_file_that_failed_gets_no_end_that_makes_it_look_whole() {
+    let bench = Bench::with_sink(|file| Box::new(Loose(file, 0)));
+    let mut events = bench.board.events();
+    bench.recorder.start(bench.request(None)).await.unwrap();
+    let mut seq = 0;
+    let closed = loop {
+        bench.sample(CAM, 1, seq, Stamp::now().0, 0);
+        seq += 1;
+        tokio::task::yield_now().await;
+        match events.try_recv() {
+            Ok(event) if matches!(event.what, What::Episode { .. }) => break event.what,
+            _ => {}
+        }
+    };
+    let What::Episode { file, error, verdict, .. } = closed else { unreachable!() };
+    assert!(error.unwrap().contains("cable pulled"));
+    assert_eq!(verdict.grade, Grade::Bad);
+    let said = inspect::inspect(&file).unwrap();
+    assert_eq!((said.end, said.recorded_verdict), (inspect::FileEnd::Unfinished, None));
+    assert_ne!(said.verdict.grade, Grade::Good);
+    let repaired = recover::recover(&file, &mut |_, _| std::ops::ControlFlow::Continue(())).unwrap();
+    assert!(matches!(repaired.outcome, recover::Outcome::Repaired(_)), "{repaired:?}");
+}
+
+#[tokio::test]
+async fn a_footer_without_our_summary_makes_no_episode_whole() {
+    // As a version before this one left it: the writer was dropped, and ended the file itself.
+    let bench = Bench::new();
+    let (file, _) = bench.one_second().await;
+    bench.until_file(&file).await;
+    let partial = bench.folder.path().join("t_001.mcap.partial");
+    let mut writer = mcap::Writer::new(File::create(&partial).unwrap()).unwrap();
+    let bytes = std::fs::read(&file).unwrap();
+    for record in mcap::read::LinearReader::new(&bytes).unwrap() {
+        if let mcap::records::Record::Metadata(metadata) = record.unwrap()
+            && metadata.name == "rapid"
+        {
+            writer.write_metadata(&metadata).unwrap();
+        }
+    }
+    for message in mcap::MessageStream::new(&bytes).unwrap() {
+        writer.write(&message.unwrap()).unwrap();
+    }
+    drop(writer);
+    let said = inspect::inspect(&partial).unwrap();
+    let reason = "the file is not whole: the recorder has not finished it";
+    assert_eq!(said.end, inspect::FileEnd::Finished);
+    assert!(said.verdict.reasons.iter().any(|said| said == reason), "{:?}", said.verdict);
+    let said = recover::recover(&partial, &mut |_, _| std::ops::ControlFlow::Continue(())).unwrap();
+    let recover::Outcome::Repaired(repaired) = said.outcome else { panic!("{said:?}") };
+    // Nothing of it is left out, and nothing of it is kept.
+    assert!(repaired.original.is_none() && !partial.exists());
+    let reasons = inspect::inspect(&repaired.to).unwrap().verdict.reasons;
+    assert!(reasons.iter().any(|said| said.contains("it was repaired")), "{reasons:?}");
+}
+
 /// A disk that takes everything and keeps nothing for sure.
 struct Unsure(File);
 
@@ -164,6 +242,10 @@ async fn a_panic_leaves_a_finished_file_and_says_so() {
     let What::Episode { file, error, .. } = bench.until_closed(&mut events).await else { unreachable!() };
     assert_eq!(file, finished);
     assert!(error.unwrap().contains("scripted panic"));
+    // Whoever reads the file is told what the recorder said.
+    let said = inspect::inspect(&finished).unwrap();
+    assert!(said.recorded_verdict.as_ref().unwrap().reasons.iter().any(|said| said.contains("scripted panic")));
+    assert_eq!(Some(said.verdict), said.recorded_verdict);
     assert_eq!(read(&finished).on("/rapid/tof").count(), 1);
     assert!(matches!(bench.recorder.start(bench.request(None)).await, Err(RecordError::Ended)));
 }

@@ -51,6 +51,10 @@ async fn a_disk_that_fills_up_is_told_once_and_ends_the_episode_with_a_whole_fil
     let error = error.unwrap();
     assert!(error.contains("nearly full") && error.contains("disk_reserve") && error.contains("--out"), "{error}");
     let read = read(&finished);
+    assert_eq!(read.metadata["rapid/summary"]["cut_short"], error);
+    let said = inspect::inspect(&finished).unwrap();
+    assert!(said.verdict.grade > Grade::Good && said.verdict.why().contains(&error), "{:?}", said.verdict);
+    assert_eq!(Some(said.verdict), said.recorded_verdict);
     assert_eq!(read.on("/rapid/tof").count(), 1);
     assert_eq!(read.on("/rapid/event").filter(|message| text(&message.4, "kind") == "disk_low").count(), 1);
     assert_eq!(bench.board.snapshot().last_episode, Some(finished));
@@ -97,6 +101,43 @@ async fn a_folder_that_is_removed_comes_back_with_the_episode() {
     assert_eq!((report.error, report.file.as_path()), (None, finished.as_path()));
     assert_eq!(read(&finished).on("/rapid/tof").count(), 2);
     assert_eq!(std::fs::read_dir(finished.parent().unwrap()).unwrap().count(), 1);
+}
+
+#[tokio::test]
+async fn a_file_removed_on_a_file_system_that_only_hides_it_is_written_again() {
+    // As NFS and libfuse do it.
+    for hidden in [".nfs000000000004a1c700000002", ".fuse_hidden0000000300000001"] {
+        let bench = Bench::new();
+        let finished = bench.recorder.start(bench.request(None)).await.unwrap();
+        bench.sample(TOF, 1, 0, Stamp::now().0, 0);
+        let hidden = finished.with_file_name(hidden);
+        std::fs::rename(finished.with_extension("mcap.partial"), &hidden).unwrap();
+        bench.script.taken().await;
+        let report = bench.recorder.stop().await.unwrap();
+        assert_eq!((report.error, report.file.as_path()), (None, finished.as_path()));
+        // Which the file system itself takes away.
+        std::fs::remove_file(&hidden).unwrap();
+        assert_eq!(read(&finished).on("/rapid/tof").count(), 1);
+    }
+}
+
+#[tokio::test]
+async fn a_folder_whose_name_is_no_utf_8_holds_episodes_like_any_other() {
+    use std::os::unix::ffi::OsStrExt;
+    let bench = Bench::new();
+    let mut request = bench.request(None);
+    request.out = bench.folder.path().join(std::ffi::OsStr::from_bytes(b"caf\xe9"));
+    let finished = bench.recorder.start(request).await.unwrap();
+    bench.sample(TOF, 1, 0, Stamp::now().0, 0);
+    bench.script.taken().await;
+    let report = bench.recorder.stop().await.unwrap();
+    assert_eq!((report.error.as_deref(), report.file.as_path()), (None, finished.as_path()));
+    assert!(serde_json::to_string(&inspect::list(&finished)).unwrap().contains("caf\u{fffd}/"));
+    let read = read(&finished);
+    assert_eq!(read.on("/rapid/tof").count(), 1);
+    let recording: Vec<_> = read.on("/rapid/event").filter(|message| text(&message.4, "kind") == "recording").collect();
+    assert_eq!(recording.len(), 1);
+    assert!(text(&recording[0].4, "json").contains("caf\u{fffd}/"), "{}", text(&recording[0].4, "json"));
 }
 
 #[tokio::test]

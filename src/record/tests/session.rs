@@ -15,14 +15,13 @@ fn session(folder: &Path, board: &Arc<Board>, masks: &MaskHistory) -> Session {
 
 fn session_of(registry: Registry, folder: &Path, board: &Arc<Board>, masks: &MaskHistory) -> Session {
     let clock = WallClock::with_offset(i128::from(1_700_000_000 * 1000 * MS));
-    let (path, file) = EpisodePath::create(folder, "t", clock.wall_ns(Stamp(0))).unwrap();
+    let path = EpisodePath::create(folder, "t", clock.wall_ns(Stamp(0))).unwrap();
     let beginning = Beginning {
         registry: Arc::new(registry),
         board: Arc::clone(board),
         request: &EpisodeRequest::default(),
+        sink: Box::new(path.file.try_clone().unwrap()),
         path,
-        handle: file.try_clone().unwrap(),
-        sink: Box::new(file),
         attached: &Attached::default(),
         clock,
         begin: Stamp(1000 * MS),
@@ -170,4 +169,44 @@ fn a_slow_sensor_makes_its_frame_and_every_frame_waits_for_it() {
     assert_eq!(sample.2 - read.on("/rapid/frame").next().unwrap().2, 299 * MS, "the file keeps the capture time");
     let modalities: serde_json::Value = serde_json::from_str(&read.metadata["rapid"]["modalities"]).unwrap();
     assert_eq!(modalities[usize::from(TOF)]["latency_ns"], 300_000_000);
+}
+
+/// What a device that is plugged in says on the board.
+fn attach(name: &str, bit: u8) -> What {
+    let usb = UsbIdentity { port: "1-3".to_owned(), ..UsbIdentity::default() };
+    What::Attach { device: name.to_owned(), bit: id(bit), node: "/dev/video9".to_owned(), usb, driver: None }
+}
+
+#[tokio::test]
+async fn a_device_that_is_plugged_in_and_never_sends_is_missed_by_recorder_and_inspect_alike() {
+    let silent = "never: plugged in for";
+    // In before the episode, in it, and out again in it.
+    for (before, missed) in [(true, true), (true, false), (false, false)] {
+        let bench = Bench::new();
+        let begin = Stamp::now().0;
+        bench.mask(0b10, 1, begin);
+        bench.script.taken().await;
+        if before {
+            bench.board.announce(attach("never", NEVER));
+        }
+        let finished = bench.recorder.start(bench.request(Some(Duration::from_millis(500)))).await.unwrap();
+        if before && !missed {
+            let (device, bit, witness) = ("never".to_owned(), id(NEVER), "kernel".to_owned());
+            bench.board.announce(What::Detach { device, bit, witness });
+        }
+        let t0 = Stamp::now().0;
+        for n in 0..45 {
+            bench.mask(0b10, n + 2, t0 + n * 10 * MS);
+            bench.sample(TOF, 1, n, t0 + n * 10 * MS, 0);
+        }
+        bench.until_file(&finished).await;
+        let said = inspect::inspect(&finished).unwrap();
+        let reasons = &said.verdict.reasons;
+        assert_eq!(reasons.iter().any(|reason| reason.starts_with(silent)), missed, "{before}: {reasons:?}");
+        assert_eq!(said.verdict.grade > Grade::Good, missed, "{reasons:?}");
+        assert_eq!(Some(&said.verdict), said.recorded_verdict.as_ref());
+        let never = said.modalities.iter().find(|modality| modality.name == "never").unwrap();
+        let plugged = never.quality.unwrap().plugged;
+        assert!(if missed { (0.49..0.51).contains(&plugged) } else { plugged < 0.4 }, "{plugged}");
+    }
 }

@@ -27,6 +27,8 @@ fn good() -> Quality {
         offset: None,
         presence: Some(0.7),
         present: 7.0,
+        plugged: 7.5,
+        opening: 0.5,
         hz: Some(30.0),
         nominal_hz: Some(30.0),
         longest_gap: 0.04,
@@ -41,7 +43,14 @@ fn limits() -> VerdictSpec {
 
 fn verdict_on(quality: &Quality, file: FileState<'_>) -> Verdict {
     let modalities = [Judged { name: "cam", quality, limits: limits() }];
-    judge(&Facts { modalities: &modalities, masks_dropped: 0, events_missed: 0, losses: Losses::Apart, file })
+    judge(&Facts {
+        modalities: &modalities,
+        masks_dropped: 0,
+        events_missed: 0,
+        seconds: 10.0,
+        losses: Losses::Apart,
+        file,
+    })
 }
 
 #[track_caller]
@@ -130,6 +139,7 @@ fn a_modality_that_was_there_and_sent_nothing_is_bad_and_one_that_was_not_is_not
             modalities: &modalities,
             masks_dropped: 0,
             events_missed: 0,
+            seconds: 10.0,
             losses: Losses::Apart,
             file: FileState::Whole,
         };
@@ -147,11 +157,51 @@ fn a_modality_that_was_there_and_sent_nothing_is_bad_and_one_that_was_not_is_not
 }
 
 #[test]
+fn a_device_that_is_plugged_in_and_does_not_run_is_missed_and_one_that_starts_is_not() {
+    use Grade::{Good, Suspect};
+    let says = |seconds: f64, quality: Quality, limits: VerdictSpec| {
+        let talks = good();
+        let modalities =
+            [Judged { name: "cam", quality: &talks, limits }, Judged { name: "tof", quality: &quality, limits }];
+        let (losses, file) = (Losses::Apart, FileState::Whole);
+        let said = judge(&Facts { modalities: &modalities, masks_dropped: 0, events_missed: 0, seconds, losses, file });
+        (said.grade, said.why())
+    };
+    let never = |plugged| Quality { samples: 0, present: 0.0, plugged, opening: plugged, hz: None, ..good() };
+    for (seconds, plugged, said) in [
+        (10.0, 10.0, Some("tof: plugged in for 10.0 s and sent nothing (limit 5.0 s)")),
+        (60.0, 5.1, Some("tof: plugged in for 5.1 s and sent nothing (limit 5.0 s)")),
+        (3.0, 3.0, Some("tof: plugged in for 3.0 s and sent nothing (limit half the episode)")),
+        // Plugged in towards the end; never plugged in.
+        (10.0, 4.9, None),
+        (3.0, 1.4, None),
+        (10.0, 0.0, None),
+    ] {
+        let expected = said.map_or((Good, String::new()), |said| (Suspect, said.to_owned()));
+        assert_eq!(says(seconds, never(plugged), limits()), expected, "{plugged} of {seconds} s");
+    }
+    // One that ran, and was started again for too long.
+    let restarted = |opening| Quality { plugged: 9.0, opening, ..good() };
+    assert_eq!(says(10.0, restarted(4.9), limits()).0, Good);
+    let said = "tof: plugged in for 5.5 s without running (limit 5.0 s)";
+    assert_eq!(says(10.0, restarted(5.5), limits()), (Suspect, said.to_owned()));
+    let mut off = limits();
+    off.suspect.opening = None;
+    assert_eq!(says(10.0, never(10.0), off).0, Good);
+}
+
+#[test]
 fn the_file_and_what_is_missing_in_it_count_and_the_gravest_comes_first() {
     let quality = Quality { lost: 5, ..good() };
     let modalities = [Judged { name: "cam", quality: &quality, limits: limits() }];
-    let facts =
-        |file| Facts { modalities: &modalities, masks_dropped: 2, events_missed: 1, losses: Losses::Apart, file };
+    let facts = |file| Facts {
+        modalities: &modalities,
+        masks_dropped: 2,
+        events_missed: 1,
+        seconds: 10.0,
+        losses: Losses::Apart,
+        file,
+    };
     let said = judge(&facts(FileState::NotWhole("it was recovered")));
     let lost = "cam: 5 of 215 samples lost by the device (limit 1 %)";
     let missing =
@@ -167,6 +217,7 @@ fn the_file_and_what_is_missing_in_it_count_and_the_gravest_comes_first() {
         modalities: &modalities,
         masks_dropped: 0,
         events_missed: 0,
+        seconds: 10.0,
         losses: Losses::Together,
         file: FileState::Whole,
     };
@@ -185,6 +236,7 @@ fn a_check_that_is_off_says_nothing() {
         frozen: None,
         late: None,
         gap: None,
+        opening: None,
         clock: None,
         rate: None,
     };
@@ -197,6 +249,7 @@ fn a_check_that_is_off_says_nothing() {
         frozen: 9.0,
         late: 50,
         longest_gap: 9.0,
+        opening: 9.0,
         clock_drift: Some(999.0),
         clock_ahead: 999.0,
         hz: Some(1.0),
@@ -208,6 +261,7 @@ fn a_check_that_is_off_says_nothing() {
         modalities: &modalities,
         masks_dropped: 0,
         events_missed: 0,
+        seconds: 10.0,
         losses: Losses::Apart,
         file: FileState::Whole,
     };

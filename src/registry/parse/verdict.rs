@@ -27,8 +27,12 @@ const SHARES: [(&str, Share, Worse); 7] = [
     ("rate", |limits| &mut limits.rate, Worse::Less),
 ];
 /// Checks whose limit is a time; longer is worse.
-const TIMES: [(&str, Time); 3] =
-    [("frozen", |limits| &mut limits.frozen), ("gap", |limits| &mut limits.gap), ("clock", |limits| &mut limits.clock)];
+const TIMES: [(&str, Time); 4] = [
+    ("frozen", |limits| &mut limits.frozen),
+    ("gap", |limits| &mut limits.gap),
+    ("opening", |limits| &mut limits.opening),
+    ("clock", |limits| &mut limits.clock),
+];
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Worse {

@@ -1,0 +1,29 @@
+//! What an event of an episode says to people. Pure.
+
+use crate::status::What;
+
+/// An event for people.
+pub(super) fn describe(what: &What) -> String {
+    match what {
+        What::Attach { device, node, usb, .. } => match &usb.serial {
+            Some(serial) => format!("{device} attached: {node}, port {}, serial {serial}", usb.port),
+            None => format!("{device} attached: {node}, port {}", usb.port),
+        },
+        What::Opened { device, provenance, .. } => {
+            let unit = provenance.usb.serial.as_deref().unwrap_or("without a serial number");
+            format!("{device} opened in epoch {}: unit {unit}", provenance.epoch.0)
+        }
+        What::Detach { device, witness, .. } => format!("{device} detached, told by {witness}"),
+        What::State { device, state, mask, detail, .. } => {
+            let state = format!("{state:?}").to_lowercase();
+            format!("{device} {state}, mask {mask}: {detail}")
+        }
+        What::Unregistered { device, reason } => format!("{device} not registered: {reason}"),
+        What::Recording { file } => format!("recording {}", file.display()),
+        What::Episode { file, .. } => format!("finished {}", file.display()),
+        What::Recovered { text, .. } | What::Log { text, .. } => text.clone(),
+        What::DiskLow { .. } | What::ClockStep { .. } => {
+            what.sentence().map_or_else(String::new, |(_, sentence)| sentence)
+        }
+    }
+}
