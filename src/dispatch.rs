@@ -2,6 +2,8 @@
 //!
 //! Invariant: every error is printed here, once.
 
+mod failure;
+
 use std::io::{self, IsTerminal, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
@@ -13,21 +15,21 @@ use std::time::Duration;
 use clap::CommandFactory;
 use tokio_util::sync::CancellationToken;
 
+use self::failure::Failure;
 use crate::app::{self, AppError, Devices, Options, Screen, mask_path};
 use crate::cli::{Calibration, Cli, Command, Global, RunArgs, SimArgs};
 use crate::commands::calibrate::LatencyOptions;
 use crate::commands::devices::{Entries, Formats};
-use crate::commands::inspect::InspectFailure;
 use crate::commands::{self, Format, Outcome, mask::MaskOptions};
-use crate::driver::{DriverError, replay};
+use crate::driver::replay;
 use crate::headless::style::{ColourChoice, Palette, Terminal};
 use crate::hotplug::udev;
 use crate::outlet;
-use crate::record::inspect::{self, InspectError};
+use crate::record::inspect;
 use crate::record::{self, EpisodeRequest, RecordError};
 use crate::registry::scenario::Scenario;
-use crate::registry::{Attachment, Registry, RegistryErrors};
-use crate::rig::presence::{PresenceError, json_path, read_mask};
+use crate::registry::{Attachment, Registry};
+use crate::rig::presence::{json_path, read_mask};
 use crate::text;
 
 /// Tasks that are left at the end have this long to go.
@@ -36,84 +38,6 @@ const LAST_TASKS: Duration = Duration::from_millis(500);
 const LAST_WORDS: Duration = Duration::from_secs(2);
 /// The mask's JSON file holds 64 devices at most; anything larger is not it.
 const LARGEST_JSON: u64 = 1 << 20;
-
-/// Why a command ended without having done what it was asked.
-#[derive(Debug, thiserror::Error)]
-enum Failure {
-    #[error(transparent)]
-    App(#[from] AppError),
-    /// The registry is wrong.
-    #[error("{0}")]
-    Registry(#[from] RegistryErrors),
-    /// There is none.
-    #[error(
-        "no devices.toml: looked for {}\n    fix: write one (`rapid devices` lists what is plugged in), name one with --config, \
-         or look around with `rapid --sim`", .0.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ")
-    )]
-    NoRegistry(Vec<PathBuf>),
-    #[error(transparent)]
-    Presence(#[from] PresenceError),
-    #[error(transparent)]
-    Hotplug(#[from] crate::hotplug::HotplugError),
-    #[error(transparent)]
-    Inspect(#[from] InspectError),
-    #[error(transparent)]
-    Artifacts(#[from] commands::artifacts::ArtifactsError),
-    #[error(transparent)]
-    Mask(#[from] commands::mask::MaskError),
-    #[error(transparent)]
-    Calibrate(#[from] commands::calibrate::CalibrateError),
-    /// Not every file was repaired; which and why has been printed.
-    #[error("")]
-    Recover(commands::recover::Outcome),
-    /// The episode to play is none.
-    #[error(transparent)]
-    Replay(DriverError),
-    /// The folder for episodes cannot be written to.
-    #[error(transparent)]
-    Folder(RecordError),
-    /// What was wrong has been printed.
-    #[error("")]
-    Told,
-    #[error("output: {0}")]
-    Output(#[from] io::Error),
-    /// Whatever was done has been undone on the way here.
-    #[error("rapid panicked; please report this")]
-    Panicked,
-}
-
-impl From<InspectFailure> for Failure {
-    fn from(failure: InspectFailure) -> Self {
-        match failure {
-            InspectFailure::Episode(error) => Self::Inspect(error),
-            InspectFailure::Output(error) => Self::Output(error),
-        }
-    }
-}
-
-impl Failure {
-    /// Exit codes: 1 failed while running, 2 bad configuration or arguments, 130 interrupted twice.
-    fn code(&self) -> u8 {
-        match self {
-            Self::App(AppError::InterruptedTwice) => 130,
-            Self::App(AppError::Logging(_))
-            | Self::Registry(_)
-            | Self::NoRegistry(_)
-            | Self::Replay(_)
-            | Self::Folder(_)
-            | Self::Inspect(InspectError::NotMcap(_))
-            | Self::Told => 2,
-            Self::Inspect(InspectError::Io { source, .. })
-                if matches!(source.kind(), io::ErrorKind::NotFound | io::ErrorKind::IsADirectory) =>
-            {
-                2
-            }
-            Self::Calibrate(error) if error.is_bad_argument() => 2,
-            Self::Recover(outcome) if outcome.is_bad_argument() => 2,
-            _ => 1,
-        }
-    }
-}
 
 /// Runs what was typed.
 #[must_use]

@@ -1,0 +1,91 @@
+//! Why a command failed, and its exit code.
+
+use std::io;
+use std::path::PathBuf;
+
+use crate::app::AppError;
+use crate::commands;
+use crate::commands::inspect::InspectFailure;
+use crate::driver::DriverError;
+use crate::record::RecordError;
+use crate::record::inspect::InspectError;
+use crate::registry::RegistryErrors;
+use crate::rig::presence::PresenceError;
+
+/// Why a command ended without having done what it was asked.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum Failure {
+    #[error(transparent)]
+    App(#[from] AppError),
+    /// The registry is wrong.
+    #[error("{0}")]
+    Registry(#[from] RegistryErrors),
+    /// There is none.
+    #[error(
+        "no devices.toml: looked for {}\n    fix: write one (`rapid devices` lists what is plugged in), name one with --config, \
+         or look around with `rapid --sim`", .0.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ")
+    )]
+    NoRegistry(Vec<PathBuf>),
+    #[error(transparent)]
+    Presence(#[from] PresenceError),
+    #[error(transparent)]
+    Hotplug(#[from] crate::hotplug::HotplugError),
+    #[error(transparent)]
+    Inspect(#[from] InspectError),
+    #[error(transparent)]
+    Artifacts(#[from] commands::artifacts::ArtifactsError),
+    #[error(transparent)]
+    Mask(#[from] commands::mask::MaskError),
+    #[error(transparent)]
+    Calibrate(#[from] commands::calibrate::CalibrateError),
+    /// Not every file was repaired; which and why has been printed.
+    #[error("")]
+    Recover(commands::recover::Outcome),
+    /// The episode to play is none.
+    #[error(transparent)]
+    Replay(DriverError),
+    /// The folder for episodes cannot be written to.
+    #[error(transparent)]
+    Folder(RecordError),
+    /// What was wrong has been printed.
+    #[error("")]
+    Told,
+    #[error("output: {0}")]
+    Output(#[from] io::Error),
+    /// Whatever was done has been undone on the way here.
+    #[error("rapid panicked; please report this")]
+    Panicked,
+}
+
+impl From<InspectFailure> for Failure {
+    fn from(failure: InspectFailure) -> Self {
+        match failure {
+            InspectFailure::Episode(error) => Self::Inspect(error),
+            InspectFailure::Output(error) => Self::Output(error),
+        }
+    }
+}
+
+impl Failure {
+    /// Exit codes: 1 failed while running, 2 bad configuration or arguments, 130 interrupted twice.
+    pub(super) fn code(&self) -> u8 {
+        match self {
+            Self::App(AppError::InterruptedTwice) => 130,
+            Self::App(AppError::Logging(_))
+            | Self::Registry(_)
+            | Self::NoRegistry(_)
+            | Self::Replay(_)
+            | Self::Folder(_)
+            | Self::Inspect(InspectError::NotMcap(_))
+            | Self::Told => 2,
+            Self::Inspect(InspectError::Io { source, .. })
+                if matches!(source.kind(), io::ErrorKind::NotFound | io::ErrorKind::IsADirectory) =>
+            {
+                2
+            }
+            Self::Calibrate(error) if error.is_bad_argument() => 2,
+            Self::Recover(outcome) if outcome.is_bad_argument() => 2,
+            _ => 1,
+        }
+    }
+}
