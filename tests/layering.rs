@@ -1,7 +1,7 @@
 //! The architecture as data, and a check that the sources keep to it.
 //!
 //! Modules lie in layers and import downwards only. Every third-party crate has one home. `unsafe`
-//! lives at the edge. Files stay readable in one sitting.
+//! lives at the edge, locks off the way of a sample. Files stay readable in one sitting.
 //!
 //! What is read are tokens, not text: comments and strings do not count, macros do. Items under
 //! `#[cfg(test)]` are left out: a test may build its subject from whatever it likes.
@@ -89,6 +89,20 @@ const ABOVE_NOUNS: &str = "layers 1 and up";
 
 /// Where `unsafe` may stand: at the borders to the kernel and to shared memory.
 const UNSAFE_HOMES: &[&str] = &["driver", "bus"];
+
+/// What makes one thread wait for another.
+const LOCKS: &[&str] = &["Mutex", "RwLock", "Condvar", "ReentrantMutex", "Semaphore", "Barrier"];
+
+/// Where a lock may stand, and why that holds up no sample.
+const LOCK_HOMES: &[(&str, &str)] = &[
+    ("bus/shared", "the handle of a loan: made, locked and dropped by one thread"),
+    ("status/board", "what a screen shows: written when a state changes and twice a second, read by the screen"),
+    ("rig/worker", "a program waits for the end of the one before"),
+    ("registry/scenario", "the light that a simulated camera looks at while it is calibrated"),
+    ("fault", "tests"),
+    ("panics", "messages of panics"),
+    ("tui", "the monitor's terminal"),
+];
 
 /// Lines of a file that are not tests.
 const MAX_LINES: usize = 400;
@@ -392,6 +406,12 @@ fn check(source: &Source) -> Vec<Violation> {
             rules.push((*line, format!("`unsafe` outside {}", UNSAFE_HOMES.join("/ and ") + "/")));
         }
     }
+    for (line, path) in &source.paths {
+        let lock = path.iter().find(|name| LOCKS.contains(&name.as_str()));
+        if let (Some(lock), false) = (lock, LOCK_HOMES.iter().any(|(allowed, _)| is_within(&place, allowed))) {
+            rules.push((*line, format!("`{lock}`: nothing between a device and the file waits for another thread")));
+        }
+    }
     for (line, word) in &source.prints {
         rules.push((*line, format!("`{word}!`: write to a given `impl io::Write`")));
     }
@@ -541,10 +561,13 @@ mod the_check_itself {
     }
 
     #[test]
-    fn unsafe_prints_and_long_files_are_found() {
+    fn unsafe_prints_locks_and_long_files_are_found() {
         finds("bus/mod.rs", "fn f() { unsafe { g() } }", &[]);
         finds("rig/mod.rs", "fn f() {\n unsafe { g() } }", &["2: `unsafe` outside driver/ and bus/"]);
         finds("rig/mod.rs", "fn f() { if a { println!(\"x\") } }", &["1: `println!`"]);
+        finds("status/board.rs", "use std::sync::{Arc, Mutex};", &[]);
+        finds("rig/stream.rs", "use std::sync::{Arc, Mutex};", &["1: `Mutex`"]);
+        finds("sync/ring.rs", "struct A(std::sync::RwLock<u8>);", &["1: `RwLock`"]);
         let long = "//\n".repeat(MAX_LINES);
         finds("rig/mod.rs", &long, &[]);
         finds("rig/mod.rs", &format!("{long}//\n"), &["1: 401 lines"]);
