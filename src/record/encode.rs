@@ -5,6 +5,8 @@
 //!
 //! Invariant: once the buffer has grown to the largest message, nothing here allocates.
 
+use std::ops::Range;
+
 use super::schema::SampleSchema;
 use crate::mask::PhysicalMask;
 use crate::sample::{Encoding, SampleHeader};
@@ -17,7 +19,8 @@ const BYTES: u8 = 2;
 const FIXED32: u8 = 5;
 
 /// Writes a sample as `schema` says. `wall_ns` is its capture time on the wall clock, `frame_id`
-/// the modality's name.
+/// the modality's name. Returns where in
+/// `out` the payload lies.
 pub fn sample(
     out: &mut Vec<u8>,
     schema: SampleSchema,
@@ -25,14 +28,15 @@ pub fn sample(
     frame_id: &str,
     header: &SampleHeader,
     payload: &[u8],
-) {
+) -> Range<usize> {
     out.clear();
     timestamp(out, wall_ns);
     match schema {
         SampleSchema::CompressedImage => {
-            bytes(out, 2, payload);
+            let place = bytes(out, 2, payload);
             bytes(out, 3, b"jpeg");
             bytes(out, 4, frame_id.as_bytes());
+            place
         }
         SampleSchema::RawImage => {
             let (encoding, bytes_a_pixel) = match Encoding::from_raw(header.encoding) {
@@ -44,8 +48,9 @@ pub fn sample(
             fixed32(out, 3, header.height);
             bytes(out, 4, encoding.as_bytes());
             fixed32(out, 5, header.width.saturating_mul(bytes_a_pixel));
-            bytes(out, 6, payload);
+            let place = bytes(out, 6, payload);
             bytes(out, 7, frame_id.as_bytes());
+            place
         }
         // A packed repeated double is little-endian 64-bit floats, which is what the payload holds;
         // bytes are bytes.
@@ -182,12 +187,14 @@ fn fixed32(out: &mut Vec<u8>, field: u8, value: u32) {
     }
 }
 
-fn bytes(out: &mut Vec<u8>, field: u8, value: &[u8]) {
+/// Returns where `value` lies.
+fn bytes(out: &mut Vec<u8>, field: u8, value: &[u8]) -> Range<usize> {
     if !value.is_empty() {
         key(out, field, BYTES);
         varint(out, value.len() as u64);
         out.extend_from_slice(value);
     }
+    out.len() - value.len()..out.len()
 }
 
 #[cfg(test)]

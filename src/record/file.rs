@@ -9,6 +9,7 @@
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
+use std::ops::Range;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -119,6 +120,9 @@ struct Track {
     topic: String,
     metadata: BTreeMap<String, String>,
     channels: [Option<u16>; SampleSchema::COUNT],
+    /// Its newest message, and where the sample lies in it.
+    message: Vec<u8>,
+    newest: Option<Range<usize>>,
 }
 
 impl EpisodeFile {
@@ -162,7 +166,9 @@ impl EpisodeFile {
                 ("kind".to_owned(), kind),
             ]);
             let (name, topic) = (device.name.clone(), device.topic.clone());
-            let mut track = Track { name, topic, metadata, channels: [None; SampleSchema::COUNT] };
+            // Grows to the largest sample: what a registry allows is mostly far more.
+            let (message, newest) = (Vec::new(), None);
+            let mut track = Track { name, topic, metadata, channels: [None; SampleSchema::COUNT], message, newest };
             track.channel(&mut file.writer, SampleSchema::expected(device))?;
             if let Some(place) = file.tracks.get_mut(device.id.index()) {
                 *place = Some(track);
@@ -171,15 +177,25 @@ impl EpisodeFile {
         Ok(file)
     }
 
+    /// Is this, byte for byte, the newest sample of the modality? Compared with what was written, of which a
+    /// copy would cost as much as writing it.
+    pub(super) fn repeats(&self, id: ModalityId, payload: &[u8]) -> bool {
+        let Some(Some(track)) = self.tracks.get(id.index()) else { return false };
+        track.newest.clone().and_then(|place| track.message.get(place)) == Some(payload)
+    }
+
     /// Writes a sample; one of a modality that is not registered is not written.
     pub(super) fn sample(&mut self, id: ModalityId, header: &SampleHeader, payload: &[u8]) -> io::Result<()> {
         let Some(Some(track)) = self.tracks.get_mut(id.index()) else { return Ok(()) };
         let schema = SampleSchema::of(header, payload);
         let channel = track.channel(&mut self.writer, schema)?;
         let log_time = self.clock.wall_ns(Stamp(header.capture_ns));
-        encode::sample(&mut self.message, schema, log_time, &track.name, header, payload);
+        track.newest = Some(encode::sample(&mut track.message, schema, log_time, &track.name, header, payload));
         self.bytes += payload.len() as u64;
-        self.write(channel, header.seq, log_time, Stamp(header.recv_ns))
+        let message = message_header(channel, header.seq, log_time, self.clock.wall_ns(Stamp(header.recv_ns)));
+        self.writer.write_to_known_channel(&message, &track.message).map_err(io_error)?;
+        self.messages += 1;
+        Ok(())
     }
 
     /// Writes a publication of the mask.
@@ -229,13 +245,17 @@ impl EpisodeFile {
     }
 
     fn write(&mut self, channel_id: u16, sequence: u64, log_time: u64, published: Stamp) -> io::Result<()> {
-        #[expect(clippy::cast_possible_truncation, reason = "MCAP has 32 bits for it: the lower ones")]
-        let sequence = sequence as u32;
-        let header = MessageHeader { channel_id, sequence, log_time, publish_time: self.clock.wall_ns(published) };
+        let header = message_header(channel_id, sequence, log_time, self.clock.wall_ns(published));
         self.writer.write_to_known_channel(&header, &self.message).map_err(io_error)?;
         self.messages += 1;
         Ok(())
     }
+}
+
+fn message_header(channel_id: u16, sequence: u64, log_time: u64, publish_time: u64) -> MessageHeader {
+    #[expect(clippy::cast_possible_truncation, reason = "MCAP has 32 bits for it: the lower ones")]
+    let sequence = sequence as u32;
+    MessageHeader { channel_id, sequence, log_time, publish_time }
 }
 
 /// The writer of an episode's file.

@@ -45,8 +45,6 @@ pub(super) struct Measured {
     pub(super) limits: VerdictSpec,
     /// How long before its capture what a sample shows happened, ns.
     pub(super) latency_ns: u64,
-    /// Largest payload, bytes: reserved where payloads are compared.
-    pub(super) max_bytes: usize,
 }
 
 /// When frames are, and how long they wait.
@@ -140,7 +138,7 @@ impl Measures {
         let mut lanes = Vec::new();
         lanes.resize_with(MAX_MODALITIES, || None);
         for measured in modalities {
-            let compares = measured.limits.compares().then_some(measured.max_bytes);
+            let compares = measured.limits.compares();
             if let Some(lane) = lanes.get_mut(measured.id.index()) {
                 *lane = Some(Lane {
                     measured: measured.clone(),

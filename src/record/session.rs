@@ -151,6 +151,7 @@ impl Session {
         if !self.holds(Stamp(header.capture_ns), latency) || self.failed.is_some() {
             return;
         }
+        let repeated = Some(self.file.repeats(id, payload));
         if let Err(error) = self.file.sample(id, header, payload) {
             self.failed = Some(error);
             return;
@@ -163,6 +164,7 @@ impl Session {
             flagged,
             jpeg: Encoding::from_raw(header.encoding) == Some(Encoding::Mjpeg),
             payload,
+            repeated,
         };
         self.measures.sample(id, &seen);
         if flagged {
@@ -387,7 +389,6 @@ fn measured(registry: &Registry) -> Vec<Measured> {
         id: device.id,
         limits: device.verdict,
         latency_ns: nanoseconds(device.latency),
-        max_bytes: device.max_bytes,
     };
     registry.devices.iter().map(measured).collect()
 }

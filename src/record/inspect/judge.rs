@@ -102,8 +102,15 @@ impl Judge {
                 _ => {}
             }
         }
-        let seen =
-            Seen { seq: sequence.into(), capture_ns: captured, recv_ns: received, flagged: false, jpeg, payload };
+        let seen = Seen {
+            seq: sequence.into(),
+            capture_ns: captured,
+            recv_ns: received,
+            flagged: false,
+            jpeg,
+            payload,
+            repeated: None,
+        };
         self.measures.sample(id, &seen);
     }
 
@@ -225,7 +232,6 @@ fn registered(about: &BTreeMap<String, String>) -> Option<Vec<Measured>> {
         id: device.id,
         limits: device.verdict,
         latency_ns: nanoseconds(device.latency),
-        max_bytes: 0,
     });
     Some(measured.collect())
 }
@@ -238,7 +244,7 @@ fn listed(about: &BTreeMap<String, String>) -> Option<Vec<Measured>> {
         let kind: ModalityKind = serde_json::from_value(entry.get("kind")?.clone()).ok()?;
         // Files of earlier versions have no latencies.
         let latency_ns = entry.get("latency_ns").and_then(Value::as_u64).unwrap_or(0);
-        Some(Measured { id, limits: VerdictSpec::of(kind, STALL_AFTER, None), latency_ns, max_bytes: 0 })
+        Some(Measured { id, limits: VerdictSpec::of(kind, STALL_AFTER, None), latency_ns })
     };
     Some(list.iter().filter_map(measured).collect())
 }

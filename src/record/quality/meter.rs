@@ -22,6 +22,8 @@ pub(in crate::record) struct Seen<'a> {
     pub(in crate::record) jpeg: bool,
     /// Its bytes.
     pub(in crate::record) payload: &'a [u8],
+    /// They are those of the sample before; `None`: to be found out here, with a copy of each.
+    pub(in crate::record) repeated: Option<bool>,
 }
 
 /// Counts of samples.
@@ -84,14 +86,16 @@ pub(in crate::record) struct Meter {
     begin_ns: u64,
     seq: Option<u64>,
     run_began_ns: u64,
-    /// The bytes of the newest sample, where two are to be compared.
-    newest: Option<Vec<u8>>,
+    /// Are samples compared with the one before?
+    compares: bool,
+    /// The bytes of the newest sample, unless whoever brings samples compares them.
+    newest: Vec<u8>,
 }
 
 impl Meter {
-    /// A meter of an episode that begins at `begin_ns`. `compares` is the largest payload if payloads
-    /// are to be compared with one another.
-    pub(super) fn new(begin_ns: u64, compares: Option<usize>) -> Self {
+    /// A meter of an episode that begins at `begin_ns`. `compares`: payloads are compared with the
+    /// one before.
+    pub(super) fn new(begin_ns: u64, compares: bool) -> Self {
         Self {
             counts: Counts::default(),
             run: Run::default(),
@@ -106,7 +110,8 @@ impl Meter {
             begin_ns,
             seq: None,
             run_began_ns: begin_ns,
-            newest: compares.map(Vec::with_capacity),
+            compares,
+            newest: Vec::new(),
         }
     }
 
@@ -141,9 +146,19 @@ impl Meter {
     }
 
     fn compare(&mut self, seen: &Seen<'_>) {
-        let Some(newest) = &mut self.newest else { return };
-        // Equal bytes need no copy; of unequal pictures mostly the lengths differ already.
-        if self.counts.samples > 1 && newest == seen.payload {
+        if !self.compares {
+            return;
+        }
+        let repeated = seen.repeated.unwrap_or_else(|| {
+            // Equal bytes need no copy; of unequal pictures mostly the lengths differ already.
+            let equal = self.newest == seen.payload;
+            if !equal {
+                self.newest.clear();
+                self.newest.extend_from_slice(seen.payload);
+            }
+            equal
+        });
+        if repeated && self.counts.samples > 1 {
             self.counts.repeated += 1;
             self.run.samples += 1;
             self.run.length_ns = seen.capture_ns.saturating_sub(self.run_began_ns);
@@ -152,8 +167,6 @@ impl Meter {
             }
             return;
         }
-        newest.clear();
-        newest.extend_from_slice(seen.payload);
         self.run = Run::default();
         self.run_began_ns = seen.capture_ns;
     }

@@ -17,17 +17,14 @@ fn id(bit: u8) -> ModalityId {
 
 fn measures(kind: ModalityKind) -> Measures {
     let limits = VerdictSpec::of(kind, Duration::from_millis(500), Some(30.0));
-    let measured = [
-        Measured { id: id(0), limits, max_bytes: 64, latency_ns: 0 },
-        Measured { id: id(3), limits, max_bytes: 64, latency_ns: 0 },
-    ];
+    let measured = [Measured { id: id(0), limits, latency_ns: 0 }, Measured { id: id(3), limits, latency_ns: 0 }];
     Measures::new(&measured, Frames { begin_ns: BEGIN, hz: 30.0, wait: Duration::from_millis(125) })
 }
 
 /// A sample captured `at` ms after the beginning and received `late` ms later.
 fn seen(seq: u64, at: u64, late: u64, payload: &[u8]) -> Seen<'_> {
     let capture_ns = BEGIN + at * MS;
-    Seen { seq, capture_ns, recv_ns: capture_ns + late * MS, flagged: false, jpeg: false, payload }
+    Seen { seq, capture_ns, recv_ns: capture_ns + late * MS, flagged: false, jpeg: false, payload, repeated: None }
 }
 
 fn quality_at(measures: &Measures, end_ms: u64) -> Quality {
@@ -194,7 +191,7 @@ fn a_clock_that_runs_differently_drifts_and_one_that_is_ahead_is_in_the_future()
             let error = i64::try_from(n * 33 * MS).unwrap() * ppm / 1_000_000;
             let capture_ns = at.checked_add_signed(error).unwrap();
             let recv_ns = at + 20 * MS + n % 7 * jitter_ms * MS;
-            let seen = Seen { seq: n, capture_ns, recv_ns, flagged: false, jpeg: false, payload: b"" };
+            let seen = Seen { seq: n, capture_ns, recv_ns, flagged: false, jpeg: false, payload: b"", repeated: None };
             measures.sample(id(0), &seen);
         }
         quality_at(&measures, seconds * 1000)
@@ -294,7 +291,7 @@ proptest! {
     fn no_sample_makes_it_panic(samples in prop::collection::vec(any::<(u64, u64, u64, bool)>(), 0..40), end in any::<u64>()) {
         let mut measures = measures(ModalityKind::Image);
         for (seq, capture_ns, recv_ns, jpeg) in &samples {
-            let seen = Seen { seq: *seq, capture_ns: *capture_ns, recv_ns: *recv_ns, flagged: false, jpeg: *jpeg, payload: b"" };
+            let seen = Seen { seq: *seq, capture_ns: *capture_ns, recv_ns: *recv_ns, flagged: false, jpeg: *jpeg, payload: b"", repeated: None };
             measures.sample(id(0), &seen);
             measures.mask(*capture_ns, PhysicalMask(*seq));
             measures.missing(id(0), *seq, *recv_ns);
