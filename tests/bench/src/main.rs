@@ -34,7 +34,7 @@ type Failure = Box<dyn std::error::Error>;
 /// Figures of rapid on this machine, each beside a baseline measured in the same run. Nothing passes or fails.
 #[derive(Debug, Parser)]
 #[command(
-    after_help = "Examples:\n  rapid-bench                     everything, some 15 minutes\n  rapid-bench --quick             \
+    after_help = "Examples:\n  rapid-bench                     everything, some 20 minutes\n  rapid-bench --quick             \
                         short runs: see that it works\n  rapid-bench --only sync write   two sections\n  rapid-bench --json            \
                         one JSON object a figure and line"
 )]

@@ -21,7 +21,7 @@ pub(crate) fn unplug(bench: &Bench) -> Result<Vec<Figure>, Failure> {
 
 /// Plugging and unplugging on the virtual bench.
 pub(crate) fn cycles(bench: &Bench) -> Result<Vec<Figure>, Failure> {
-    let cycles = bench.choose("20", "2");
+    let cycles = bench.choose("50", "2");
     Ok(vbench(bench, "cycles", "vbench-cycles", &[cycles.into()]))
 }
 

@@ -40,6 +40,7 @@ fn run() -> Result<(), Box<dyn std::error::Error>> {
             .map_or_else(String::new, |rhythm| format!("; longest pause of the sampler {:.1} ms", rhythm.pause_ms));
         let figure = Figure::new(name, "ms", rhythm.map(|rhythm| rhythm.longest_ms));
         let figure = figure.baseline(idle.filter(|_| span != Span::Idle)).note(format!("{note}{own}"));
+        let figure = Figure { target: idle.filter(|_| span == Span::Deaf), ..figure };
         if json { println!("{}", figure.json()) } else { println!("{figure}") }
     }
     Ok(())
