@@ -189,11 +189,11 @@ mod tests {
         ];
         let expected = "\
 load
-                value  baseline  target
-  cpu    %       12.3         3    < 25  met
+            value  baseline  target
+  cpu    %   12.3         3    < 25  met
       user and system
-  drops             2         -     = 0  MISSED
-  rss               -         -       -  not measured
+  drops         2         -     = 0  MISSED
+  rss           -         -       -  not measured
       no /proc
 ";
         assert_eq!(table("load", &figures), expected);
