@@ -89,6 +89,9 @@ eval "$(sed -n 's/^# *\(useradd .*\)/\1/p; s/^# *\(install .*\)/\1/p' $unit)" ||
 chmod 755 /usr/local/bin/rapid
 cat >/tmp/as-unit.sh <<END
 set -e
+# Holds the namespace, with the recordings in it, beyond the program's end.
+sleep 600 &
+echo \$! >$out/holder
 mkdir -p /var/lib/rapid
 mount -t tmpfs -o mode=755 state /var/lib/rapid
 chown $(key User): /var/lib/rapid
@@ -106,10 +109,10 @@ awk '/^(Uid|CapEff|NoNewPrivs)/' /proc/$rapid_pid/status >$out/unit.status
 for task in /proc/$rapid_pid/task/*; do [ "$(cat $task/comm)" = mask ] && chrt -p ${task##*/}; done >$out/unit.sched
 sleep 1
 kill -$(key KillSignal) $rapid_pid
-# The namespace ends with its last process: the file is fetched through it before that.
-mkdir -p $out/unit
-while kill -0 $rapid_pid 2>/dev/null; do cp /proc/$rapid_pid/root/var/lib/rapid/* $out/unit/ 2>/dev/null; sleep 0.02; done
 rapid_wait
+mkdir -p $out/unit
+cp /proc/$(cat $out/holder)/root/var/lib/rapid/* $out/unit/
+kill $(cat $out/holder)
 kept unit
 emu_quit
 exit 0
