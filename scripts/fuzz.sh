@@ -18,14 +18,17 @@ instrumented="-Cpasses=sancov-module -Cllvm-args=-sanitizer-coverage-level=4 -Cl
 
 # With a target named, build scripts and procedural macros are built without these flags.
 export CARGO_PROFILE_RELEASE_LTO=off CARGO_PROFILE_RELEASE_STRIP=none CARGO_PROFILE_RELEASE_DEBUG=line-tables-only
-RUSTFLAGS="${RUSTFLAGS:-} $instrumented" cargo build --locked --release -p fuzz --features libfuzzer --bins \
+RUSTFLAGS="${RUSTFLAGS:-} $instrumented" cargo build --locked --release -p fuzz --features libfuzzer --bin libfuzzer \
     --target "$triple" --target-dir "$PLACE"
 readonly BIN="$PLACE/$triple/release"
+# What lists and replays has no use for the instrumentation, and cannot be linked with it.
+cargo build --locked -p fuzz --bin fuzz
+readonly FUZZ="${CARGO_TARGET_DIR:-$PWD/target}/debug/fuzz"
 
 mkdir -p "$PLACE/found"
-"$BIN/fuzz" seeds "$PLACE/seeds"
+"$FUZZ" seeds "$PLACE/seeds"
 targets=("$@")
-[[ ${#targets[@]} -gt 0 ]] || mapfile -t targets < <("$BIN/fuzz" list)
+[[ ${#targets[@]} -gt 0 ]] || mapfile -t targets < <("$FUZZ" list)
 
 broken=()
 for target in "${targets[@]}"; do
