@@ -11,6 +11,8 @@ use crate::modality::ModalityId;
 
 /// File the mask is published in, read by other processes.
 pub const MASK_PATH: &str = "/dev/shm/rapid_hardware_mask";
+/// Topic on which it is published, on the bus and in recordings.
+pub const MASK_TOPIC: &str = "/rapid/mask";
 /// Size of the published record in bytes.
 pub const RECORD_LEN: usize = 32;
 

@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use rustix::process::Signal;
 use serde_json::Value;
-use support::{Episode, EventMessage, PATIENCE, Place, Running, events};
+use support::{Episode, EventMessage, Place, Running, events, until};
 
 const TOPIC: &str = "/rapid/process/counter";
 
@@ -66,14 +66,6 @@ fn is_alive(pid: u32) -> bool {
     Path::new(&format!("/proc/{pid}")).exists()
 }
 
-fn wait_until(condition: impl Fn() -> bool, what: &str) {
-    let begun = Instant::now();
-    while !condition() {
-        assert!(begun.elapsed() < PATIENCE, "{what}");
-        std::thread::sleep(std::time::Duration::from_millis(5));
-    }
-}
-
 /// Children of a process, dead ones included.
 fn children(pid: u32) -> Vec<u32> {
     let tasks = std::fs::read_dir(format!("/proc/{pid}/task")).expect("its threads").flatten();
@@ -86,12 +78,8 @@ fn descriptors(pid: u32) -> usize {
 }
 
 /// Waits until the words have been printed this many times.
-fn wait_for_count(running: &mut Running, words: &str, count: usize) {
-    let begun = Instant::now();
-    while running.output().matches(words).count() < count {
-        assert!(begun.elapsed() < PATIENCE, "fewer than {count} {words:?} in: {}", running.output());
-        std::thread::sleep(std::time::Duration::from_millis(5));
-    }
+fn wait_for_count(running: &Running, words: &str, count: usize) {
+    until(&format!("{words:?} {count} times"), || running.output().matches(words).count() >= count);
 }
 
 #[test]
@@ -154,15 +142,15 @@ fn plugging_again_and_again_leaves_no_process_no_descriptor_and_no_memory() {
     let place = Place::new();
     registry(&place, "", "");
     let scenario = "repeat = \"1500ms\"\n[[event]]\nat = \"1s\"\nunplug = \"counter\"\n[[event]]\nat = \"1200ms\"\nplug = \"counter\"\n";
-    let mut running = place.start(&sim(&place, scenario), "\"streaming\"");
-    wait_for_count(&mut running, "\"streaming\"", 2);
+    let running = place.start(&sim(&place, scenario), "\"streaming\"");
+    wait_for_count(&running, "\"streaming\"", 2);
     let rapid = running.pid();
     let settled = || children(rapid).len() == 1;
-    wait_until(settled, "one program at a time");
+    until("one program at a time", settled);
     let (before, memory) = (descriptors(rapid), place.shared_memory().len());
-    wait_for_count(&mut running, "\"streaming\"", 8);
-    wait_until(|| settled() && descriptors(rapid) <= before, "descriptors leak");
-    wait_until(|| place.shared_memory().len() <= memory, "shared memory leaks");
+    wait_for_count(&running, "\"streaming\"", 8);
+    until("descriptors leak", || settled() && descriptors(rapid) <= before);
+    until("shared memory leaks", || place.shared_memory().len() <= memory);
     running.signal(Signal::INT);
     let (code, output, errors) = running.end();
     assert_eq!(code, Some(0), "{errors}");
@@ -211,8 +199,8 @@ fn a_program_that_floods_its_output_is_thinned_and_its_samples_are_whole() {
 fn a_program_without_a_heartbeat_is_stalled_then_started_again() {
     let place = Place::new();
     registry(&place, ", \"--silent-after\", \"20\"", "heartbeat = \"200ms\"");
-    let mut running = place.start(&sim(&place, ""), "\"backoff\"");
-    wait_for_count(&mut running, "\"streaming\"", 2);
+    let running = place.start(&sim(&place, ""), "\"backoff\"");
+    wait_for_count(&running, "\"streaming\"", 2);
     running.signal(Signal::INT);
     let (_, output, _) = running.end();
     let told = events(&output);
@@ -229,13 +217,13 @@ fn the_end_of_a_run_waits_for_a_deaf_program_and_a_second_signal_does_not() {
     for second in [false, true] {
         let place = Place::new();
         registry(&place, ", \"--ignore-sigterm\"", "");
-        let running = place.start(&sim(&place, ""), "\"streaming\"");
+        let mut running = place.start(&sim(&place, ""), "\"streaming\"");
         let told = events(&running.output());
         let begun = Instant::now();
         running.signal(Signal::INT);
         if second {
             // The mask says 0 only when all is over: until then there is something to interrupt.
-            std::thread::sleep(std::time::Duration::from_millis(500));
+            running.wait_for("told to end");
             running.signal(Signal::INT);
         }
         let (code, output, _) = running.end();
@@ -257,7 +245,7 @@ fn a_killed_rapid_takes_its_programs_along() {
     assert!(pids.iter().all(|pid| is_alive(*pid)) && pids.len() == 1);
     running.signal(Signal::KILL);
     running.end();
-    wait_until(|| !pids.iter().any(|pid| is_alive(*pid)), "the program outlived rapid");
+    until("the program outlived rapid", || !pids.iter().any(|pid| is_alive(*pid)));
 }
 
 #[test]

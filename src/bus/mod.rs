@@ -36,7 +36,7 @@ use service::Service;
 
 pub use inbox::Inbox;
 pub use ingress::{Given, Ingress, Watch};
-pub use topic::{MASK_TOPIC, TopicId, TopicSpec};
+pub use topic::{TopicId, TopicSpec};
 pub use writer::Writer;
 
 type TopicFactory = iceoryx2::service::port_factory::publish_subscribe::PortFactory<Service, [u8], SampleHeader>;

@@ -1,10 +1,9 @@
 //! Topics: name, depth and memory of each, decided once from the registry.
 
+use crate::mask::MASK_TOPIC;
 use crate::modality::ModalityId;
 use crate::registry::{DeviceSpec, POOL_SPARE};
 
-/// Topic of the physical mask, on the bus and in recordings.
-pub const MASK_TOPIC: &str = "/rapid/mask";
 /// 4 s of mask at 500 Hz: as long as a consumer may be held up without losing one.
 const MASK_DEPTH: usize = 2048;
 /// u64 mask and u64 sequence.

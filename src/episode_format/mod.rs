@@ -22,8 +22,6 @@ use std::path::{Path, PathBuf};
 
 use rustix::fs::OFlags;
 
-/// Topic of the physical mask.
-pub(crate) const MASK_TOPIC: &str = "/rapid/mask";
 /// Topic of the frame index.
 pub(crate) const FRAME_TOPIC: &str = "/rapid/frame";
 /// Topic of events.

@@ -19,8 +19,8 @@ use mcap::{Attachment, McapError, WriteOptions, Writer};
 
 use super::encode::{self, EventText};
 use super::schema::{self, PROTOBUF, SampleSchema, Schema};
-use crate::episode_format::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, MASK_TOPIC, SUMMARY};
-use crate::mask::PhysicalMask;
+use crate::episode_format::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, SUMMARY};
+use crate::mask::{MASK_TOPIC, PhysicalMask};
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::registry::Registry;
 use crate::sample::SampleHeader;

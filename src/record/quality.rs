@@ -60,6 +60,7 @@ pub(super) struct Frames {
 
 /// What a modality was like over an episode.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[cfg_attr(test, derive(Default))]
 pub struct Quality {
     /// Samples in the file.
     pub samples: u64,

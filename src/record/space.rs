@@ -336,4 +336,14 @@ mod tests {
         space.release();
         assert_eq!(blocks(&file), 0);
     }
+
+    #[test]
+    fn room_beside_an_episode_is_twice_the_reserve() {
+        let disk = Disk { free: 1000, size: 4000 };
+        assert!(
+            !disk.lacks_room_beside_an_episode(200, Some(400)) && disk.lacks_room_beside_an_episode(201, Some(400))
+        );
+        // A twentieth of the disk.
+        assert!(!disk.lacks_room_beside_an_episode(600, None) && disk.lacks_room_beside_an_episode(601, None));
+    }
 }

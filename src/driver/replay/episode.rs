@@ -13,8 +13,8 @@ use super::wire::{self, Schema};
 use super::{DriverError, fatal};
 use crate::episode_format::walk::{FileEnd, MAGIC, Trust, Walk, op};
 use crate::episode_format::wire::Fields;
-use crate::episode_format::{self, ABOUT, MASK_TOPIC};
-use crate::mask::PhysicalMask;
+use crate::episode_format::{self, ABOUT};
+use crate::mask::{MASK_TOPIC, PhysicalMask};
 use crate::modality::ModalityId;
 
 /// Changes of the mask that are played: a device that flaps at 500 Hz, the rate of the mask, reaches

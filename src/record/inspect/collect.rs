@@ -8,8 +8,8 @@ use super::super::wire::{Fields, protobuf};
 use super::judge::{Ending, Judge, recorded_verdict};
 use super::units;
 use super::{EventReport, Inspection, Lateness, MaskEdge, ModalityReport, TopicReport};
-use crate::episode_format::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, MASK_TOPIC, RECOVERED, SUMMARY};
-use crate::mask::PhysicalMask;
+use crate::episode_format::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, RECOVERED, SUMMARY};
+use crate::mask::{MASK_TOPIC, PhysicalMask};
 use crate::modality::ModalityId;
 
 /// Events kept: a rig that flaps all day must not fill the memory.

@@ -191,18 +191,21 @@ impl Judge {
     }
 }
 
+const DAMAGED: &str = "parts of it are damaged";
+
 fn file_state<'a>(ending: &Ending<'a>) -> FileState<'a> {
     let Ending { file: walked, summary, repaired, .. } = ending;
     let cut_short = summary.get(CUT_SHORT);
     match walked.end {
         FileEnd::Finished if *repaired => FileState::NotWhole("it was repaired, and what came last may be missing"),
-        FileEnd::Finished if walked.damaged_chunks == 0 => match cut_short {
+        // A check value that is not right counts as much as a chunk that cannot be read.
+        FileEnd::Finished if walked.damaged_chunks == 0 && walked.sound => match cut_short {
             Some(why) => FileState::NotWhole(why),
             // Whoever wrote the footer: what the recorder ends, it sums up.
             None if summary.is_empty() => FileState::NotWhole("the recorder has not finished it"),
             None => FileState::Whole,
         },
-        FileEnd::Finished => FileState::NotWhole("parts of it are damaged"),
+        FileEnd::Finished => FileState::NotWhole(DAMAGED),
         FileEnd::Unfinished => FileState::NotWhole("the recorder has not finished it"),
         FileEnd::Torn => FileState::NotWhole("its last record is cut"),
         FileEnd::Damaged => FileState::NotWhole("from some place on it cannot be read"),

@@ -265,27 +265,15 @@ fn quality() -> Quality {
     Quality {
         samples: 200,
         bytes: 7_000_000,
-        lost: 0,
         dropped: 3,
-        damaged: 0,
-        truncated: 0,
-        duplicates: 0,
-        repeated: 0,
-        frozen_samples: 0,
-        frozen: 0.0,
-        late: 0,
-        lateness: None,
-        clock_drift: None,
-        clock_ahead: 0.0,
-        offset: None,
         presence: Some(0.7),
         present: 7.0,
         plugged: 7.0,
-        opening: 0.0,
         hz: Some(28.6),
         nominal_hz: Some(30.0),
         longest_gap: 0.0667,
         frames_present: 210,
         frames_valid: 209,
+        ..Quality::default()
     }
 }

@@ -160,3 +160,6 @@ fn event(recovered: Recovered) -> What {
         _ => What::Log { level, text },
     }
 }
+
+#[cfg(test)]
+mod tests;

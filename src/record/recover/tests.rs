@@ -2,7 +2,6 @@
 
 use std::collections::BTreeSet;
 use std::io::Write;
-use std::sync::Arc;
 use std::time::Duration;
 
 use proptest::prelude::*;
@@ -10,9 +9,9 @@ use proptest::prelude::*;
 use super::copy::{About, Error};
 use super::*;
 use crate::episode_format::testing::{self, Message, metadata, mutated, mutations, strictly};
+use crate::record::Sink;
 use crate::record::tests::{Bench, registry};
-use crate::record::{Disk, Sink};
-use crate::status::{Board, Grade, Level, What};
+use crate::status::{Grade, Level};
 
 fn go_on(_: u64, _: u64) -> ControlFlow<()> {
     ControlFlow::Continue(())
@@ -25,7 +24,7 @@ fn repaired(path: &Path) -> Repaired {
     }
 }
 
-fn names(folder: &Path) -> Vec<String> {
+pub(super) fn names(folder: &Path) -> Vec<String> {
     let mut names: Vec<_> =
         fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
     names.sort();
@@ -33,14 +32,14 @@ fn names(folder: &Path) -> Vec<String> {
 }
 
 /// The bytes of an episode of the recorder, and a folder to play with.
-async fn recorded() -> (tempfile::TempDir, Vec<u8>) {
+pub(super) async fn recorded() -> (tempfile::TempDir, Vec<u8>) {
     let bench = Bench::new();
     let (file, _) = bench.one_second().await;
     bench.until_file(&file).await;
     (tempfile::tempdir().unwrap(), fs::read(&file).unwrap())
 }
 
-fn put(folder: &tempfile::TempDir, name: &str, bytes: &[u8]) -> PathBuf {
+pub(super) fn put(folder: &tempfile::TempDir, name: &str, bytes: &[u8]) -> PathBuf {
     let path = folder.path().join(name);
     fs::write(&path, bytes).unwrap();
     path
@@ -395,53 +394,4 @@ async fn two_repairs_at_once_make_one_file() {
         }
         assert_eq!(names(folder.path()).len(), round + 1);
     }
-}
-
-#[tokio::test]
-async fn in_the_background_a_folder_is_repaired_and_it_is_said() {
-    let (folder, bytes) = recorded().await;
-    put(&folder, "a_001.mcap.partial", &bytes[..bytes.len() / 2]);
-    put(&folder, "a_002.mcap.partial", b"");
-    let busy = put(&folder, "a_003.mcap.partial", &bytes[..bytes.len() / 2]);
-    put(&folder, "a_004.mcap", &bytes[..100]);
-    let held = File::open(&busy).unwrap();
-    held.lock().unwrap();
-    let board = Arc::new(Board::new(&registry()));
-    let mut events = board.events();
-    let repairs = Repairs::start(folder.path().to_owned(), Some(1 << 20), Arc::clone(&board)).unwrap();
-    let mut said = Vec::new();
-    for _ in 0..3 {
-        said.push(events.recv().await.unwrap().what);
-    }
-    let What::Recovered { file, messages, text, .. } = &said[0] else { panic!("{said:?}") };
-    assert_eq!((file, strictly(&fs::read(file).unwrap()).len() as u64), (&folder.path().join("a_001.mcap"), *messages));
-    assert!(text.contains("a_001.mcap.partial: repaired, "), "{text}");
-    assert!(matches!(&said[1], What::Log { text, .. } if text.ends_with("a_002.mcap.partial: of no bytes; removed")));
-    assert!(matches!(&said[2], What::Log { text, .. } if text.contains("a_003.mcap.partial: another rapid")));
-    drop(repairs);
-    // A finished file is nobody's business.
-    assert_eq!(names(folder.path()), ["a_001.mcap", "a_003.mcap.partial", "a_004.mcap"]);
-    assert!(Repairs::start(folder.path().join("missing"), None, board).is_ok());
-}
-
-#[tokio::test]
-async fn a_repair_in_the_background_leaves_the_room_of_an_episode() {
-    let (folder, bytes) = recorded().await;
-    let partial = put(&folder, "a_001.mcap.partial", &bytes[..bytes.len() / 2]);
-    let free = Disk::of(&File::open(folder.path()).unwrap()).unwrap().free;
-    let board = Arc::new(Board::new(&registry()));
-    let mut events = board.events();
-    // Three quarters of what is free: a repair would fit, and an episode be warned of.
-    let _repairs = Repairs::start(folder.path().to_owned(), Some(free / 4 * 3), board).unwrap();
-    let What::Log { text, .. } = events.recv().await.unwrap().what else { panic!() };
-    assert!(text.contains("a_001.mcap.partial: not repaired: it takes ") && text.contains("; make room and"), "{text}");
-    assert!(partial.exists());
-}
-
-#[test]
-fn room_beside_an_episode_is_twice_the_reserve() {
-    let disk = Disk { free: 1000, size: 4000 };
-    assert!(!disk.lacks_room_beside_an_episode(200, Some(400)) && disk.lacks_room_beside_an_episode(201, Some(400)));
-    // A twentieth of the disk.
-    assert!(!disk.lacks_room_beside_an_episode(600, None) && disk.lacks_room_beside_an_episode(601, None));
 }

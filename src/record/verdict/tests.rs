@@ -12,19 +12,8 @@ fn good() -> Quality {
     Quality {
         samples: 210,
         bytes: 6_000_000,
-        lost: 0,
-        dropped: 0,
-        damaged: 0,
-        truncated: 0,
-        duplicates: 0,
-        repeated: 0,
-        frozen_samples: 0,
-        frozen: 0.0,
-        late: 0,
         lateness: Some(crate::record::Spread { p50: 20.0, p95: 25.0, p99: 40.0, max: 240.0 }),
         clock_drift: Some(0.2),
-        clock_ahead: 0.0,
-        offset: None,
         presence: Some(0.7),
         present: 7.0,
         plugged: 7.5,
@@ -34,6 +23,7 @@ fn good() -> Quality {
         longest_gap: 0.04,
         frames_present: 210,
         frames_valid: 210,
+        ..Quality::default()
     }
 }
 
@@ -41,16 +31,13 @@ fn limits() -> VerdictSpec {
     VerdictSpec::of(ModalityKind::Image, Duration::from_millis(500), Some(30.0))
 }
 
+/// Of an episode of ten seconds in which nothing went missing.
+fn facts<'a>(modalities: &'a [Judged<'a>], file: FileState<'a>) -> Facts<'a> {
+    Facts { modalities, masks_dropped: 0, events_missed: 0, seconds: 10.0, losses: Losses::Apart, file }
+}
+
 fn verdict_on(quality: &Quality, file: FileState<'_>) -> Verdict {
-    let modalities = [Judged { name: "cam", quality, limits: limits() }];
-    judge(&Facts {
-        modalities: &modalities,
-        masks_dropped: 0,
-        events_missed: 0,
-        seconds: 10.0,
-        losses: Losses::Apart,
-        file,
-    })
+    judge(&facts(&[Judged { name: "cam", quality, limits: limits() }], file))
 }
 
 #[track_caller]
@@ -135,15 +122,7 @@ fn a_modality_that_was_there_and_sent_nothing_is_bad_and_one_that_was_not_is_not
             Judged { name: "cam", quality: &talks, limits: limits() },
             Judged { name: "tof", quality: quiet, limits: limits() },
         ];
-        let facts = Facts {
-            modalities: &modalities,
-            masks_dropped: 0,
-            events_missed: 0,
-            seconds: 10.0,
-            losses: Losses::Apart,
-            file: FileState::Whole,
-        };
-        judge(&facts)
+        judge(&facts(&modalities, FileState::Whole))
     };
     let said = both(&silent(3.0));
     assert_eq!(said.reasons, ["tof: nothing was received, although it was present for 3.0 s"]);
@@ -194,33 +173,19 @@ fn a_device_that_is_plugged_in_and_does_not_run_is_missed_and_one_that_starts_is
 fn the_file_and_what_is_missing_in_it_count_and_the_gravest_comes_first() {
     let quality = Quality { lost: 5, ..good() };
     let modalities = [Judged { name: "cam", quality: &quality, limits: limits() }];
-    let facts = |file| Facts {
-        modalities: &modalities,
-        masks_dropped: 2,
-        events_missed: 1,
-        seconds: 10.0,
-        losses: Losses::Apart,
-        file,
-    };
-    let said = judge(&facts(FileState::NotWhole("it was recovered")));
+    let of = |file| Facts { masks_dropped: 2, events_missed: 1, ..facts(&modalities, file) };
+    let said = judge(&of(FileState::NotWhole("it was recovered")));
     let lost = "cam: 5 of 215 samples lost by the device (limit 1 %)";
     let missing =
         ["2 publications of the mask are not in the file (limit 0)", "1 events are not in the file (limit 0)"];
     assert_eq!(said.reasons, ["the file is not whole: it was recovered", lost, missing[0], missing[1]]);
     assert_eq!(said.grade, Grade::Suspect);
-    let said = judge(&facts(FileState::Failed("no space left on device")));
+    let said = judge(&of(FileState::Failed("no space left on device")));
     assert_eq!(said.reasons[0], "the file could not be written: no space left on device");
     assert_eq!(said.grade, Grade::Bad);
     let together = Quality { dropped: 5, ..good() };
     let modalities = [Judged { name: "cam", quality: &together, limits: limits() }];
-    let facts = Facts {
-        modalities: &modalities,
-        masks_dropped: 0,
-        events_missed: 0,
-        seconds: 10.0,
-        losses: Losses::Together,
-        file: FileState::Whole,
-    };
+    let facts = Facts { losses: Losses::Together, ..facts(&modalities, FileState::Whole) };
     let why = judge(&facts).why();
     assert_eq!(why, "cam: 5 of 215 samples missing, lost by the device or dropped on the way to the file (limit 0 %)");
 }
@@ -257,15 +222,7 @@ fn a_check_that_is_off_says_nothing() {
     };
     let limits = VerdictSpec { suspect: off, bad: off, hz: Some(30.0) };
     let modalities = [Judged { name: "cam", quality: &quality, limits }];
-    let facts = Facts {
-        modalities: &modalities,
-        masks_dropped: 0,
-        events_missed: 0,
-        seconds: 10.0,
-        losses: Losses::Apart,
-        file: FileState::Whole,
-    };
-    assert_eq!(judge(&facts), Verdict::default());
+    assert_eq!(judge(&facts(&modalities, FileState::Whole)), Verdict::default());
 }
 
 proptest! {
