@@ -20,7 +20,7 @@ use proc_macro2::{Delimiter, TokenStream, TokenTree};
 
 /// Modules by layer, lowest first. A module sees those of lower layers.
 const LAYERS: &[&[&str]] = &[
-    &["modality", "mask", "sample", "time", "action", "provenance", "flash"],
+    &["modality", "mask", "sample", "time", "action", "random", "provenance", "flash"],
     &["registry", "status", "text", "outlet", "folder", "episode_format", "fault", "panics"],
     &["hotplug", "driver", "bus", "sync", "calibration"],
     &["rig", "record", "policy", "control"],
@@ -64,6 +64,8 @@ const HOMES: &[(&str, &[&str])] = &[
     ("mcap", &["record"]),
     ("nokhwa", &["driver/camera"]),
     ("parking_lot", &["bus/shared"]),
+    ("rand_distr", &["random"]),
+    ("rand_pcg", &["random"]),
     ("ratatui", &["tui"]),
     ("rustix", &["time", ABOVE_NOUNS]),
     ("serde", &[ANYWHERE]),
