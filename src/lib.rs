@@ -95,6 +95,7 @@ pub mod flash;
 pub mod folder;
 pub mod headless;
 pub mod hotplug;
+pub mod lockstep;
 pub mod logging;
 pub mod mask;
 pub mod modality;

@@ -64,7 +64,7 @@ mod tests {
     #[test]
     fn numbers_lie_where_they_should() {
         let mut random = Random::new(1, 0);
-        let mut noise = [0.0; 20_000];
+        let mut noise = vec![0.0; 20_000];
         random.fill_normal(&mut noise);
         let mean = noise.iter().sum::<f32>() / 20_000.0;
         let variance = noise.iter().map(|value| value * value).sum::<f32>() / 20_000.0;

@@ -24,7 +24,7 @@ const LAYERS: &[&[&str]] = &[
     &["registry", "status", "text", "outlet", "folder", "episode_format", "fault", "panics"],
     &["hotplug", "driver", "bus", "sync", "calibration"],
     &["rig", "record", "policy", "control"],
-    &["app", "tui", "headless", "logging"],
+    &["app", "lockstep", "tui", "headless", "logging"],
     &["main", "dispatch", "cli", "commands"],
 ];
 
@@ -103,6 +103,7 @@ const LOCK_HOMES: &[(&str, &str)] = &[
     ("registry/scenario", "the light that a simulated camera looks at while it is calibrated"),
     ("fault", "tests"),
     ("panics", "messages of panics"),
+    ("driver/sim/task", "the simulated world, which its devices share"),
     ("tui", "the monitor's terminal"),
 ];
 
