@@ -6,3 +6,6 @@
 //! which action is executed at which tick, or that none is.
 
 pub mod bundle;
+pub mod horizon;
+pub mod normalize;
+pub mod scheduler;
