@@ -100,6 +100,7 @@ pub mod mask;
 pub mod modality;
 pub mod outlet;
 pub mod panics;
+pub mod policy;
 pub mod provenance;
 pub mod random;
 pub mod record;

@@ -70,6 +70,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("rustix", &["time", ABOVE_NOUNS]),
     ("serde", &[ANYWHERE]),
     ("serde_json", &[ABOVE_NOUNS]),
+    ("sha2", &["policy/bundle"]),
     ("strsim", &["registry"]),
     ("thiserror", &[ANYWHERE]),
     ("tokio", &[ABOVE_NOUNS]),
