@@ -6,3 +6,5 @@
 //! which action is executed at which tick, or that none is.
 
 pub mod bundle;
+pub mod graphs;
+pub mod library;
