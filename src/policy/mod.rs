@@ -8,3 +8,4 @@
 pub mod bundle;
 pub mod graphs;
 pub mod library;
+pub mod picture;
