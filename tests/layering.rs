@@ -63,6 +63,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("lz4", &["episode_format"]),
     ("mcap", &["record"]),
     ("nokhwa", &["driver/camera"]),
+    ("ort", &["policy/library", "policy/graphs"]),
     ("parking_lot", &["bus/shared"]),
     ("rand_distr", &["random"]),
     ("rand_pcg", &["random"]),
@@ -84,8 +85,8 @@ const HOMES: &[(&str, &[&str])] = &[
     ("unicode_segmentation", &["text"]),
     ("unicode_width", &["text"]),
     ("v4l", &["driver/camera"]),
-    ("zstd", &["episode_format"]),
-    ("zune_jpeg", &["calibration/brightness"]),
+    ("zstd", &["episode_format", "policy/library"]),
+    ("zune_jpeg", &["calibration/brightness", "policy/picture"]),
 ];
 const ANYWHERE: &str = "*";
 const ABOVE_NOUNS: &str = "layers 1 and up";
@@ -102,6 +103,7 @@ const LOCK_HOMES: &[(&str, &str)] = &[
     ("status/board", "what a screen shows: written when a state changes and twice a second, read by the screen"),
     ("rig/worker", "a program waits for the end of the one before"),
     ("registry/scenario", "the light that a simulated camera looks at while it is calibrated"),
+    ("policy/library", "onnxruntime is loaded once, before the first chunk"),
     ("fault", "tests"),
     ("panics", "messages of panics"),
     ("driver/sim/task", "the simulated world, which its devices share"),
