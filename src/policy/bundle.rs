@@ -13,9 +13,22 @@
 //! Invariant: of every check all mistakes are told at once, each with the key and a fix.
 //! Invariant: nothing downstream of a [`Bundle`] checks it again.
 
+mod action;
+mod devices;
+#[cfg(test)]
+pub(crate) mod example;
+mod files;
 mod graphs;
+mod json;
+mod keys;
+mod observations;
+mod parse;
+mod read;
 mod spec;
+#[cfg(test)]
+mod tests;
 
+pub use files::{Graph, POLICY_FILE};
 pub use graphs::{Element, GraphShape, TensorShape};
 pub use spec::{
     BetaSchedule, Bundle, BundleAction, BundleErrors, ColorOrder, GraphFile, ImageSpec, MaskSpec, Normalization,

@@ -1,11 +1,16 @@
 //! Policies: what a trained model wants to see, and what becomes of its answers.
 //!
 //! A policy is a folder, a [`bundle`]: two graphs and `policy.json`, which says everything about
-//! them that a rig must know. [`scheduler`] takes the noise out of an action chunk step by step,
-//! [`normalize`] maps numbers into the range a network was trained on and back, [`horizon`] decides
-//! which action is executed at which tick, or that none is.
+//! them that a rig must know. [`library`] brings onnxruntime into the process, [`graphs`] run on it.
+//! [`picture`] and `observation` make what the encoder reads, `sampler` makes action chunks of
+//! it: [`scheduler`] takes the noise out of a chunk step by step, [`normalize`] maps numbers into the
+//! range a network was trained on and back. [`horizon`] decides which action is executed at which
+//! tick, or that none is.
 
 pub mod bundle;
 pub mod graphs;
+pub mod horizon;
 pub mod library;
+pub mod normalize;
 pub mod picture;
+pub mod scheduler;

@@ -19,6 +19,7 @@ pub mod units;
 mod words;
 
 pub use attachment::{Attachment, DeviceNode, UsbIdentity};
+pub(crate) use diagnostic::did_you_mean;
 pub use diagnostic::{Diagnostic, RegistryErrors};
 pub use identity::{Assigner, Assignment, Detached, Explanation};
 pub use limits::{Limits, VerdictSpec};

@@ -212,9 +212,9 @@ pub struct SchedulerSpec {
     pub num_train_timesteps: usize,
     /// How the noise grows.
     pub beta_schedule: BetaSchedule,
-    /// First beta, above 0; not used by `squaredcos_cap_v2`.
+    /// First beta, `1e-6..=0.999`; not used by `squaredcos_cap_v2`.
     pub beta_start: f64,
-    /// Last beta, below 1 and not below the first; not used by `squaredcos_cap_v2`.
+    /// Last beta, within the same and not below the first; not used by `squaredcos_cap_v2`.
     pub beta_end: f64,
     /// What the denoiser predicts.
     pub prediction_type: PredictionType,
