@@ -2,7 +2,7 @@
 //!
 //! A policy is a folder, a [`bundle`]: two graphs and `policy.json`, which says everything about
 //! them that a rig must know. [`library`] brings onnxruntime into the process, [`graphs`] run on it.
-//! [`picture`] and `observation` make what the encoder reads, `sampler` makes action chunks of
+//! [`picture`] and [`observation`] make what the encoder reads, [`sampler`] makes action chunks of
 //! it: [`scheduler`] takes the noise out of a chunk step by step, [`normalize`] maps numbers into the
 //! range a network was trained on and back. [`horizon`] decides which action is executed at which
 //! tick, or that none is.
@@ -12,5 +12,7 @@ pub mod graphs;
 pub mod horizon;
 pub mod library;
 pub mod normalize;
+pub mod observation;
 pub mod picture;
+pub mod sampler;
 pub mod scheduler;
