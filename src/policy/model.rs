@@ -4,7 +4,6 @@
 //! modality that is compared with a reference.
 //! Invariant: of an absent modality nothing is read: its numbers are zeros and its element of the mask is 0.
 
-use std::path::Path;
 
 use super::bundle::{Bundle, ObservationInput};
 use super::library::Environment;
