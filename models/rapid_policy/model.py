@@ -28,7 +28,8 @@ class SpatialSoftmax(nn.Module):
         self.features = nn.Conv2d(channels, keypoints, 1)
         self.sharpness = nn.Parameter(torch.tensor(4.0))
         y, x = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
-        self.register_buffer("grid", torch.stack([x.reshape(-1), y.reshape(-1)], 1))
+        # Not a weight: nothing that is learned, so that a checkpoint and the reader of a graph do without it.
+        self.register_buffer("grid", torch.stack([x.reshape(-1), y.reshape(-1)], 1), persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:
         attention = F.softmax(self.features(x).flatten(2) * self.sharpness, -1)
@@ -126,7 +127,7 @@ class Denoiser(nn.Module):
         super().__init__()
         d = self.STEP_FEATURES
         frequencies = torch.exp(torch.arange(d // 2) * -(math.log(10_000) / (d // 2 - 1)))
-        self.register_buffer("frequencies", frequencies)
+        self.register_buffer("frequencies", frequencies, persistent=False)
         self.step = nn.Sequential(nn.Linear(d, 4 * d), nn.Mish(), nn.Linear(4 * d, d))
         c = condition + d
         levels = list(zip((actions, *widths[:-1]), widths, strict=True))

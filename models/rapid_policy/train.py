@@ -260,10 +260,16 @@ def main() -> None:
         sys.exit(f"train: {error}")
     told = f"python -m rapid_policy.train EPISODES --out RUN --iterations {args.iterations} --seed {args.seed}"
     schedule = replace(defaults, iterations=args.iterations, minutes=args.minutes, seed=args.seed)
+    if state:
+        schedule = replace(Schedule(**state["schedule"]), minutes=args.minutes)
+    device = pick_device(args.device)
     facts = provenance(episodes, told)
+    facts["hardware"] = f"{args.threads} thread{'s' if args.threads > 1 else ''} of a CPU"
+    if device.type == "cuda":
+        facts["hardware"] = torch.cuda.get_device_name(device)
     if state and state["provenance"]["episodes_sha256"] != facts["episodes_sha256"]:
         sys.exit(f"train: {checkpoint} was trained on other episodes than those in {args.episodes}")
-    run = begin(spec, schedule, dataset, facts, pick_device(args.device))
+    run = begin(spec, schedule, dataset, facts, device)
     if state:
         run.load(state)
     counts = f"{len(episodes)} episodes, {len(dataset.windows)} windows, {parameters([run.policy]):,} parameters"
