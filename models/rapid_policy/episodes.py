@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from numpy.typing import NDArray
 from PIL import Image
@@ -106,7 +105,10 @@ def read_episode(path: Path, observations: tuple[Observation, ...], actions: int
             for schema, channel, message in reader.iter_messages(topics=topics, log_time_order=False):
                 decoded = decoder.decode(schema, message.data)
                 messages[channel.topic].append(_Message(message.log_time, message.sequence, schema.name, decoded))
-    except (OSError, McapError) as error:
+    except EpisodeError:
+        raise
+    # A damaged file comes to light in the container, the compression, a schema or a message: each has errors of its own.
+    except Exception as error:
         raise EpisodeError(path, f"not a whole episode: {error}") from error
     return _assemble(path, facts, summary, wanted, observations, actions, messages)
 
@@ -183,7 +185,7 @@ def _assemble(
         acted=acted,
         facts=facts,
         summary=summary,
-        tags=json.loads(facts.get("tags", "{}")),
+        tags=json.loads(facts.get("tags") or "{}"),
     )
 
 
