@@ -11,7 +11,6 @@ saw a picture of it: the episodes are dealt into folds, and each fold is tested 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from dataclasses import dataclass, replace
@@ -26,7 +25,7 @@ from rapid_policy.dataset import PAD, pool
 from rapid_policy.episodes import Episode, EpisodeError
 from rapid_policy.model import ImageEncoder
 from rapid_policy.results import write
-from rapid_policy.spec import Network, Spec, tactile, tactile_id, wrist
+from rapid_policy.spec import Network, Observation, tactile, tactile_id, wrist
 from rapid_policy.train import load_episodes
 from torch import nn
 
@@ -65,9 +64,8 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
-    spec: Spec = tactile_id()
     try:
-        episodes = [e for e in load_episodes(spec, args.episodes)]
+        episodes = load_episodes(tactile_id(), args.episodes)
         labels = [label(e) for e in episodes]
     except EpisodeError as error:
         sys.exit(f"texture: {error}")
@@ -104,7 +102,9 @@ def in_contact(episode: Episode) -> NDArray[np.bool_]:
     return episode.present["tactile_tip"] & (change > CONTACT * np.median(change[1:UNTOUCHED]))
 
 
-def gather(episodes: list[Episode], labels: list[int], contact: list[NDArray[np.bool_]], observation: Any) -> Pictures:
+def gather(
+    episodes: list[Episode], labels: list[int], contact: list[NDArray[np.bool_]], observation: Observation
+) -> Pictures:
     """The pictures of one input at all ticks in contact."""
     chosen = [c & e.present[observation.modality] for c, e in zip(contact, episodes, strict=True)]
     return Pictures(

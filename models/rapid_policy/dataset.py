@@ -38,8 +38,8 @@ class Batch:
 class Dataset:
     """All ticks of all episodes in one row, and the windows among them.
 
-    A window belongs to a tick. It does not reach over a tick that lacks a required modality or an action, nor over a gap
-    in the frame index: at such a place one segment ends and another begins, and steps beyond either end repeat it.
+    A window belongs to a tick. It does not reach over a tick that lacks a required modality or an action, nor over a
+    gap in the frame index: at such a place one segment ends and another begins, and steps beyond either end repeat it.
     """
 
     def __init__(self, spec: Spec, episodes: list[Episode]) -> None:

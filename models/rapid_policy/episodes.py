@@ -107,7 +107,7 @@ def read_episode(path: Path, observations: tuple[Observation, ...], actions: int
                 messages[channel.topic].append(_Message(message.log_time, message.sequence, schema.name, decoded))
     except EpisodeError:
         raise
-    # A damaged file comes to light in the container, the compression, a schema or a message: each has errors of its own.
+    # Damage comes to light in the container, the compression, a schema or a message: each has errors of its own.
     except Exception as error:
         raise EpisodeError(path, f"not a whole episode: {error}") from error
     return _assemble(path, facts, summary, wanted, observations, actions, messages)

@@ -28,7 +28,7 @@ from .dataset import Batch, Dataset
 from .diffusion import TRAIN_TIMESTEPS, add_noise, alphas_cumprod
 from .episodes import Episode, EpisodeError, episode_files, read_episodes
 from .model import Policy, parameters
-from .progress import Progress, plot
+from .progress import Progress, plot, recent
 from .spec import SPECS, Spec
 
 CHECKPOINT = "checkpoint.pt"
@@ -114,19 +114,34 @@ def begin(spec: Spec, schedule: Schedule, dataset: Dataset, provenance: dict[str
 
 
 def train(run: Run, dataset: Dataset, out: Path) -> float:
-    """Trains to the end of the schedule. Returns the final loss: the mean of the last hundred iterations."""
+    """Trains to the end of the schedule. Returns the final loss: the mean of the last hundred iterations.
+
+    Whatever ends it before, the checkpoint in `out` is the one to go on from.
+    """
+    progress = Progress(run.spec.name, run.schedule.iterations, run.iteration)
+    try:
+        _iterate(run, dataset, out, progress)
+        run.provenance["final_loss"] = recent(run.losses)
+    finally:
+        progress.close()
+        run.save(out / CHECKPOINT)
+    plot(run.losses, run.spec.name, out / "loss.png")
+    return run.provenance["final_loss"]
+
+
+def _iterate(run: Run, dataset: Dataset, out: Path, progress: Progress) -> None:
     schedule, device = run.schedule, next(run.policy.parameters()).device
     table = alphas_cumprod().to(device)
     started, before = time.monotonic(), run.seconds
-    progress = Progress(run.spec.name, schedule.iterations, run.iteration)
     while run.iteration < schedule.iterations:
         run.seconds = before + time.monotonic() - started
         done = max(run.iteration / schedule.iterations, run.seconds / (60 * schedule.minutes))
         if done >= 1:
             break
         _set_rate(run, done)
-        batch = dataset.draw(run.random, schedule.windows)
-        loss = _loss(run, batch, table, device)
+        loss = _loss(run, dataset.draw(run.random, schedule.windows), table, device)
+        if not torch.isfinite(loss):
+            raise ValueError(f"the loss is not finite in iteration {run.iteration}")
         run.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         nn.utils.clip_grad_norm_(run.policy.parameters(), 1.0)
@@ -137,12 +152,6 @@ def train(run: Run, dataset: Dataset, out: Path) -> float:
         progress.step(run.losses, done, run.seconds)
         if run.iteration % SAVE_EVERY == 0:
             run.save(out / CHECKPOINT)
-    progress.close()
-    final = float(np.mean(run.losses[-100:]))
-    run.provenance["final_loss"] = final
-    run.save(out / CHECKPOINT)
-    plot(run.losses, run.spec.name, out / "loss.png")
-    return final
 
 
 def _set_rate(run: Run, done: float) -> None:
@@ -274,7 +283,12 @@ def main() -> None:
         run.load(state)
     counts = f"{len(episodes)} episodes, {len(dataset.windows)} windows, {parameters([run.policy]):,} parameters"
     print(f"{spec.name}: {counts}", flush=True)
-    final = train(run, dataset, args.out)
+    try:
+        final = train(run, dataset, args.out)
+    except ValueError as error:
+        sys.exit(f"train: {error}")
+    except KeyboardInterrupt:
+        sys.exit(f"train: stopped after {run.iteration} iterations; --resume goes on from {checkpoint}")
     print(f"final loss {final:.4f} after {run.iteration} iterations, {run.seconds / 60:.1f} min: {checkpoint}")
 
 
