@@ -26,8 +26,8 @@ from rapid_policy import results
 from rapid_policy.dataset import Dataset
 from rapid_policy.episodes import Episode, EpisodeError
 from rapid_policy.export import export
-from rapid_policy.spec import Spec, arm, tactile, wrist
-from rapid_policy.train import CHECKPOINT, Schedule, begin, load_episodes, pick_device, provenance, train
+from rapid_policy.spec import Spec, arm, tactile, tactile_id, wrist
+from rapid_policy.train import CHECKPOINT, Schedule, begin, hardware, load_episodes, pick_device, provenance, train
 
 ALL = "both textures"
 ONE = "triangular"
@@ -43,6 +43,12 @@ class Configuration:
     """All episodes, or those of one texture."""
     paper: float
     """Its success in the paper."""
+    shipped: bool = False
+    """It is the policy of the repository: judged as it is, not trained anew."""
+
+    def bundle(self, runs: Path) -> Path:
+        """Where its bundle is, or comes to be."""
+        return Path(__file__).parent / self.name if self.shipped else runs / self.name / "bundle"
 
     @property
     def name(self) -> str:
@@ -54,7 +60,7 @@ CONFIGURATIONS = (
     Configuration(lambda: Spec("vision", (wrist(), arm()), mask_aware=False), ALL, 0.5),
     # With a single picture to take away it is the arm's own state that remains.
     Configuration(lambda: Spec("vision-mask", (wrist(dropout=0.3), arm())), ALL, 0.5),
-    Configuration(lambda: Spec("vision-mask-diff", (wrist(dropout=0.3), tactile(dropout=0.3), arm())), ALL, 1.0),
+    Configuration(tactile_id, ALL, 1.0, shipped=True),
     Configuration(lambda: unmasked("vision-diff-one"), ONE, 0.5),
     Configuration(lambda: unmasked("vision-diff"), ALL, 1.0),
 )
@@ -75,6 +81,7 @@ def main() -> None:
     parser.add_argument("--only", action="append", choices=names, help="this configuration; may be repeated")
     parser.add_argument("--trials", type=int, default=100)
     parser.add_argument("--iterations", type=int, default=Schedule().iterations)
+    parser.add_argument("--minutes", type=float, default=math.inf, help="end each training after so long at the latest")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=2)
     args = parser.parse_args()
@@ -90,21 +97,21 @@ def main() -> None:
 
 
 def learn(configuration: Configuration, args: argparse.Namespace) -> None:
-    """Trains the configuration and exports it to RUNS/NAME/bundle."""
-    run_folder = args.runs / configuration.name
-    if (run_folder / "bundle" / "policy.json").exists():
+    """Trains the configuration and exports its bundle."""
+    run_folder, bundle = args.runs / configuration.name, configuration.bundle(args.runs)
+    if (bundle / "policy.json").exists():
         return
     run_folder.mkdir(parents=True, exist_ok=True)
     spec = configuration.spec()
     episodes = [e for e in load_episodes(spec, args.episodes) if wanted(configuration, e)]
     dataset = Dataset(spec, episodes)
-    schedule = Schedule(iterations=args.iterations, seed=args.seed)
-    facts = {**provenance(episodes, f"ablation.py EPISODES --only {spec.name}"), "hardware": "a CPU"}
-    run = begin(spec, schedule, dataset, facts, pick_device("auto"))
+    schedule = Schedule(iterations=args.iterations, minutes=args.minutes, seed=args.seed)
+    device = pick_device("auto")
+    facts = provenance(episodes, f"ablation.py EPISODES --only {spec.name}")
+    run = begin(spec, schedule, dataset, {**facts, "hardware": hardware(device)}, device)
     final = train(run, dataset, run_folder)
     print(f"{spec.name}: final loss {final:.4f}, {run.seconds / 60:.1f} min", flush=True)
-    state = torch.load(run_folder / CHECKPOINT, map_location="cpu", weights_only=False)
-    export(state, run_folder / "bundle")
+    export(torch.load(run_folder / CHECKPOINT, map_location="cpu", weights_only=False), bundle)
 
 
 def wanted(configuration: Configuration, episode: Episode) -> bool:
@@ -117,29 +124,31 @@ def judge(configuration: Configuration, args: argparse.Namespace) -> None:
     run_folder = args.runs / configuration.name
     if (run_folder / "eval.json").exists():
         return
-    command = [str(args.rapid), "eval", str(run_folder / "bundle"), "--json", "--trials", str(args.trials)]
+    command = [str(args.rapid), "eval", str(configuration.bundle(args.runs)), "--json", "--trials", str(args.trials)]
     command += ["--condition", "full", "--seed", str(FIRST_SEED)]
-    begin_s = time.monotonic()
+    run_folder.mkdir(parents=True, exist_ok=True)
+    started = time.monotonic()
     said = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
-    record = {"command": " ".join(["rapid", *command[1:]]), "seconds": time.monotonic() - begin_s, "said": said}
+    record = {"command": " ".join(["rapid", *command[1:]]), "seconds": round(time.monotonic() - started, 1), "said": said}
     (run_folder / "eval.json").write_text(json.dumps(record, indent=2), encoding="utf-8")
 
 
 def summarize(args: argparse.Namespace) -> None:
     """Writes the table of what is judged so far."""
-    rows = [row for c in CONFIGURATIONS if (row := summary(c, args.runs / c.name)) is not None]
+    rows = [row for c in CONFIGURATIONS if (row := summary(c, args.runs)) is not None]
     if not rows:
         return
     report = {"trials": rows[0]["trials"], "first_seed": FIRST_SEED, "configurations": rows}
     results.write(args.out, "ablation", report, markdown(report))
 
 
-def summary(configuration: Configuration, run_folder: Path) -> dict[str, Any] | None:
+def summary(configuration: Configuration, runs: Path) -> dict[str, Any] | None:
     """One row; none where the configuration is not judged yet."""
-    if not (run_folder / "eval.json").exists():
+    said = runs / configuration.name / "eval.json"
+    if not said.exists():
         return None
-    judged = json.loads((run_folder / "eval.json").read_text(encoding="utf-8"))
-    trained = json.loads((run_folder / "bundle" / "policy.json").read_text(encoding="utf-8"))["training"]
+    judged = json.loads(said.read_text(encoding="utf-8"))
+    trained = json.loads((configuration.bundle(runs) / "policy.json").read_text(encoding="utf-8"))["training"]
     full = json.loads(judged["said"])["conditions"]["full"]
     return {
         "name": configuration.name,
@@ -173,9 +182,9 @@ def markdown(report: dict[str, Any]) -> str:
     lines = [
         "# What each input is worth",
         "",
-        "Five configurations of the policy, each trained on the demonstrations of `make train` and then run by the program",
-        f"(`rapid eval`) for {report['trials']} trials with everything plugged in, seeds from {report['first_seed']} on, which no",
-        "demonstration has. Success: the block ends in the bin of its texture; chance is 0.50.",
+        "Five configurations of the policy, each trained on the demonstrations of `make train` and then run by the",
+        f"program (`rapid eval`) for {report['trials']} trials with everything plugged in, seeds from {report['first_seed']}",
+        "on, which no demonstration has. Success: the block ends in the bin of its texture; chance is 0.50.",
         "",
         "| configuration | data | dropout | success | 95 % | wrong bin | incomplete | paper |",
         "|---|---|---|---|---|---|---|---|",
@@ -198,8 +207,9 @@ def markdown(report: dict[str, Any]) -> str:
     ]
     lines += [
         "",
-        "`vision-diff-one` has the paper's \"one configuration's data\": there the blocks of one kind, here the demonstrations",
-        "of one texture. Made with `make ablation`.",
+        "`tactile-id` is the bundle of the repository, vision, mask and difference. `vision-mask` has one picture to take",
+        "away, and then only the arm's state is left. `vision-diff-one` is the paper's row on the data of a single",
+        "configuration: there one kind of block, here the demonstrations of one texture. Made with `make ablation`.",
     ]
     return "\n".join(lines) + "\n"
 

@@ -197,10 +197,10 @@ def markdown(report: dict[str, Any]) -> str:
     lines = [
         "# What a picture says of the texture",
         "",
-        f"A classifier of single pictures taken while the fingertip is pressed on the block, {report['episodes']} simulated",
-        f"episodes ({', '.join(f'{n} {name}' for name, n in report['textures'].items())}). Every episode is tested by a",
-        f"classifier that saw no picture of it ({report['folds']} folds), each trained for {report['iterations']} iterations;"
-        f" seed {report['seed']}.",
+        f"A classifier of single pictures, taken while the fingertip is pressed on the block in {report['episodes']}",
+        f"simulated episodes ({', '.join(f'{n} {name}' for name, n in report['textures'].items())}). Every episode is",
+        f"tested by a classifier that saw no picture of it: {report['folds']} folds, each classifier trained for",
+        f"{report['iterations']} iterations, seed {report['seed']}.",
         "",
         "| input | pictures | accuracy | precision tri / hex | recall tri / hex | episodes by majority |",
         "|---|---|---|---|---|---|",

@@ -9,7 +9,7 @@
 #
 # RAPID is the program, default target/release/rapid. RUNS=models/runs is where demonstrations and checkpoints go; what
 # is there already is used again: a training that was stopped goes on. EPISODES=72, SEED=1000 of the demonstrations,
-# THREADS=2 and MINUTES of the training.
+# THREADS=2 and MINUTES of a training.
 #
 # Demonstrations and environment get their final names last: an interrupted run leaves nothing that looks whole.
 set -euo pipefail
@@ -20,6 +20,10 @@ RUNS="$(realpath -m "${RUNS:-models/runs}")"
 readonly RUNS
 readonly EPISODES="${EPISODES:-72}" SEED="${SEED:-1000}" THREADS="${THREADS:-2}"
 readonly DEMONSTRATIONS="$RUNS/demonstrations-$EPISODES-$SEED"
+
+SCHEDULE=(--threads "$THREADS")
+[[ -z ${MINUTES:-} ]] || SCHEDULE+=(--minutes "$MINUTES")
+readonly SCHEDULE
 
 # Threads that spin while they wait take time from whatever else runs here.
 export OMP_WAIT_POLICY="${OMP_WAIT_POLICY:-PASSIVE}"
@@ -32,7 +36,7 @@ main() {
     rapid="$(realpath -m "${2:-target/release/rapid}")"
     case "$part" in
         policy) environment; demonstrations "$rapid"; policy ;;
-        ablation) environment; demonstrations "$rapid"; in_models ablation.py "$DEMONSTRATIONS" --rapid "$rapid" --runs "$RUNS/ablation" --threads "$THREADS" ;;
+        ablation) environment; demonstrations "$rapid"; ablation "$rapid" ;;
         texture) environment; [[ -d $DEMONSTRATIONS ]] || die "no demonstrations: run make train first"; in_models texture.py "$DEMONSTRATIONS" --threads "$THREADS" ;;
         test) environment; in_models -m unittest discover -s tests -v ;;
         python) environment; shift; in_models "$@" ;;
@@ -77,11 +81,14 @@ demonstrations() {
 }
 
 policy() {
-    local run="$RUNS/tactile-id" options=(--threads "$THREADS")
-    [[ -z ${MINUTES:-} ]] || options+=(--minutes "$MINUTES")
+    local run="$RUNS/tactile-id" options=("${SCHEDULE[@]}")
     [[ ! -f $run/checkpoint.pt ]] || options+=(--resume)
     in_models -m rapid_policy.train "$DEMONSTRATIONS" --out "$run" "${options[@]}"
     in_models -m rapid_policy.export "$run/checkpoint.pt" --out tactile-id
+}
+
+ablation() {
+    in_models ablation.py "$DEMONSTRATIONS" --rapid "$1" --runs "$RUNS/ablation" "${SCHEDULE[@]}"
 }
 
 main "$@"

@@ -244,6 +244,14 @@ def pick_device(name: str) -> torch.device:
     return torch.device(name)
 
 
+def hardware(device: torch.device) -> str:
+    """What is trained on, in words."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    threads = torch.get_num_threads()
+    return f"{threads} CPU thread{'s' if threads > 1 else ''}"
+
+
 def main() -> None:
     defaults = Schedule()
     parser = argparse.ArgumentParser(prog="rapid_policy.train", description="Trains a policy from recorded episodes.")
@@ -273,9 +281,7 @@ def main() -> None:
         schedule = replace(Schedule(**state["schedule"]), minutes=args.minutes)
     device = pick_device(args.device)
     facts = provenance(episodes, told)
-    facts["hardware"] = f"{args.threads} thread{'s' if args.threads > 1 else ''} of a CPU"
-    if device.type == "cuda":
-        facts["hardware"] = torch.cuda.get_device_name(device)
+    facts["hardware"] = hardware(device)
     if state and state["provenance"]["episodes_sha256"] != facts["episodes_sha256"]:
         sys.exit(f"train: {checkpoint} was trained on other episodes than those in {args.episodes}")
     run = begin(spec, schedule, dataset, facts, device)
