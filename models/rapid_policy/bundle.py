@@ -117,6 +117,8 @@ A mask-aware diffusion policy for `rapid`: {does}
 
 Trained in simulation only: it knows the two lattices of `rapid --sim task` and no real gel.
 
+![The loss over the iterations](loss.png)
+
 ## Made with
 
     make train

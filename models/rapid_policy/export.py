@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from . import bundle
 from .bundle import DENOISER, ENCODER, encoder_inputs
 from .model import Policy, parameters
+from .progress import plot
 from .spec import Spec
 
 OPSET = 17
@@ -52,6 +53,7 @@ def export(state: dict[str, Any], out: Path) -> float:
     }
     bundle.write_policy(spec, facts, out)
     bundle.write_card(spec, facts, out)
+    plot(state["losses"], spec.name, out / "loss.png")
     return difference
 
 
