@@ -2,7 +2,7 @@
 """Tells the texture of a block from single pictures: how well the tactile camera shows it, raw and as difference to the
 untouched gel, and whether the wrist camera shows it too.
 
-    texture.py EPISODES [--out results] [--folds 10] [--iterations 300] [--seed 0] [--threads 1]
+    texture.py EPISODES [--out results] [--folds 10] [--iterations 200] [--seed 0] [--threads 1]
 
 The classifier is an image encoder of the policy with one layer more. Every episode is tested by a classifier that never
 saw a picture of it: the episodes are dealt into folds, and each fold is tested by one trained on the others.
@@ -59,7 +59,7 @@ def main() -> None:
     parser.add_argument("episodes", type=Path)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     parser.add_argument("--folds", type=int, default=10)
-    parser.add_argument("--iterations", type=int, default=300, help="of each training")
+    parser.add_argument("--iterations", type=int, default=200, help="of each training")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args()
