@@ -164,17 +164,9 @@ def summary(configuration: Configuration, runs: Path) -> dict[str, Any] | None:
         "success": full["success"] / full["trials"],
         "wrong_bin": full["wrong_bin"] / full["trials"],
         "incomplete": full["incomplete"] / full["trials"],
-        "interval": wilson(full["success"], full["trials"]),
+        "interval": results.wilson(full["success"], full["trials"]),
         "paper": configuration.paper,
     }
-
-
-def wilson(successes: int, trials: int, z: float = 1.96) -> tuple[float, float]:
-    """Where 95 % of the repetitions would have the true share (Wilson's score interval)."""
-    share, spread = successes / trials, z * z / trials
-    middle = (share + spread / 2) / (1 + spread)
-    half = z / (1 + spread) * math.sqrt(share * (1 - share) / trials + spread / (4 * trials))
-    return round(max(0.0, middle - half), 3), round(min(1.0, middle + half), 3)
 
 
 def markdown(report: dict[str, Any]) -> str:
