@@ -3,7 +3,7 @@ SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup setup-build demo test lint check bench fuzz clean
+.PHONY: help setup setup-build demo test lint check bench fuzz lerobot-test clean
 
 # A toolchain just installed by rustup is not on the PATH of a shell that was open before.
 export PATH := $(PATH):$(HOME)/.cargo/bin
@@ -45,6 +45,17 @@ bench: setup ## print figures beside their baselines (JSON=1; BENCH="--quick --o
 fuzz: ## feed every reader of strangers' bytes with made-up ones, each for FUZZ_SECONDS=60
 	@scripts/setup.sh build fuzz
 	scripts/fuzz.sh
+
+# In a place of its own and no part of the other tests: LeRobot and PyTorch are gigabytes that nothing else here needs.
+lerobot-test: LEROBOT := $(CACHE)/venv-lerobot
+lerobot-test: ## the export of LeRobot checkpoints, against LeRobot (fetches 8 GB of Python packages once)
+	@stamp=$$(sha256sum <models/requirements-lerobot.txt); \
+	if [[ $$(cat '$(LEROBOT)/stamp' 2>/dev/null) != "$$stamp" ]]; then \
+	    rm -rf '$(LEROBOT)' && python3 -m venv '$(LEROBOT)'; \
+	    '$(LEROBOT)/bin/python' -m pip install --quiet --disable-pip-version-check --only-binary=:all: --no-deps -r models/requirements-lerobot.txt; \
+	    echo "$$stamp" >'$(LEROBOT)/stamp'; \
+	fi
+	'$(LEROBOT)/bin/python' -m unittest discover -s models/tests -p 'test_export_lerobot.py' -v
 
 clean: ## remove what was built here (what setup fetched stays)
 	cargo clean
