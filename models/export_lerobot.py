@@ -27,7 +27,9 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         export(options)
     except Unsupported as error:
-        print(f"export_lerobot: {error}", file=sys.stderr)
+        # What strangers wrote into a checkpoint must not steer the terminal.
+        line = "".join(c if c.isprintable() else " " for c in str(error))
+        print(f"export_lerobot: {line}", file=sys.stderr)
         return 1
     return 0
 
@@ -54,8 +56,8 @@ def parser() -> argparse.ArgumentParser:
     add("--required", metavar="KEY", action="append", default=[],
         help="with --mask-aware: a camera the policy does not run without; may be repeated")
     add("--scheduler", choices=["DDIM", "DDPM"], help="run with this scheduler instead of config.json's noise_scheduler_type")
-    add("--steps", type=int, metavar="N", help="run this many steps instead of config.json's num_inference_steps")
-    add("--max-age-ms", type=int, default=300, metavar="MS", help="no older observation is acted on (default: 300)")
+    add("--steps", type=count, metavar="N", help="run this many steps instead of config.json's num_inference_steps")
+    add("--max-age-ms", type=count, default=300, metavar="MS", help="no older observation is acted on (default: 300)")
     return out
 
 
@@ -151,6 +153,13 @@ def pair(text: str) -> tuple[str, str]:
 
 def words(text: str) -> list[str]:
     return [word.strip() for word in text.split(",")]
+
+
+def count(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not above 0")
+    return value
 
 
 def positive(text: str) -> float:

@@ -3,6 +3,7 @@
 import warnings
 from pathlib import Path
 
+import onnx
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -105,9 +106,7 @@ def export(policy, config: Config, names: dict[str, str], mask_aware: bool, fold
         observations.append(torch.ones(batch, len(config.cameras)))
         inputs.append(MASK)
     encoder = Encoder(policy, config, mask_aware).eval()
-    with torch.no_grad():
-        condition = encoder(*observations)
-    trace(encoder, observations, inputs, CONDITION, folder / "encoder.onnx")
+    condition = trace(encoder, observations, inputs, CONDITION, folder / "encoder.onnx")
 
     sample = torch.randn(batch, config.horizon, config.action_len)
     timestep = torch.zeros(batch, dtype=torch.int64)
@@ -116,7 +115,8 @@ def export(policy, config: Config, names: dict[str, str], mask_aware: bool, fold
     return {"encoder": "encoder.onnx", "denoiser": "denoiser.onnx"}
 
 
-def trace(module: nn.Module, args: list[Tensor], inputs: list[str], output: str, file: Path) -> None:
+def trace(module: nn.Module, args: list[Tensor], inputs: list[str], output: str, file: Path) -> Tensor:
+    """Writes the graph of `module` to `file`, and returns what `module` makes of `args`."""
     with warnings.catch_warnings():
         # torch prefers its newer exporter, and says so for every graph.
         warnings.simplefilter("ignore")
@@ -130,3 +130,12 @@ def trace(module: nn.Module, args: list[Tensor], inputs: list[str], output: str,
             opset_version=OPSET,
             dynamo=False,
         )
+    with torch.no_grad():
+        made = module(*args)
+    # The tracer leaves the output's other sizes open as well. The program holds them against policy.json.
+    model = onnx.load(file)
+    for dim, size in list(zip(model.graph.output[0].type.tensor_type.shape.dim, made.shape))[1:]:
+        dim.dim_value = size
+    onnx.checker.check_model(model)
+    onnx.save(model, file)
+    return made

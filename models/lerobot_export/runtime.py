@@ -14,9 +14,15 @@ class Bundle:
     def __init__(self, folder: Path):
         self.spec = json.loads((folder / "policy.json").read_text(encoding="utf-8"))
         graphs = self.spec["graphs"]
-        providers = ["CPUExecutionProvider"]
-        self.encoder = onnxruntime.InferenceSession(str(folder / graphs["encoder"]["file"]), providers=providers)
-        self.denoiser = onnxruntime.InferenceSession(str(folder / graphs["denoiser"]["file"]), providers=providers)
+        options = onnxruntime.SessionOptions()
+        # More would wait busily, at the cost of PyTorch's on the other side.
+        options.intra_op_num_threads = 1
+
+        def session(name: str) -> onnxruntime.InferenceSession:
+            file = str(folder / graphs[name]["file"])
+            return onnxruntime.InferenceSession(file, options, providers=["CPUExecutionProvider"])
+
+        self.encoder, self.denoiser = session("encoder"), session("denoiser")
 
     def condition(self, inputs: dict[str, np.ndarray], mask: np.ndarray | None) -> np.ndarray:
         """The condition for normalised observations by key; what the mask says is absent is zeros."""

@@ -51,8 +51,9 @@ def encoder(checkpoint: Checkpoint, bundle: Bundle, random, batch: int) -> float
     inputs = {key: normal(random, batch, config.n_obs_steps, *shape) for key, shape in config.cameras.items()}
     inputs[STATE_KEY] = normal(random, batch, config.n_obs_steps, config.state_len)
     worst = 0.0
+    whole = lerobot_condition(checkpoint, inputs)
     for mask in masks(checkpoint, bundle):
-        expected = lerobot_condition(checkpoint, inputs, mask)
+        expected = masked(checkpoint, whole, mask)
         given = {}
         for spec, (key, value) in zip(bundle.spec["observations"], inputs.items()):
             absent = mask is not None and key in config.cameras and not mask[list(config.cameras).index(key)]
@@ -116,18 +117,21 @@ def lerobot_actions(checkpoint: Checkpoint, inputs: dict, mask, noise: np.ndarra
     model = checkpoint.policy.diffusion
     if mask is None:
         return model.generate_actions(batch(checkpoint, inputs), noise=torch.from_numpy(noise))
-    # LeRobot knows no mask: the columns of the absent cameras are zeroed in what it computes.
-    condition = lerobot_condition(checkpoint, inputs, mask)
+    condition = masked(checkpoint, lerobot_condition(checkpoint, inputs), mask)
     sample = model.conditional_sample(len(noise), global_cond=condition, noise=torch.from_numpy(noise))
     begin = checkpoint.config.n_obs_steps - 1
     return sample[:, begin : begin + checkpoint.config.n_action_steps]
 
 
-def lerobot_condition(checkpoint: Checkpoint, inputs: dict, mask) -> torch.Tensor:
-    config = checkpoint.config
-    condition = checkpoint.policy.diffusion._prepare_global_conditioning(batch(checkpoint, inputs))
+def lerobot_condition(checkpoint: Checkpoint, inputs: dict) -> torch.Tensor:
+    return checkpoint.policy.diffusion._prepare_global_conditioning(batch(checkpoint, inputs))
+
+
+def masked(checkpoint: Checkpoint, condition: torch.Tensor, mask) -> torch.Tensor:
+    """LeRobot knows no mask: the columns of the absent cameras are zeroed in what it computes."""
     if mask is None:
         return condition
+    config = checkpoint.config
     by_step = condition.reshape(len(condition), config.n_obs_steps, -1).clone()
     size = (by_step.shape[-1] - config.state_len) // len(config.cameras)
     for index, present in enumerate(mask):
