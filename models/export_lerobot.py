@@ -40,22 +40,54 @@ def parser() -> argparse.ArgumentParser:
         description=head, epilog=rest, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
     add = out.add_argument
-    add("path", metavar="PATH", type=Path, help="folder of the checkpoint: config.json, model.safetensors, policy_*.json")
+    add(
+        "path",
+        metavar="PATH",
+        type=Path,
+        help="folder of the checkpoint: config.json, model.safetensors, policy_*.json",
+    )
     add("out", metavar="OUT", type=Path, help="folder of the bundle; must not exist")
     add("--name", help="name of the bundle (default: that of OUT)")
     add("--hz", type=positive, help="control rate the policy was trained at (default: the fps of --dataset)")
-    add("--modality", metavar="KEY=NAME", action="append", default=[], type=pair,
-        help="entry of devices.toml that gives observation KEY (default: the last part of KEY); may be repeated")
+    add(
+        "--modality",
+        metavar="KEY=NAME",
+        action="append",
+        default=[],
+        type=pair,
+        help="entry of devices.toml that gives observation KEY (default: the last part of KEY); may be repeated",
+    )
     add("--actuator", metavar="NAME", help="entry of devices.toml that is moved (default: that of observation.state)")
-    add("--dataset", metavar="DIR", type=Path,
-        help="the LeRobotDataset it was trained on: rate, names of the actions and their limits are taken from its meta/")
-    add("--action-names", metavar="A,B", type=words, help="names of the action's values (default: those of --dataset, or a0,a1)")
+    add(
+        "--dataset",
+        metavar="DIR",
+        type=Path,
+        help="the LeRobotDataset it was trained on: its meta/ gives rate, names of the actions and their limits",
+    )
+    add(
+        "--action-names",
+        metavar="A,B",
+        type=words,
+        help="names of the action's values (default: those of --dataset, or a0,a1)",
+    )
     add("--action-units", metavar="A,B", type=words, help="their units (default: 1)")
-    add("--mask-aware", action="store_true",
-        help="zero the embedding of a camera that is absent; only for a policy that was trained so")
-    add("--required", metavar="KEY", action="append", default=[],
-        help="with --mask-aware: a camera the policy does not run without; may be repeated")
-    add("--scheduler", choices=["DDIM", "DDPM"], help="run with this scheduler instead of config.json's noise_scheduler_type")
+    add(
+        "--mask-aware",
+        action="store_true",
+        help="zero the embedding of a camera that is absent; only for a policy that was trained so",
+    )
+    add(
+        "--required",
+        metavar="KEY",
+        action="append",
+        default=[],
+        help="with --mask-aware: a camera the policy does not run without; may be repeated",
+    )
+    add(
+        "--scheduler",
+        choices=["DDIM", "DDPM"],
+        help="run with this scheduler instead of config.json's noise_scheduler_type",
+    )
     add("--steps", type=count, metavar="N", help="run this many steps instead of config.json's num_inference_steps")
     add("--max-age-ms", type=count, default=300, metavar="MS", help="no older observation is acted on (default: 300)")
     return out
@@ -103,7 +135,9 @@ def rig(options: argparse.Namespace, config: checkpoint_config.Config) -> dict:
         modalities[key] = name
     for key in options.required:
         if key not in config.cameras or not options.mask_aware:
-            raise Unsupported(f"--required {key}: goes with --mask-aware, and the cameras are {', '.join(config.cameras)}")
+            raise Unsupported(
+                f"--required {key}: goes with --mask-aware, and the cameras are {', '.join(config.cameras)}"
+            )
     cameras = [modalities[key] for key in config.cameras]
     if len(set(cameras)) < len(cameras):
         raise Unsupported(f"--modality: two cameras cannot both be {cameras[0]}")
@@ -126,7 +160,9 @@ def rig(options: argparse.Namespace, config: checkpoint_config.Config) -> dict:
     }
     for what in ("action_names", "action_units"):
         if found[what] and len(found[what]) != config.action_len:
-            raise Unsupported(f"{len(found[what])} {what.replace('_', ' ')}, but an action has {config.action_len} values")
+            raise Unsupported(
+                f"{len(found[what])} {what.replace('_', ' ')}, but an action has {config.action_len} values"
+            )
     return found
 
 

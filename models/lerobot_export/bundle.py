@@ -8,7 +8,7 @@ from pathlib import Path
 
 from . import Unsupported
 from .checkpoint import Checkpoint
-from .config import STATE_KEY, Config
+from .config import Config
 from .graphs import CONDITION, MASK
 
 FORMAT = "rapid-policy/1"
@@ -39,7 +39,9 @@ def input_names(config: Config) -> dict[str, str]:
     taken = {MASK: "the mask", CONDITION: "the encoder's output"}
     for key, name in names.items():
         if name in taken:
-            raise Unsupported(f"{config.folder / 'config.json'}: input_features.{key}: {taken[name]} has the name {name}, too")
+            raise Unsupported(
+                f"{config.folder / 'config.json'}: input_features.{key}: {taken[name]} has the name {name}, too"
+            )
         taken[name] = key
     return names
 
@@ -53,7 +55,13 @@ def write_policy(checkpoint: Checkpoint, options: Options, graphs: dict[str, str
         if key in config.cameras:
             observation |= {"kind": "image", "required": not options.mask_aware or key in options.required}
             # Resize and crop are in the graph.
-            observation |= {"shape": config.cameras[key], "color": "rgb", "resize": None, "crop": None, "operation": None}
+            observation |= {
+                "shape": config.cameras[key],
+                "color": "rgb",
+                "resize": None,
+                "crop": None,
+                "operation": None,
+            }
         else:
             observation |= {"shape": [config.state_len]}
         observations.append(observation | {"normalization": checkpoint.normalization(key)})
@@ -116,9 +124,13 @@ def write_card(policy: dict, folder: Path) -> None:
     action, scheduler, training = policy["action"], policy["scheduler"], policy["training"]
     rows = []
     for spec in policy["observations"]:
+        what = f"{spec['kind']} {' x '.join(str(n) for n in spec['shape'])}"
         need = "required" if spec["required"] else "may be absent"
-        shape = " x ".join(str(n) for n in spec["shape"])
-        rows.append(f"| `{spec['key']}` | `{spec['modality']}` | {spec['kind']} {shape} | {spec['normalization']['mode']} | {need} |")
+        rows.append(f"| `{spec['key']}` | `{spec['modality']}` | {what} | {spec['normalization']['mode']} | {need} |")
+    executed = f"{policy['n_action_steps']} of them, from number {policy['action_start']} on"
+    values = ", ".join(f"`{name}` [{unit}]" for name, unit in zip(action["names"], action["units"], strict=True))
+    steps = f"{scheduler['num_inference_steps']} of {scheduler['num_train_timesteps']} steps"
+    differences = ", ".join(f"{name} {value:.1e}" for name, value in training["verification"].items())
     if policy["mask_aware"]:
         mask = (
             "Mask-aware by request: an absent camera's embedding is replaced by zeros. That serves only a policy that "
@@ -135,16 +147,14 @@ A LeRobot DiffusionPolicy, exported by `models/export_lerobot.py`. `policy.json`
 |---|---|---|---|---|
 {chr(10).join(rows)}
 
-{policy["n_obs_steps"]} observations at {policy["control_hz"]:g} Hz give {policy["horizon"]} actions; {policy["n_action_steps"]} of
-them, from number {policy["action_start"]} on, are executed by `{action["actuator"]}`:
-{", ".join(f"`{name}` [{unit}]" for name, unit in zip(action["names"], action["units"]))}, within the range of the training data.
+{policy["n_obs_steps"]} observations at {policy["control_hz"]:g} Hz give {policy["horizon"]} actions. {executed},
+are executed by `{action["actuator"]}`, within the range of the training data: {values}.
 {mask}
 
-Scheduler: {scheduler["type"]}, {scheduler["num_inference_steps"]} of {scheduler["num_train_timesteps"]} steps, {scheduler["beta_schedule"]}, predicts {scheduler["prediction_type"]}.
+Scheduler: {scheduler["type"]}, {steps}, {scheduler["beta_schedule"]}, predicts {scheduler["prediction_type"]}.
 
-Weights: SHA-256 `{training["weights_sha256"]}`. Largest difference from LeRobot at export, over random observations:
-{", ".join(f"{name} {value:.1e}" for name, value in training["verification"].items())}. How well the policy does its task was
-not measured by the export.
+Weights: SHA-256 `{training["weights_sha256"]}`. Largest difference from LeRobot at export, over random
+observations: {differences}. How well the policy does its task was not measured.
 """,
         encoding="utf-8",
     )

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
-from lerobot.configs.policies import PreTrainedConfig
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.processor.converters import (
     batch_to_transition,
@@ -17,7 +17,7 @@ from lerobot.processor.converters import (
 )
 
 from . import Unsupported
-from .config import ACTION_KEY, MAX_GRAPH_BYTES, STATE_KEY, Config
+from .config import ACTION_KEY, MAX_GRAPH_BYTES, Config
 
 PRE, POST = "policy_preprocessor.json", "policy_postprocessor.json"
 # What LeRobot's DiffusionPolicy brings of its own. A step beside these would be left out of the bundle in silence.
@@ -179,7 +179,9 @@ def check_steps(file: Path) -> None:
         raise Unsupported(f"{file}: no list of steps: {error!r}") from error
     for index, name in enumerate(names):
         if name not in STEPS[file.name]:
-            raise Unsupported(f"{file}: steps[{index}].registry_name: {name} is not supported: a bundle has no such step")
+            raise Unsupported(
+                f"{file}: steps[{index}].registry_name: {name} is not supported: a bundle has no such step"
+            )
     if (needed := STEPS[file.name][-1 if file.name == PRE else 0]) not in names:
         raise Unsupported(f"{file}: steps: no {needed}, so nothing says how numbers are normalised")
 

@@ -119,7 +119,9 @@ def inputs(raw: dict, refuse) -> tuple[dict[str, list[int]], int]:
         elif key != STATE_KEY:
             raise refuse(f"input_features.{key}", f"type {kind}: only pictures (VISUAL) and {STATE_KEY} are supported")
     if not 1 <= len(cameras) <= MAX_CAMERAS:
-        raise refuse("input_features", f"{len(cameras)} cameras ({', '.join(cameras)}): 1 to {MAX_CAMERAS} are supported")
+        raise refuse(
+            "input_features", f"{len(cameras)} cameras ({', '.join(cameras)}): 1 to {MAX_CAMERAS} are supported"
+        )
     if len({tuple(shape) for shape in cameras.values()}) > 1:
         raise refuse("input_features", f"cameras of different shapes, which DiffusionPolicy does not take: {cameras}")
     state = found.get(STATE_KEY)

@@ -69,7 +69,7 @@ class Encoder(nn.Module):
     def forward(self, *inputs: Tensor) -> Tensor:
         cameras, state = inputs[: len(self.encoders)], inputs[len(self.encoders)]
         features = [state]
-        for index, (encoder, camera) in enumerate(zip(self.encoders, cameras)):
+        for index, (encoder, camera) in enumerate(zip(self.encoders, cameras, strict=True)):
             x = self.picture(camera.flatten(0, 1))
             x = torch.flatten(encoder.pool(encoder.backbone(x)), start_dim=1)
             # The batch is the one size left open: an unflatten would write that of the traced batch into the graph.
@@ -111,7 +111,9 @@ def export(policy, config: Config, names: dict[str, str], mask_aware: bool, fold
     sample = torch.randn(batch, config.horizon, config.action_len)
     timestep = torch.zeros(batch, dtype=torch.int64)
     denoiser_inputs = ["sample", "timestep", CONDITION]
-    trace(Denoiser(policy).eval(), [sample, timestep, condition], denoiser_inputs, "prediction", folder / "denoiser.onnx")
+    trace(
+        Denoiser(policy).eval(), [sample, timestep, condition], denoiser_inputs, "prediction", folder / "denoiser.onnx"
+    )
     return {"encoder": "encoder.onnx", "denoiser": "denoiser.onnx"}
 
 
@@ -134,7 +136,8 @@ def trace(module: nn.Module, args: list[Tensor], inputs: list[str], output: str,
         made = module(*args)
     # The tracer leaves the output's other sizes open as well. The program holds them against policy.json.
     model = onnx.load(file)
-    for dim, size in list(zip(model.graph.output[0].type.tensor_type.shape.dim, made.shape))[1:]:
+    dims = model.graph.output[0].type.tensor_type.shape.dim
+    for dim, size in zip(dims[1:], made.shape[1:], strict=True):
         dim.dim_value = size
     onnx.checker.check_model(model)
     onnx.save(model, file)

@@ -60,7 +60,7 @@ class Bundle:
             inputs[spec["key"]] = value
         condition = self.condition(inputs, mask)
         x = noise
-        for t, previous, at, at_previous in steps(self.spec["scheduler"]):
+        for t, at, at_previous in steps(self.spec["scheduler"]):
             output = self.predict(x, np.full(len(x), t, np.int64), condition)
             x = step(self.spec["scheduler"], output, x, at, at_previous, fresh_noise if t > 0 else None)
         begin = self.spec["action_start"]
@@ -92,7 +92,7 @@ def denormalize(value: np.ndarray, slices: list[dict]) -> np.ndarray:
 
 
 def steps(spec: dict):
-    """The timesteps from the last, each with the one after it and both alphas; spacing "leading" alone."""
+    """The timesteps from the last, each with its alpha and that of the one visited next; spacing "leading" alone."""
     assert spec["timestep_spacing"] == "leading", spec["timestep_spacing"]
     total, stride = spec["num_train_timesteps"], spec["num_train_timesteps"] // spec["num_inference_steps"]
     alphas = np.cumprod(1 - betas(spec), dtype=np.float32)
@@ -100,7 +100,7 @@ def steps(spec: dict):
     for i in reversed(range(spec["num_inference_steps"])):
         t = i * stride + spec["steps_offset"]
         previous = t - stride
-        yield t, previous, alphas[min(t, total - 1)], alphas[previous] if previous >= 0 else last
+        yield t, alphas[t], alphas[previous] if previous >= 0 else last
 
 
 def betas(spec: dict) -> np.ndarray:

@@ -41,7 +41,9 @@ def verify(checkpoint: Checkpoint, folder: Path) -> dict[str, float]:
     # A difference that is no number compares as false with everything.
     if wrong := [name for name, difference in found.items() if not difference <= TOLERANCE]:
         figures = ", ".join(f"{name} {difference:.2e}" for name, difference in found.items())
-        raise Mismatch(f"the bundle differs from LeRobot in {', '.join(wrong)}: {figures}; at most {TOLERANCE} is allowed")
+        raise Mismatch(
+            f"the bundle differs from LeRobot in {', '.join(wrong)}: {figures}; at most {TOLERANCE} is allowed"
+        )
     return found
 
 
@@ -55,7 +57,7 @@ def encoder(checkpoint: Checkpoint, bundle: Bundle, random, batch: int) -> float
     for mask in masks(checkpoint, bundle):
         expected = masked(checkpoint, whole, mask)
         given = {}
-        for spec, (key, value) in zip(bundle.spec["observations"], inputs.items()):
+        for spec, (key, value) in zip(bundle.spec["observations"], inputs.items(), strict=True):
             absent = mask is not None and key in config.cameras and not mask[list(config.cameras).index(key)]
             given[spec["key"]] = np.full_like(value, np.nan) if absent else value
         rows = None if mask is None else np.tile(np.float32(mask), (batch, 1))
@@ -86,7 +88,8 @@ def end_to_end(checkpoint: Checkpoint, bundle: Bundle, random) -> dict[str, floa
     }
     state = states(checkpoint, bundle, random, (batch, config.n_obs_steps, config.state_len))
     noise = normal(random, batch, config.horizon, config.action_len)
-    raw = dict(zip((spec["key"] for spec in bundle.spec["observations"]), [*pictures.values(), state]))
+    names = [spec["key"] for spec in bundle.spec["observations"]]
+    raw = dict(zip(names, [*pictures.values(), state], strict=True))
 
     observation = {key: torch.from_numpy(value).float() / 255 for key, value in pictures.items()}
     observation[STATE_KEY] = torch.from_numpy(state)

@@ -1,54 +1,17 @@
 """export_lerobot.py on small random checkpoints that LeRobot itself writes (`make lerobot-test`)."""
 
-import contextlib
-import io
 import json
 import os
-import shutil
-import sys
-import tempfile
 import unittest
-from dataclasses import dataclass, field
 from hashlib import sha256
-from pathlib import Path
-from types import SimpleNamespace
 
-os.environ["HF_HUB_OFFLINE"] = "1"
-# Threads that wait busily for one another make this many times slower on a machine that has other work.
-os.environ["OMP_NUM_THREADS"] = "1"
-os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
-import export_lerobot
 import numpy as np
 import onnx
-import torch
-from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
-from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
-from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
-from lerobot.policies.diffusion.processor_diffusion import make_diffusion_pre_post_processors
+from lerobot_checkpoints import ACTION, ACTION_LEN, STATE, STATE_LEN, TOP, WRIST, Case, Temporary, run, write
+
 from lerobot_export import checkpoint as loading
 from lerobot_export import config as checkpoint_config
 from lerobot_export import runtime, verify
-
-TOP, WRIST, STATE, ACTION = "observation.images.top", "observation.images.wrist", "observation.state", "action"
-STATE_LEN, ACTION_LEN = 5, 3
-
-
-@dataclass
-class Case:
-    """A checkpoint, and how it is exported."""
-
-    cameras: list[str] = field(default_factory=lambda: [TOP])
-    height: int = 64
-    width: int = 64
-    modes: dict[str, str] = field(default_factory=dict)
-    # More of DiffusionConfig.
-    settings: dict = field(default_factory=dict)
-    # Statistics by key and name, over the random ones.
-    stats: dict[str, dict] = field(default_factory=dict)
-    arguments: list[str] = field(default_factory=list)
-
 
 CASES = {
     "one camera, LeRobot's defaults": Case(),
@@ -96,59 +59,6 @@ CASES = {
 }
 
 
-def write(case: Case, folder: Path) -> None:
-    """Makes the checkpoint as LeRobot's training saves one."""
-    torch.manual_seed(0)
-    image = PolicyFeature(FeatureType.VISUAL, (3, case.height, case.width))
-    config = DiffusionConfig(
-        device="cpu",
-        input_features={key: image for key in case.cameras} | {STATE: PolicyFeature(FeatureType.STATE, (STATE_LEN,))},
-        output_features={ACTION: PolicyFeature(FeatureType.ACTION, (ACTION_LEN,))},
-        down_dims=(32, 64),
-        **case.settings,
-    )
-    config.normalization_mapping |= {kind: NormalizationMode(mode) for kind, mode in case.modes.items()}
-    stats = {key: statistics(3, 1, 1) for key in case.cameras}
-    stats |= {STATE: statistics(STATE_LEN), ACTION: statistics(ACTION_LEN)}
-    for key, given in case.stats.items():
-        stats[key] |= {name: torch.tensor(values) for name, values in given.items()}
-    policy = DiffusionPolicy(config)
-    for module in policy.modules():
-        # Fresh running statistics are 0 and 1, with which batch normalisation would show nothing.
-        if isinstance(module, torch.nn.BatchNorm2d):
-            module.running_mean.uniform_(-0.1, 0.1)
-            module.running_var.uniform_(0.5, 1.5)
-    for part in (policy, *make_diffusion_pre_post_processors(config, stats)):
-        part.save_pretrained(folder)
-
-
-def statistics(*shape: int) -> dict[str, torch.Tensor]:
-    low = torch.rand(shape) - 0.6
-    names = {"min": 0.0, "q01": 0.1, "q10": 0.2, "mean": 0.5, "q90": 0.8, "q99": 0.9, "max": 1.0}
-    width = 0.5 + torch.rand(shape)
-    return {name: low + part * width for name, part in names.items()} | {"std": 0.2 + torch.rand(shape)}
-
-
-def run(*arguments) -> SimpleNamespace:
-    """The command as a user gives it: status, what it printed, what it complained of."""
-    out, complaint = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(complaint):
-        status = export_lerobot.main([str(argument) for argument in arguments])
-    return SimpleNamespace(status=status, out=out.getvalue(), complaint=complaint.getvalue())
-
-
-class Temporary(unittest.TestCase):
-    def setUp(self):
-        self.folder = Path(tempfile.mkdtemp())
-        self.addCleanup(shutil.rmtree, self.folder)
-        self.source, self.bundle = self.folder / "checkpoint", self.folder / "bundle"
-
-    def edit(self, file: Path, change) -> None:
-        content = json.loads(file.read_text())
-        change(content)
-        file.write_text(json.dumps(content))
-
-
 class Exports(Temporary):
     """What can be exported is, equals LeRobot, and has the format of a bundle."""
 
@@ -179,7 +89,9 @@ class Exports(Temporary):
                 shapes[name, value.name] = (value.type.tensor_type.elem_type, dims)
         real, whole = onnx.TensorProto.FLOAT, onnx.TensorProto.INT64
         width = to * (STATE_LEN + 64 * len(case.cameras))
-        expected = {("encoder", key.rsplit(".")[-1]): (real, ["B", to, 3, case.height, case.width]) for key in case.cameras}
+        expected = {
+            ("encoder", key.rsplit(".")[-1]): (real, ["B", to, 3, case.height, case.width]) for key in case.cameras
+        }
         expected["encoder", "state"] = (real, ["B", to, STATE_LEN])
         if policy["mask"] is not None:
             expected["encoder", "mask"] = (real, ["B", len(case.cameras)])
@@ -209,11 +121,23 @@ class Exports(Temporary):
 
     def test_defaults(self):
         policy = self.check(CASES["one camera, LeRobot's defaults"])
-        self.assertEqual(policy["scheduler"], {
-            "type": "DDPM", "num_train_timesteps": 100, "beta_schedule": "squaredcos_cap_v2", "beta_start": 0.0001,
-            "beta_end": 0.02, "prediction_type": "epsilon", "clip_sample": True, "clip_sample_range": 1.0,
-            "set_alpha_to_one": True, "steps_offset": 0, "timestep_spacing": "leading", "num_inference_steps": 100,
-        })
+        self.assertEqual(
+            policy["scheduler"],
+            {
+                "type": "DDPM",
+                "num_train_timesteps": 100,
+                "beta_schedule": "squaredcos_cap_v2",
+                "beta_start": 0.0001,
+                "beta_end": 0.02,
+                "prediction_type": "epsilon",
+                "clip_sample": True,
+                "clip_sample_range": 1.0,
+                "set_alpha_to_one": True,
+                "steps_offset": 0,
+                "timestep_spacing": "leading",
+                "num_inference_steps": 100,
+            },
+        )
         modes = [spec["normalization"]["mode"] for spec in policy["observations"]]
         self.assertEqual(modes, ["mean_std", "min_max"])
         self.assertEqual(policy["observations"][0]["normalization"]["eps"], 1e-8)
@@ -287,7 +211,9 @@ class Verification(Temporary):
 
         mistakes = {
             "state's statistics": lambda policy: policy["observations"][2]["normalization"]["min"].__setitem__(0, -9.0),
-            "picture's statistics": lambda policy: policy["observations"][1]["normalization"]["max"].__setitem__(2, 3.0),
+            "picture's statistics": lambda policy: policy["observations"][1]["normalization"]["max"].__setitem__(
+                2, 3.0
+            ),
             "action's statistics": lambda policy: policy["action"]["normalization"][0]["max"].__setitem__(1, 5.0),
             "start": lambda policy: policy.update(action_start=0),
             "schedule": lambda policy: policy["scheduler"].update(beta_schedule="linear"),
@@ -318,98 +244,6 @@ class Verification(Temporary):
         self.assertEqual(done.status, 1)
         self.assertIn("the bundle differs from LeRobot in actions, actions in units", done.complaint)
         self.assertEqual(os.listdir(self.folder), ["checkpoint"])
-
-
-class Refusals(Temporary):
-    """What cannot be exported is refused in words that name the key."""
-
-    @classmethod
-    def setUpClass(cls):
-        cls.whole = Path(tempfile.mkdtemp()) / "checkpoint"
-        cls.addClassCleanup(shutil.rmtree, cls.whole.parent)
-        write(Case(), cls.whole)
-
-    def refused(self, words: list[str], *arguments) -> None:
-        done = run(self.source, self.bundle, *(arguments or ("--hz", 10)))
-        self.assertEqual(done.status, 1)
-        for word in words:
-            self.assertIn(word, done.complaint)
-        self.assertFalse(self.bundle.exists())
-        shutil.rmtree(self.source)
-
-    def changed(self, change, *words: str, file: str = "config.json") -> None:
-        """The checkpoint with its configuration changed is refused with these words."""
-        with self.subTest(words[0]):
-            shutil.copytree(self.whole, self.source)
-            self.edit(self.source / file, change)
-            self.refused([file, *words])
-
-    def test_configuration(self):
-        picture = {"type": "VISUAL", "shape": [3, 64, 64]}
-        more = {"observation.images.b": picture, "observation.images.c": picture}
-        env = {"observation.environment_state": {"type": "ENV", "shape": [9]}}
-        self.changed(lambda c: c.update(type="act"), "type:", '"act" is not supported')
-        self.changed(lambda c: c["input_features"].update(more), "input_features:", "3 cameras")
-        self.changed(lambda c: c["input_features"].pop(TOP), "input_features:", "0 cameras")
-        self.changed(lambda c: c["input_features"].update(env), "input_features.observation.environment_state")
-        self.changed(lambda c: c["input_features"].pop(STATE), f"input_features.{STATE}: missing")
-        self.changed(lambda c: c["input_features"][TOP].update(shape=[1, 64, 64]), f"input_features.{TOP}.shape")
-        self.changed(lambda c: c["input_features"].update({"observation.state_mask": picture | {"type": "LANGUAGE"}}),
-            "input_features.observation.state_mask", "LANGUAGE")
-        self.changed(lambda c: c["input_features"].update({"observation.images.mask": picture}),
-            "input_features.observation.images.mask", "the mask has the name mask")
-        self.changed(lambda c: c.update(output_features={"pose": {"type": "ACTION", "shape": [3]}}), "output_features.action")
-        self.changed(lambda c: c.update(n_action_steps=16), "n_action_steps: 16 is more than", "15")
-        self.changed(lambda c: c.update(beta_schedule="sigmoid"), 'beta_schedule: "sigmoid"')
-        self.changed(lambda c: c.update(use_peft=True), "use_peft")
-        self.changed(lambda c: c.update(of_a_later_version=1), "LeRobot cannot read it", "of_a_later_version")
-
-    def test_weights_of_another_configuration(self):
-        shutil.copytree(self.whole, self.source)
-        self.edit(self.source / "config.json", lambda c: c.update(down_dims=[32, 96]))
-        self.refused(["the weights do not fit config.json"])
-
-    def test_processors(self):
-        shutil.copytree(self.whole, self.source)
-        (self.source / "policy_preprocessor.json").unlink()
-        self.refused(["policy_preprocessor.json: missing", "migrate_policy_normalization"])
-        step = {"registry_name": "relative_actions_processor", "config": {}}
-        self.changed(lambda c: c["steps"].insert(2, step), "steps[2].registry_name: relative_actions_processor",
-            file="policy_preprocessor.json")
-        self.changed(lambda c: c["steps"].pop(0), "no unnormalizer_processor", file="policy_postprocessor.json")
-
-    def test_statistics(self):
-        write(Case(stats={STATE: {"min": [0.0, 0.0, 0.5, 0.0, 0.0], "max": [1.0, 1.0, 0.5, 1.0, 1.0]}}), self.source)
-        self.refused([f"{STATE}, dimension 2", "min = 0.5 and max = 0.5"])
-        write(Case(stats={STATE: {"max": [1.0, float("nan"), 1.0, 1.0, 1.0]}}), self.source)
-        self.refused([f"max of {STATE}, dimension 1: nan"])
-
-    def test_umi(self):
-        for files in ({".hydra/config.yaml": "a: 1"}, {"checkpoints/latest.ckpt": ""},
-            {"config.json": '{"_target_": "diffusion_policy.workspace.Workspace", "shape_meta": {}}'}):
-            with self.subTest(str(files)):
-                for name, text in files.items():
-                    file = self.source / name
-                    file.parent.mkdir(parents=True, exist_ok=True)
-                    file.write_text(text)
-                self.refused(["a UMI checkpoint, which is not supported yet", "down_sample_steps", "rotation"])
-        done = run(self.folder / "latest.ckpt", self.bundle, "--hz", 10)
-        self.assertIn("UMI", done.complaint)
-
-    def test_arguments(self):
-        for arguments, words in (
-            ((), ["--hz", "--dataset"]),
-            (("--hz", 10, "--modality", "observation.image.top=cam"), ["observation.image.top=cam", TOP]),
-            (("--hz", 10, "--required", TOP), ["--required", "--mask-aware"]),
-            (("--hz", 10, "--action-names", "x,y"), ["2 action names", "3 values"]),
-            (("--hz", 10, "--steps", 101), ["101 inference steps"]),
-            (("--dataset", "/nowhere"), ["/nowhere", "LeRobotDataset"]),
-        ):
-            with self.subTest(str(arguments)):
-                shutil.copytree(self.whole, self.source)
-                self.refused(words, *(arguments or ("--name", "x")))
-        self.bundle.mkdir()
-        self.assertIn("exists already", run(self.whole, self.bundle, "--hz", 10).complaint)
 
 
 if __name__ == "__main__":
