@@ -94,7 +94,7 @@ def denormalize(value: np.ndarray, slices: list[dict]) -> np.ndarray:
 def steps(spec: dict):
     """The timesteps from the last, each with its alpha and that of the one visited next; spacing "leading" alone."""
     assert spec["timestep_spacing"] == "leading", spec["timestep_spacing"]
-    total, stride = spec["num_train_timesteps"], spec["num_train_timesteps"] // spec["num_inference_steps"]
+    stride = spec["num_train_timesteps"] // spec["num_inference_steps"]
     alphas = np.cumprod(1 - betas(spec), dtype=np.float32)
     last = np.float32(1) if spec["type"] == "DDPM" or spec["set_alpha_to_one"] else alphas[0]
     for i in reversed(range(spec["num_inference_steps"])):
