@@ -100,7 +100,7 @@ pub struct Global {
 /// Where devices come from.
 #[derive(Debug, Clone, Args)]
 pub struct SimArgs {
-    /// Simulated devices: those of the registry, or what a scenario file says
+    /// Simulated devices: those of the registry, what a scenario file says, or `task`, a robot that sorts blocks
     #[arg(long, value_name = "SCENARIO", num_args = 0..=1, value_hint = ValueHint::FilePath)]
     pub sim: Option<Option<PathBuf>>,
 }
@@ -130,6 +130,15 @@ pub struct RunArgs {
     /// Observations a second [default: as the registry says]
     #[arg(long, value_name = "HZ", value_parser = rate)]
     pub rate: Option<f64>,
+    /// Number of the first trial of `--sim task`
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub seed: u64,
+    /// With `--sim task --record`: a script that knows the task demonstrates it, faster than real time
+    #[arg(long, requires = "record")]
+    pub expert: bool,
+    /// Demonstrations to record, each of another trial
+    #[arg(long, value_name = "COUNT", default_value_t = 1, requires = "expert")]
+    pub episodes: usize,
     /// Half width of an observation's window [default: as the registry says]
     #[arg(long, value_name = "TIME", value_parser = window)]
     pub window: Option<Duration>,

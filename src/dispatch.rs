@@ -117,13 +117,20 @@ enum Source {
     Machine,
     /// A scenario: the demonstration, or that of a file.
     Scenario(Option<PathBuf>),
+    /// The simulated task.
+    Task,
     /// A recorded episode.
     Episode(PathBuf),
 }
 
 impl Source {
     fn of(simulation: SimArgs) -> Self {
-        simulation.sim.map_or(Self::Machine, Self::Scenario)
+        match simulation.sim {
+            None => Self::Machine,
+            // A file of that name is ./task.
+            Some(Some(file)) if file.as_os_str() == "task" => Self::Task,
+            Some(file) => Self::Scenario(file),
+        }
     }
 }
 
@@ -135,7 +142,7 @@ fn devices(
     format: Format,
     out: &mut dyn Write,
 ) -> Result<(), Failure> {
-    if let Source::Scenario(_) = source {
+    if let Source::Scenario(_) | Source::Task = source {
         let (registry, attached) = plugged(global, source)?;
         let plugged = commands::devices::list(Entries::Of(&registry), &attached, formats);
         return Ok(commands::devices::print(&plugged, Some(&registry), format, out)?);
@@ -157,7 +164,15 @@ fn devices(
 
 /// A registry that can be used, and what is plugged in.
 fn plugged(global: &Global, source: Source) -> Result<(Registry, Vec<Attachment>), Failure> {
-    let Source::Scenario(file) = source else { return Ok((load(&registry_path(global)?)?, udev::enumerate()?)) };
+    let file = match source {
+        Source::Scenario(file) => file,
+        Source::Task => {
+            let registry = Registry::task();
+            let attached = crate::hotplug::script::attached(&Scenario::task(&registry, 0));
+            return Ok((registry, attached));
+        }
+        Source::Machine | Source::Episode(_) => return Ok((load(&registry_path(global)?)?, udev::enumerate()?)),
+    };
     let registry = registry_or_builtin(global)?;
     let attached = crate::hotplug::script::attached(&scenario(file.as_deref(), &registry)?);
     Ok((registry, attached))
@@ -208,6 +223,9 @@ fn recover(paths: &[PathBuf], format: Format) -> Result<(), Failure> {
 
 /// The rig: on this machine, simulated, or played from an episode.
 fn run(global: &Global, args: &RunArgs, source: Source) -> Result<(), Failure> {
+    if args.expert {
+        return demonstrate(global, args, &source);
+    }
     let mut duration = args.duration;
     let (mut registry, devices) = match source {
         Source::Episode(file) => {
@@ -221,6 +239,11 @@ fn run(global: &Global, args: &RunArgs, source: Source) -> Result<(), Failure> {
         Source::Scenario(file) => {
             let registry = registry_or_builtin(global)?;
             let scenario = scenario(file.as_deref(), &registry)?;
+            (registry, Devices::Simulated(scenario))
+        }
+        Source::Task => {
+            let registry = Registry::task();
+            let scenario = Scenario::task(&registry, args.seed);
             (registry, Devices::Simulated(scenario))
         }
         Source::Machine => (load(&registry_path(global)?)?, Devices::Machine),
@@ -249,6 +272,39 @@ fn run(global: &Global, args: &RunArgs, source: Source) -> Result<(), Failure> {
         instance: global.instance.clone(),
     };
     Ok(block_on(app::run(options))??)
+}
+
+/// Demonstrations of the simulated task.
+fn demonstrate(global: &Global, args: &RunArgs, source: &Source) -> Result<(), Failure> {
+    if !matches!(source, Source::Task) {
+        return Err(Failure::Arguments("--expert knows the simulated task alone: write --sim task --expert --record"));
+    }
+    if args.duration.is_some() || args.rate.is_some() || args.window.is_some() {
+        let text = "--duration, --rate and --window do not go with --expert: a demonstration takes as long as it takes";
+        return Err(Failure::Arguments(text));
+    }
+    prepare(&args.out).map_err(Failure::Folder)?;
+    let request =
+        EpisodeRequest { out: args.out.clone(), task: args.task.clone(), tags: args.tag.clone(), duration: None };
+    let format = if global.json { Format::Json } else { Format::Text };
+    let (seed, episodes) = (args.seed, args.episodes);
+    let stop = Arc::new(AtomicBool::new(false));
+    let asked = Arc::clone(&stop);
+    block_on(async move {
+        let work = tokio::task::spawn_blocking(move || {
+            let stop = || asked.load(Ordering::Relaxed);
+            commands::demonstrate::run(&request, seed, episodes, format, &stop, &mut io::stdout())
+        });
+        tokio::spawn(async move {
+            // The one in progress is finished.
+            if tokio::signal::ctrl_c().await.is_ok() {
+                stop.store(true, Ordering::Relaxed);
+            }
+        });
+        work.await
+    })?
+    .map_err(|_| Failure::Panicked)??;
+    Ok(())
 }
 
 /// The folder an episode is to be written to at once: better refused before the devices are started.

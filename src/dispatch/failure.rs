@@ -47,6 +47,11 @@ pub(super) enum Failure {
     /// The folder for episodes cannot be written to.
     #[error(transparent)]
     Folder(RecordError),
+    #[error(transparent)]
+    Demonstrate(#[from] commands::demonstrate::DemonstrateError),
+    /// What was typed makes no sense together.
+    #[error("{0}")]
+    Arguments(&'static str),
     /// What was wrong has been printed.
     #[error("")]
     Told,
@@ -77,6 +82,7 @@ impl Failure {
             | Self::Replay(_)
             | Self::Folder(_)
             | Self::Inspect(InspectError::NotMcap(_))
+            | Self::Arguments(_)
             | Self::Told => 2,
             Self::Inspect(InspectError::Io { source, .. })
                 if matches!(source.kind(), io::ErrorKind::NotFound | io::ErrorKind::IsADirectory) =>
