@@ -55,7 +55,7 @@ lerobot-test: ## the export of LeRobot checkpoints, against LeRobot (fetches 8 G
 	    '$(LEROBOT)/bin/python' -m pip install --quiet --disable-pip-version-check --only-binary=:all: --no-deps -r models/requirements-lerobot.txt; \
 	    echo "$$stamp" >'$(LEROBOT)/stamp'; \
 	fi
-	'$(LEROBOT)/bin/python' -m unittest discover -s models/tests -p 'test_export_lerobot*.py' -v
+	'$(LEROBOT)/bin/python' -m unittest discover -s models/tests/lerobot -v
 
 clean: ## remove what was built here (what setup fetched stays)
 	cargo clean

@@ -16,7 +16,7 @@ os.environ["HF_HUB_OFFLINE"] = "1"
 # Threads that wait busily for one another make this many times slower on a machine that has other work.
 os.environ["OMP_NUM_THREADS"] = "1"
 os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import torch
 from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
