@@ -101,7 +101,13 @@ def export(options: argparse.Namespace) -> None:
 
     # LeRobot and torch take seconds to import, and a refusal needs neither.
     os.environ.setdefault("HF_HUB_OFFLINE", "1")
-    from lerobot_export import bundle, checkpoint, graphs, verify
+    try:
+        from lerobot_export import bundle, checkpoint, graphs, verify
+    except ModuleNotFoundError as error:
+        raise Unsupported(
+            f"{sys.executable} has no {error.name}: use a Python environment with what is in "
+            "models/requirements-lerobot.txt (its first lines say how; `make lerobot-test` makes one)"
+        ) from error
 
     settings = bundle.Options(**settings)
     names = bundle.input_names(config)

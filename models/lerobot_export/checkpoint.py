@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import shorten
 
 import numpy as np
 from lerobot.configs.policies import PreTrainedConfig
@@ -15,6 +16,7 @@ from lerobot.processor.converters import (
     transition_to_batch,
     transition_to_policy_action,
 )
+from safetensors import SafetensorError
 
 from . import Unsupported
 from .config import ACTION_KEY, MAX_GRAPH_BYTES, Config
@@ -126,8 +128,8 @@ class Checkpoint:
 def load(config: Config, scheduler: str | None, steps: int | None) -> Checkpoint:
     """Loads the weights and processors; `scheduler` and `steps` overrule the configuration's where given."""
     folder = config.folder
-    for file in STEPS:
-        check_steps(folder / file)
+    pre = pipeline(folder / PRE, batch_to_transition, transition_to_batch)
+    post = pipeline(folder / POST, policy_action_to_transition, transition_to_policy_action)
     settings = parse(config)
     settings.device = "cpu"
     # All weights come from the checkpoint: nothing is fetched, and nothing is compiled before it is traced.
@@ -137,23 +139,17 @@ def load(config: Config, scheduler: str | None, steps: int | None) -> Checkpoint
         settings.noise_scheduler_type = scheduler
     if steps is not None:
         settings.num_inference_steps = steps
-    count = settings.num_inference_steps or settings.num_train_timesteps
-    if not 1 <= count <= settings.num_train_timesteps:
-        raise Unsupported(f"{count} inference steps: num_train_timesteps is {settings.num_train_timesteps}")
+    total = settings.num_train_timesteps
+    count = total if settings.num_inference_steps is None else settings.num_inference_steps
+    if not 1 <= count <= total:
+        raise Unsupported(f"{folder / 'config.json'}: {count} inference steps: num_train_timesteps is {total}")
     try:
         policy = DiffusionPolicy.from_pretrained(folder, config=settings, strict=True)
-    except (OSError, RuntimeError, ValueError) as error:
-        raise Unsupported(f"{folder}: the weights do not fit config.json: {error}") from error
+    except (OSError, RuntimeError, ValueError, SafetensorError) as error:
+        raise Unsupported(f"{folder}: the weights do not fit config.json: {shorten(str(error), 400)}") from error
     for name, module in (("down_dims", policy.diffusion.unet), ("vision_backbone", policy.diffusion.rgb_encoder)):
         if (size := 4 * sum(p.numel() for p in module.parameters())) > MAX_GRAPH_BYTES:
             raise Unsupported(f"{folder / 'config.json'}: {name}: {size} bytes of weights do not fit one ONNX file")
-    cpu = {"device_processor": {"device": "cpu"}}
-    pre = PolicyProcessorPipeline.from_pretrained(
-        folder, PRE, overrides=cpu, to_transition=batch_to_transition, to_output=transition_to_batch
-    )
-    post = PolicyProcessorPipeline.from_pretrained(
-        folder, POST, overrides=cpu, to_transition=policy_action_to_transition, to_output=transition_to_policy_action
-    )
     return Checkpoint(config, policy.eval(), pre, post)
 
 
@@ -162,11 +158,24 @@ def parse(config: Config) -> DiffusionConfig:
         settings = PreTrainedConfig.from_pretrained(config.folder)
         settings.validate_features()
     except (Exception, SystemExit) as error:  # draccus raises whatever its parsers raise
-        raise Unsupported(f"{config.folder / 'config.json'}: LeRobot cannot read it: {error}") from error
+        raise Unsupported(
+            f"{config.folder / 'config.json'}: LeRobot cannot read it: {shorten(str(error), 400)}"
+        ) from error
     return settings
 
 
-def check_steps(file: Path) -> None:
+def pipeline(file: Path, to_transition, to_output) -> PolicyProcessorPipeline:
+    overrides = {"device_processor": {"device": "cpu"}} if "device_processor" in check_steps(file) else {}
+    try:
+        return PolicyProcessorPipeline.from_pretrained(
+            file.parent, file.name, overrides=overrides, to_transition=to_transition, to_output=to_output
+        )
+    except Exception as error:  # what LeRobot's steps raise at what they were saved with is theirs
+        raise Unsupported(f"{file}: LeRobot cannot load it: {shorten(str(error), 400)}") from error
+
+
+def check_steps(file: Path) -> list[str]:
+    """The names of a processor's steps, all of them such as a bundle can say."""
     try:
         steps = json.loads(file.read_text(encoding="utf-8"))["steps"]
         names = [step.get("registry_name") or step.get("class") for step in steps]
@@ -184,6 +193,7 @@ def check_steps(file: Path) -> None:
             )
     if (needed := STEPS[file.name][-1 if file.name == PRE else 0]) not in names:
         raise Unsupported(f"{file}: steps: no {needed}, so nothing says how numbers are normalised")
+    return names
 
 
 def normalizer(pipeline: PolicyProcessorPipeline, name: str):

@@ -65,10 +65,28 @@ class Refusals(Temporary):
         self.edit(self.source / "config.json", lambda c: c.update(down_dims=[32, 96]))
         self.refused(["the weights do not fit config.json"])
 
+    def test_files_that_are_cut_off(self):
+        for file, words in (
+            ("model.safetensors", ["the weights do not fit config.json"]),
+            (
+                "policy_preprocessor_step_3_normalizer_processor.safetensors",
+                ["policy_preprocessor.json", "cannot load"],
+            ),
+            ("config.json", ["config.json"]),
+        ):
+            with self.subTest(file):
+                shutil.copytree(self.whole, self.source)
+                content = (self.source / file).read_bytes()
+                (self.source / file).write_bytes(content[: len(content) // 2])
+                self.refused(words)
+
     def test_processors(self):
         shutil.copytree(self.whole, self.source)
         (self.source / "policy_preprocessor.json").unlink()
         self.refused(["policy_preprocessor.json: missing", "migrate_policy_normalization"])
+        shutil.copytree(self.whole, self.source)
+        (self.source / "policy_postprocessor_step_0_unnormalizer_processor.safetensors").unlink()
+        self.refused(["policy_postprocessor.json", "LeRobot cannot load it"])
         step = {"registry_name": "relative_actions_processor", "config": {}}
         self.changed(
             lambda c: c["steps"].insert(2, step),
