@@ -97,7 +97,7 @@ fn onnxruntime(out: &Path) -> Result<(), Box<dyn Error>> {
     let packed = out.join(format!("onnxruntime-{sum}-{LEVEL}.zst"));
     if !packed.exists() {
         let bytes = std::fs::read(&library)?;
-        let found: String = Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect();
+        let found = Sha256::digest(&bytes).iter().fold(String::new(), |text, byte| format!("{text}{byte:02x}"));
         if found != sum {
             return Err(format!(
                 "{} is not the file that {PINNED} names: remove it, then `make setup`",

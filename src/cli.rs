@@ -8,6 +8,8 @@ use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::parser::ValueSource;
 use clap::{ArgAction, ArgMatches, Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueHint};
 
+use crate::lockstep::evaluate::Condition;
+
 /// Records robot demonstrations from sensors that come and go
 #[derive(Debug, Parser)]
 #[command(
@@ -59,6 +61,16 @@ Of a cut or damaged X.mcap a whole X.recovered.mcap is made beside it. A file be
 Examples:
   rapid recover episodes
   rapid recover copied/20260101_place-block_001.mcap";
+
+const EVAL: &str = "\
+Conditions: full, no-tactile (the tactile sensor is not there), hot-unplug (it is pulled out while the
+block is carried), hot-replug (pulled out on the way to the block, and plugged in again).
+Trials run faster than real time; the same seed gives the same trial.
+
+Examples:
+  rapid eval
+  rapid eval --trials 100 --json > result.jsonl
+  rapid eval --static-config --condition hot-unplug models/tactile-id";
 
 const LATENCY: &str = "\
 How: stop a running rapid (the camera must be free), darken the room, and point the camera at this
@@ -209,6 +221,31 @@ pub enum Command {
         #[command(flatten)]
         run: RunArgs,
     },
+    /// Tries a policy on the simulated task, with a sensor that is pulled out
+    #[command(after_help = EVAL)]
+    Eval {
+        /// Policy [default: models/tactile-id here, or in ~/.local/share/rapid or /usr/share/rapid]
+        #[arg(value_hint = ValueHint::DirPath)]
+        bundle: Option<PathBuf>,
+        /// Trials a condition
+        #[arg(long, value_name = "COUNT", default_value_t = 25)]
+        trials: usize,
+        /// Number of the first trial; demonstrations begin at 0 unless --seed said otherwise
+        #[arg(long, value_name = "N", default_value_t = 50_000)]
+        seed: u64,
+        /// One of the conditions; may be repeated [default: all]
+        #[arg(long, value_name = "NAME", value_parser = condition)]
+        condition: Vec<Condition>,
+        /// As software with a fixed set of sensors: one that goes ends the run
+        #[arg(long)]
+        static_config: bool,
+        /// Steps of denoising [default: as the policy says]
+        #[arg(long, value_name = "COUNT")]
+        denoising_steps: Option<usize>,
+        /// onnxruntime to use instead of the one inside rapid
+        #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+        ort_lib: Option<PathBuf>,
+    },
     /// Prints a completion script: source <(rapid completions bash)
     Completions {
         /// Shell
@@ -341,6 +378,11 @@ fn window(text: &str) -> Result<Duration, String> {
 fn rate(text: &str) -> Result<f64, String> {
     let hertz: f64 = text.parse().map_err(|_| "write a number, for example 30".to_owned())?;
     if (0.1..=1000.0).contains(&hertz) { Ok(hertz) } else { Err("must lie between 0.1 and 1000 Hz".to_owned()) }
+}
+
+fn condition(text: &str) -> Result<Condition, String> {
+    let known = Condition::ALL.into_iter().find(|condition| condition.word() == text);
+    known.ok_or_else(|| format!("one of {}", Condition::ALL.map(Condition::word).join(", ")))
 }
 
 fn tag(text: &str) -> Result<(String, String), String> {

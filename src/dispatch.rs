@@ -20,10 +20,12 @@ use crate::app::{self, AppError, Devices, Options, Screen, mask_path};
 use crate::cli::{Calibration, Cli, Command, Global, RunArgs, SimArgs};
 use crate::commands::calibrate::LatencyOptions;
 use crate::commands::devices::{Entries, Formats};
+use crate::commands::eval::EvalOptions;
 use crate::commands::{self, Format, Outcome, mask::MaskOptions};
 use crate::driver::replay;
 use crate::headless::style::{ColourChoice, Palette, Terminal};
 use crate::hotplug::udev;
+use crate::lockstep::evaluate::{Condition, Configuration};
 use crate::outlet;
 use crate::record::inspect;
 use crate::record::{self, EpisodeRequest, RecordError};
@@ -106,6 +108,14 @@ fn print(global: &Global, before: SimArgs, command: Command) -> Result<(), Failu
             Outcome::BadConfiguration => Err(Failure::Told),
         },
         Command::Recover { paths } => recover(&paths, format),
+        Command::Eval { bundle, trials, seed, condition, static_config, denoising_steps, ort_lib } => {
+            let configuration = if static_config { Configuration::Static } else { Configuration::Dynamic };
+            let conditions = if condition.is_empty() { Condition::ALL.to_vec() } else { condition };
+            let bundle = policy(bundle)?;
+            let options =
+                EvalOptions { bundle, trials, seed, conditions, configuration, denoising_steps, library: ort_lib };
+            interruptible(move |stop| commands::eval::run(&options, format, stop, &mut io::stdout()))
+        }
         Command::Completions { shell } => Ok(commands::completions::completions(&mut Cli::command(), shell, out)?),
         Command::Replay { .. } => Ok(()),
     }
@@ -288,13 +298,27 @@ fn demonstrate(global: &Global, args: &RunArgs, source: &Source) -> Result<(), F
         EpisodeRequest { out: args.out.clone(), task: args.task.clone(), tags: args.tag.clone(), duration: None };
     let format = if global.json { Format::Json } else { Format::Text };
     let (seed, episodes) = (args.seed, args.episodes);
+    interruptible(move |stop| commands::demonstrate::run(&request, seed, episodes, format, stop, &mut io::stdout()))
+}
+
+/// Where the policy is that was named, or the usual one.
+fn policy(named: Option<PathBuf>) -> Result<PathBuf, Failure> {
+    const USUAL: &str = "models/tactile-id";
+    let data = std::env::var_os("XDG_DATA_HOME").map(PathBuf::from).filter(|path| path.is_absolute());
+    let home = || std::env::var_os("HOME").map(|home| PathBuf::from(home).join(".local/share"));
+    let places = [Some(PathBuf::new()), data.or_else(home).map(|data| data.join("rapid")), Some("/usr/share/rapid".into())];
+    let places: Vec<PathBuf> = places.into_iter().flatten().map(|place| place.join(USUAL)).collect();
+    named.or_else(|| places.iter().find(|place| place.exists()).cloned()).ok_or(Failure::NoPolicy(places))
+}
+
+/// Does work that ends between two pieces of it when it is interrupted, and prints what it has.
+fn interruptible<E: Into<Failure> + Send + 'static>(
+    work: impl FnOnce(&dyn Fn() -> bool) -> Result<(), E> + Send + 'static,
+) -> Result<(), Failure> {
     let stop = Arc::new(AtomicBool::new(false));
     let asked = Arc::clone(&stop);
     block_on(async move {
-        let work = tokio::task::spawn_blocking(move || {
-            let stop = || asked.load(Ordering::Relaxed);
-            commands::demonstrate::run(&request, seed, episodes, format, &stop, &mut io::stdout())
-        });
+        let work = tokio::task::spawn_blocking(move || work(&|| asked.load(Ordering::Relaxed)));
         tokio::spawn(async move {
             // The one in progress is finished.
             if tokio::signal::ctrl_c().await.is_ok() {
@@ -303,8 +327,8 @@ fn demonstrate(global: &Global, args: &RunArgs, source: &Source) -> Result<(), F
         });
         work.await
     })?
-    .map_err(|_| Failure::Panicked)??;
-    Ok(())
+    .map_err(|_| Failure::Panicked)?
+    .map_err(Into::into)
 }
 
 /// The folder an episode is to be written to at once: better refused before the devices are started.

@@ -6,6 +6,7 @@ pub mod check;
 pub mod completions;
 pub mod demonstrate;
 pub mod devices;
+pub mod eval;
 pub mod inspect;
 pub mod mask;
 pub mod progress;

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use crate::app::AppError;
 use crate::commands;
+use crate::commands::eval::EvalError;
 use crate::commands::inspect::InspectFailure;
 use crate::driver::DriverError;
 use crate::record::RecordError;
@@ -48,6 +49,14 @@ pub(super) enum Failure {
     #[error(transparent)]
     Folder(RecordError),
     #[error(transparent)]
+    Eval(#[from] commands::eval::EvalError),
+    /// There is no policy to run.
+    #[error(
+        "no policy: looked for {}\n    fix: name the folder of one, or make one with `make train`",
+        .0.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ")
+    )]
+    NoPolicy(Vec<PathBuf>),
+    #[error(transparent)]
     Demonstrate(#[from] commands::demonstrate::DemonstrateError),
     /// What was typed makes no sense together.
     #[error("{0}")]
@@ -83,6 +92,7 @@ impl Failure {
             | Self::Folder(_)
             | Self::Inspect(InspectError::NotMcap(_))
             | Self::Arguments(_)
+            | Self::Eval(EvalError::Bundle(_))
             | Self::Told => 2,
             Self::Inspect(InspectError::Io { source, .. })
                 if matches!(source.kind(), io::ErrorKind::NotFound | io::ErrorKind::IsADirectory) =>
@@ -91,6 +101,7 @@ impl Failure {
             }
             Self::Calibrate(error) if error.is_bad_argument() => 2,
             Self::Recover(outcome) if outcome.is_bad_argument() => 2,
+            Self::NoPolicy(_) => 3,
             _ => 1,
         }
     }

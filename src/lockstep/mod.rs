@@ -7,6 +7,7 @@
 //! Invariant: a run is a function of its seed and its scenario.
 
 pub mod collect;
+pub mod evaluate;
 
 use std::time::Duration;
 

@@ -1,7 +1,7 @@
 //! Graphs: the networks of a bundle, loaded and run.
 //!
-//! [`Graph::load`] reads one, which says of itself what it takes and gives ([`Graph::shape`]). Held
-//! against its bundle, it is [bound](Graph::bind) to memory for one batch of every tensor, which every
+//! [`LoadedGraph::load`] reads one, which says of itself what it takes and gives ([`LoadedGraph::shape`]). Held
+//! against its bundle, it is [bound](LoadedGraph::bind) to memory for one batch of every tensor, which every
 //! later run reads and writes in place.
 //!
 //! Invariant: a run on bound memory allocates nothing on this side of the library.
@@ -9,7 +9,7 @@
 use ort::memory::Allocator;
 use ort::session::builder::{GraphOptimizationLevel, SessionBuilder};
 use ort::session::{HasSelectedOutputs, OutputSelector, RunOptions, Session, SessionInputValue};
-use ort::value::{DynValue, Outlet, Tensor, TensorElementType, ValueType};
+use ort::value::{DynValue, Outlet, PrimitiveTensorElementType, Tensor, TensorElementType, ValueType};
 
 use super::bundle::{Element, GraphShape, TensorShape};
 use super::library::Environment;
@@ -33,6 +33,22 @@ pub enum GraphError {
         /// The input or output.
         tensor: String,
     },
+    /// An input is missing.
+    #[error("{name}: there is no input `{input}`")]
+    NoInput {
+        /// The graph's file.
+        name: String,
+        /// The input's name.
+        input: String,
+    },
+    /// What is written to an input does not suit it.
+    #[error("{name}: input {index} does not take what it is given")]
+    Input {
+        /// The graph's file.
+        name: String,
+        /// The place among the inputs.
+        index: usize,
+    },
     /// A run failed.
     #[error("{name}: {error}")]
     Run {
@@ -45,12 +61,12 @@ pub enum GraphError {
 
 /// A graph that has been loaded.
 #[derive(Debug)]
-pub struct Graph {
+pub struct LoadedGraph {
     name: String,
     session: Session,
 }
 
-impl Graph {
+impl LoadedGraph {
     /// Reads a graph from the bytes of the file called `name`. It will run on `threads` threads, the
     /// calling one among them, at least 1.
     ///
@@ -87,14 +103,11 @@ impl Graph {
             .map(|input| make_input(&name, &tensor_shape(input)).map(SessionInputValue::Owned))
             .collect::<Result<Vec<_>, _>>()?;
         let mut selector = OutputSelector::default();
-        let mut output_lens = Vec::new();
         for output in session.outputs() {
-            let (value, len) = make_output(&name, &tensor_shape(output))?;
-            selector = selector.preallocate(output.name(), value);
-            output_lens.push(len);
+            selector = selector.preallocate(output.name(), make_output(&name, &tensor_shape(output))?);
         }
         let options = RunOptions::new().map_err(|error| run_error(&name, &error))?.with_outputs(selector);
-        Ok(BoundGraph { name, session, inputs, output_lens, options })
+        Ok(BoundGraph { name, session, inputs, options })
     }
 }
 
@@ -103,46 +116,57 @@ pub struct BoundGraph {
     name: String,
     session: Session,
     inputs: Vec<SessionInputValue<'static>>,
-    output_lens: Vec<usize>,
     options: RunOptions<HasSelectedOutputs>,
 }
 
 impl BoundGraph {
     /// The place among the inputs of the one called `name`.
-    #[must_use]
-    pub fn input_index(&self, name: &str) -> Option<usize> {
-        self.session.inputs().iter().position(|input| input.name() == name)
-    }
-
-    /// Numbers of the output with this place among the outputs.
-    #[must_use]
-    pub fn output_len(&self, index: usize) -> Option<usize> {
-        self.output_lens.get(index).copied()
-    }
-
-    /// The numbers of an input, to be written.
     ///
     /// # Errors
-    /// When there is no such input, or it has no floats.
-    pub fn input(&mut self, index: usize) -> Result<&mut [f32], GraphError> {
-        self.values(index)
+    /// When there is none.
+    pub fn input_index(&self, name: &str) -> Result<usize, GraphError> {
+        let place = self.session.inputs().iter().position(|input| input.name() == name);
+        place.ok_or_else(|| GraphError::NoInput { name: self.name.clone(), input: name.to_owned() })
     }
 
-    /// The whole numbers of an input, to be written.
+    /// Writes the numbers of an input.
     ///
     /// # Errors
-    /// When there is no such input, or it has no 64-bit integers.
-    pub fn input_integers(&mut self, index: usize) -> Result<&mut [i64], GraphError> {
-        self.values(index)
-    }
-
-    fn values<T: ort::value::PrimitiveTensorElementType>(&mut self, index: usize) -> Result<&mut [T], GraphError> {
-        let wrong = |error: String| GraphError::Run { name: self.name.clone(), error };
-        match self.inputs.get_mut(index) {
-            Some(SessionInputValue::Owned(value)) => {
-                value.try_extract_tensor_mut().map(|(_, values)| values).map_err(|error| wrong(error.to_string()))
+    /// When there is no such input, or it holds others or not so many.
+    pub fn write(&mut self, index: usize, values: &[f32]) -> Result<(), GraphError> {
+        self.fill(index, |place: &mut [f32]| {
+            let fits = place.len() == values.len();
+            if fits {
+                place.copy_from_slice(values);
             }
-            _ => Err(wrong(format!("there is no input {index}"))),
+            fits
+        })
+    }
+
+    /// Writes the same whole number all over an input.
+    ///
+    /// # Errors
+    /// When there is no such input, or it holds others.
+    pub fn write_integer(&mut self, index: usize, value: i64) -> Result<(), GraphError> {
+        self.fill(index, |place: &mut [i64]| {
+            place.fill(value);
+            true
+        })
+    }
+
+    fn fill<T: PrimitiveTensorElementType>(
+        &mut self,
+        index: usize,
+        fill: impl FnOnce(&mut [T]) -> bool,
+    ) -> Result<(), GraphError> {
+        let filled = match self.inputs.get_mut(index) {
+            Some(SessionInputValue::Owned(value)) => value.try_extract_tensor_mut().map(|(_, place)| fill(place)),
+            _ => Ok(false),
+        };
+        match filled {
+            Ok(true) => Ok(()),
+            Ok(false) => Err(GraphError::Input { name: self.name.clone(), index }),
+            Err(error) => Err(run_error(&self.name, &error)),
         }
     }
 
@@ -222,14 +246,14 @@ fn make_input(graph: &str, shape: &TensorShape) -> Result<DynValue, GraphError> 
     value.map_err(|error| run_error(graph, &error))
 }
 
-/// Memory that a run writes before anybody reads it, and how many elements it has.
-fn make_output(graph: &str, shape: &TensorShape) -> Result<(DynValue, usize), GraphError> {
-    let (dims, len) = dims(graph, shape)?;
+/// Memory that a run writes before anybody reads it.
+fn make_output(graph: &str, shape: &TensorShape) -> Result<DynValue, GraphError> {
+    let (dims, _) = dims(graph, shape)?;
     if shape.element != Element::F32 {
         return Err(kind(graph, shape));
     }
     let value = Tensor::<f32>::new(&Allocator::default(), dims).map_err(|error| run_error(graph, &error))?;
-    Ok((value.into_dyn(), len))
+    Ok(value.into_dyn())
 }
 
 fn kind(graph: &str, shape: &TensorShape) -> GraphError {

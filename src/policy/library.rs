@@ -98,7 +98,6 @@ impl Cause {
         );
         match (self, origin) {
             (Self::LeftOut, _) => format!("run `make setup` and build again, or {name_one}"),
-            (_, Origin::Inside) => name_one,
             (_, Origin::Option(_)) if !INSIDE.is_empty() => {
                 format!("{name_one}, or leave --ort-lib out: rapid carries one")
             }

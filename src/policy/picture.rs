@@ -12,6 +12,7 @@ use zune_jpeg::zune_core::colorspace::ColorSpace;
 use zune_jpeg::zune_core::options::DecoderOptions;
 
 use super::bundle::{ColorOrder, ImageSpec, Normalization, Operation};
+use super::normalize::Normalizer;
 use crate::calibration::with_mark;
 use crate::sample::Encoding;
 
@@ -74,8 +75,7 @@ pub struct Picture<'a> {
 #[derive(Debug)]
 pub struct Preprocessor {
     spec: ImageSpec,
-    /// What a channel's values are multiplied with, and what is added then.
-    affine: [(f32, f32); CHANNELS],
+    normalizer: Normalizer,
     reference: Option<Reference>,
     /// The picture with the mark that its decoder looks for.
     jpeg: Vec<u8>,
@@ -137,7 +137,7 @@ impl Preprocessor {
         let len = CHANNELS * spec.height * spec.width;
         Self {
             spec,
-            affine: std::array::from_fn(|channel| affine(normalization, channel)),
+            normalizer: Normalizer::new(normalization, CHANNELS),
             reference: (spec.operation == Some(Operation::DiffToReference)).then(|| Reference::new(len)),
             jpeg: Vec::new(),
             pixels: Vec::new(),
@@ -176,11 +176,7 @@ impl Preprocessor {
         if let Some(reference) = &mut self.reference {
             reference.compare(out);
         }
-        for (plane, (scale, offset)) in out.chunks_exact_mut(self.spec.height * self.spec.width).zip(self.affine) {
-            for value in plane {
-                *value = *value * scale + offset;
-            }
-        }
+        self.normalizer.normalize_planes(out);
         Ok(())
     }
 
@@ -310,24 +306,6 @@ fn colors(yuyv: &[u8]) -> [u8; 2 * CHANNELS] {
             .map(|color| u8::try_from(((color + 32_768) >> 16).clamp(0, 255)).unwrap_or(u8::MAX))
     });
     [first[0], first[1], first[2], second[0], second[1], second[2]]
-}
-
-/// Normalisation as one product and one sum.
-fn affine(normalization: &Normalization, channel: usize) -> (f32, f32) {
-    let at = |values: &[f32]| values.get(channel).copied().map_or(f64::NAN, f64::from);
-    let (scale, offset) = match normalization {
-        Normalization::MinMax { min, max } => {
-            let scale = 2.0 / (at(max) - at(min));
-            (scale, -at(min) * scale - 1.0)
-        }
-        Normalization::MeanStd { mean, std, eps } => {
-            let scale = 1.0 / (at(std) + f64::from(*eps));
-            (scale, -at(mean) * scale)
-        }
-        Normalization::Identity => (1.0, 0.0),
-    };
-    #[expect(clippy::cast_possible_truncation, reason = "values are 32-bit floats")]
-    (scale as f32, offset as f32)
 }
 
 #[cfg(test)]
