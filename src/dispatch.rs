@@ -306,7 +306,8 @@ fn policy(named: Option<PathBuf>) -> Result<PathBuf, Failure> {
     const USUAL: &str = "models/tactile-id";
     let data = std::env::var_os("XDG_DATA_HOME").map(PathBuf::from).filter(|path| path.is_absolute());
     let home = || std::env::var_os("HOME").map(|home| PathBuf::from(home).join(".local/share"));
-    let places = [Some(PathBuf::new()), data.or_else(home).map(|data| data.join("rapid")), Some("/usr/share/rapid".into())];
+    let places =
+        [Some(PathBuf::new()), data.or_else(home).map(|data| data.join("rapid")), Some("/usr/share/rapid".into())];
     let places: Vec<PathBuf> = places.into_iter().flatten().map(|place| place.join(USUAL)).collect();
     named.or_else(|| places.iter().find(|place| place.exists()).cloned()).ok_or(Failure::NoPolicy(places))
 }

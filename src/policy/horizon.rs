@@ -2,7 +2,7 @@
 //!
 //! A policy answers an observation of tick o with a chunk of `horizon` actions, and action
 //! `action_start + (k - o)` of it is the one of tick k. The next observation is sent
-//! `n_action_steps` ticks after o; the chunk goes on to its end, so that it bridges the time until
+//! `n_action_steps` ticks after o, or at once when a modality comes or goes; the chunk goes on to its end, so that it bridges the time until
 //! the new one is there. The new one is joined at the action of the tick, never at its beginning: a
 //! chunk stands for moments, and those that have passed are left out.
 //!
@@ -75,6 +75,8 @@ pub struct Executor {
     clamped_told: bool,
     /// The observation that is with the policy.
     in_flight: Option<u64>,
+    /// What of the policy's modalities was present in the last observation sent.
+    asked_with: Option<PhysicalMask>,
     /// Chunks of earlier observations are not used.
     fence: u64,
     /// The first tick that no step was made for.
@@ -116,6 +118,7 @@ impl Executor {
             observed: None,
             clamped_told: false,
             in_flight: None,
+            asked_with: None,
             fence: 0,
             next: 0,
             hold: None,
@@ -129,7 +132,10 @@ impl Executor {
     /// [`Self::take`] or [`Self::failed`] must follow before there is another.
     pub fn wants_observation(&mut self, tick: u64, situation: Situation) -> bool {
         self.too_old = false;
+        let seen = self.relevant(situation.mask);
         let due = self.observed.is_none_or(|observed| tick.saturating_sub(observed) >= self.n_action_steps);
+        // What was decided with other senses is to be decided again, at once.
+        let due = due || self.asked_with != Some(seen);
         if self.in_flight.is_some() || !due || self.missing(situation.mask).is_some() {
             return false;
         }
@@ -139,6 +145,7 @@ impl Executor {
             return false;
         }
         self.in_flight = Some(tick);
+        self.asked_with = Some(seen);
         self.counts.requests += 1;
         true
     }
@@ -221,6 +228,12 @@ impl Executor {
     #[must_use]
     pub const fn in_flight(&self) -> Option<u64> {
         self.in_flight
+    }
+
+    /// Which of the modalities that the policy observes are present.
+    fn relevant(&self, mask: PhysicalMask) -> PhysicalMask {
+        let ids = self.modalities.iter().filter_map(|modality| modality.id);
+        ids.fold(PhysicalMask::EMPTY, |seen, id| seen.with(id, mask.contains(id)))
     }
 
     /// The index of the action of `tick`, and the chunk's age in ticks.

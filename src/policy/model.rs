@@ -4,7 +4,6 @@
 //! modality that is compared with a reference.
 //! Invariant: of an absent modality nothing is read: its numbers are zeros and its element of the mask is 0.
 
-
 use super::bundle::{Bundle, ObservationInput};
 use super::library::Environment;
 use super::observation::{ObservationTensors, VectorError};
@@ -131,7 +130,9 @@ impl Lane {
         step: usize,
         tensors: &mut ObservationTensors,
     ) -> Result<(), AnswerError> {
-        let Some(encoding) = cell.encoding else { return Err(AnswerError::Encoding { modality: self.modality.clone() }) };
+        let Some(encoding) = cell.encoding else {
+            return Err(AnswerError::Encoding { modality: self.modality.clone() });
+        };
         if let Some(pictures) = &mut self.pictures {
             let Some(place) = tensors.step_mut(at, step) else { return Ok(()) };
             let picture = Picture { encoding, width: cell.width, height: cell.height, bytes: &cell.bytes };

@@ -136,7 +136,8 @@ impl Observer {
             // sample has been overwritten since.
             for (back, step) in (0..self.steps).rev().enumerate() {
                 let kept = lane.chosen.get(back).copied().flatten();
-                let kept = kept.filter(|kept| lane.places.get(kept.place).is_some_and(|place| place.header.seq == kept.seq));
+                let kept =
+                    kept.filter(|kept| lane.places.get(kept.place).is_some_and(|place| place.header.seq == kept.seq));
                 chosen = kept.or(chosen);
                 let (Some(kept), Some(cell)) = (chosen, request.cell_mut(at, step)) else { continue };
                 if let Some(place) = lane.places.get(kept.place) {

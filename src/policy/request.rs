@@ -5,11 +5,10 @@
 //!
 //! Invariant: nothing here allocates once its cells have grown to the largest samples.
 
-use serde::Serialize;
-
 use super::bundle::Bundle;
 use crate::mask::PhysicalMask;
 use crate::sample::{Encoding, SampleHeader};
+use crate::status::ObservedSamples;
 use crate::time::Stamp;
 
 /// The samples of `To` ticks, and what was present at the last of them.
@@ -44,15 +43,6 @@ pub struct Cell {
     pub height: u32,
     /// The payload.
     pub bytes: Vec<u8>,
-}
-
-/// Which samples a chunk was computed from: enough to compute it again from the recording.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct Sources {
-    /// The modality.
-    pub modality: String,
-    /// Numbers of its samples, the oldest step first; none where it was absent.
-    pub seqs: Vec<u64>,
 }
 
 impl Cell {
@@ -108,11 +98,12 @@ impl Request {
 
     /// Which samples these are.
     #[must_use]
-    pub fn sources(&self, bundle: &Bundle) -> Vec<Sources> {
-        let sources = |(at, observation): (usize, &super::bundle::ObservationSpec)| {
-            let seqs = (0..self.steps).filter(|_| self.is_present(at)).filter_map(|step| Some(self.cell(at, step)?.seq));
-            Sources { modality: observation.modality.clone(), seqs: seqs.collect() }
+    pub fn samples(&self, bundle: &Bundle) -> Vec<ObservedSamples> {
+        let samples = |(at, observation): (usize, &super::bundle::ObservationSpec)| {
+            let seqs =
+                (0..self.steps).filter(|_| self.is_present(at)).filter_map(|step| Some(self.cell(at, step)?.seq));
+            ObservedSamples { modality: observation.modality.clone(), seqs: seqs.collect() }
         };
-        bundle.observations.iter().enumerate().map(sources).collect()
+        bundle.observations.iter().enumerate().map(samples).collect()
     }
 }
