@@ -189,8 +189,10 @@ impl Bench<'_> {
             if missing(everything(self.registry), rig.mask()) {
                 status = Status::Degraded;
             }
-            let asked = seen.pilot.look(tick, rig.now(), rig.now(), &mut request);
-            let answer = asked.then(|| self.model.answer(&request, &mut chunk));
+            let answer = seen.pilot.look(tick, rig.now(), rig.now()).then(|| {
+                seen.pilot.fill(tick, rig.now(), &mut request);
+                self.model.answer(&request, &mut chunk)
+            });
             let action = seen.pilot.step(tick).action.and_then(axes);
             if let Some(action) = action {
                 rig.act(action, &mut seen);
