@@ -46,7 +46,6 @@ fuzz: ## feed every reader of strangers' bytes with made-up ones, each for FUZZ_
 	@scripts/setup.sh build fuzz
 	scripts/fuzz.sh
 
-<<<<<<< HEAD
 # Training is no part of `test` or of `setup`: the bundle is in the repository, and its Python environment is 5 GB.
 train: setup-build ## record demonstrations, train on them, export models/tactile-id (THREADS=2, MINUTES=)
 	cargo build --release --locked
@@ -61,7 +60,7 @@ ablation: setup-build ## train five configurations of the policy and run each: m
 
 texture: ## what a tactile picture says of the texture: models/results/texture.md
 	scripts/train.sh texture
-=======
+
 # In a place of its own and no part of the other tests: LeRobot and PyTorch are gigabytes that nothing else here needs.
 lerobot-test: LEROBOT := $(CACHE)/venv-lerobot
 lerobot-test: ## the export of LeRobot checkpoints, against LeRobot (fetches 8 GB of Python packages once)
@@ -72,7 +71,6 @@ lerobot-test: ## the export of LeRobot checkpoints, against LeRobot (fetches 8 G
 	    echo "$$stamp" >'$(LEROBOT)/stamp'; \
 	fi
 	'$(LEROBOT)/bin/python' -m unittest discover -s models/tests/lerobot -v
->>>>>>> ler
 
 clean: ## remove what was built here (what setup fetched stays)
 	cargo clean
