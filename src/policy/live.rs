@@ -81,7 +81,8 @@ impl Live {
         let (tell, told) = sync_channel(1);
         let chunk = vec![0.0; model.chunk_len()];
         let request = Exchange { request: Request::new(&options.bundle), chunk, outcome: Ok(()), done: Stamp(0) };
-        let policy = std::thread::Builder::new().name("policy".to_owned()).spawn(move || compute(model, &asked, &tell))?;
+        let policy =
+            std::thread::Builder::new().name("policy".to_owned()).spawn(move || compute(model, &asked, &tell))?;
         let latencies = Histogram::new_with_bounds(1, LONGEST_US, 3).map_err(io::Error::other)?;
         let control = Control::new(options, registry, inbox, actions, board, (ask, told), request, latencies);
         let (stopped, guard) = (stop.clone(), ended.clone().drop_guard());
@@ -208,7 +209,11 @@ impl Control {
             self.tick(tick, at);
             // Ticks that have passed altogether are left out: actions are for their moments.
             let behind = Stamp::now().since(at).as_secs_f64() / period.as_secs_f64();
-            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a count of ticks, not negative")]
+            #[expect(
+                clippy::cast_possible_truncation,
+                clippy::cast_sign_loss,
+                reason = "a count of ticks, not negative"
+            )]
             let skipped = behind as u64;
             tick += 1 + skipped;
         }
@@ -217,6 +222,9 @@ impl Control {
 
     /// Waits until everything present is seen, then says when the grid begins.
     fn first_sight(&mut self, stop: &CancellationToken) -> Option<Stamp> {
+        // What came while the policy was loaded and waited is of no interest now, save for the mask.
+        self.drain();
+        self.pilot.forget();
         while !stop.is_cancelled() {
             self.drain();
             if let Some(newest) = self.pilot.first_sight() {

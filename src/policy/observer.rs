@@ -157,11 +157,15 @@ impl Observer {
         }
     }
 
-    /// Forgets what was seen: another episode.
+    /// Forgets what was seen.
     pub fn clear(&mut self) {
         self.sync.clear();
         for lane in &mut self.lanes {
             lane.chosen.fill(None);
+            lane.next = 0;
+            for place in &mut lane.places {
+                place.header = SampleHeader::default();
+            }
         }
     }
 }

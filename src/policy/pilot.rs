@@ -49,6 +49,11 @@ impl Pilot {
         self.mask = mask;
     }
 
+    /// Forgets the samples it was given.
+    pub fn forget(&mut self) {
+        self.observer.clear();
+    }
+
     /// The mask in force.
     #[must_use]
     pub const fn mask_in_force(&self) -> PhysicalMask {
