@@ -85,7 +85,7 @@ impl Condition {
         }
         let (out, back) = self.windows(seed);
         // Between two ticks: at the tick of that step the bit is clear.
-        let at = |step: u32| STEP * (SETTLE + step) - STEP / 2;
+        let at = |step: u32| STEP * (SETTLE + step - 1) + STEP / 2;
         let event = |step, action| ScenarioEvent { at: at(step), device: PULLED.to_owned(), action };
         scenario.events.extend(out.map(|step| event(step, ScenarioAction::Unplug)));
         scenario.events.extend(back.map(|step| event(step, ScenarioAction::Plug { port: None })));
@@ -170,18 +170,18 @@ impl Bench<'_> {
     pub fn run(&mut self, condition: Condition, seed: u64) -> Result<Trial, TrialError> {
         let mut rig = Lockstep::new(self.registry, condition.scenario(self.registry, seed), Stamp(1_000_000_000))?;
         self.model.reset();
-        let mut seen = Seen { pilot: Pilot::new(self.bundle, self.registry, WithoutMask::Hold, seed) };
+        let mut witness = Seen { pilot: Pilot::new(self.bundle, self.registry, WithoutMask::Hold, seed) };
         let mut request = Request::new(self.bundle);
         let mut chunk = vec![0.0; self.model.chunk_len()];
         for _ in 0..SETTLE {
-            rig.deliver(&mut seen)?;
-            rig.pass(&mut seen);
+            rig.deliver(&mut witness)?;
+            rig.pass(&mut witness);
         }
         let launched = rig.mask();
         let (mut status, mut failure) = (Status::Normal, None);
         let mut tick = 0;
         while !rig.trial().trial().world.is_done() {
-            rig.deliver(&mut seen)?;
+            rig.deliver(&mut witness)?;
             if self.configuration == Configuration::Static && missing(launched, rig.mask()) {
                 status = Status::Crash;
                 break;
@@ -189,17 +189,17 @@ impl Bench<'_> {
             if missing(everything(self.registry), rig.mask()) {
                 status = Status::Degraded;
             }
-            let answer = seen.pilot.look(tick, rig.now(), rig.now()).then(|| {
-                seen.pilot.fill(tick, rig.now(), &mut request);
+            let answer = witness.pilot.look(tick, rig.now(), rig.now()).then(|| {
+                witness.pilot.fill(tick, rig.now(), &mut request);
                 self.model.answer(&request, &mut chunk)
             });
-            let action = seen.pilot.step(tick).action.and_then(axes);
+            let action = witness.pilot.step(tick).action.and_then(axes);
             if let Some(action) = action {
-                rig.act(action, &mut seen);
+                rig.act(action, &mut witness);
             }
             rig.trial().trial().step(0.0);
-            rig.pass(&mut seen);
-            take(answer, &mut seen.pilot, request.tick, &chunk, &mut failure);
+            rig.pass(&mut witness);
+            take(answer, &mut witness.pilot, request.tick, &chunk, &mut failure);
             tick += 1;
         }
         let trial = rig.trial().trial();
@@ -213,7 +213,7 @@ impl Bench<'_> {
             outcome: trial.world.outcome(),
             status,
             steps: trial.world.steps(),
-            counts: seen.pilot.counts(),
+            counts: witness.pilot.counts(),
             failure,
         })
     }
