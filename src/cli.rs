@@ -1,5 +1,8 @@
 //! The command line: what can be typed, and nothing of what it does.
 
+mod compare;
+mod values;
+
 use std::ffi::OsString;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -8,6 +11,9 @@ use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::parser::ValueSource;
 use clap::{ArgAction, ArgMatches, Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueHint};
 
+pub use self::compare::CompareArgs;
+use self::compare::{REPLAY, needless};
+use self::values::{condition, duration, flashing, instance, light_delay, rate, tag, window};
 use crate::lockstep::evaluate::Condition;
 
 /// Records robot demonstrations from sensors that come and go
@@ -212,7 +218,7 @@ pub enum Command {
         paths: Vec<PathBuf>,
     },
     /// Plays an episode as if its devices were plugged in
-    #[command(after_help = "The registry is the one in the episode; --config is not looked at.")]
+    #[command(after_help = REPLAY)]
     Replay {
         /// Episode
         #[arg(value_hint = ValueHint::FilePath)]
@@ -220,6 +226,9 @@ pub enum Command {
         /// Options of the run.
         #[command(flatten)]
         run: RunArgs,
+        /// Options of a comparison.
+        #[command(flatten)]
+        compare: CompareArgs,
     },
     /// Tries a policy on the simulated task, with a sensor that is pulled out
     #[command(after_help = EVAL)]
@@ -301,6 +310,13 @@ impl Cli {
             };
             return Err(command.error(ErrorKind::ArgumentConflict, text));
         }
+        if let Some(("replay", typed)) = matches.subcommand()
+            && let Some(option) = needless(typed)
+        {
+            let text =
+                format!("--{option} is an option of a run, and --infer compares without one: leave one of them out");
+            return Err(command.error(ErrorKind::ArgumentConflict, text));
+        }
         if let Some(Some(file)) = &cli.simulation.sim
             && let Some(name) = file.to_str().filter(|name| command.find_subcommand(name).is_some())
         {
@@ -342,59 +358,6 @@ fn explained(error: clap::Error, command: &mut clap::Command) -> clap::Error {
         _ => return error,
     };
     command.error(ErrorKind::InvalidSubcommand, format!("{word:?} is no command; {place}"))
-}
-
-fn duration(text: &str) -> Result<Duration, String> {
-    match humantime::parse_duration(text) {
-        Ok(Duration::ZERO) => Err("must be longer than nothing".to_owned()),
-        Ok(duration) => Ok(duration),
-        Err(_) => Err("write a number and a unit, for example 30s, 500ms or 2m".to_owned()),
-    }
-}
-
-fn flashing(text: &str) -> Result<Duration, String> {
-    match duration(text)? {
-        length if (Duration::from_secs(5)..=Duration::from_mins(10)).contains(&length) => Ok(length),
-        _ => Err("must lie between 5s and 10m".to_owned()),
-    }
-}
-
-fn light_delay(text: &str) -> Result<Duration, String> {
-    match humantime::parse_duration(text) {
-        Ok(delay) if delay <= Duration::from_secs(1) => Ok(delay),
-        Ok(_) => Err("must be 1s at most".to_owned()),
-        Err(_) => Err("write a number and a unit, for example 15ms".to_owned()),
-    }
-}
-
-fn window(text: &str) -> Result<Duration, String> {
-    match humantime::parse_duration(text) {
-        Ok(window) if (Duration::from_millis(1)..=Duration::from_secs(10)).contains(&window) => Ok(window),
-        Ok(_) => Err("must lie between 1ms and 10s".to_owned()),
-        Err(_) => Err("write a number and a unit, for example 25ms".to_owned()),
-    }
-}
-
-fn rate(text: &str) -> Result<f64, String> {
-    let hertz: f64 = text.parse().map_err(|_| "write a number, for example 30".to_owned())?;
-    if (0.1..=1000.0).contains(&hertz) { Ok(hertz) } else { Err("must lie between 0.1 and 1000 Hz".to_owned()) }
-}
-
-fn condition(text: &str) -> Result<Condition, String> {
-    let known = Condition::ALL.into_iter().find(|condition| condition.word() == text);
-    known.ok_or_else(|| format!("one of {}", Condition::ALL.map(Condition::word).join(", ")))
-}
-
-fn tag(text: &str) -> Result<(String, String), String> {
-    match text.split_once('=') {
-        Some((key, value)) if !key.is_empty() => Ok((key.to_owned(), value.to_owned())),
-        _ => Err("write KEY=VALUE, for example finger=soft".to_owned()),
-    }
-}
-
-fn instance(text: &str) -> Result<String, String> {
-    let plain = !text.is_empty() && text.len() <= 32 && text.chars().all(|c| c.is_ascii_alphanumeric() || c == '-');
-    if plain { Ok(text.to_owned()) } else { Err("1 to 32 letters, digits and dashes".to_owned()) }
 }
 
 #[cfg(test)]

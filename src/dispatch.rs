@@ -3,6 +3,7 @@
 //! Invariant: every error is printed here, once.
 
 mod failure;
+mod places;
 
 use std::io::{self, IsTerminal, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -16,9 +17,11 @@ use clap::CommandFactory;
 use tokio_util::sync::CancellationToken;
 
 use self::failure::Failure;
+use self::places::{find_registry, registry_path};
 use crate::app::{self, AppError, Devices, Options, Screen, mask_path};
-use crate::cli::{Calibration, Cli, Command, Global, RunArgs, SimArgs};
+use crate::cli::{Calibration, Cli, Command, CompareArgs, Global, RunArgs, SimArgs};
 use crate::commands::calibrate::LatencyOptions;
+use crate::commands::compare::CompareOptions;
 use crate::commands::devices::{Entries, Formats};
 use crate::commands::eval::EvalOptions;
 use crate::commands::{self, Format, Outcome, mask::MaskOptions};
@@ -46,7 +49,9 @@ const LARGEST_JSON: u64 = 1 << 20;
 pub fn dispatch(cli: Cli) -> ExitCode {
     let outcome = match cli.command {
         None => run(&cli.global, &cli.run, Source::of(cli.simulation)),
-        Some(Command::Replay { file, run: ref args }) => run(&cli.global, args, Source::Episode(file)),
+        Some(Command::Replay { file, run: ref args, compare: CompareArgs { compare_with: None, .. } }) => {
+            run(&cli.global, args, Source::Episode(file))
+        }
         Some(command) => print(&cli.global, cli.simulation, command),
     };
     match outcome {
@@ -117,7 +122,12 @@ fn print(global: &Global, before: SimArgs, command: Command) -> Result<(), Failu
             interruptible(move |stop| commands::eval::run(&options, format, stop, &mut io::stdout()))
         }
         Command::Completions { shell } => Ok(commands::completions::completions(&mut Cli::command(), shell, out)?),
-        Command::Replay { .. } => Ok(()),
+        Command::Replay { file, run: _, compare } => {
+            let CompareArgs { compare_with, tolerance, denoising_steps, ort_lib } = compare;
+            let bundle = policy(compare_with.flatten())?;
+            let options = CompareOptions { file, bundle, tolerance, denoising_steps, library: ort_lib };
+            interruptible(move |stop| commands::compare::run(&options, format, stop, &mut io::stdout()))
+        }
     }
 }
 
@@ -358,27 +368,6 @@ fn load(path: &Path) -> Result<Registry, Failure> {
         let _ = writeln!(io::stderr(), "{} {warning}", stderr_palette().warn("warning:"));
     }
     Ok(loaded.registry)
-}
-
-fn registry_path(global: &Global) -> Result<PathBuf, Failure> {
-    find_registry(global).ok_or_else(|| Failure::NoRegistry(usual_places()))
-}
-
-/// The registry named, or the first of the usual places where there is one.
-fn find_registry(global: &Global) -> Option<PathBuf> {
-    if let Some(path) = &global.config {
-        return Some(path.clone());
-    }
-    usual_places().into_iter().find(|path| path.exists())
-}
-
-fn usual_places() -> Vec<PathBuf> {
-    let home = || std::env::var_os("HOME").map(|home| PathBuf::from(home).join(".config"));
-    let config = std::env::var_os("XDG_CONFIG_HOME").map(PathBuf::from).filter(|path| path.is_absolute());
-    let mut places = vec![PathBuf::from("devices.toml")];
-    places.extend(config.or_else(home).map(|folder| folder.join("rapid/devices.toml")));
-    places.push(PathBuf::from("/etc/rapid/devices.toml"));
-    places
 }
 
 /// Runs `work` on a runtime of its own. When it is done nothing is waited for: a thread that is

@@ -144,7 +144,8 @@ impl Watch<'_> {
             self.beside.failure = refused.or_else(|| self.beside.failure.take());
         }
         let step = self.pilot.step(number);
-        let recorded = self.recorded.get(&number).filter(|recorded| recorded.len() == self.beside.difference.axes.len());
+        let recorded =
+            self.recorded.get(&number).filter(|recorded| recorded.len() == self.beside.difference.axes.len());
         match (step.action, recorded) {
             (Some(action), Some(recorded)) => {
                 self.beside.compared += 1;
