@@ -3,7 +3,7 @@ SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup setup-build demo test lint check bench fuzz clean
+.PHONY: help setup setup-build demo test lint check bench fuzz train train-test ablation texture lerobot-test clean
 
 # A toolchain just installed by rustup is not on the PATH of a shell that was open before.
 export PATH := $(PATH):$(HOME)/.cargo/bin
@@ -45,6 +45,32 @@ bench: setup ## print figures beside their baselines (JSON=1; BENCH="--quick --o
 fuzz: ## feed every reader of strangers' bytes with made-up ones, each for FUZZ_SECONDS=60
 	@scripts/setup.sh build fuzz
 	scripts/fuzz.sh
+
+# Training is no part of `test` or of `setup`: the bundle is in the repository, and its Python environment is 5 GB.
+train: setup-build ## record demonstrations, train on them, export models/tactile-id (THREADS=2, MINUTES=)
+	cargo build --release --locked
+	scripts/train.sh policy '$(TARGET)/release/rapid'
+
+train-test: ## tests of the Python under models/
+	RAPID_BIN='$(TARGET)/release/rapid' scripts/train.sh test
+
+ablation: setup-build ## train five configurations of the policy and run each: models/results/ablation.md
+	cargo build --release --locked
+	scripts/train.sh ablation '$(TARGET)/release/rapid'
+
+texture: ## what a tactile picture says of the texture: models/results/texture.md
+	scripts/train.sh texture
+
+# In a place of its own and no part of the other tests: LeRobot and PyTorch are gigabytes that nothing else here needs.
+lerobot-test: LEROBOT := $(CACHE)/venv-lerobot
+lerobot-test: ## the export of LeRobot checkpoints, against LeRobot (fetches 8 GB of Python packages once)
+	@stamp=$$(sha256sum <models/requirements-lerobot.txt); \
+	if [[ $$(cat '$(LEROBOT)/stamp' 2>/dev/null) != "$$stamp" ]]; then \
+	    rm -rf '$(LEROBOT)' && python3 -m venv '$(LEROBOT)'; \
+	    '$(LEROBOT)/bin/python' -m pip install --quiet --disable-pip-version-check --only-binary=:all: --no-deps -r models/requirements-lerobot.txt; \
+	    echo "$$stamp" >'$(LEROBOT)/stamp'; \
+	fi
+	'$(LEROBOT)/bin/python' -m unittest discover -s models/tests/lerobot -v
 
 clean: ## remove what was built here (what setup fetched stays)
 	cargo clean

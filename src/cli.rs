@@ -1,8 +1,5 @@
 //! The command line: what can be typed, and nothing of what it does.
 
-mod compare;
-mod values;
-
 use std::ffi::OsString;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -11,10 +8,11 @@ use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::parser::ValueSource;
 use clap::{ArgAction, ArgMatches, Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueHint};
 
-pub use self::compare::CompareArgs;
-use self::compare::{REPLAY, needless};
-use self::values::{condition, duration, flashing, instance, light_delay, rate, tag, window};
-use crate::lockstep::evaluate::Condition;
+mod compare;
+mod policy;
+
+pub use compare::CompareArgs;
+pub use policy::{EvalArgs, PolicyArgs};
 
 /// Records robot demonstrations from sensors that come and go
 #[derive(Debug, Parser)]
@@ -29,6 +27,9 @@ pub struct Cli {
     /// Options of a run.
     #[command(flatten)]
     pub run: RunArgs,
+    /// A policy at the controls.
+    #[command(flatten)]
+    pub policy: PolicyArgs,
     /// Where devices come from.
     #[command(flatten, next_help_heading = RUN)]
     pub simulation: SimArgs,
@@ -52,11 +53,12 @@ Examples:
   rapid devices                         what is plugged in, and which entry it is
   rapid                                 the monitor on the real rig
   rapid --headless --record --duration 30s --task \"place block\" --tag finger=soft
+  rapid --infer --sim task --duration 20s         a policy sorts a simulated block
   rapid inspect episodes/20260101_place-block_001.mcap
   rapid recover episodes                after a crash: makes the unfinished episodes whole
 
 Exit codes: 0 done, 1 failed while running, 2 bad configuration or arguments,
-            130 interrupted twice";
+            3 a device or a policy that is needed is not there, 130 interrupted twice";
 
 const RECOVER: &str = "\
 A run that may record does this by itself, in the background, for what it finds in its --out folder.
@@ -67,16 +69,6 @@ Of a cut or damaged X.mcap a whole X.recovered.mcap is made beside it. A file be
 Examples:
   rapid recover episodes
   rapid recover copied/20260101_place-block_001.mcap";
-
-const EVAL: &str = "\
-Conditions: full, no-tactile (the tactile sensor is not there), hot-unplug (it is pulled out while the
-block is carried), hot-replug (pulled out on the way to the block, and plugged in again).
-Trials run faster than real time; the same seed gives the same trial.
-
-Examples:
-  rapid eval
-  rapid eval --trials 100 --json > result.jsonl
-  rapid eval --static-config --condition hot-unplug models/tactile-id";
 
 const LATENCY: &str = "\
 How: stop a running rapid (the camera must be free), darken the room, and point the camera at this
@@ -148,7 +140,7 @@ pub struct RunArgs {
     /// Observations a second [default: as the registry says]
     #[arg(long, value_name = "HZ", value_parser = rate)]
     pub rate: Option<f64>,
-    /// Number of the first trial of `--sim task`
+    /// Number of the first trial of `--sim task`, and of the noise of a policy
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
     /// With `--sim task --record`: a script that knows the task demonstrates it, faster than real time
@@ -218,7 +210,7 @@ pub enum Command {
         paths: Vec<PathBuf>,
     },
     /// Plays an episode as if its devices were plugged in
-    #[command(after_help = REPLAY)]
+    #[command(after_help = compare::REPLAY)]
     Replay {
         /// Episode
         #[arg(value_hint = ValueHint::FilePath)]
@@ -231,30 +223,8 @@ pub enum Command {
         compare: CompareArgs,
     },
     /// Tries a policy on the simulated task, with a sensor that is pulled out
-    #[command(after_help = EVAL)]
-    Eval {
-        /// Policy [default: models/tactile-id here, or in ~/.local/share/rapid or /usr/share/rapid]
-        #[arg(value_hint = ValueHint::DirPath)]
-        bundle: Option<PathBuf>,
-        /// Trials a condition
-        #[arg(long, value_name = "COUNT", default_value_t = 25)]
-        trials: usize,
-        /// Number of the first trial; demonstrations begin at 0 unless --seed said otherwise
-        #[arg(long, value_name = "N", default_value_t = 50_000)]
-        seed: u64,
-        /// One of the conditions; may be repeated [default: all]
-        #[arg(long, value_name = "NAME", value_parser = condition)]
-        condition: Vec<Condition>,
-        /// As software with a fixed set of sensors: one that goes ends the run
-        #[arg(long)]
-        static_config: bool,
-        /// Steps of denoising [default: as the policy says]
-        #[arg(long, value_name = "COUNT")]
-        denoising_steps: Option<usize>,
-        /// onnxruntime to use instead of the one inside rapid
-        #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
-        ort_lib: Option<PathBuf>,
-    },
+    #[command(after_help = policy::EVAL)]
+    Eval(EvalArgs),
     /// Prints a completion script: source <(rapid completions bash)
     Completions {
         /// Shell
@@ -311,10 +281,8 @@ impl Cli {
             return Err(command.error(ErrorKind::ArgumentConflict, text));
         }
         if let Some(("replay", typed)) = matches.subcommand()
-            && let Some(option) = needless(typed)
+            && let Some(text) = compare::conflict(typed)
         {
-            let text =
-                format!("--{option} is an option of a run, and --infer compares without one: leave one of them out");
             return Err(command.error(ErrorKind::ArgumentConflict, text));
         }
         if let Some(Some(file)) = &cli.simulation.sim
@@ -335,10 +303,13 @@ impl Cli {
 /// An option of a run before a command that would not look at it.
 fn stray(matches: &ArgMatches, command: &str) -> Option<String> {
     let run = RunArgs::augment_args(clap::Command::new("run"));
+    let policy = PolicyArgs::augment_args(clap::Command::new("run"));
     let simulation = SimArgs::augment_args(clap::Command::new("run"));
     // `rapid --sim --json devices` is understood.
-    let known =
-        run.get_arguments().chain(simulation.get_arguments().filter(|_| !matches!(command, "devices" | "calibrate")));
+    let known = run
+        .get_arguments()
+        .chain(policy.get_arguments())
+        .chain(simulation.get_arguments().filter(|_| !matches!(command, "devices" | "calibrate")));
     let typed = |id: &str| matches.value_source(id) == Some(ValueSource::CommandLine);
     known.map(|argument| argument.get_id().as_str()).find(|id| typed(id)).map(str::to_owned)
 }
@@ -358,6 +329,54 @@ fn explained(error: clap::Error, command: &mut clap::Command) -> clap::Error {
         _ => return error,
     };
     command.error(ErrorKind::InvalidSubcommand, format!("{word:?} is no command; {place}"))
+}
+
+fn duration(text: &str) -> Result<Duration, String> {
+    match humantime::parse_duration(text) {
+        Ok(Duration::ZERO) => Err("must be longer than nothing".to_owned()),
+        Ok(duration) => Ok(duration),
+        Err(_) => Err("write a number and a unit, for example 30s, 500ms or 2m".to_owned()),
+    }
+}
+
+fn flashing(text: &str) -> Result<Duration, String> {
+    match duration(text)? {
+        length if (Duration::from_secs(5)..=Duration::from_mins(10)).contains(&length) => Ok(length),
+        _ => Err("must lie between 5s and 10m".to_owned()),
+    }
+}
+
+fn light_delay(text: &str) -> Result<Duration, String> {
+    match humantime::parse_duration(text) {
+        Ok(delay) if delay <= Duration::from_secs(1) => Ok(delay),
+        Ok(_) => Err("must be 1s at most".to_owned()),
+        Err(_) => Err("write a number and a unit, for example 15ms".to_owned()),
+    }
+}
+
+fn window(text: &str) -> Result<Duration, String> {
+    match humantime::parse_duration(text) {
+        Ok(window) if (Duration::from_millis(1)..=Duration::from_secs(10)).contains(&window) => Ok(window),
+        Ok(_) => Err("must lie between 1ms and 10s".to_owned()),
+        Err(_) => Err("write a number and a unit, for example 25ms".to_owned()),
+    }
+}
+
+fn rate(text: &str) -> Result<f64, String> {
+    let hertz: f64 = text.parse().map_err(|_| "write a number, for example 30".to_owned())?;
+    if (0.1..=1000.0).contains(&hertz) { Ok(hertz) } else { Err("must lie between 0.1 and 1000 Hz".to_owned()) }
+}
+
+fn tag(text: &str) -> Result<(String, String), String> {
+    match text.split_once('=') {
+        Some((key, value)) if !key.is_empty() => Ok((key.to_owned(), value.to_owned())),
+        _ => Err("write KEY=VALUE, for example finger=soft".to_owned()),
+    }
+}
+
+fn instance(text: &str) -> Result<String, String> {
+    let plain = !text.is_empty() && text.len() <= 32 && text.chars().all(|c| c.is_ascii_alphanumeric() || c == '-');
+    if plain { Ok(text.to_owned()) } else { Err("1 to 32 letters, digits and dashes".to_owned()) }
 }
 
 #[cfg(test)]

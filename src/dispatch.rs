@@ -3,7 +3,7 @@
 //! Invariant: every error is printed here, once.
 
 mod failure;
-mod places;
+mod policy;
 
 use std::io::{self, IsTerminal, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -17,18 +17,14 @@ use clap::CommandFactory;
 use tokio_util::sync::CancellationToken;
 
 use self::failure::Failure;
-use self::places::{find_registry, registry_path};
 use crate::app::{self, AppError, Devices, Options, Screen, mask_path};
-use crate::cli::{Calibration, Cli, Command, CompareArgs, Global, RunArgs, SimArgs};
+use crate::cli::{Calibration, Cli, Command, Global, PolicyArgs, RunArgs, SimArgs};
 use crate::commands::calibrate::LatencyOptions;
-use crate::commands::compare::CompareOptions;
 use crate::commands::devices::{Entries, Formats};
-use crate::commands::eval::EvalOptions;
 use crate::commands::{self, Format, Outcome, mask::MaskOptions};
 use crate::driver::replay;
 use crate::headless::style::{ColourChoice, Palette, Terminal};
 use crate::hotplug::udev;
-use crate::lockstep::evaluate::{Condition, Configuration};
 use crate::outlet;
 use crate::record::inspect;
 use crate::record::{self, EpisodeRequest, RecordError};
@@ -48,10 +44,11 @@ const LARGEST_JSON: u64 = 1 << 20;
 #[must_use]
 pub fn dispatch(cli: Cli) -> ExitCode {
     let outcome = match cli.command {
-        None => run(&cli.global, &cli.run, Source::of(cli.simulation)),
-        Some(Command::Replay { file, run: ref args, compare: CompareArgs { compare_with: None, .. } }) => {
-            run(&cli.global, args, Source::Episode(file))
-        }
+        None => run(&cli.global, &cli.run, Source::of(cli.simulation), Some(cli.policy)),
+        Some(Command::Replay { file, run: ref args, compare }) => match compare.compare_with.clone() {
+            Some(bundle) => policy::compare(&cli.global, file, bundle, compare),
+            None => run(&cli.global, args, Source::Episode(file), None),
+        },
         Some(command) => print(&cli.global, cli.simulation, command),
     };
     match outcome {
@@ -113,21 +110,9 @@ fn print(global: &Global, before: SimArgs, command: Command) -> Result<(), Failu
             Outcome::BadConfiguration => Err(Failure::Told),
         },
         Command::Recover { paths } => recover(&paths, format),
-        Command::Eval { bundle, trials, seed, condition, static_config, denoising_steps, ort_lib } => {
-            let configuration = if static_config { Configuration::Static } else { Configuration::Dynamic };
-            let conditions = if condition.is_empty() { Condition::ALL.to_vec() } else { condition };
-            let bundle = policy(bundle)?;
-            let options =
-                EvalOptions { bundle, trials, seed, conditions, configuration, denoising_steps, library: ort_lib };
-            interruptible(move |stop| commands::eval::run(&options, format, stop, &mut io::stdout()))
-        }
+        Command::Eval(args) => policy::eval(args, format),
         Command::Completions { shell } => Ok(commands::completions::completions(&mut Cli::command(), shell, out)?),
-        Command::Replay { file, run: _, compare } => {
-            let CompareArgs { compare_with, tolerance, denoising_steps, ort_lib } = compare;
-            let bundle = policy(compare_with.flatten())?;
-            let options = CompareOptions { file, bundle, tolerance, denoising_steps, library: ort_lib };
-            interruptible(move |stop| commands::compare::run(&options, format, stop, &mut io::stdout()))
-        }
+        Command::Replay { .. } => Ok(()),
     }
 }
 
@@ -242,9 +227,9 @@ fn recover(paths: &[PathBuf], format: Format) -> Result<(), Failure> {
 }
 
 /// The rig: on this machine, simulated, or played from an episode.
-fn run(global: &Global, args: &RunArgs, source: Source) -> Result<(), Failure> {
+fn run(global: &Global, args: &RunArgs, source: Source, policy: Option<PolicyArgs>) -> Result<(), Failure> {
     if args.expert {
-        return demonstrate(global, args, &source);
+        return policy::demonstrate(global, args, &source);
     }
     let mut duration = args.duration;
     let (mut registry, devices) = match source {
@@ -277,12 +262,15 @@ fn run(global: &Global, args: &RunArgs, source: Source) -> Result<(), Failure> {
     if args.record {
         prepare(&args.out).map_err(Failure::Folder)?;
     }
-    let screen = match (args.headless || !io::stdout().is_terminal(), global.json) {
+    let monitor = policy.as_ref().is_none_or(|policy| policy.infer.is_none() || policy.monitor);
+    let screen = match (args.headless || !monitor || !io::stdout().is_terminal(), global.json) {
         (_, true) => Screen::Json,
         (true, false) => Screen::Lines,
         (false, false) => Screen::Monitor,
     };
+    let policy = policy.map(|policy| policy::at_the_controls(policy, args.seed, &registry)).transpose()?.flatten();
     let options = Options {
+        policy,
         registry,
         devices,
         screen,
@@ -292,54 +280,6 @@ fn run(global: &Global, args: &RunArgs, source: Source) -> Result<(), Failure> {
         instance: global.instance.clone(),
     };
     Ok(block_on(app::run(options))??)
-}
-
-/// Demonstrations of the simulated task.
-fn demonstrate(global: &Global, args: &RunArgs, source: &Source) -> Result<(), Failure> {
-    if !matches!(source, Source::Task) {
-        return Err(Failure::Arguments("--expert knows the simulated task alone: write --sim task --expert --record"));
-    }
-    if args.duration.is_some() || args.rate.is_some() || args.window.is_some() {
-        let text = "--duration, --rate and --window do not go with --expert: a demonstration takes as long as it takes";
-        return Err(Failure::Arguments(text));
-    }
-    prepare(&args.out).map_err(Failure::Folder)?;
-    let request =
-        EpisodeRequest { out: args.out.clone(), task: args.task.clone(), tags: args.tag.clone(), duration: None };
-    let format = if global.json { Format::Json } else { Format::Text };
-    let (seed, episodes) = (args.seed, args.episodes);
-    interruptible(move |stop| commands::demonstrate::run(&request, seed, episodes, format, stop, &mut io::stdout()))
-}
-
-/// Where the policy is that was named, or the usual one.
-fn policy(named: Option<PathBuf>) -> Result<PathBuf, Failure> {
-    const USUAL: &str = "models/tactile-id";
-    let data = std::env::var_os("XDG_DATA_HOME").map(PathBuf::from).filter(|path| path.is_absolute());
-    let home = || std::env::var_os("HOME").map(|home| PathBuf::from(home).join(".local/share"));
-    let places =
-        [Some(PathBuf::new()), data.or_else(home).map(|data| data.join("rapid")), Some("/usr/share/rapid".into())];
-    let places: Vec<PathBuf> = places.into_iter().flatten().map(|place| place.join(USUAL)).collect();
-    named.or_else(|| places.iter().find(|place| place.exists()).cloned()).ok_or(Failure::NoPolicy(places))
-}
-
-/// Does work that ends between two pieces of it when it is interrupted, and prints what it has.
-fn interruptible<E: Into<Failure> + Send + 'static>(
-    work: impl FnOnce(&dyn Fn() -> bool) -> Result<(), E> + Send + 'static,
-) -> Result<(), Failure> {
-    let stop = Arc::new(AtomicBool::new(false));
-    let asked = Arc::clone(&stop);
-    block_on(async move {
-        let work = tokio::task::spawn_blocking(move || work(&|| asked.load(Ordering::Relaxed)));
-        tokio::spawn(async move {
-            // The one in progress is finished.
-            if tokio::signal::ctrl_c().await.is_ok() {
-                stop.store(true, Ordering::Relaxed);
-            }
-        });
-        work.await
-    })?
-    .map_err(|_| Failure::Panicked)?
-    .map_err(Into::into)
 }
 
 /// The folder an episode is to be written to at once: better refused before the devices are started.
@@ -368,6 +308,27 @@ fn load(path: &Path) -> Result<Registry, Failure> {
         let _ = writeln!(io::stderr(), "{} {warning}", stderr_palette().warn("warning:"));
     }
     Ok(loaded.registry)
+}
+
+fn registry_path(global: &Global) -> Result<PathBuf, Failure> {
+    find_registry(global).ok_or_else(|| Failure::NoRegistry(usual_places()))
+}
+
+/// The registry named, or the first of the usual places where there is one.
+fn find_registry(global: &Global) -> Option<PathBuf> {
+    if let Some(path) = &global.config {
+        return Some(path.clone());
+    }
+    usual_places().into_iter().find(|path| path.exists())
+}
+
+fn usual_places() -> Vec<PathBuf> {
+    let home = || std::env::var_os("HOME").map(|home| PathBuf::from(home).join(".config"));
+    let config = std::env::var_os("XDG_CONFIG_HOME").map(PathBuf::from).filter(|path| path.is_absolute());
+    let mut places = vec![PathBuf::from("devices.toml")];
+    places.extend(config.or_else(home).map(|folder| folder.join("rapid/devices.toml")));
+    places.push(PathBuf::from("/etc/rapid/devices.toml"));
+    places
 }
 
 /// Runs `work` on a runtime of its own. When it is done nothing is waited for: a thread that is

@@ -53,7 +53,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("crc32fast", &["episode_format"]),
     ("crossterm", &["tui"]),
     ("futures", &["hotplug", "driver", "bus", "rig", "record", "app", "tui", "headless", "commands"]),
-    ("hdrhistogram", &["record/quality"]),
+    ("hdrhistogram", &["record/quality", "policy/live"]),
     ("humantime", &["registry", "cli", "commands"]),
     ("iceoryx2", &["bus"]),
     ("iceoryx2_bb_elementary_traits", &["bus"]),

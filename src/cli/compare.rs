@@ -36,14 +36,15 @@ pub struct CompareArgs {
     pub ort_lib: Option<PathBuf>,
 }
 
-/// An option of a run where an episode is compared.
-pub(super) fn needless(replay: &ArgMatches) -> Option<String> {
+/// Why an episode is not to be compared: an option of a run.
+pub(super) fn conflict(replay: &ArgMatches) -> Option<String> {
     let typed = |id: &str| replay.value_source(id) == Some(ValueSource::CommandLine);
     if !typed("compare_with") {
         return None;
     }
     let run = RunArgs::augment_args(clap::Command::new("run"));
-    run.get_arguments().map(|argument| argument.get_id().as_str()).find(|id| typed(id)).map(str::to_owned)
+    let option = run.get_arguments().map(|argument| argument.get_id().as_str()).find(|id| typed(id))?;
+    Some(format!("--{option} is an option of a run, and --infer compares without one: leave one of them out"))
 }
 
 fn tolerance(text: &str) -> Result<f64, String> {

@@ -133,7 +133,8 @@ impl Watch<'_> {
         let (number, stamp) = (self.tick, self.grid.tick(self.tick));
         self.tick += 1;
         self.beside.ticks += 1;
-        if self.pilot.look(number, stamp, stamp, &mut self.request) {
+        if self.pilot.look(number, stamp, stamp) {
+            self.pilot.fill(number, stamp, &mut self.request);
             let refused = match self.model.answer(&self.request, &mut self.chunk) {
                 Ok(()) => self.pilot.answer(number, &self.chunk).err().map(|refused| refused.to_string()),
                 Err(error) => {

@@ -10,6 +10,7 @@ use crate::commands::eval::EvalError;
 use crate::commands::inspect::InspectFailure;
 use crate::compare::CompareError;
 use crate::driver::DriverError;
+use crate::policy::bundle::BundleErrors;
 use crate::record::RecordError;
 use crate::record::inspect::InspectError;
 use crate::registry::RegistryErrors;
@@ -52,6 +53,9 @@ pub(super) enum Failure {
     Folder(RecordError),
     #[error(transparent)]
     Eval(#[from] commands::eval::EvalError),
+    /// The policy is wrong, or not for this rig.
+    #[error(transparent)]
+    Bundle(BundleErrors),
     /// There is no policy to run.
     #[error(
         "no policy: looked for {}\n    fix: name the folder of one, or make one with `make train`",
@@ -96,6 +100,7 @@ impl Failure {
             | Self::Folder(_)
             | Self::Inspect(InspectError::NotMcap(_))
             | Self::Arguments(_)
+            | Self::Bundle(_)
             | Self::Eval(EvalError::Bundle(_))
             | Self::Compare(
                 CompareFailure::Bundle(_)
@@ -114,7 +119,7 @@ impl Failure {
             }
             Self::Calibrate(error) if error.is_bad_argument() => 2,
             Self::Recover(outcome) if outcome.is_bad_argument() => 2,
-            Self::NoPolicy(_) => 3,
+            Self::NoPolicy(_) | Self::App(AppError::Required(_)) => 3,
             _ => 1,
         }
     }

@@ -87,7 +87,7 @@ impl Condition {
         }
         let (out, back) = self.windows(seed);
         // Between two ticks: at the tick of that step the bit is clear.
-        let at = |step: u32| STEP * (SETTLE + step) - STEP / 2;
+        let at = |step: u32| STEP * (SETTLE + step - 1) + STEP / 2;
         let event = |step, action| ScenarioEvent { at: at(step), device: PULLED.to_owned(), action };
         scenario.events.extend(out.map(|step| event(step, ScenarioAction::Unplug)));
         scenario.events.extend(back.map(|step| event(step, ScenarioAction::Plug { port: None })));
@@ -216,14 +216,14 @@ impl Bench<'_> {
             Some(Recording { recorder, request, library, .. }) => (Some(recorder), Some((request, library))),
             None => (None, None),
         };
-        let mut seen = Seen { pilot: Pilot::new(self.bundle, self.registry, WithoutMask::Hold, seed), recorder };
+        let mut witness = Seen { pilot: Pilot::new(self.bundle, self.registry, WithoutMask::Hold, seed), recorder };
         let mut request = Request::new(self.bundle);
         let mut chunk = vec![0.0; self.model.chunk_len()];
         for _ in 0..SETTLE {
-            rig.deliver(&mut seen)?;
-            rig.pass(&mut seen);
+            rig.deliver(&mut witness)?;
+            rig.pass(&mut witness);
         }
-        if let (Some(recorder), Some((request, library))) = (&mut seen.recorder, told) {
+        if let (Some(recorder), Some((request, library))) = (&mut witness.recorder, told) {
             recorder.begin(request, rig.now())?;
             recorder.event(&Event { stamp: rig.now(), what: self.begins(library) });
         }
@@ -231,7 +231,7 @@ impl Bench<'_> {
         let (mut status, mut failure) = (Status::Normal, None);
         let mut tick = 0;
         while !rig.trial().trial().world.is_done() {
-            rig.deliver(&mut seen)?;
+            rig.deliver(&mut witness)?;
             if self.configuration == Configuration::Static && missing(launched, rig.mask()) {
                 status = Status::Crash;
                 break;
@@ -239,23 +239,25 @@ impl Bench<'_> {
             if missing(everything(self.registry), rig.mask()) {
                 status = Status::Degraded;
             }
-            let asked = seen.pilot.look(tick, rig.now(), rig.now(), &mut request);
-            let answer = asked.then(|| self.model.answer(&request, &mut chunk));
-            let action = seen.pilot.step(tick).action.and_then(axes);
+            let answer = witness.pilot.look(tick, rig.now(), rig.now()).then(|| {
+                witness.pilot.fill(tick, rig.now(), &mut request);
+                self.model.answer(&request, &mut chunk)
+            });
+            let action = witness.pilot.step(tick).action.and_then(axes);
             if let Some(action) = action {
-                rig.act(tick, action, &mut seen);
+                rig.act(tick, action, &mut witness);
             }
             rig.trial().trial().step(0.0);
-            rig.pass(&mut seen);
-            if let Some(skipped) = take(answer, &mut seen.pilot, request.tick, &chunk, &mut failure) {
-                seen.chunk(rig.now(), || self.chunk(&request, &chunk, skipped));
-            }
-            if let Some(recorder) = &mut seen.recorder {
+            rig.pass(&mut witness);
+            let skipped = take(answer, &mut witness.pilot, request.tick, &chunk, &mut failure);
+            if let Some(recorder) = &mut witness.recorder {
+                let what = skipped.map(|skipped| self.gave(&request, &chunk, skipped));
+                what.into_iter().for_each(|what| recorder.event(&Event { stamp: rig.now(), what }));
                 recorder.advance(rig.now());
             }
             tick += 1;
         }
-        let report = seen.recorder.as_mut().and_then(|recorder| recorder.finish(rig.now()));
+        let report = witness.recorder.as_mut().and_then(|recorder| recorder.finish(rig.now()));
         let trial = rig.trial().trial();
         let (unplugged_at, plugged_at) = condition.windows(seed);
         let trial = Trial {
@@ -267,7 +269,7 @@ impl Bench<'_> {
             outcome: trial.world.outcome(),
             status,
             steps: trial.world.steps(),
-            counts: seen.pilot.counts(),
+            counts: witness.pilot.counts(),
             failure,
         };
         Ok((trial, report))
@@ -284,7 +286,7 @@ impl Bench<'_> {
         }
     }
 
-    fn chunk(&self, request: &Request, actions: &[f32], skipped: u64) -> What {
+    fn gave(&self, request: &Request, actions: &[f32], skipped: u64) -> What {
         What::Chunk(Box::new(Chunk {
             tick: request.tick,
             observed_ns: request.stamp.0,
@@ -341,14 +343,6 @@ fn axes(action: &[f32]) -> Option<[f64; AXES]> {
 struct Seen<'a> {
     pilot: Pilot,
     recorder: Option<&'a mut Stepped>,
-}
-
-impl Seen<'_> {
-    fn chunk(&mut self, stamp: Stamp, what: impl FnOnce() -> What) {
-        if let Some(recorder) = &mut self.recorder {
-            recorder.event(&Event { stamp, what: what() });
-        }
-    }
 }
 
 impl Taker for Seen<'_> {

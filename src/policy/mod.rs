@@ -8,12 +8,13 @@
 //!
 //! [`observer`] chooses what is seen at a tick and fills a [`request`], [`horizon`] decides which action
 //! is executed at which tick, or that none is. [`pilot`] is these two: what a loop on the control grid
-//! steps.
+//! steps. [`live`] is that loop in real time.
 
 pub mod bundle;
 pub mod graphs;
 pub mod horizon;
 pub mod library;
+pub mod live;
 pub mod model;
 pub mod normalize;
 pub mod observation;

@@ -101,6 +101,16 @@ impl Observer {
         self.sync.push(id, SyncSample { capture, recv, seq: header.seq, epoch, keep });
     }
 
+    /// The capture of the newest sample, once every modality that is present has sent one.
+    #[must_use]
+    pub fn first_sight(&self, mask: PhysicalMask) -> Option<Stamp> {
+        let present = self.lanes.iter().filter(|lane| lane.id.is_some_and(|id| mask.contains(id)));
+        let newest = |lane: &Lane| lane.places.iter().map(|place| place.header.capture_ns).max().filter(|ns| *ns > 0);
+        // One that has sent nothing makes all of it nothing.
+        let newest = present.map(newest).collect::<Option<Vec<u64>>>()?;
+        newest.into_iter().max().map(Stamp)
+    }
+
     /// Looks at a tick, by what is known `now`. Returns the age of the oldest sample of what is present;
     /// `None` if something present has no sample at all, or nothing is present.
     pub fn look(&mut self, tick: Stamp, now: Stamp, mask: PhysicalMask) -> Option<Duration> {
@@ -147,11 +157,15 @@ impl Observer {
         }
     }
 
-    /// Forgets what was seen: another episode.
+    /// Forgets what was seen.
     pub fn clear(&mut self) {
         self.sync.clear();
         for lane in &mut self.lanes {
             lane.chosen.fill(None);
+            lane.next = 0;
+            for place in &mut lane.places {
+                place.header = SampleHeader::default();
+            }
         }
     }
 }

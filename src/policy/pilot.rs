@@ -49,25 +49,37 @@ impl Pilot {
         self.mask = mask;
     }
 
+    /// Forgets the samples it was given.
+    pub fn forget(&mut self) {
+        self.observer.clear();
+    }
+
     /// The mask in force.
     #[must_use]
     pub const fn mask_in_force(&self) -> PhysicalMask {
         self.mask
     }
 
+    /// The capture of the newest sample, once every modality that is present has sent one.
+    #[must_use]
+    pub fn first_sight(&self) -> Option<Stamp> {
+        self.observer.first_sight(self.mask)
+    }
+
     /// Looks at tick number `number` of the control grid, which is at `tick`. Says whether the policy is to
-    /// be asked; if so, `request` is what, and [`Self::answer`] or [`Self::failed`] must follow.
-    pub fn look(&mut self, number: u64, tick: Stamp, now: Stamp, request: &mut Request) -> bool {
+    /// be asked; if so, [`Self::fill`] says what, and [`Self::answer`] or [`Self::failed`] must follow.
+    pub fn look(&mut self, number: u64, tick: Stamp, now: Stamp) -> bool {
         let observation_age = self.observer.look(tick, now, self.mask);
         self.situation = Situation { mask: self.mask, observation_age };
-        if !self.executor.wants_observation(number, self.situation) {
-            return false;
-        }
+        self.executor.wants_observation(number, self.situation)
+    }
+
+    /// Makes `request` the question of tick `number`, which was looked at last and is at `tick`.
+    pub fn fill(&self, number: u64, tick: Stamp, request: &mut Request) {
         (request.tick, request.stamp, request.mask) = (number, tick, self.mask);
         // Of each request its own, so that a chunk can be computed again without those before it.
         request.seed = self.seed.wrapping_mul(0x9e37_79b9_7f4a_7c15).wrapping_add(number);
         self.observer.fill(request);
-        true
     }
 
     /// What is to be done at tick `number`, which was looked at.

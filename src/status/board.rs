@@ -130,6 +130,12 @@ impl Board {
         self.mask_sequence.store(sequence, Ordering::Relaxed);
     }
 
+    /// The mask as published.
+    #[must_use]
+    pub fn mask(&self) -> PhysicalMask {
+        PhysicalMask(self.mask.load(Ordering::Relaxed))
+    }
+
     /// Publications of the mask so far.
     #[must_use]
     pub fn mask_sequence(&self) -> u64 {
@@ -139,6 +145,12 @@ impl Board {
     /// Reports the recording in progress, or that there is none.
     pub fn set_recording(&self, recording: Option<RecordingStatus>) {
         *lock(&self.recording) = recording;
+    }
+
+    /// Is an episode in progress?
+    #[must_use]
+    pub fn is_recording(&self) -> bool {
+        lock(&self.recording).is_some()
     }
 
     /// Reports what the policy does, or that there is none.
@@ -214,7 +226,7 @@ impl Board {
             rig: self.rig.clone(),
             taken,
             uptime: taken.since(self.started),
-            mask: PhysicalMask(self.mask.load(Ordering::Relaxed)),
+            mask: self.mask(),
             mask_sequence: self.mask_sequence.load(Ordering::Relaxed),
             devices: devices.collect(),
             recording: lock(&self.recording).clone(),

@@ -1,0 +1,158 @@
+"""Makes a bundle of a checkpoint: both graphs as ONNX, checked against PyTorch, `policy.json` and a model card.
+
+    python -m rapid_policy.export RUN/checkpoint.pt --out models/NAME
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from torch import Tensor, nn
+
+from . import bundle
+from .bundle import DENOISER, ENCODER, encoder_inputs
+from .model import Policy, parameters
+from .progress import plot
+from .spec import Spec
+
+OPSET = 17
+# Both compute in float32 and in another order.
+TOLERANCE = 1e-4
+
+
+def export(state: dict[str, Any], out: Path) -> float:
+    """Writes the bundle of the checkpoint `state` into `out`. Returns the largest difference found to PyTorch."""
+    spec = Spec.from_dict(state["spec"])
+    policy = Policy(spec)
+    policy.load_state_dict(state["average"])
+    policy.eval()
+    out.mkdir(parents=True, exist_ok=True)
+    write_graph(policy.encoder, encoder_example(spec), encoder_inputs(spec), "global_cond", out / ENCODER)
+    names = ["sample", "timestep", "global_cond"]
+    write_graph(policy.denoiser, denoiser_example(spec), names, "epsilon", out / DENOISER)
+    difference = largest_difference(spec, policy, out)
+    schedule = state["schedule"]
+    facts = {
+        **state["provenance"],
+        "seed": schedule["seed"],
+        "iterations": state["iteration"],
+        "batch_windows": schedule["windows"],
+        "draws": schedule["draws"],
+        "minutes": round(state["seconds"] / 60, 1),
+        "parameters": parameters([policy]),
+        "difference": difference,
+    }
+    bundle.write_policy(spec, facts, out)
+    bundle.write_card(spec, facts, out)
+    plot(state["losses"], spec.name, out / "loss.png")
+    return difference
+
+
+def encoder_example(spec: Spec, batch: int = 2, mask: tuple[int, ...] | None = None) -> tuple[Tensor, ...]:
+    """Random inputs of the encoder."""
+    inputs = [torch.rand(batch, spec.n_obs_steps, *o.shape) * 2 - 1 for o in spec.observations]
+    if spec.mask_aware:
+        row = torch.tensor(mask or (1,) * len(spec.images), dtype=torch.float32)
+        inputs.append(row.repeat(batch, 1))
+    return tuple(inputs)
+
+
+def denoiser_example(spec: Spec, batch: int = 2, timestep: int = 90) -> tuple[Tensor, ...]:
+    """Random inputs of the denoiser."""
+    sample = torch.randn(batch, spec.horizon, len(spec.action_names))
+    return sample, torch.full((batch,), timestep, dtype=torch.int64), torch.randn(batch, spec.condition)
+
+
+def write_graph(module: nn.Module, example: tuple[Tensor, ...], inputs: list[str], output: str, path: Path) -> None:
+    """Traces the module. Constants are not folded: every weight keeps its name and shape, onnxruntime folds them."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            module,
+            example,
+            str(path),
+            input_names=inputs,
+            output_names=[output],
+            dynamic_axes={name: {0: "B"} for name in [*inputs, output]},
+            opset_version=OPSET,
+            do_constant_folding=False,
+            dynamo=False,
+        )
+    onnx.checker.check_model(str(path), full_check=True)
+
+
+def largest_difference(spec: Spec, policy: Policy, folder: Path) -> float:
+    """Between the graphs and PyTorch, over random inputs: every mask, batches of 1 and 3, all timesteps used."""
+    encoder, denoiser = (session(folder / name) for name in (ENCODER, DENOISER))
+    masks = itertools.product((0, 1), repeat=len(spec.images)) if spec.mask_aware else [None]
+    differences = []
+    with torch.no_grad():
+        for mask, batch in itertools.product(masks, (1, 3)):
+            inputs = encoder_example(spec, batch, mask)
+            expected = policy.encoder(*inputs)
+            differences.append(_difference(expected, encoder, encoder_inputs(spec), inputs))
+            if mask is not None:
+                # Whatever an absent picture holds, it must not come through.
+                spoilt = _spoil_absent(spec, inputs, mask)
+                differences.append(_difference(expected, encoder, encoder_inputs(spec), spoilt))
+        for timestep, batch in itertools.product(range(0, 100, 10), (1, 3)):
+            inputs = denoiser_example(spec, batch, timestep)
+            names = ["sample", "timestep", "global_cond"]
+            differences.append(_difference(policy.denoiser(*inputs), denoiser, names, inputs))
+    # `max` would pass over a NaN.
+    return float(np.max(differences))
+
+
+def _spoil_absent(spec: Spec, inputs: tuple[Tensor, ...], mask: tuple[int, ...]) -> tuple[Tensor, ...]:
+    """The same inputs, with NaN where the mask has no picture."""
+    absent = {o.key for o, there in zip(spec.images, mask, strict=True) if not there}
+    named = zip(encoder_inputs(spec), inputs, strict=True)
+    return tuple(torch.full_like(value, torch.nan) if name in absent else value for name, value in named)
+
+
+def session(path: Path, threads: int = 1) -> onnxruntime.InferenceSession:
+    """A graph, run on so many threads."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+
+def _difference(
+    expected: Tensor, graph: onnxruntime.InferenceSession, names: list[str], inputs: tuple[Tensor, ...]
+) -> float:
+    feed = {name: value.numpy() for name, value in zip(names, inputs, strict=True)}
+    (got,) = graph.run(None, feed)
+    return float(np.abs(got - expected.numpy()).max())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="rapid_policy.export", description="Makes a bundle of a checkpoint.")
+    parser.add_argument("checkpoint", type=Path)
+    parser.add_argument("--out", type=Path, required=True, help="folder of the bundle")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    try:
+        state = torch.load(args.checkpoint, map_location="cpu", weights_only=False)
+    except OSError as error:
+        sys.exit(f"export: {args.checkpoint}: {error}")
+    if "final_loss" not in state["provenance"]:
+        sys.exit(f"export: {args.checkpoint} is of a training that has not ended; go on with --resume")
+    difference = export(state, args.out)
+    size = sum(path.stat().st_size for path in args.out.glob("*.onnx")) / 1e6
+    print(f"{args.out}: {size:.1f} MB, largest difference to PyTorch {difference:.2e}")
+    if not difference <= TOLERANCE:
+        sys.exit(f"export: the graphs differ from PyTorch by more than {TOLERANCE}")
+
+
+if __name__ == "__main__":
+    main()

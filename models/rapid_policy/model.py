@@ -1,0 +1,174 @@
+"""The two networks: an encoder of observations that knows what is absent, and the denoiser of action sequences.
+
+The denoiser is the one-dimensional U-Net of Diffusion Policy (Chi et al., 2023) at a size that one processor core runs
+ten times in a control period.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from .spec import Network, Spec
+
+# The first thing an image encoder does is to average this many pixels each way: half the picture is enough to see the
+# lattice, and training keeps the smaller pictures in memory.
+POOL = 2
+
+
+class SpatialSoftmax(nn.Module):
+    """Where in the picture each of `keypoints` features lies: [B, C, h, w] -> [B, 2 * keypoints], in -1..1."""
+
+    def __init__(self, channels: int, keypoints: int, height: int, width: int) -> None:
+        super().__init__()
+        self.features = nn.Conv2d(channels, keypoints, 1)
+        self.sharpness = nn.Parameter(torch.tensor(4.0))
+        y, x = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
+        # Not a weight: nothing that is learned, so that a checkpoint and the reader of a graph do without it.
+        self.register_buffer("grid", torch.stack([x.reshape(-1), y.reshape(-1)], 1), persistent=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        attention = F.softmax(self.features(x).flatten(2) * self.sharpness, -1)
+        return (attention @ self.grid).flatten(1)
+
+
+class ImageEncoder(nn.Module):
+    """One picture [B, 3, H, W] in -1..1 -> [B, image_features]."""
+
+    def __init__(self, height: int, width: int, sizes: Network) -> None:
+        super().__init__()
+
+        def block(inputs: int, outputs: int, kernel: int, stride: int) -> nn.Sequential:
+            convolution = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False)
+            return nn.Sequential(convolution, nn.GroupNorm(max(1, outputs // 8), outputs), nn.ReLU())
+
+        c = sizes.image_width
+        self.net = nn.Sequential(block(3, c, 5, 2), block(c, 2 * c, 3, 2), block(2 * c, 4 * c, 3, 1))
+        # The mean says what is there, the keypoints where it is.
+        self.where = SpatialSoftmax(4 * c, sizes.keypoints, height // POOL // 4, width // POOL // 4)
+        self.out = nn.Linear(4 * c + 2 * sizes.keypoints, sizes.image_features)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.pooled(F.avg_pool2d(x, POOL))
+
+    def pooled(self, x: Tensor) -> Tensor:
+        """The same of a picture that is pooled already: [B, 3, H / POOL, W / POOL]."""
+        features = self.net(x)
+        return self.out(torch.cat([features.mean((2, 3)), self.where(features)], 1))
+
+
+class ObservationEncoder(nn.Module):
+    """All observations -> `global_cond` [B, Dc]: at each step the vectors, then an embedding of each picture."""
+
+    def __init__(self, spec: Spec) -> None:
+        super().__init__()
+        self.keys = [o.key for o in spec.observations]
+        self.image_keys = [o.key for o in spec.images]
+        self.vector_keys = [o.key for o in spec.vectors]
+        self.mask_aware = spec.mask_aware
+        self.images = nn.ModuleDict({o.key: ImageEncoder(*o.shape[1:], spec.network) for o in spec.images})
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Inputs in the order of the observations: pictures [B, To, 3, H, W], vectors [B, To, D]; then the mask."""
+        observations = dict(zip(self.keys, inputs, strict=False))
+        return self.encode(observations, inputs[-1] if self.mask_aware else None, pooled=False)
+
+    def encode(self, observations: dict[str, Tensor], mask: Tensor | None, *, pooled: bool) -> Tensor:
+        """`mask` [B, M], 1 where the picture is there. `pooled` says that the pictures are pooled already."""
+        vectors = [observations[key] for key in self.vector_keys]
+        embeddings = []
+        for i, key in enumerate(self.image_keys):
+            pictures, encoder = observations[key], self.images[key]
+            embedding = (encoder.pooled if pooled else encoder)(pictures.flatten(0, 1))
+            embedding = embedding.unflatten(0, pictures.shape[:2])
+            if mask is not None:
+                # Chosen, not multiplied: NaN times zero would still be NaN, and an absent picture may hold anything.
+                present = mask[:, None, i : i + 1] > 0.5
+                embedding = torch.where(present, embedding, torch.zeros((), dtype=embedding.dtype, device=mask.device))
+            embeddings.append(embedding)
+        return torch.cat([x.float() for x in vectors + embeddings], -1).flatten(1)
+
+
+class ConvBlock(nn.Module):
+    """[B, C, T] -> [B, outputs, T]"""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.block = nn.Sequential(nn.Conv1d(inputs, outputs, 5, padding=2), nn.GroupNorm(8, outputs), nn.Mish())
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.block(x)
+
+
+class ResidualBlock(nn.Module):
+    """Two convolutions, scaled and shifted by the condition (FiLM): [B, inputs, T], [B, D] -> [B, outputs, T]."""
+
+    def __init__(self, inputs: int, outputs: int, condition: int) -> None:
+        super().__init__()
+        self.first, self.second = ConvBlock(inputs, outputs), ConvBlock(outputs, outputs)
+        self.film = nn.Sequential(nn.Mish(), nn.Linear(condition, 2 * outputs))
+        self.skip = nn.Conv1d(inputs, outputs, 1) if inputs != outputs else nn.Identity()
+
+    def forward(self, x: Tensor, condition: Tensor) -> Tensor:
+        scale, shift = self.film(condition).unsqueeze(-1).chunk(2, 1)
+        return self.second(scale * self.first(x) + shift) + self.skip(x)
+
+
+class Denoiser(nn.Module):
+    """Sample [B, Tp, Da], timestep i64 [B], global_cond [B, Dc] -> the noise predicted in the sample [B, Tp, Da]."""
+
+    STEP_FEATURES = 64
+
+    def __init__(self, actions: int, condition: int, widths: tuple[int, ...]) -> None:
+        super().__init__()
+        d = self.STEP_FEATURES
+        frequencies = torch.exp(torch.arange(d // 2) * -(math.log(10_000) / (d // 2 - 1)))
+        self.register_buffer("frequencies", frequencies, persistent=False)
+        self.step = nn.Sequential(nn.Linear(d, 4 * d), nn.Mish(), nn.Linear(4 * d, d))
+        c = condition + d
+        levels = list(zip((actions, *widths[:-1]), widths, strict=True))
+        self.down = nn.ModuleList(
+            nn.ModuleList([ResidualBlock(i, o, c), ResidualBlock(o, o, c), shrink])
+            for (i, o), shrink in zip(
+                levels, [*(nn.Conv1d(o, o, 3, 2, 1) for _, o in levels[:-1]), nn.Identity()], strict=True
+            )
+        )
+        self.middle = nn.ModuleList(ResidualBlock(widths[-1], widths[-1], c) for _ in range(2))
+        self.up = nn.ModuleList(
+            nn.ModuleList([ResidualBlock(2 * o, i, c), ResidualBlock(i, i, c), nn.ConvTranspose1d(i, i, 4, 2, 1)])
+            for i, o in reversed(levels[1:])
+        )
+        self.out = nn.Sequential(ConvBlock(widths[0], widths[0]), nn.Conv1d(widths[0], actions, 1))
+
+    def forward(self, sample: Tensor, timestep: Tensor, global_cond: Tensor) -> Tensor:
+        phase = timestep[:, None].float() * self.frequencies[None]
+        c = torch.cat([self.step(torch.cat([phase.sin(), phase.cos()], -1)), global_cond], -1)
+        x, kept = sample.transpose(1, 2), []
+        for first, second, shrink in self.down:
+            x = second(first(x, c), c)
+            kept.append(x)
+            x = shrink(x)
+        for block in self.middle:
+            x = block(x, c)
+        for first, second, grow in self.up:
+            x = grow(second(first(torch.cat([x, kept.pop()], 1), c), c))
+        return self.out(x).transpose(1, 2)
+
+
+class Policy(nn.Module):
+    """Both networks, as they are trained."""
+
+    def __init__(self, spec: Spec) -> None:
+        super().__init__()
+        self.spec = spec
+        self.encoder = ObservationEncoder(spec)
+        self.denoiser = Denoiser(len(spec.action_names), spec.condition, spec.network.denoiser)
+
+
+def parameters(modules: Iterable[nn.Module]) -> int:
+    """How many numbers are learned."""
+    return sum(p.numel() for module in modules for p in module.parameters())

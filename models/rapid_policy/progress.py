@@ -1,0 +1,61 @@
+"""What is seen of a training: a bar on a terminal, lines in a log, a plot at the end."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+LINE_EVERY = 100
+SMOOTHED = 100
+
+
+class Progress:
+    """Shows the loss and the time left."""
+
+    def __init__(self, name: str, iterations: int, already: int) -> None:
+        self._name, self._iterations = name, iterations
+        self._bar = tqdm(total=iterations, initial=already, desc=name) if sys.stderr.isatty() else None
+
+    def step(self, losses: list[float], done: float, seconds: float) -> None:
+        """One iteration more; `done` is the share of the whole schedule."""
+        if self._bar is not None:
+            if len(losses) % 10 == 0:
+                self._bar.set_postfix(loss=f"{recent(losses):.4f}", refresh=False)
+            self._bar.update()
+        elif len(losses) % LINE_EVERY == 0:
+            left = seconds / done * (1 - done) if done > 0 else float("nan")
+            text = f"{self._name}: {len(losses)}/{self._iterations} loss {recent(losses):.4f}, {left / 60:.1f} min left"
+            print(text, flush=True)
+
+    def close(self) -> None:
+        """Ends the bar."""
+        if self._bar is not None:
+            self._bar.close()
+
+
+def recent(losses: list[float]) -> float:
+    """Mean of the last iterations."""
+    return float(np.mean(losses[-SMOOTHED:]))
+
+
+def plot(losses: list[float], title: str, path: Path) -> None:
+    """Writes the loss over the iterations as a picture."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(7, 4))
+    axes.plot(losses, color="0.8", linewidth=0.5, label="each iteration")
+    if len(losses) >= SMOOTHED:
+        smooth = np.convolve(losses, np.ones(SMOOTHED) / SMOOTHED, "valid")
+        axes.plot(np.arange(SMOOTHED - 1, len(losses)), smooth, label=f"mean of {SMOOTHED}")
+    axes.set(yscale="log", xlabel="iteration", ylabel="mean squared error of the noise", title=title)
+    axes.legend()
+    axes.grid(alpha=0.3)
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+    plt.close(figure)

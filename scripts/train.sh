@@ -1,0 +1,94 @@
+#!/usr/bin/env bash
+# Runs what trains and measures policies, in a Python environment of its own.
+#
+#     train.sh policy [RAPID]      demonstrations, training, export to models/tactile-id
+#     train.sh ablation RAPID      what each input of the policy is worth: models/results/ablation.{json,md}
+#     train.sh texture             what a tactile picture says of the texture: models/results/texture.{json,md}
+#     train.sh test                tests of the Python under models/
+#     train.sh python ARGS...      that Python, run in models/
+#
+# RAPID is the program, default target/release/rapid. RUNS=models/runs is where demonstrations and checkpoints go; what
+# is there already is used again: a training that was stopped goes on. EPISODES=72, SEED=1000 of the demonstrations,
+# THREADS=2 and MINUTES of a training.
+#
+# Demonstrations and environment get their final names last: an interrupted run leaves nothing that looks whole.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+
+readonly VENV="${XDG_CACHE_HOME:-$HOME/.cache}/rapid/train-venv"
+RUNS="$(realpath -m "${RUNS:-models/runs}")"
+readonly RUNS
+readonly EPISODES="${EPISODES:-72}" SEED="${SEED:-1000}" THREADS="${THREADS:-2}"
+readonly DEMONSTRATIONS="$RUNS/demonstrations-$EPISODES-$SEED"
+
+SCHEDULE=(--threads "$THREADS")
+[[ -z ${MINUTES:-} ]] || SCHEDULE+=(--minutes "$MINUTES")
+readonly SCHEDULE
+
+# Threads that spin while they wait take time from whatever else runs here.
+export OMP_WAIT_POLICY="${OMP_WAIT_POLICY:-PASSIVE}"
+
+say() { printf 'train: %s\n' "$*"; }
+die() { printf 'train: %s\n' "$*" >&2; exit 1; }
+
+main() {
+    local part="${1:-}" rapid
+    rapid="$(realpath -m "${2:-target/release/rapid}")"
+    case "$part" in
+        policy) environment; demonstrations "$rapid"; policy ;;
+        ablation) environment; demonstrations "$rapid"; ablation "$rapid" ;;
+        texture) environment; [[ -d $DEMONSTRATIONS ]] || die "no demonstrations: run make train first"; in_models texture.py "$DEMONSTRATIONS" --threads "$THREADS" ;;
+        test) environment; in_models -m unittest discover -s tests -v ;;
+        python) environment; shift; in_models "$@" ;;
+        *) die "unknown part '$part': policy, ablation, texture, test or python" ;;
+    esac
+}
+
+in_models() {
+    (cd models && exec "$VENV/bin/python" "$@")
+}
+
+# Whole when its stamp, written last, names the present requirements and its Python runs.
+environment() {
+    local requirements=models/requirements.txt stamp
+    stamp=$(sha256sum <"$requirements")
+    if [[ $(cat "$VENV/stamp" 2>/dev/null) = "$stamp" ]] && "$VENV/bin/python" -c 'import torch' 2>/dev/null; then
+        return
+    fi
+    say "making the Python environment of the training: $VENV"
+    mkdir -p "$(dirname "$VENV")"
+    exec 9>"$VENV.lock"
+    flock 9
+    rm -rf "$VENV"
+    python3 -m venv "$VENV"
+    "$VENV/bin/python" -m pip install --quiet --disable-pip-version-check --only-binary=:all: -r "$requirements"
+    "$VENV/bin/python" -c 'import torch'
+    echo "$stamp" >"$VENV/stamp"
+}
+
+demonstrations() {
+    local rapid="$1"
+    if [[ -d $DEMONSTRATIONS ]]; then
+        say "demonstrations of before: $DEMONSTRATIONS"
+        return
+    fi
+    [[ -x $rapid ]] || die "no program $rapid: build it with cargo build --release"
+    say "recording $EPISODES demonstrations: $DEMONSTRATIONS"
+    rm -rf "$DEMONSTRATIONS.partial"
+    mkdir -p "$DEMONSTRATIONS.partial"
+    "$rapid" --sim task --expert --record --episodes "$EPISODES" --out "$DEMONSTRATIONS.partial" --seed "$SEED"
+    mv "$DEMONSTRATIONS.partial" "$DEMONSTRATIONS"
+}
+
+policy() {
+    local run="$RUNS/tactile-id" options=("${SCHEDULE[@]}")
+    [[ ! -f $run/checkpoint.pt ]] || options+=(--resume)
+    in_models -m rapid_policy.train "$DEMONSTRATIONS" --out "$run" "${options[@]}"
+    in_models -m rapid_policy.export "$run/checkpoint.pt" --out tactile-id
+}
+
+ablation() {
+    in_models ablation.py "$DEMONSTRATIONS" --rapid "$1" --runs "$RUNS/ablation" "${SCHEDULE[@]}"
+}
+
+main "$@"
