@@ -76,14 +76,14 @@ pub(super) struct Summary {
     devices: Vec<Row>,
     episodes: Vec<Episode>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    policy: Option<Policy>,
+    policy: Option<PolicyRow>,
     /// Events this output did not see because it was behind.
     missed_events: u64,
 }
 
 /// What the policy came to.
 #[derive(Debug, Serialize)]
-struct Policy {
+struct PolicyRow {
     policy: String,
     dry_run: bool,
     #[serde(flatten)]
@@ -177,7 +177,7 @@ impl Tally {
             episodes: self.episodes,
             policy: self.policy_end.map(|sum| {
                 let (policy, dry_run) = self.policy.unwrap_or_default();
-                Policy { policy, dry_run, sum }
+                PolicyRow { policy, dry_run, sum }
             }),
             missed_events: self.missed,
         }
@@ -229,7 +229,7 @@ impl Summary {
             let said = if reasons.is_empty() { episode.error.as_slice() } else { reasons };
             lines.extend(said.iter().map(|reason| format!("         {}", text::plain(reason))));
         }
-        if let Some(Policy { policy, dry_run, sum }) = &self.policy {
+        if let Some(PolicyRow { policy, dry_run, sum }) = &self.policy {
             let dry = if *dry_run { format!("  {}", palette.warn("dry run")) } else { String::new() };
             lines.push(format!("policy   {}{dry}  {}", palette.bold(&text::plain(policy)), sum.counts()));
         }

@@ -29,7 +29,7 @@ pub(super) fn rows(policy: &PolicyStatus, width: u16, most: u16, theme: Theme) -
     if most < 3 {
         return most.min(1);
     }
-    let rows = Axes::new(policy, usize::from(width.saturating_sub(2)), theme).rows();
+    let rows = Arrangement::new(policy, usize::from(width.saturating_sub(2)), theme).rows();
     u16::try_from(rows.saturating_add(2)).unwrap_or(most).min(most)
 }
 
@@ -88,7 +88,7 @@ fn short(policy: &PolicyStatus, width: usize, theme: Theme) -> Line<'static> {
         return line;
     }
     line.spans.extend([Span::raw(" "), Span::raw(latency(policy, theme)), Span::raw("   ")]);
-    let axes = Axes::new(policy, width.saturating_sub(line.width()), theme).row(Style::new());
+    let axes = Arrangement::new(policy, width.saturating_sub(line.width()), theme).row(Style::new());
     line.spans.extend(axes.spans);
     line
 }
@@ -153,14 +153,14 @@ fn action(policy: &PolicyStatus, width: usize, rows: usize, theme: Theme) -> Vec
     if policy.action.is_empty() {
         return vec![Line::styled("no action yet", theme.faint())];
     }
-    Axes::new(policy, width, theme).lines(rows, if policy.hold.is_some() { theme.faint() } else { Style::new() })
+    Arrangement::new(policy, width, theme).lines(rows, if policy.hold.is_some() { theme.faint() } else { Style::new() })
 }
 
 type Axis = (String, f64, String);
 
 /// How the axes of an action are arranged: all in a row where they fit, otherwise in columns of equal width.
 #[derive(Debug, Clone, Copy)]
-struct Axes<'a> {
+struct Arrangement<'a> {
     axes: &'a [Axis],
     width: usize,
     /// Columns of name and unit, and axes in a row; none where all are in one row.
@@ -168,7 +168,7 @@ struct Axes<'a> {
     theme: Theme,
 }
 
-impl<'a> Axes<'a> {
+impl<'a> Arrangement<'a> {
     fn new(policy: &'a PolicyStatus, width: usize, theme: Theme) -> Self {
         let axes = policy.action.as_slice();
         let mut arranged = Self { axes, width, grid: None, theme };

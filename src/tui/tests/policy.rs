@@ -18,9 +18,9 @@ fn holding() -> PolicyStatus {
     PolicyStatus { hold: Some(MISSING.to_owned()), unused: 2, chunk_age: None, ..policy() }
 }
 
-fn arm(axes: usize) -> PolicyStatus {
+fn arm(count: usize) -> PolicyStatus {
     let axis = |n: usize| (format!("joint_{n}"), n as f64 * -0.731, "rad".to_owned());
-    PolicyStatus { action: (1..=axes).map(axis).collect(), ..policy() }
+    PolicyStatus { action: (1..=count).map(axis).collect(), ..policy() }
 }
 
 #[test]
