@@ -141,7 +141,10 @@ def summarize(args: argparse.Namespace) -> None:
     rows = [row for c in CONFIGURATIONS if (row := summary(c, args.runs)) is not None]
     if not rows:
         return
-    report = {"trials": rows[0]["trials"], "first_seed": FIRST_SEED, "configurations": rows}
+    told = f"ablation.py EPISODES --rapid RAPID --trials {args.trials} --iterations {args.iterations} --seed {args.seed}"
+    if math.isfinite(args.minutes):
+        told += f" --minutes {args.minutes:g}"
+    report = {"command": told, "trials": rows[0]["trials"], "first_seed": FIRST_SEED, "configurations": rows}
     results.write(args.out, "ablation", report, markdown(report))
 
 
@@ -185,11 +188,11 @@ def markdown(report: dict[str, Any]) -> str:
     lines = [
         "# What each input is worth",
         "",
-        "Five configurations of the policy, each trained on the demonstrations of `make train` and then run by the",
-        f"program (`rapid eval`) for {report['trials']} trials with everything plugged in, seeds from {report['first_seed']}",
-        f"on, which no demonstration has; {report['configurations'][0]['triangular']:.0%} of the blocks are triangular. Success:"
-        " the block ends in the bin of its",
-        "texture. Left: it ends in the bin of the triangular ones, whichever it is. Interval: Wilson's.",
+        "Five configurations of the policy, each trained on the demonstrations of `make train` and then run by the program",
+        f"(`rapid eval`) for {report['trials']} trials with everything plugged in, with seeds that no demonstration has:",
+        f"{report['first_seed']} and on, {report['configurations'][0]['triangular']:.0%} of the blocks triangular. Success:",
+        "the block ends in the bin of its texture. Left: it ends in the bin of the triangular ones, whichever it is.",
+        "Interval: Wilson's.",
         "",
         "| configuration | episodes | dropout | success | 95 % | wrong bin | incomplete | left | paper |",
         "|---|---|---|---|---|---|---|---|---|",
@@ -217,7 +220,12 @@ def markdown(report: dict[str, Any]) -> str:
         "state is left. `vision-diff-one` is the paper's row on the data of a single configuration: there the blocks of one",
         "size, here the demonstrations of one texture. Diff: the tactile picture, as difference to the first one.",
         "",
-        "Made with `make ablation`; the trials of a row with",
+        "Made with `make ablation`, which runs",
+        "",
+        f"    python {report['command']}",
+        "",
+        "where `--minutes` ends a training that has not come to its last iteration, with the learning rate fallen by then;",
+        "and that, for the trials of each,",
         "",
         f"    {report['configurations'][0]['command']}",
     ]
