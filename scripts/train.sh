@@ -33,7 +33,7 @@ die() { printf 'train: %s\n' "$*" >&2; exit 1; }
 
 main() {
     local part="${1:-}" rapid
-    rapid="$(realpath -m "${2:-target/release/rapid}")"
+    rapid="$(realpath -m -- "${2:-target/release/rapid}")"
     case "$part" in
         policy) environment; demonstrations "$rapid"; policy ;;
         ablation) environment; demonstrations "$rapid"; ablation "$rapid" ;;
