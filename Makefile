@@ -3,7 +3,7 @@ SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup setup-build demo test lint check bench fuzz train train-test ablation texture clean
+.PHONY: help setup setup-build demo test lint check bench fuzz train train-test ablation texture lerobot-test clean
 
 # A toolchain just installed by rustup is not on the PATH of a shell that was open before.
 export PATH := $(PATH):$(HOME)/.cargo/bin
@@ -61,6 +61,17 @@ ablation: setup-build ## train five configurations of the policy and run each: m
 
 texture: ## what a tactile picture says of the texture: models/results/texture.md
 	scripts/train.sh texture
+
+# In a place of its own and no part of the other tests: LeRobot and PyTorch are gigabytes that nothing else here needs.
+lerobot-test: LEROBOT := $(CACHE)/venv-lerobot
+lerobot-test: ## the export of LeRobot checkpoints, against LeRobot (fetches 8 GB of Python packages once)
+	@stamp=$$(sha256sum <models/requirements-lerobot.txt); \
+	if [[ $$(cat '$(LEROBOT)/stamp' 2>/dev/null) != "$$stamp" ]]; then \
+	    rm -rf '$(LEROBOT)' && python3 -m venv '$(LEROBOT)'; \
+	    '$(LEROBOT)/bin/python' -m pip install --quiet --disable-pip-version-check --only-binary=:all: --no-deps -r models/requirements-lerobot.txt; \
+	    echo "$$stamp" >'$(LEROBOT)/stamp'; \
+	fi
+	'$(LEROBOT)/bin/python' -m unittest discover -s models/tests/lerobot -v
 
 clean: ## remove what was built here (what setup fetched stays)
 	cargo clean

@@ -1,10 +1,11 @@
 //! Compiles each recorded schema to the `FileDescriptorSet` that MCAP wants beside the messages:
-//! the schema's file and everything it imports. Says whether the library that policies need is at
-//! hand.
+//! the schema's file and everything it imports. Packs the library that policies need.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+
+use sha2::{Digest as _, Sha256};
 
 const PROTO: &str = "src/record/proto";
 const SCHEMAS: [&str; 8] = [
@@ -21,13 +22,15 @@ const SCHEMAS: [&str; 8] = [
 /// The pinned files of onnxruntime, as `sha256sum` lists them: `<sum>  <arch>/<file>`.
 const PINNED: &str = "scripts/onnxruntime.sha256";
 const LIBRARY: &str = "libonnxruntime.so.";
+/// Higher levels save a few percent and take many times as long, to pack and to unpack.
+const LEVEL: i32 = 9;
 
 fn main() -> Result<(), Box<dyn Error>> {
-    onnxruntime()?;
     commit();
     println!("cargo::rerun-if-changed={PROTO}");
     println!("cargo::rerun-if-changed=build.rs");
     let out = PathBuf::from(std::env::var("OUT_DIR")?);
+    onnxruntime(&out)?;
     for schema in SCHEMAS {
         let mut compiler = protox::Compiler::new([PROTO])?;
         compiler.include_imports(true).include_source_info(false).open_file(format!("{schema}.proto"))?;
@@ -57,34 +60,55 @@ fn commit() {
     }
 }
 
-/// This version runs no policy and embeds nothing: it says what a build leaves out, so that nobody
-/// who builds by hand is surprised later.
-fn onnxruntime() -> Result<(), Box<dyn Error>> {
+/// Packs the library that policies need for the program to carry: `src/policy/library.rs` includes
+/// what is written here. Without the library that is an empty file, and the build goes on: recording
+/// needs none.
+fn onnxruntime(out: &Path) -> Result<(), Box<dyn Error>> {
     println!("cargo::rerun-if-changed={PINNED}");
     let arch = std::env::var("CARGO_CFG_TARGET_ARCH")?;
     let pinned = std::fs::read_to_string(PINNED)?;
-    let version =
-        pinned.lines().find_map(|line| line.split_whitespace().nth(1)?.strip_prefix(&format!("{arch}/{LIBRARY}")));
+    let entry = pinned.lines().find_map(|line| {
+        let (sum, file) = line.split_once("  ")?;
+        Some((sum, file.strip_prefix(&format!("{arch}/{LIBRARY}"))?))
+    });
     // Where `make setup` puts it. A path that does not exist is not watched: cargo would run this
-    // script at every build.
+    // script at every build. `make setup` touches this script when it has fetched the library.
     let cache = std::env::var_os("XDG_CACHE_HOME")
         .map(PathBuf::from)
         .or_else(|| Some(PathBuf::from(std::env::var_os("HOME")?).join(".cache")));
-    let library = cache
-        .zip(version)
-        .map(|(cache, version)| cache.join(format!("rapid/onnxruntime/{version}-{arch}/{LIBRARY}{version}")))
-        .filter(|path| path.is_file());
-    let (Some(library), Some(version)) = (library, version) else {
+    let library = cache.zip(entry).map(|(cache, (sum, version))| {
+        (cache.join(format!("rapid/onnxruntime/{version}-{arch}/{LIBRARY}{version}")), sum, version)
+    });
+    let Some((library, sum, version)) = library.filter(|(path, ..)| path.is_file()) else {
         println!(
-            "cargo::warning=built without onnxruntime, which `make setup` fetches: recording needs none, and \
-             this version runs no policy"
+            "cargo::warning=built without onnxruntime, which `make setup` fetches: recording needs none, policies \
+             will need --ort-lib or ORT_DYLIB_PATH"
         );
-        println!("cargo::rustc-env=RAPID_BUILT_WITH=onnxruntime: left out (this version runs no policy)");
+        println!(
+            "cargo::rustc-env=RAPID_BUILT_WITH=onnxruntime: none inside (a policy needs --ort-lib or ORT_DYLIB_PATH)"
+        );
+        let none = out.join("onnxruntime-none.zst");
+        std::fs::write(&none, [])?;
+        println!("cargo::rustc-env=RAPID_ONNXRUNTIME={}", none.display());
         return Ok(());
     };
     println!("cargo::rerun-if-changed={}", library.display());
-    println!(
-        "cargo::rustc-env=RAPID_BUILT_WITH=onnxruntime: {version} at hand, not embedded (this version runs no policy)"
-    );
+    println!("cargo::rustc-env=RAPID_BUILT_WITH=onnxruntime: {version} inside");
+    let packed = out.join(format!("onnxruntime-{sum}-{LEVEL}.zst"));
+    if !packed.exists() {
+        let bytes = std::fs::read(&library)?;
+        let found = Sha256::digest(&bytes).iter().fold(String::new(), |text, byte| format!("{text}{byte:02x}"));
+        if found != sum {
+            return Err(format!(
+                "{} is not the file that {PINNED} names: remove it, then `make setup`",
+                library.display()
+            )
+            .into());
+        }
+        let partial = packed.with_extension("partial");
+        std::fs::write(&partial, zstd::bulk::compress(&bytes, LEVEL)?)?;
+        std::fs::rename(&partial, &packed)?;
+    }
+    println!("cargo::rustc-env=RAPID_ONNXRUNTIME={}", packed.display());
     Ok(())
 }

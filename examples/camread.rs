@@ -83,6 +83,7 @@ fn device(arguments: &[String]) -> Result<DeviceSpec, Box<dyn std::error::Error>
         depth: 4,
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
+        action: None,
         verdict: rapid::registry::VerdictSpec::of(
             rapid::modality::ModalityKind::Image,
             Duration::from_millis(500),

@@ -80,6 +80,7 @@ fn registry(count: u8) -> Registry {
                 None,
             ),
             latency: Duration::ZERO,
+            action: None,
         })
     };
     Registry {

@@ -3,8 +3,9 @@
 #
 #     setup.sh [build] [test] [fuzz]
 #
-# build: what building and running need. test: the rest - lint tools, the Python that reads episodes and topics from
-# outside, the pinned onnxruntime library, the virtual bench with its guest image. fuzz: what libFuzzer is built with.
+# build: what building and running need, the pinned onnxruntime library among it. test: the rest - lint tools, the
+# Python that reads episodes and topics from outside, the virtual bench with its guest image. fuzz: what libFuzzer is
+# built with.
 #
 # Every step looks first and does nothing when it is done already. Whatever is fetched lies outside the tree in
 # ${XDG_CACHE_HOME:-~/.cache}/rapid, is checked against the hashes pinned in the tree, and gets its final name last:
@@ -16,9 +17,9 @@ readonly ORT_VERSION=1.24.4
 readonly CACHE="${XDG_CACHE_HOME:-$HOME/.cache}/rapid"
 readonly VENV="$CACHE/venv"
 
-# pkg-config, libudev-dev: crate udev. libclang-dev: the V4L2 bindings. libstdc++6: onnxruntime at run time.
-readonly BUILD_PACKAGES=(gcc libc6-dev pkg-config libudev-dev libclang-dev libstdc++6)
-readonly TEST_PACKAGES=(python3 python3-venv)
+# pkg-config, libudev-dev: crate udev. libclang-dev: the V4L2 bindings. libstdc++6: onnxruntime at run time. python3,
+# python3-venv: pip, which fetches onnxruntime; the program itself needs neither.
+readonly BUILD_PACKAGES=(gcc libc6-dev pkg-config libudev-dev libclang-dev libstdc++6 python3 python3-venv)
 readonly FUZZ_PACKAGES=(g++)
 
 changed=0
@@ -47,7 +48,8 @@ main() {
     done
     toolchain
     packages "${wanted[@]}"
-    [[ " $* " != *" test "* ]] || { lint_tools; python_venv; onnxruntime; guest_image; }
+    [[ " $* " != *" build "* ]] || onnxruntime
+    [[ " $* " != *" test "* ]] || { lint_tools; python_venv; guest_image; }
     if [[ $changed = 0 ]]; then say "nothing to do ($*)"; else say "done ($*)"; fi
 }
 
@@ -65,7 +67,6 @@ lint_tools() {
 # The packages of the test part, a line each.
 test_packages() {
     local list=tests/vbench/image/packages.txt
-    printf '%s\n' "${TEST_PACKAGES[@]}"
     [[ ! -f $list ]] || sed 's/#.*//' "$list" | tr -s '[:space:]' '\n' | sed '/^$/d'
 }
 
@@ -126,17 +127,20 @@ onnxruntime() {
     trap "rm -rf '$partial'" EXIT
     # The library in the wheel does not depend on the Python the wheel is for; one is named so that every machine
     # gets the same bytes.
-    "$VENV/bin/python" -m pip download --quiet --disable-pip-version-check --no-deps --only-binary=:all: \
+    python3 -m venv "$partial/venv"
+    "$partial/venv/bin/python" -m pip download --quiet --disable-pip-version-check --no-deps --only-binary=:all: \
         --python-version 3.12 --implementation cp --abi cp312 \
         --platform "manylinux_2_27_$arch" --platform "manylinux_2_28_$arch" \
         --dest "$partial" "onnxruntime==$ORT_VERSION"
     local wheels=("$partial"/*.whl)
     checked "$partial" "$arch/$(basename "${wheels[0]}")" || die "${wheels[0]##*/} is not the wheel that is pinned in scripts/onnxruntime.sha256"
-    "$VENV/bin/python" -m zipfile -e "${wheels[0]}" "$partial/wheel"
+    python3 -m zipfile -e "${wheels[0]}" "$partial/wheel"
     cp "$partial/wheel/onnxruntime/capi/$library" "$partial/$library"
     checked "$partial" "$arch/$library" || die "$library is not the one that is pinned in scripts/onnxruntime.sha256"
     mkdir -p "$dir"
     mv "$partial/$library" "$dir/$library"
+    # A program that was built without it is built anew: cargo watches this file, not one that was not there.
+    touch build.rs
     rm -rf "$partial"
     trap - EXIT
 }

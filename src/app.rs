@@ -1,11 +1,12 @@
 //! The program: puts the stages together, runs them, and takes them down in order.
 //!
-//! Taking down: the episode ends and streams stop, the recorder finishes its file, the programs of
+//! Taking down: the policy holds, the episode ends and streams stop, the recorder finishes its file, the programs of
 //! devices are waited for, the mask says 0 and its files go, the screen says what was recorded and gives the terminal back.
 //!
 //! Invariant: only this module sees every stage.
 //! Invariant: whatever ends the run, an episode in progress is finished first.
 
+mod autopilot;
 mod conductor;
 pub(crate) mod signals;
 
@@ -39,6 +40,8 @@ use crate::rig::presence::{Claim, Presence, PresenceError};
 use crate::rig::{Rig, RigError};
 use crate::status::{Board, Command};
 use crate::tui::{self, TuiError};
+use autopilot::Autopilot;
+pub use autopilot::PolicyOptions;
 use conductor::Conductor;
 use signals::Signals;
 
@@ -73,6 +76,8 @@ pub struct Options {
     pub screen: Screen,
     /// What an episode is called and where it goes; its duration is that of `duration`.
     pub episode: EpisodeRequest,
+    /// The policy at the controls, if one is to be.
+    pub policy: Option<PolicyOptions>,
     /// Begin an episode at the start.
     pub record: bool,
     /// How long to record, or to run when nothing is recorded.
@@ -111,6 +116,15 @@ pub enum AppError {
     /// A thread or signal handler.
     #[error("the system refuses: {0}")]
     System(#[from] std::io::Error),
+    /// The policy.
+    #[error(transparent)]
+    Policy(#[from] autopilot::LoadError),
+    /// What the policy requires is not there.
+    #[error("the policy needs {0}: plug it in, or write --wait to start when it is there")]
+    Required(String),
+    /// The policy does not end.
+    #[error("the policy did not end within {} s", LAST_CHUNK.as_secs())]
+    Stuck,
     /// An episode's file is not whole.
     #[error("{}: {reason}", file.display())]
     Episode {
@@ -190,6 +204,8 @@ pub async fn run(options: Options) -> Result<(), AppError> {
             (rig, outcome)
         }
     });
+    let autopilot =
+        options.policy.map(|policy| Autopilot::launch(policy, &registry, &bus, &board, options.record)).transpose()?;
     let episode = EpisodeRequest { duration: options.duration, ..options.episode };
     // In the background: nothing of this run waits for what an earlier one left behind.
     let may_record = options.record || options.screen == Screen::Monitor;
@@ -210,7 +226,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     };
     let (kind, screen) = (options.screen, Some(screen));
     let mut running =
-        Running { rig, rig_ended, rig_stop, hurry, mask_ended, kind, screen, screen_stop, signals, asked };
+        Running { rig, rig_ended, rig_stop, hurry, mask_ended, kind, screen, screen_stop, signals, asked, autopilot };
     // A panic here ends the run like any other: what it leaves is taken down in order.
     let conducted = AssertUnwindSafe(conductor.conduct(&mut running)).catch_unwind().await;
     let outcome = conducted.unwrap_or(Err(AppError::Panicked("the main task")));
@@ -220,6 +236,8 @@ pub async fn run(options: Options) -> Result<(), AppError> {
 /// The screen has limits of its own for a reader that does not read. This one is for a screen that is
 /// stuck: crossterm 0.29 reads without end from a terminal that was hung up at the wrong moment.
 const LAST_OUTPUT: Duration = Duration::from_secs(10);
+/// A chunk that is being computed has this long; computing one takes a tenth of a second at most.
+const LAST_CHUNK: Duration = Duration::from_secs(5);
 /// After a second signal, what is still to be shown has this long: enough for a terminal to be given
 /// back.
 const LAST_OUTPUT_IN_A_HURRY: Duration = Duration::from_secs(1);
@@ -279,6 +297,15 @@ struct Running {
     screen_stop: CancellationToken,
     signals: Signals,
     asked: mpsc::Receiver<Command>,
+    autopilot: Option<Autopilot>,
+}
+
+/// Waits for the end of the policy, if there is one, whose outcome is taken.
+async fn policy_ended(autopilot: &mut Option<Autopilot>) -> Result<(), AppError> {
+    match autopilot {
+        Some(autopilot) => autopilot.ended().await,
+        None => std::future::pending().await,
+    }
 }
 
 /// Waits for the end of the screen, whose outcome is taken; for ever if it was taken before.
@@ -295,6 +322,17 @@ async fn finish(
     mut conductor: Conductor,
     mut outcome: Result<(), AppError>,
 ) -> Result<(), AppError> {
+    // First of all nothing moves any more. A chunk that is being computed is waited for with the rest.
+    let policy_ended = async {
+        match &mut running.autopilot {
+            Some(autopilot) => {
+                let ended = timeout(LAST_CHUNK, autopilot.stop()).await;
+                ended.unwrap_or(Err(AppError::Stuck))
+            }
+            None => Ok(()),
+        }
+    };
+    keep_first(&mut outcome, policy_ended.await);
     running.rig_stop.cancel();
     let rig = running.rig;
     let take_down = async {

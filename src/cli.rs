@@ -8,6 +8,10 @@ use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::parser::ValueSource;
 use clap::{ArgAction, ArgMatches, Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueHint};
 
+mod policy;
+
+pub use policy::{EvalArgs, PolicyArgs};
+
 /// Records robot demonstrations from sensors that come and go
 #[derive(Debug, Parser)]
 #[command(
@@ -21,6 +25,9 @@ pub struct Cli {
     /// Options of a run.
     #[command(flatten)]
     pub run: RunArgs,
+    /// A policy at the controls.
+    #[command(flatten)]
+    pub policy: PolicyArgs,
     /// Where devices come from.
     #[command(flatten, next_help_heading = RUN)]
     pub simulation: SimArgs,
@@ -44,11 +51,12 @@ Examples:
   rapid devices                         what is plugged in, and which entry it is
   rapid                                 the monitor on the real rig
   rapid --headless --record --duration 30s --task \"place block\" --tag finger=soft
+  rapid --infer --sim task --duration 20s         a policy sorts a simulated block
   rapid inspect episodes/20260101_place-block_001.mcap
   rapid recover episodes                after a crash: makes the unfinished episodes whole
 
 Exit codes: 0 done, 1 failed while running, 2 bad configuration or arguments,
-            130 interrupted twice";
+            3 a device or a policy that is needed is not there, 130 interrupted twice";
 
 const RECOVER: &str = "\
 A run that may record does this by itself, in the background, for what it finds in its --out folder.
@@ -100,7 +108,7 @@ pub struct Global {
 /// Where devices come from.
 #[derive(Debug, Clone, Args)]
 pub struct SimArgs {
-    /// Simulated devices: those of the registry, or what a scenario file says
+    /// Simulated devices: those of the registry, what a scenario file says, or `task`, a robot that sorts blocks
     #[arg(long, value_name = "SCENARIO", num_args = 0..=1, value_hint = ValueHint::FilePath)]
     pub sim: Option<Option<PathBuf>>,
 }
@@ -130,6 +138,15 @@ pub struct RunArgs {
     /// Observations a second [default: as the registry says]
     #[arg(long, value_name = "HZ", value_parser = rate)]
     pub rate: Option<f64>,
+    /// Number of the first trial of `--sim task`, and of the noise of a policy
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub seed: u64,
+    /// With `--sim task --record`: a script that knows the task demonstrates it, faster than real time
+    #[arg(long, requires = "record")]
+    pub expert: bool,
+    /// Demonstrations to record, each of another trial
+    #[arg(long, value_name = "COUNT", default_value_t = 1, requires = "expert")]
+    pub episodes: usize,
     /// Half width of an observation's window [default: as the registry says]
     #[arg(long, value_name = "TIME", value_parser = window)]
     pub window: Option<Duration>,
@@ -200,6 +217,9 @@ pub enum Command {
         #[command(flatten)]
         run: RunArgs,
     },
+    /// Tries a policy on the simulated task, with a sensor that is pulled out
+    #[command(after_help = policy::EVAL)]
+    Eval(EvalArgs),
     /// Prints a completion script: source <(rapid completions bash)
     Completions {
         /// Shell
@@ -273,10 +293,13 @@ impl Cli {
 /// An option of a run before a command that would not look at it.
 fn stray(matches: &ArgMatches, command: &str) -> Option<String> {
     let run = RunArgs::augment_args(clap::Command::new("run"));
+    let policy = PolicyArgs::augment_args(clap::Command::new("run"));
     let simulation = SimArgs::augment_args(clap::Command::new("run"));
     // `rapid --sim --json devices` is understood.
-    let known =
-        run.get_arguments().chain(simulation.get_arguments().filter(|_| !matches!(command, "devices" | "calibrate")));
+    let known = run
+        .get_arguments()
+        .chain(policy.get_arguments())
+        .chain(simulation.get_arguments().filter(|_| !matches!(command, "devices" | "calibrate")));
     let typed = |id: &str| matches.value_source(id) == Some(ValueSource::CommandLine);
     known.map(|argument| argument.get_id().as_str()).find(|id| typed(id)).map(str::to_owned)
 }

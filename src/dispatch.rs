@@ -3,6 +3,7 @@
 //! Invariant: every error is printed here, once.
 
 mod failure;
+mod policy;
 
 use std::io::{self, IsTerminal, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -17,7 +18,7 @@ use tokio_util::sync::CancellationToken;
 
 use self::failure::Failure;
 use crate::app::{self, AppError, Devices, Options, Screen, mask_path};
-use crate::cli::{Calibration, Cli, Command, Global, RunArgs, SimArgs};
+use crate::cli::{Calibration, Cli, Command, Global, PolicyArgs, RunArgs, SimArgs};
 use crate::commands::calibrate::LatencyOptions;
 use crate::commands::devices::{Entries, Formats};
 use crate::commands::{self, Format, Outcome, mask::MaskOptions};
@@ -43,8 +44,8 @@ const LARGEST_JSON: u64 = 1 << 20;
 #[must_use]
 pub fn dispatch(cli: Cli) -> ExitCode {
     let outcome = match cli.command {
-        None => run(&cli.global, &cli.run, Source::of(cli.simulation)),
-        Some(Command::Replay { file, run: ref args }) => run(&cli.global, args, Source::Episode(file)),
+        None => run(&cli.global, &cli.run, Source::of(cli.simulation), Some(cli.policy)),
+        Some(Command::Replay { file, run: ref args }) => run(&cli.global, args, Source::Episode(file), None),
         Some(command) => print(&cli.global, cli.simulation, command),
     };
     match outcome {
@@ -106,6 +107,7 @@ fn print(global: &Global, before: SimArgs, command: Command) -> Result<(), Failu
             Outcome::BadConfiguration => Err(Failure::Told),
         },
         Command::Recover { paths } => recover(&paths, format),
+        Command::Eval(args) => policy::eval(args, format),
         Command::Completions { shell } => Ok(commands::completions::completions(&mut Cli::command(), shell, out)?),
         Command::Replay { .. } => Ok(()),
     }
@@ -117,13 +119,20 @@ enum Source {
     Machine,
     /// A scenario: the demonstration, or that of a file.
     Scenario(Option<PathBuf>),
+    /// The simulated task.
+    Task,
     /// A recorded episode.
     Episode(PathBuf),
 }
 
 impl Source {
     fn of(simulation: SimArgs) -> Self {
-        simulation.sim.map_or(Self::Machine, Self::Scenario)
+        match simulation.sim {
+            None => Self::Machine,
+            // A file of that name is ./task.
+            Some(Some(file)) if file.as_os_str() == "task" => Self::Task,
+            Some(file) => Self::Scenario(file),
+        }
     }
 }
 
@@ -135,7 +144,7 @@ fn devices(
     format: Format,
     out: &mut dyn Write,
 ) -> Result<(), Failure> {
-    if let Source::Scenario(_) = source {
+    if let Source::Scenario(_) | Source::Task = source {
         let (registry, attached) = plugged(global, source)?;
         let plugged = commands::devices::list(Entries::Of(&registry), &attached, formats);
         return Ok(commands::devices::print(&plugged, Some(&registry), format, out)?);
@@ -157,7 +166,15 @@ fn devices(
 
 /// A registry that can be used, and what is plugged in.
 fn plugged(global: &Global, source: Source) -> Result<(Registry, Vec<Attachment>), Failure> {
-    let Source::Scenario(file) = source else { return Ok((load(&registry_path(global)?)?, udev::enumerate()?)) };
+    let file = match source {
+        Source::Scenario(file) => file,
+        Source::Task => {
+            let registry = Registry::task();
+            let attached = crate::hotplug::script::attached(&Scenario::task(&registry, 0));
+            return Ok((registry, attached));
+        }
+        Source::Machine | Source::Episode(_) => return Ok((load(&registry_path(global)?)?, udev::enumerate()?)),
+    };
     let registry = registry_or_builtin(global)?;
     let attached = crate::hotplug::script::attached(&scenario(file.as_deref(), &registry)?);
     Ok((registry, attached))
@@ -207,7 +224,10 @@ fn recover(paths: &[PathBuf], format: Format) -> Result<(), Failure> {
 }
 
 /// The rig: on this machine, simulated, or played from an episode.
-fn run(global: &Global, args: &RunArgs, source: Source) -> Result<(), Failure> {
+fn run(global: &Global, args: &RunArgs, source: Source, policy: Option<PolicyArgs>) -> Result<(), Failure> {
+    if args.expert {
+        return policy::demonstrate(global, args, &source);
+    }
     let mut duration = args.duration;
     let (mut registry, devices) = match source {
         Source::Episode(file) => {
@@ -223,6 +243,11 @@ fn run(global: &Global, args: &RunArgs, source: Source) -> Result<(), Failure> {
             let scenario = scenario(file.as_deref(), &registry)?;
             (registry, Devices::Simulated(scenario))
         }
+        Source::Task => {
+            let registry = Registry::task();
+            let scenario = Scenario::task(&registry, args.seed);
+            (registry, Devices::Simulated(scenario))
+        }
         Source::Machine => (load(&registry_path(global)?)?, Devices::Machine),
     };
     if let Some(rate) = args.rate {
@@ -234,12 +259,15 @@ fn run(global: &Global, args: &RunArgs, source: Source) -> Result<(), Failure> {
     if args.record {
         prepare(&args.out).map_err(Failure::Folder)?;
     }
-    let screen = match (args.headless || !io::stdout().is_terminal(), global.json) {
+    let monitor = policy.as_ref().is_none_or(|policy| policy.infer.is_none() || policy.monitor);
+    let screen = match (args.headless || !monitor || !io::stdout().is_terminal(), global.json) {
         (_, true) => Screen::Json,
         (true, false) => Screen::Lines,
         (false, false) => Screen::Monitor,
     };
+    let policy = policy.map(|policy| policy::at_the_controls(policy, args.seed, &registry)).transpose()?.flatten();
     let options = Options {
+        policy,
         registry,
         devices,
         screen,

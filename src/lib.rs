@@ -25,7 +25,7 @@
 //!       folder                                   files others cannot lead astray
 //!       panics                                   where their messages go
 //!       episode_format                           an episode's file, record by record
-//!  L0   modality   mask   sample   time   provenance   flash     nouns
+//!  L0   modality   mask   sample   action   time   random   provenance   flash     nouns
 //! ```
 //!
 //! The arrows are the way of the data. Imports point down only; the stages of L3 do not know one
@@ -81,6 +81,7 @@
 //! * Bytes from devices and files never make the program panic. `unsafe` stands in [`driver`] and
 //!   [`bus`] alone.
 
+pub mod action;
 pub mod app;
 pub mod bus;
 pub mod calibration;
@@ -94,12 +95,15 @@ pub mod flash;
 pub mod folder;
 pub mod headless;
 pub mod hotplug;
+pub mod lockstep;
 pub mod logging;
 pub mod mask;
 pub mod modality;
 pub mod outlet;
 pub mod panics;
+pub mod policy;
 pub mod provenance;
+pub mod random;
 pub mod record;
 pub mod registry;
 pub mod rig;

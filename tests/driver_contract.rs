@@ -71,6 +71,7 @@ fn spec(node: NodeSpec) -> DeviceSpec {
         depth: 4,
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
+        action: None,
         verdict: rapid::registry::VerdictSpec::of(
             rapid::modality::ModalityKind::Image,
             Duration::from_millis(500),
@@ -96,7 +97,9 @@ async fn open_sim(source: SimSource) -> (Driver, Arc<SimDevice>) {
     let spec = match source {
         SimSource::Camera { .. } => camera_spec(),
         SimSource::Serial { channels, .. } => serial_spec(Framing::Line, Parse::Csv, channels),
-        SimSource::Process | SimSource::Replay { .. } => serial_spec(Framing::Line, Parse::Csv, 1),
+        SimSource::Task { .. } | SimSource::Process | SimSource::Replay { .. } => {
+            serial_spec(Framing::Line, Parse::Csv, 1)
+        }
     };
     let device = sim_device(source);
     let driver = Driver::open(&spec, &DeviceNode::Sim(Arc::clone(&device))).await.unwrap();

@@ -20,11 +20,11 @@ use proc_macro2::{Delimiter, TokenStream, TokenTree};
 
 /// Modules by layer, lowest first. A module sees those of lower layers.
 const LAYERS: &[&[&str]] = &[
-    &["modality", "mask", "sample", "time", "action", "provenance", "flash"],
+    &["modality", "mask", "sample", "time", "action", "random", "provenance", "flash"],
     &["registry", "status", "text", "outlet", "folder", "episode_format", "fault", "panics"],
     &["hotplug", "driver", "bus", "sync", "calibration"],
     &["rig", "record", "policy", "control"],
-    &["app", "tui", "headless", "logging"],
+    &["app", "lockstep", "tui", "headless", "logging"],
     &["main", "dispatch", "cli", "commands"],
 ];
 
@@ -53,7 +53,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("crc32fast", &["episode_format"]),
     ("crossterm", &["tui"]),
     ("futures", &["hotplug", "driver", "bus", "rig", "record", "app", "tui", "headless", "commands"]),
-    ("hdrhistogram", &["record/quality"]),
+    ("hdrhistogram", &["record/quality", "policy/live"]),
     ("humantime", &["registry", "cli", "commands"]),
     ("iceoryx2", &["bus"]),
     ("iceoryx2_bb_elementary_traits", &["bus"]),
@@ -63,11 +63,15 @@ const HOMES: &[(&str, &[&str])] = &[
     ("lz4", &["episode_format"]),
     ("mcap", &["record"]),
     ("nokhwa", &["driver/camera"]),
+    ("ort", &["policy/library", "policy/graphs"]),
     ("parking_lot", &["bus/shared"]),
+    ("rand_distr", &["random"]),
+    ("rand_pcg", &["random"]),
     ("ratatui", &["tui"]),
     ("rustix", &["time", ABOVE_NOUNS]),
     ("serde", &[ANYWHERE]),
     ("serde_json", &[ABOVE_NOUNS]),
+    ("sha2", &["policy/bundle"]),
     ("strsim", &["registry"]),
     ("thiserror", &[ANYWHERE]),
     ("tokio", &[ABOVE_NOUNS]),
@@ -81,8 +85,8 @@ const HOMES: &[(&str, &[&str])] = &[
     ("unicode_segmentation", &["text"]),
     ("unicode_width", &["text"]),
     ("v4l", &["driver/camera"]),
-    ("zstd", &["episode_format"]),
-    ("zune_jpeg", &["calibration/brightness"]),
+    ("zstd", &["episode_format", "policy/library"]),
+    ("zune_jpeg", &["calibration/brightness", "policy/picture"]),
 ];
 const ANYWHERE: &str = "*";
 const ABOVE_NOUNS: &str = "layers 1 and up";
@@ -99,8 +103,10 @@ const LOCK_HOMES: &[(&str, &str)] = &[
     ("status/board", "what a screen shows: written when a state changes and twice a second, read by the screen"),
     ("rig/worker", "a program waits for the end of the one before"),
     ("registry/scenario", "the light that a simulated camera looks at while it is calibrated"),
+    ("policy/library", "onnxruntime is loaded once, before the first chunk"),
     ("fault", "tests"),
     ("panics", "messages of panics"),
+    ("driver/sim/task", "the simulated world, which its devices share"),
     ("tui", "the monitor's terminal"),
 ];
 

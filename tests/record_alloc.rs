@@ -157,6 +157,7 @@ async fn only_chunks_allocate() {
         depth: 64,
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
+        action: None,
         verdict: rapid::registry::VerdictSpec::of(
             rapid::modality::ModalityKind::Image,
             Duration::from_millis(500),

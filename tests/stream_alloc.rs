@@ -231,6 +231,7 @@ fn take(inbox: &Inbox, counts: &mut [usize; 3]) {
         .drain(&mut |topic, _, _| match topic {
             TopicId::Modality(id) => counts[id.index()] += 1,
             TopicId::Mask => counts[2] += 1,
+            TopicId::Action => {}
         })
         .unwrap();
 }

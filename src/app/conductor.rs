@@ -11,7 +11,7 @@ use tokio::sync::{broadcast, mpsc};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
 use tokio_util::sync::CancellationToken;
 
-use super::{AppError, Running, Screen, screen_ended};
+use super::{AppError, Running, Screen, policy_ended, screen_ended};
 use crate::fault;
 use crate::record::{EpisodeRequest, RecordError, Recorder};
 use crate::rig::RigCommand;
@@ -58,6 +58,8 @@ impl Conductor {
                 // Its outcome is taken when everything is taken down.
                 () = running.rig_ended.cancelled() => return output,
                 () = running.mask_ended.cancelled() => return Err(AppError::Panicked("thread `mask`")),
+                // It ends by itself only when it cannot go on.
+                outcome = policy_ended(&mut running.autopilot) => return outcome,
                 outcome = screen_ended(&mut running.screen) => match outcome {
                     Err(panicked @ AppError::Panicked(_)) => return Err(panicked),
                     // An episode is worth more than its log lines, and goes on without.

@@ -13,6 +13,7 @@
 //! Invariant: writers live as long as the bus. What a reader has not fetched dies with its writer
 //! (iceoryx2 0.10), so a writer that went with its device would take the last samples along.
 
+mod actions;
 mod inbox;
 mod ingress;
 mod place;
@@ -34,6 +35,7 @@ use crate::sample::SampleHeader;
 
 use service::Service;
 
+pub use actions::Actions;
 pub use inbox::Inbox;
 pub use ingress::{Given, Ingress, Watch};
 pub use topic::{TopicId, TopicSpec};
@@ -109,6 +111,8 @@ pub enum BusError {
 pub struct Bus {
     // Declared in the order they must be dropped: ports, services, node.
     writers: Vec<(TopicId, Arc<Writer>)>,
+    /// None without an actuator.
+    actions: Option<Arc<Actions>>,
     topics: Vec<(TopicSpec, TopicFactory)>,
     wake: EventFactory<Service>,
     ingresses: Vec<(ModalityId, Arc<Ingress>)>,
@@ -144,12 +148,13 @@ impl Bus {
                 let prefix = config.global.prefix.to_string();
                 place::in_the_way(&prefix).unwrap_or_else(|| BusError::Node(error.to_string()))
             })?;
-        let specs = registry.devices.iter().map(TopicSpec::of_device).chain([TopicSpec::mask()]);
+        let action = registry.actuator().map(|_| TopicSpec::action());
+        let specs = registry.devices.iter().map(TopicSpec::of_device).chain([TopicSpec::mask()]).chain(action);
         let topics = specs.map(|spec| open_topic(&node, spec)).collect::<Result<Vec<_>, _>>()?;
         let wake = node
             .service_builder(&service_name(WAKE_SERVICE)?)
             .event()
-            .max_notifiers(crate::modality::MAX_MODALITIES + MAX_NODES)
+            .max_notifiers(crate::modality::MAX_MODALITIES + 1 + MAX_NODES)
             .max_listeners(MAX_NODES)
             .max_nodes(MAX_NODES)
             .event_id_max_value(255)
@@ -165,7 +170,9 @@ impl Bus {
             .filter(|device| matches!(device.node, NodeSpec::Process(_)))
             .map(|device| Ok((device.id, Arc::new(Ingress::open(&node, device)?))))
             .collect::<Result<Vec<_>, BusError>>()?;
-        Ok(Self { writers, topics, wake, ingresses, node: Arc::new(node) })
+        let actions = topics.iter().find(|(spec, _)| spec.id == TopicId::Action);
+        let actions = actions.map(|(spec, factory)| Actions::open(spec, factory).map(Arc::new)).transpose()?;
+        Ok(Self { writers, actions, topics, wake, ingresses, node: Arc::new(node) })
     }
 
     /// Where the program that reads modality `id` publishes; `None` if no program does.
@@ -192,6 +199,12 @@ impl Bus {
     /// When more programs subscribe than the topics have room for.
     pub fn inbox(&self) -> Result<Inbox, BusError> {
         Inbox::open(&self.topics, &self.wake)
+    }
+
+    /// What the actuator is told; `None` without an actuator in the registry.
+    #[must_use]
+    pub fn actions(&self) -> Option<Arc<Actions>> {
+        self.actions.clone()
     }
 
     /// Bytes of shared memory that the pools of all topics reserve.

@@ -31,6 +31,7 @@ fn registry(depth: usize) -> Registry {
             depth,
             when_stale: WhenStale::Hold,
             latency: Duration::ZERO,
+            action: None,
             verdict: crate::registry::VerdictSpec::of(
                 crate::modality::ModalityKind::Image,
                 Duration::from_millis(500),

@@ -1,5 +1,6 @@
 //! Topics: name, depth and memory of each, decided once from the registry.
 
+use crate::action::{ACTION_TOPIC, MAX_ACTION};
 use crate::mask::MASK_TOPIC;
 use crate::modality::ModalityId;
 use crate::registry::{DeviceSpec, POOL_SPARE};
@@ -9,6 +10,9 @@ const MASK_DEPTH: usize = 2048;
 /// u64 mask and u64 sequence.
 const MASK_BYTES: usize = 16;
 
+/// 2 s of actions at 200 Hz, twice the rate of the fastest policy.
+const ACTION_DEPTH: usize = 400;
+
 /// Which topic.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum TopicId {
@@ -16,6 +20,8 @@ pub enum TopicId {
     Modality(ModalityId),
     /// The physical mask.
     Mask,
+    /// Actions for the actuator; there is none without an actuator in the registry.
+    Action,
 }
 
 /// A topic as it is opened.
@@ -43,6 +49,11 @@ impl TopicSpec {
 
     pub(super) fn mask() -> Self {
         Self { id: TopicId::Mask, name: MASK_TOPIC.to_owned(), depth: MASK_DEPTH, max_bytes: MASK_BYTES }
+    }
+
+    pub(super) fn action() -> Self {
+        let max_bytes = MAX_ACTION * size_of::<f64>();
+        Self { id: TopicId::Action, name: ACTION_TOPIC.to_owned(), depth: ACTION_DEPTH, max_bytes }
     }
 
     /// Samples in the pool, for queues of `depth`.

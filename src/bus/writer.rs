@@ -6,6 +6,7 @@ use iceoryx2::port::publisher::Publisher;
 use iceoryx2::prelude::*;
 
 use super::{BusError, EventFactory, Service, TopicFactory, TopicId, TopicSpec, topic_error};
+use crate::modality::MAX_MODALITIES;
 use crate::sample::SampleHeader;
 
 /// The one writer of a topic.
@@ -44,6 +45,7 @@ impl Writer {
             TopicId::Modality(modality) => Some(modality.index()),
             // Consumers find the mask when they look; 500 wake-ups a second would tell them nothing.
             TopicId::Mask => None,
+            TopicId::Action => Some(MAX_MODALITIES),
         };
         let wake = event
             .map(|event| {

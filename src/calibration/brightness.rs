@@ -31,12 +31,13 @@ pub fn brightness(encoding: Encoding, bytes: &[u8]) -> Result<f64, BrightnessErr
         // Y0 U Y1 V: every other byte is luminance.
         Encoding::Yuyv => mean(bytes.iter().step_by(2)),
         Encoding::Mjpeg => {
-            let bytes = &with_mark(bytes);
+            let mut marked = Vec::new();
+            with_mark(bytes, &mut marked);
             let options = DecoderOptions::default()
                 .jpeg_set_out_colorspace(ColorSpace::Luma)
                 .set_max_width(LARGEST)
                 .set_max_height(LARGEST);
-            let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
+            let mut decoder = JpegDecoder::new_with_options(ZCursor::new(&marked), options);
             let pixels = decoder.decode().map_err(|error| BrightnessError::Damaged(error.to_string()))?;
             mean(pixels.iter())
         }
@@ -44,11 +45,15 @@ pub fn brightness(encoding: Encoding, bytes: &[u8]) -> Result<f64, BrightnessErr
     }
 }
 
-/// The picture with the mark (segment APP0) that motion JPEG has in AVI files. Cameras leave out the Huffman tables
-/// and mean those of the standard (ITU-T T.81 K.3); the decoder takes these for what is missing when it finds the mark.
-fn with_mark(jpeg: &[u8]) -> Vec<u8> {
+/// Makes `marked` the picture with the mark (segment APP0) that motion JPEG has in AVI files. Cameras
+/// leave out the Huffman tables and mean those of the standard (ITU-T T.81 K.3); the decoder takes
+/// these for what is missing when it finds the mark.
+pub(crate) fn with_mark(jpeg: &[u8], marked: &mut Vec<u8>) {
     let (start, rest) = jpeg.split_at(jpeg.len().min(2));
-    [start, &[0xff, 0xe0, 0, 8], b"AVI1\0\0", rest].concat()
+    marked.clear();
+    for part in [start, &[0xff, 0xe0, 0, 8], b"AVI1\0\0", rest] {
+        marked.extend_from_slice(part);
+    }
 }
 
 fn mean<'a>(luminance: impl Iterator<Item = &'a u8>) -> Result<f64, BrightnessError> {

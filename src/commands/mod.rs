@@ -4,9 +4,12 @@ pub mod artifacts;
 pub mod calibrate;
 pub mod check;
 pub mod completions;
+pub mod demonstrate;
 pub mod devices;
+pub mod eval;
 pub mod inspect;
 pub mod mask;
+pub mod progress;
 pub mod recover;
 
 /// How a listing is written.

@@ -5,8 +5,10 @@ use std::path::PathBuf;
 
 use crate::app::AppError;
 use crate::commands;
+use crate::commands::eval::EvalError;
 use crate::commands::inspect::InspectFailure;
 use crate::driver::DriverError;
+use crate::policy::bundle::BundleErrors;
 use crate::record::RecordError;
 use crate::record::inspect::InspectError;
 use crate::registry::RegistryErrors;
@@ -47,6 +49,22 @@ pub(super) enum Failure {
     /// The folder for episodes cannot be written to.
     #[error(transparent)]
     Folder(RecordError),
+    #[error(transparent)]
+    Eval(#[from] commands::eval::EvalError),
+    /// The policy is wrong, or not for this rig.
+    #[error(transparent)]
+    Bundle(BundleErrors),
+    /// There is no policy to run.
+    #[error(
+        "no policy: looked for {}\n    fix: name the folder of one, or make one with `make train`",
+        .0.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ")
+    )]
+    NoPolicy(Vec<PathBuf>),
+    #[error(transparent)]
+    Demonstrate(#[from] commands::demonstrate::DemonstrateError),
+    /// What was typed makes no sense together.
+    #[error("{0}")]
+    Arguments(&'static str),
     /// What was wrong has been printed.
     #[error("")]
     Told,
@@ -77,6 +95,9 @@ impl Failure {
             | Self::Replay(_)
             | Self::Folder(_)
             | Self::Inspect(InspectError::NotMcap(_))
+            | Self::Arguments(_)
+            | Self::Bundle(_)
+            | Self::Eval(EvalError::Bundle(_))
             | Self::Told => 2,
             Self::Inspect(InspectError::Io { source, .. })
                 if matches!(source.kind(), io::ErrorKind::NotFound | io::ErrorKind::IsADirectory) =>
@@ -85,6 +106,7 @@ impl Failure {
             }
             Self::Calibrate(error) if error.is_bad_argument() => 2,
             Self::Recover(outcome) if outcome.is_bad_argument() => 2,
+            Self::NoPolicy(_) | Self::App(AppError::Required(_)) => 3,
             _ => 1,
         }
     }

@@ -110,6 +110,19 @@ impl Driver {
         }
     }
 
+    /// Tells an actuator where to go: a target an axis, in the order and the units of its table of actions.
+    ///
+    /// # Errors
+    /// When the device takes no actions, or others.
+    pub fn command(&mut self, target: &[f64]) -> Result<(), DriverError> {
+        match self {
+            Self::Sim(driver) => driver.command(target),
+            Self::Camera(_) | Self::Serial(_) | Self::Replay(_) => {
+                Err(DriverError::Fatal("this version commands simulated actuators alone".to_owned()))
+            }
+        }
+    }
+
     /// What was agreed with the device: format, rate, driver, for people.
     #[must_use]
     pub fn description(&self) -> String {

@@ -7,6 +7,7 @@
 //! Invariant: the sequence goes on over a replug; a number that is skipped is told in `lost`.
 
 mod pictures;
+pub mod task;
 
 use std::collections::BTreeMap;
 use std::f64::consts::TAU;
@@ -19,7 +20,7 @@ use tokio::time::Instant;
 use self::pictures::{PICTURES, Pictures, Scene, encode, fill, write_picture};
 use super::{DriverError, Reading, unblock};
 use crate::provenance::{Format, Negotiated};
-use crate::registry::scenario::{self, SimDevice, SimSource};
+use crate::registry::scenario::{self, SimDevice, SimSource, TaskPart};
 use crate::registry::{DeviceSpec, NodeSpec};
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
 use crate::time::{Stamp, nanoseconds};
@@ -52,6 +53,7 @@ pub struct Sim {
 enum Content {
     Pictures(Pictures),
     Values { channels: usize, seed: u64 },
+    Task { part: TaskPart, trial: task::Shared },
 }
 
 impl Sim {
@@ -69,6 +71,10 @@ impl Sim {
             SimSource::Serial { channels, hz, seed } => {
                 (Content::Values { channels, seed }, hz, SERIAL_BACKLOG.as_secs() * u64::from(hz.max(1)))
             }
+            SimSource::Task { part, ref scene } => {
+                let content = Content::Task { part, trial: task::Shared::of(scene)? };
+                (content, task::STEP_HZ, CAMERA_BACKLOG)
+            }
             SimSource::Process | SimSource::Replay { .. } => {
                 return Err(DriverError::Fatal(format!("{} sends no samples made up here", device.name)));
             }
@@ -76,6 +82,7 @@ impl Sim {
         let capacity = match &content {
             Content::Pictures(pictures) => pictures.largest(),
             Content::Values { channels, .. } => channels * 8,
+            Content::Task { .. } => task::SIDE * task::SIDE * 3,
         };
         let grid = Grid { begun: device.begun, rate: u64::from(rate.max(1)) };
         let next = grid.first_after(stamp_of(Instant::now()));
@@ -90,6 +97,22 @@ impl Sim {
             self.controls = camera.controls.iter().cloned().collect();
         }
         self
+    }
+
+    /// Tells the arm of the simulated task where to go: as many numbers as it has axes.
+    ///
+    /// # Errors
+    /// When the device is no actuator, or takes another count of numbers.
+    pub(super) fn command(&mut self, target: &[f64]) -> Result<(), DriverError> {
+        match (&self.content, target.try_into()) {
+            (Content::Task { part: TaskPart::Arm, trial }, Ok(target)) => trial.trial().command(target),
+            (Content::Task { part: TaskPart::Arm, .. }, Err(_)) => {
+                let text = format!("{} takes {} numbers, not {}", self.device.name, task::AXES, target.len());
+                return Err(DriverError::Retry(text));
+            }
+            _ => return Err(DriverError::Fatal(format!("{} is no actuator", self.device.name))),
+        }
+        Ok(())
     }
 
     /// The next sample.
@@ -124,6 +147,11 @@ impl Sim {
                     pictures.write(sequence, lit, &mut self.payload);
                 }
                 Content::Values { channels, seed } => write_values(*channels, *seed, sequence, &mut self.payload),
+                Content::Task { part, trial } => {
+                    let mut trial = trial.trial();
+                    trial.advance_to(u32::try_from(point).unwrap_or(u32::MAX));
+                    trial.sample(*part, &mut self.payload)?;
+                }
             }
         }
         if hits(faults.truncate_every, point) {
@@ -140,6 +168,7 @@ impl Sim {
         let (encoding, width, height) = match &self.content {
             Content::Pictures(pictures) => (Encoding::Mjpeg, pictures.width, pictures.height),
             Content::Values { channels, .. } => (Encoding::F64, u32::try_from(*channels).unwrap_or(u32::MAX), 0),
+            Content::Task { part, .. } => task::layout(*part),
         };
         Reading { bytes: &self.payload, encoding, captured, flags: FLAG_DEVICE_TIME, width, height, lost }
     }
@@ -180,6 +209,10 @@ impl Sim {
                 format!("simulated camera, MJPG {width}x{height} at {fps} fps")
             }
             SimSource::Serial { channels, hz, .. } => format!("simulated serial line, {channels} numbers at {hz} Hz"),
+            SimSource::Task { part: TaskPart::Arm, .. } => "arm of the simulated task".to_owned(),
+            SimSource::Task { .. } => {
+                format!("camera of the simulated task, MJPG {0}x{0} at {1} fps", task::SIDE, task::STEP_HZ)
+            }
             SimSource::Process | SimSource::Replay { .. } => String::new(),
         }
     }
@@ -194,6 +227,15 @@ impl Sim {
             SimSource::Serial { channels, hz, .. } => {
                 Some(Format::Messages { baud: None, channels, hz: Some(hz.into()) })
             }
+            SimSource::Task { part: TaskPart::Arm, .. } => {
+                Some(Format::Messages { baud: None, channels: task::AXES, hz: Some(task::STEP_HZ.into()) })
+            }
+            SimSource::Task { .. } => Some(Format::Pictures {
+                fourcc: "MJPG".to_owned(),
+                width: task::SIDE_PIXELS,
+                height: task::SIDE_PIXELS,
+                fps: Some(task::STEP_HZ.into()),
+            }),
             SimSource::Replay { .. } | SimSource::Process => None,
         };
         let bus = Some(format!("sim:{}", self.device.name));
@@ -221,7 +263,9 @@ pub(super) fn check(spec: &DeviceSpec, device: &SimDevice) -> Result<(), DriverE
         }
         (SimSource::Camera { .. }, NodeSpec::Serial(_)) => (String::from("pictures"), String::from("a serial line")),
         (SimSource::Serial { .. }, NodeSpec::Camera(_)) => (String::from("numbers"), String::from("a camera")),
-        (SimSource::Process | SimSource::Replay { .. }, _) | (_, NodeSpec::Process(_)) => return Ok(()),
+        (SimSource::Task { .. } | SimSource::Process | SimSource::Replay { .. }, _) | (_, NodeSpec::Process(_)) => {
+            return Ok(());
+        }
     };
     Err(DriverError::Fatal(format!(
         "the scenario's device {} sends {sends}, [device.{}] says {wished}: make them equal",
@@ -241,7 +285,7 @@ pub fn frame(source: &SimSource, sequence: u32) -> Option<Vec<u8>> {
             write_picture(&picture, seed, sequence, &mut payload);
         }
         SimSource::Serial { channels, seed, .. } => write_values(channels, seed, sequence, &mut payload),
-        SimSource::Process | SimSource::Replay { .. } => return None,
+        SimSource::Task { .. } | SimSource::Process | SimSource::Replay { .. } => return None,
     }
     Some(payload)
 }

@@ -115,9 +115,19 @@ impl Columns {
                 rest.push_str(&why);
                 (&"episode".to_owned(), None, palette.grade(verdict.grade, &pad(verdict.grade.word())), rest)
             }
-            What::DiskLow { .. } | What::ClockStep { .. } => {
+            What::DiskLow { .. }
+            | What::ClockStep { .. }
+            | What::Policy { .. }
+            | What::Chunk(_)
+            | What::Hold { .. }
+            | What::Act { .. }
+            | What::PolicyEnd { .. } => {
                 let (level, text) = event.what.sentence().unwrap_or((Level::Warn, String::new()));
-                let subject = if matches!(event.what, What::DiskLow { .. }) { "disk" } else { "clock" };
+                let subject = match event.what {
+                    What::DiskLow { .. } => "disk",
+                    What::ClockStep { .. } => "clock",
+                    _ => "policy",
+                };
                 (&subject.to_owned(), None, palette.level(level, &pad(level.word())), text)
             }
             What::Recovered { text, .. } => (&"episode".to_owned(), None, palette.warn(&pad("repaired")), text.clone()),

@@ -19,46 +19,76 @@ use crate::time::Stamp;
 /// Plays a [`Scenario`] on tokio's clock, from the moment it is made.
 #[derive(Debug)]
 pub struct Script {
-    devices: Vec<ScenarioDevice>,
-    plugged: HashMap<String, (PathBuf, Arc<SimDevice>)>,
-    /// Where the counter of an unplugged device stands: it goes on when it is plugged again.
-    sequences: HashMap<String, u32>,
-    events: Vec<ScenarioEvent>,
-    next: usize,
-    round: Instant,
-    repeat: Option<Duration>,
-    begun: Stamp,
+    timeline: Timeline,
+    begin: Instant,
     timer: Pin<Box<Sleep>>,
-    queue: VecDeque<HotplugEvent>,
 }
 
 impl Script {
     /// Begins: what is plugged at the start is told at once.
     #[must_use]
     pub fn new(scenario: Scenario) -> Self {
-        let round = Instant::now();
-        let mut script = Self {
+        let begin = Instant::now();
+        Self { timeline: Timeline::new(scenario, Stamp::now()), begin, timer: Box::pin(sleep_until(begin)) }
+    }
+}
+
+/// The events of a [`Scenario`] in their order, for whoever keeps the time.
+#[derive(Debug)]
+pub struct Timeline {
+    devices: Vec<ScenarioDevice>,
+    plugged: HashMap<String, (PathBuf, Arc<SimDevice>)>,
+    /// Where the counter of an unplugged device stands: it goes on when it is plugged again.
+    sequences: HashMap<String, u32>,
+    events: Vec<ScenarioEvent>,
+    next: usize,
+    /// When the round of events in progress began, from the scenario's beginning.
+    round: Duration,
+    repeat: Option<Duration>,
+    begun: Stamp,
+    queue: VecDeque<HotplugEvent>,
+}
+
+impl Timeline {
+    /// The scenario's beginning, at `begun`: what is plugged then are the first events.
+    #[must_use]
+    pub fn new(scenario: Scenario, begun: Stamp) -> Self {
+        let mut timeline = Self {
             devices: scenario.devices,
             plugged: HashMap::new(),
             sequences: HashMap::new(),
             events: scenario.events,
             next: 0,
-            round,
+            round: Duration::ZERO,
             repeat: scenario.repeat,
-            begun: Stamp::now(),
-            timer: Box::pin(sleep_until(round)),
+            begun,
             queue: VecDeque::new(),
         };
-        for device in script.devices.iter().filter(|d| d.plugged).map(|d| d.name.clone()).collect::<Vec<_>>() {
-            script.plug(&device, None);
+        for device in timeline.devices.iter().filter(|d| d.plugged).map(|d| d.name.clone()).collect::<Vec<_>>() {
+            timeline.plug(&device, None);
         }
-        script
+        timeline
     }
 
-    fn play(&mut self, event: &ScenarioEvent) {
+    /// The next event that has happened by `now`; the moment of the call may be later.
+    pub fn next_by(&mut self, now: Stamp) -> Option<HotplugEvent> {
+        loop {
+            if let Some(event) = self.queue.pop_front() {
+                return Some(event);
+            }
+            if self.begun.after(self.due()?) > now {
+                return None;
+            }
+            let event = self.events.get(self.next)?.clone();
+            self.next += 1;
+            self.play(&event, now);
+        }
+    }
+
+    fn play(&mut self, event: &ScenarioEvent, now: Stamp) {
         match &event.action {
             ScenarioAction::Plug { port } => self.plug(&event.device, port.as_deref()),
-            ScenarioAction::Unplug => self.unplug(&event.device),
+            ScenarioAction::Unplug => self.unplug(&event.device, now),
             ScenarioAction::Silence => self.set_silent(&event.device, true),
             ScenarioAction::Resume => self.set_silent(&event.device, false),
         }
@@ -78,12 +108,11 @@ impl Script {
         self.queue.push_back(HotplugEvent::Added(attachment));
     }
 
-    fn unplug(&mut self, name: &str) {
+    fn unplug(&mut self, name: &str, now: Stamp) {
         let Some((syspath, sim)) = self.plugged.remove(name) else { return };
         sim.unplug();
         self.sequences.insert(name.to_owned(), sim.sequence.load(Ordering::Relaxed));
-        let (witnessed, witness) = (Stamp::now(), Witness::Script);
-        self.queue.push_back(HotplugEvent::Removed { syspath, witnessed, witness });
+        self.queue.push_back(HotplugEvent::Removed { syspath, witnessed: now, witness: Witness::Script });
     }
 
     fn set_silent(&self, name: &str, silent: bool) {
@@ -92,8 +121,8 @@ impl Script {
         }
     }
 
-    /// When the next event is due; `None` when the scenario is over.
-    fn due(&mut self) -> Option<Instant> {
+    /// When the next event is due, from the beginning; `None` when the scenario is over.
+    fn due(&mut self) -> Option<Duration> {
         if self.next == self.events.len() {
             let repeat = self.repeat.filter(|_| !self.events.is_empty())?;
             self.round += repeat;
@@ -123,17 +152,18 @@ impl Stream for Script {
 
     fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
         loop {
-            if let Some(event) = self.queue.pop_front() {
+            if let Some(event) = self.timeline.queue.pop_front() {
                 return Poll::Ready(Some(Ok(event)));
             }
             // The stream of a finished scenario goes on without events, like that of a machine
             // nobody plugs anything into.
-            let Some(due) = self.due() else { return Poll::Pending };
+            let Some(due) = self.timeline.due() else { return Poll::Pending };
+            let due = self.begin + due;
             self.timer.as_mut().reset(due);
             ready!(self.timer.as_mut().poll(context));
-            let event = self.events[self.next].clone();
-            self.next += 1;
-            self.play(&event);
+            let event = self.timeline.events[self.timeline.next].clone();
+            self.timeline.next += 1;
+            self.timeline.play(&event, Stamp::now());
         }
     }
 }

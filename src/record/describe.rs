@@ -22,8 +22,12 @@ pub(super) fn describe(what: &What) -> String {
         What::Recording { file } => format!("recording {}", file.display()),
         What::Episode { file, .. } => format!("finished {}", file.display()),
         What::Recovered { text, .. } | What::Log { text, .. } => text.clone(),
-        What::DiskLow { .. } | What::ClockStep { .. } => {
-            what.sentence().map_or_else(String::new, |(_, sentence)| sentence)
-        }
+        What::DiskLow { .. }
+        | What::ClockStep { .. }
+        | What::Policy { .. }
+        | What::Chunk(_)
+        | What::Hold { .. }
+        | What::Act { .. }
+        | What::PolicyEnd { .. } => what.sentence().map_or_else(String::new, |(_, sentence)| sentence),
     }
 }

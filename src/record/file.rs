@@ -19,6 +19,7 @@ use mcap::{Attachment, McapError, WriteOptions, Writer};
 
 use super::encode::{self, EventText};
 use super::schema::{self, PROTOBUF, SampleSchema, Schema};
+use crate::action::ACTION_TOPIC;
 use crate::episode_format::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, SUMMARY};
 use crate::mask::{MASK_TOPIC, PhysicalMask};
 use crate::modality::{MAX_MODALITIES, ModalityId};
@@ -58,6 +59,8 @@ pub(super) struct EpisodeFile {
     message: Vec<u8>,
     tracks: Vec<Option<Track>>,
     mask: u16,
+    /// None without an actuator in the registry.
+    action: Option<u16>,
     frame: u16,
     event: u16,
     log: u16,
@@ -153,10 +156,32 @@ impl EpisodeFile {
         let frame = add_channel(&mut writer, schema::FRAME, FRAME_TOPIC, &none)?;
         let event = add_channel(&mut writer, schema::EVENT, EVENT_TOPIC, &none)?;
         let log = add_channel(&mut writer, schema::LOG, LOG_TOPIC, &none)?;
+        let action = match registry.actuator() {
+            Some((device, action)) => {
+                let names = serde_json::json!(action.names).to_string();
+                let units = serde_json::json!(action.units).to_string();
+                let metadata = [("actuator", device.name.clone()), ("names", names), ("units", units)];
+                let metadata = metadata.map(|(key, value)| (key.to_owned(), value)).into();
+                Some(add_channel(&mut writer, SampleSchema::Scalars.schema(), ACTION_TOPIC, &metadata)?)
+            }
+            None => None,
+        };
         let mut tracks = Vec::new();
         tracks.resize_with(MAX_MODALITIES, || None);
-        let mut file =
-            Self { shut, writer, clock, message: Vec::new(), tracks, mask, frame, event, log, messages: 0, bytes: 0 };
+        let mut file = Self {
+            shut,
+            writer,
+            clock,
+            message: Vec::new(),
+            tracks,
+            mask,
+            action,
+            frame,
+            event,
+            log,
+            messages: 0,
+            bytes: 0,
+        };
         for device in &registry.devices {
             let kind = serde_json::to_value(device.modality().kind).ok();
             let kind = kind.as_ref().and_then(|kind| kind.as_str()).unwrap_or_default().to_owned();
@@ -203,6 +228,15 @@ impl EpisodeFile {
         let log_time = self.clock.wall_ns(Stamp(header.capture_ns));
         encode::mask(&mut self.message, log_time, mask, sequence);
         self.write(self.mask, sequence, log_time, Stamp(header.recv_ns))
+    }
+
+    /// Writes an action, if the registry has an actuator for it.
+    pub(super) fn action(&mut self, header: &SampleHeader, payload: &[u8]) -> io::Result<()> {
+        let schema = SampleSchema::of(header, payload);
+        let Some(channel) = self.action.filter(|_| schema == SampleSchema::Scalars) else { return Ok(()) };
+        let log_time = self.clock.wall_ns(Stamp(header.capture_ns));
+        encode::sample(&mut self.message, schema, log_time, "", header, payload);
+        self.write(channel, header.seq, log_time, Stamp(header.recv_ns))
     }
 
     /// Writes a tick of the frame index, for which samples received until `deadline` counted.

@@ -28,6 +28,7 @@ pub mod schema;
 mod session;
 mod source;
 mod space;
+pub mod stepped;
 mod streams;
 #[cfg(test)]
 mod tests;

@@ -22,7 +22,7 @@ use serde::Serialize;
 
 use crate::mask::PhysicalMask;
 use crate::modality::{MAX_MODALITIES, ModalityId};
-use crate::registry::VerdictSpec;
+use crate::registry::{DeviceSpec, Registry, VerdictSpec};
 use crate::sync::Grid;
 use crate::time::{Stamp, nanoseconds};
 use plugged::Plugged;
@@ -47,6 +47,18 @@ pub(super) struct Measured {
     pub(super) latency_ns: u64,
 }
 
+impl Measured {
+    /// Every modality of a registry.
+    pub(super) fn all(registry: &Registry) -> Vec<Self> {
+        let measured = |device: &DeviceSpec| Self {
+            id: device.id,
+            limits: device.verdict,
+            latency_ns: nanoseconds(device.latency),
+        };
+        registry.devices.iter().map(measured).collect()
+    }
+}
+
 /// When frames are, and how long they wait.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Frames {
@@ -56,6 +68,13 @@ pub(super) struct Frames {
     pub(super) hz: f64,
     /// How long after its tick a frame is evaluated.
     pub(super) wait: Duration,
+}
+
+impl Frames {
+    /// The frames of an episode that begins at `begin`; each waits for its window and for `settle`.
+    pub(super) fn of(registry: &Registry, begin: Stamp, settle: Duration) -> Self {
+        Self { begin_ns: begin.0, hz: registry.rig.observation_hz, wait: registry.rig.sync_window + settle }
+    }
 }
 
 /// What a modality was like over an episode.

@@ -37,11 +37,11 @@ use super::verdict::{Facts, FileState, Judged, Losses, judge};
 use super::writeback::Writeback;
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
-use crate::registry::{DeviceSpec, Registry};
+use crate::registry::Registry;
 use crate::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
 use crate::status::{Board, Event, RecordingStatus, What};
 use crate::sync::{Grid, SyncModality, SyncSample, Synchronizer};
-use crate::time::{Stamp, WallClock, nanoseconds};
+use crate::time::{Stamp, WallClock};
 
 /// How long after its capture a sample may arrive and still belong to its frame. The slowest we
 /// know: a camera at 15 Hz stamps the start of exposure and delivers after exposure, transfer and
@@ -97,7 +97,7 @@ impl Session {
         let said = metadata::beginning(&registry, request, &units, clock, begin);
         let mut file = EpisodeFile::begin(sink, &registry, clock, begin, said)?;
         let settle = SETTLE + registry.devices.iter().map(|device| device.latency).max().unwrap_or_default();
-        let mut measures = Measures::new(&measured(&registry), frames(&registry, begin, settle));
+        let mut measures = Measures::new(&Measured::all(&registry), Frames::of(&registry, begin, settle));
         for device in registry.devices.iter().filter(|device| attached.has(&device.name)) {
             measures.plugged(device.id, begin.0, true);
         }
@@ -190,6 +190,13 @@ impl Session {
         }
         self.failed = self.file.mask(header, mask, sequence).err();
         self.measures.mask(header.capture_ns, mask);
+    }
+
+    /// Takes an action.
+    pub(super) fn action(&mut self, header: &SampleHeader, payload: &[u8]) {
+        if self.holds(Stamp(header.capture_ns), Duration::ZERO) && self.failed.is_none() {
+            self.failed = self.file.action(header, payload).err();
+        }
     }
 
     /// Takes an event.
@@ -381,19 +388,4 @@ impl Session {
         }
         Ok(())
     }
-}
-
-/// What is measured of the devices of a registry.
-fn measured(registry: &Registry) -> Vec<Measured> {
-    let measured = |device: &DeviceSpec| Measured {
-        id: device.id,
-        limits: device.verdict,
-        latency_ns: nanoseconds(device.latency),
-    };
-    registry.devices.iter().map(measured).collect()
-}
-
-/// When the frames of an episode are that begins at `begin`.
-fn frames(registry: &Registry, begin: Stamp, settle: Duration) -> Frames {
-    Frames { begin_ns: begin.0, hz: registry.rig.observation_hz, wait: registry.rig.sync_window + settle }
 }

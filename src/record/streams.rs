@@ -39,6 +39,11 @@ impl Streams {
                     session.sample(id, header, payload, hole);
                 }
             }
+            TopicId::Action => {
+                if let Some(session) = session {
+                    session.action(header, payload);
+                }
+            }
             TopicId::Mask => {
                 let Some((mask, sequence)) = read_mask(payload) else { return };
                 let now = Last { seq: sequence, lost: 0, captured: Stamp(header.capture_ns) };

@@ -102,6 +102,7 @@ fn device(bit: u8, name: &str, node: NodeSpec) -> DeviceSpec {
         depth: 64,
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
+        action: None,
         verdict,
     }
 }

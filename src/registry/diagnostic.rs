@@ -79,7 +79,7 @@ pub(super) fn nearest<'k>(given: &str, known: impl IntoIterator<Item = &'k str>)
 }
 
 /// The fix for a name that is not known: the nearest one, or all there are.
-pub(super) fn did_you_mean(given: &str, known: &[&str], what: &str) -> String {
+pub(crate) fn did_you_mean(given: &str, known: &[&str], what: &str) -> String {
     match nearest(given, known.iter().copied()) {
         Some(name) => format!("did you mean \"{name}\"?"),
         None => format!("{what}: {}", known.join(", ")),

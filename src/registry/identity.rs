@@ -19,7 +19,7 @@ use std::collections::VecDeque;
 use std::path::Path;
 
 use super::attachment::{Attachment, DeviceNode, UsbIdentity};
-use super::scenario::SimSource;
+use super::scenario::{SimSource, TaskPart};
 use super::spec::{DeviceSpec, IdentitySpec, NodeSpec, Opens, Registry};
 use crate::modality::ModalityId;
 
@@ -358,8 +358,12 @@ impl Entry {
             DeviceNode::Tty(_) => self.kind == Kind::Serial,
             DeviceNode::Usb(_) => self.kind == Kind::Usb,
             DeviceNode::Sim(device) => match device.source {
-                SimSource::Camera { .. } => self.kind == Kind::Camera && !self.is_process,
-                SimSource::Serial { .. } => self.kind == Kind::Serial && !self.is_process,
+                SimSource::Camera { .. } | SimSource::Task { part: TaskPart::Wrist | TaskPart::Tactile, .. } => {
+                    self.kind == Kind::Camera && !self.is_process
+                }
+                SimSource::Serial { .. } | SimSource::Task { part: TaskPart::Arm, .. } => {
+                    self.kind == Kind::Serial && !self.is_process
+                }
                 SimSource::Process => self.is_process,
                 // A recorded topic stands for whatever recorded it.
                 SimSource::Replay { .. } => true,

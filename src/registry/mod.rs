@@ -14,16 +14,18 @@ pub mod scenario;
 mod scenario_file;
 mod section;
 mod spec;
+pub mod task;
 pub mod trust;
 pub mod units;
 mod words;
 
 pub use attachment::{Attachment, DeviceNode, UsbIdentity};
+pub(crate) use diagnostic::did_you_mean;
 pub use diagnostic::{Diagnostic, RegistryErrors};
 pub use identity::{Assigner, Assignment, Detached, Explanation};
 pub use limits::{Limits, VerdictSpec};
 pub use parse::{BUILTIN, Loaded};
 pub use spec::{
-    CameraSpec, DeviceSpec, Framing, IdentitySpec, MAX_BORROWED, MAX_SUBSCRIBERS, Mount, NodeSpec, Opens, POOL_SPARE,
-    Parse, PixelFormat, ProcessSpec, Registry, RigSpec, SerialSpec, WhenStale,
+    ActionSpec, CameraSpec, DeviceSpec, Framing, IdentitySpec, MAX_BORROWED, MAX_SUBSCRIBERS, Mount, NodeSpec, Opens,
+    POOL_SPARE, Parse, PixelFormat, ProcessSpec, Registry, RigSpec, SerialSpec, WhenStale,
 };

@@ -6,6 +6,7 @@
 //! Invariant: no text makes this panic.
 //! Invariant: all problems of a file are reported at once, each with its place and a fix.
 
+mod action;
 mod budget;
 mod device;
 mod file;
@@ -86,6 +87,7 @@ impl Registry {
         }
         check_identities(&drafts, &mut problems);
         check_topics(&drafts, &mut problems);
+        check_actuators(&drafts, &mut problems);
         let mut warnings = assign_bits(&mut drafts, &mut problems);
         warnings.extend(unused_ports(&drafts, &problems));
         warnings.extend(drafts.iter().filter_map(|draft| program::distrusted(draft, &problems)));
@@ -236,6 +238,16 @@ fn check_topics(drafts: &[Draft<'_>], problems: &mut Problems<'_>) {
         );
         let fix = format!("choose another, for example {:?}", format!("{}/{}", draft.topic, draft.name));
         draft.section.report(problems, "topic", message, fix);
+    }
+}
+
+/// An action has no name of a device in it: it means the one actuator there is.
+fn check_actuators(drafts: &[Draft<'_>], problems: &mut Problems<'_>) {
+    let mut actuators = drafts.iter().filter(|draft| draft.action.is_some());
+    let Some(first) = actuators.next() else { return };
+    for draft in actuators {
+        let message = format!("[{}] is an actuator already, and a rig has one", first.section.entry);
+        draft.section.report(problems, "action", message, "remove one of the two action tables");
     }
 }
 

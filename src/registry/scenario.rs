@@ -5,9 +5,10 @@
 //!
 //! [`Attachment`]: super::Attachment
 
+use std::any::Any;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::Duration;
 
 use super::attachment::UsbIdentity;
@@ -84,6 +85,13 @@ pub enum SimSource {
         /// Chooses the values.
         seed: u64,
     },
+    /// A part of the simulated task.
+    Task {
+        /// Which.
+        part: TaskPart,
+        /// The trial it stands in, with the other parts.
+        scene: Arc<Scene>,
+    },
     /// Nothing of its own: the program of the entry runs as it would for a real device.
     Process,
     /// The samples of one topic of a recorded episode, at their recorded distances in time.
@@ -95,6 +103,32 @@ pub enum SimSource {
         /// Wall time of the episode's beginning as recorded, ns: moment zero of the scenario.
         begin_ns: u64,
     },
+}
+
+/// A device of the simulated task.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum TaskPart {
+    /// The camera at the wrist.
+    Wrist,
+    /// The camera behind the gel of the fingertip.
+    Tactile,
+    /// The arm with its gripper: tells its state, and is the actuator.
+    Arm,
+}
+
+/// What the devices of one simulated task share. What it holds is the driver's own.
+#[derive(Debug)]
+pub struct Scene {
+    /// Number of the trial.
+    pub seed: u64,
+    /// The trial, once a device has been opened.
+    pub trial: OnceLock<Arc<dyn Any + Send + Sync>>,
+}
+
+impl PartialEq for Scene {
+    fn eq(&self, other: &Self) -> bool {
+        self.seed == other.seed
+    }
 }
 
 /// What stands for the kernel's driver of a simulated device.

@@ -105,6 +105,12 @@ impl Scenario {
         Ok(Self { devices, events: events.into_iter().map(|placed| placed.event).collect(), repeat })
     }
 
+    /// Every entry is plugged in, and nothing happens.
+    #[must_use]
+    pub(super) fn quiet(registry: &Registry) -> Self {
+        Self { devices: every_entry(registry), events: Vec::new(), repeat: None }
+    }
+
     /// What `rapid --sim` plays without a file: everything is plugged; the second camera, or for
     /// want of one the last device, is pulled at 3 s and plugged again at 6 s, every 12 s.
     #[must_use]
@@ -217,7 +223,7 @@ fn device(section: &Section<'_>, registry: &Registry, problems: &mut Problems<'_
             *rate = hz.unwrap_or(*rate);
             *chosen = seed.unwrap_or(*chosen);
         }
-        SimSource::Process | SimSource::Replay { .. } => {}
+        SimSource::Task { .. } | SimSource::Process | SimSource::Replay { .. } => {}
     }
     device.plugged = section.flag(problems, "plugged").unwrap_or(true);
     device.usb.vid = section.usb_id(problems, "vid").unwrap_or(device.usb.vid);

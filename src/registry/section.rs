@@ -4,6 +4,8 @@
 //! been reported: the reader goes on with the default either way, so that one look finds all
 //! problems, and the result is thrown away if there were any.
 
+mod list;
+
 use std::ops::RangeInclusive;
 use std::path::Path;
 use std::time::Duration;

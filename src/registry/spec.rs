@@ -87,6 +87,22 @@ pub struct DeviceSpec {
     pub latency: Duration,
     /// What the verdict on its part of an episode is made of.
     pub verdict: VerdictSpec,
+    /// The device is an actuator, and takes these actions.
+    pub action: Option<ActionSpec>,
+}
+
+/// `[device.NAME.action]`: what an actuator may be told. All lists have one entry an axis, `1..=64` of
+/// them.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ActionSpec {
+    /// What each axis is called.
+    pub names: Vec<String>,
+    /// Its unit, for people.
+    pub units: Vec<String>,
+    /// Lowest target, finite.
+    pub min: Vec<f64>,
+    /// Highest target, finite and above the lowest.
+    pub max: Vec<f64>,
 }
 
 /// Which USB device an entry means.
@@ -265,6 +281,12 @@ impl Registry {
     #[must_use]
     pub fn device(&self, id: ModalityId) -> Option<&DeviceSpec> {
         self.devices.iter().find(|device| device.id == id)
+    }
+
+    /// The actuator, if there is one.
+    #[must_use]
+    pub fn actuator(&self) -> Option<(&DeviceSpec, &ActionSpec)> {
+        self.devices.iter().find_map(|device| Some((device, device.action.as_ref()?)))
     }
 
     /// The entry of this name.

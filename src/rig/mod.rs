@@ -13,9 +13,22 @@ pub mod slot;
 mod stream;
 mod worker;
 
-pub use owner::{Rig, RigError};
+pub use owner::Rig;
 
+use crate::hotplug::HotplugError;
 use crate::modality::ModalityId;
+use presence::PresenceError;
+
+/// Why the rig cannot go on.
+#[derive(Debug, thiserror::Error)]
+pub enum RigError {
+    /// Plugging can no longer be watched.
+    #[error(transparent)]
+    Hotplug(#[from] HotplugError),
+    /// The mask cannot be published.
+    #[error(transparent)]
+    Presence(#[from] PresenceError),
+}
 
 /// What the rig may be asked for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -11,13 +11,13 @@ use tokio::task::{Id, JoinError, JoinSet};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep, timeout};
 use tokio_util::sync::CancellationToken;
 
-use super::RigCommand;
-use super::presence::{JsonDevice, Presence, PresenceError};
+use super::presence::{JsonDevice, Presence};
 use super::slot::{Effects, End, Input, Slot};
 use super::stream::{Numbers, Report, Reported, Stream};
 use super::worker::{Seat, Workers};
-use crate::bus::{Bus, TopicId, Writer};
-use crate::hotplug::{HotplugError, HotplugEvent, HotplugStream, Witness};
+use super::{RigCommand, RigError};
+use crate::bus::{Actions, Bus, TopicId, Writer};
+use crate::hotplug::{HotplugEvent, HotplugStream, Witness};
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::registry::{Assigner, Assignment, Attachment, DeviceSpec, Registry};
@@ -31,17 +31,6 @@ const JSON_PERIOD: Duration = Duration::from_secs(1);
 const STOP_LIMIT: Duration = Duration::from_millis(500);
 /// Reports that may wait; streams report a few times in their life.
 const REPORT_DEPTH: usize = 1024;
-
-/// Why the rig cannot go on.
-#[derive(Debug, thiserror::Error)]
-pub enum RigError {
-    /// Plugging can no longer be watched.
-    #[error(transparent)]
-    Hotplug(#[from] HotplugError),
-    /// The mask cannot be published.
-    #[error(transparent)]
-    Presence(#[from] PresenceError),
-}
 
 /// Owner of every device's life and of the mask.
 #[derive(Debug)]
@@ -74,6 +63,8 @@ struct Modality {
     stop: CancellationToken,
     /// Where its program works, if it has one.
     seat: Option<Seat>,
+    /// What it is told, if it is the actuator.
+    actions: Option<Arc<Actions>>,
     /// What was agreed with the device, or why it does not run.
     detail: String,
 }
@@ -92,6 +83,7 @@ impl Rig {
                 numbers: Arc::default(),
                 attached: Stamp::default(),
                 stop: CancellationToken::new(),
+                actions: spec.action.as_ref().and_then(|_| bus.actions()),
                 seat: workers.as_ref().and_then(|workers| workers.seat(spec, bus)),
                 detail: String::new(),
             })
@@ -261,7 +253,7 @@ impl Rig {
             Report::Stalled => self.apply(id, Input::Stalled(epoch)),
             Report::Resumed => self.apply(id, Input::Resumed(epoch)),
             Report::Refused(reason) => {
-                let text = format!("{}: samples are lost: {reason}", modality.spec.name);
+                let text = format!("{}: {reason}", modality.spec.name);
                 self.board.announce(What::Log { level: Level::Error, text });
             }
         }
@@ -337,6 +329,7 @@ impl Rig {
             reports,
             stop: modality.stop.clone(),
             seat: modality.seat.clone(),
+            actions: modality.actions.clone(),
         };
         let task = self.streams.spawn(stream.run());
         self.tasks.insert(task.id(), (id, epoch));

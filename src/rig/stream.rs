@@ -9,12 +9,13 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use tokio::sync::mpsc;
-use tokio::time::{Instant, sleep_until, timeout};
+use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until, timeout};
 use tokio_util::sync::CancellationToken;
 
 use super::slot::End;
 use super::worker::{MOST_SILENT_BEATS, Seat, Worker};
-use crate::bus::Writer;
+use crate::action::MAX_ACTION;
+use crate::bus::{Actions, Writer};
 use crate::driver::{Driver, DriverError, Reading};
 use crate::fault;
 use crate::provenance::Negotiated;
@@ -33,6 +34,8 @@ const SILENT_AFTER: Duration = Duration::from_secs(2);
 /// A camera always sends: one that has sent nothing for this long is opened again. Six of these and the
 /// delays between them fit into the minute in which five restarts are allowed.
 const CAMERA_LIMIT: Duration = Duration::from_secs(5);
+/// How often the actuator is asked whether it was told something.
+const ACTIONS_EVERY: Duration = Duration::from_millis(2);
 
 /// What a stream tells the rig while it runs.
 #[derive(Debug, Clone, PartialEq)]
@@ -47,7 +50,7 @@ pub(super) enum Report {
     Stalled,
     /// Samples come again.
     Resumed,
-    /// A sample could not be published; told once an epoch.
+    /// Samples or actions are lost, and why; told once an epoch.
     Refused(String),
 }
 
@@ -88,6 +91,8 @@ pub(super) struct Stream {
     pub(super) stop: CancellationToken,
     /// Where the program of the entry works, if it has one.
     pub(super) seat: Option<Seat>,
+    /// What it is told, if it is the actuator.
+    pub(super) actions: Option<Arc<Actions>>,
 }
 
 /// Where the samples of a stream come from.
@@ -120,6 +125,13 @@ impl Source {
         match self {
             Self::Driver(driver) => driver.description(),
             Self::Worker(worker) => worker.description(),
+        }
+    }
+
+    fn command(&mut self, target: &[f64]) -> Result<(), DriverError> {
+        match self {
+            Self::Driver(driver) => driver.command(target),
+            Self::Worker(_) => Err(DriverError::Fatal("a program of the rig takes no actions".to_owned())),
         }
     }
 
@@ -171,6 +183,11 @@ impl Stream {
         tokio::pin!(stall);
         let silent = self.silence();
         tokio::pin!(silent);
+        let mut told = interval(ACTIONS_EVERY);
+        told.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut action = [0.0; MAX_ACTION];
+        // What was said before it was there was not meant for now.
+        let _ = self.actions.as_ref().and_then(|actions| actions.newest(&mut action));
         // The timer is looked at when it fires, not set anew at every sample.
         let mut newest = Instant::now();
         loop {
@@ -186,12 +203,22 @@ impl Stream {
                         && !refused
                     {
                         refused = true;
-                        self.report(Report::Refused(reason)).await;
+                        self.report(Report::Refused(format!("samples are lost: {reason}"))).await;
                     }
                     if pulse != Pulse::Beating {
                         let report = if pulse == Pulse::Silent { Report::Started } else { Report::Resumed };
                         pulse = Pulse::Beating;
                         self.report(report).await;
+                    }
+                }
+                _ = told.tick(), if self.actions.is_some() => {
+                    let newest = self.actions.as_ref().and_then(|actions| actions.newest(&mut action));
+                    if let Some(target) = newest
+                        && let Err(error) = source.command(target)
+                        && !refused
+                    {
+                        refused = true;
+                        self.report(Report::Refused(format!("it does not move: {error}"))).await;
                     }
                 }
                 reason = &mut silent, if pulse == Pulse::Silent => return (End::Retry, reason),

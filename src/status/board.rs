@@ -14,7 +14,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::broadcast;
 
-use super::{DeviceStatus, Event, LogLine, RecordingStatus, SlotState, Snapshot, Verdict, What};
+use super::{DeviceStatus, Event, LogLine, PolicyStatus, RecordingStatus, SlotState, Snapshot, Verdict, What};
 use crate::mask::PhysicalMask;
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::registry::Registry;
@@ -80,6 +80,7 @@ pub struct Board {
     mask: AtomicU64,
     mask_sequence: AtomicU64,
     recording: Mutex<Option<RecordingStatus>>,
+    policy: Mutex<Option<PolicyStatus>>,
     last_episode: Mutex<Option<(PathBuf, Verdict)>>,
     last_end: Mutex<Option<EpisodeEnd>>,
     log: Mutex<VecDeque<LogLine>>,
@@ -101,6 +102,7 @@ impl Board {
             mask: AtomicU64::new(0),
             mask_sequence: AtomicU64::new(0),
             recording: Mutex::new(None),
+            policy: Mutex::new(None),
             last_episode: Mutex::new(None),
             last_end: Mutex::new(None),
             log: Mutex::new(VecDeque::with_capacity(LOG_LINES)),
@@ -128,6 +130,12 @@ impl Board {
         self.mask_sequence.store(sequence, Ordering::Relaxed);
     }
 
+    /// The mask as published.
+    #[must_use]
+    pub fn mask(&self) -> PhysicalMask {
+        PhysicalMask(self.mask.load(Ordering::Relaxed))
+    }
+
     /// Publications of the mask so far.
     #[must_use]
     pub fn mask_sequence(&self) -> u64 {
@@ -137,6 +145,17 @@ impl Board {
     /// Reports the recording in progress, or that there is none.
     pub fn set_recording(&self, recording: Option<RecordingStatus>) {
         *lock(&self.recording) = recording;
+    }
+
+    /// Is an episode in progress?
+    #[must_use]
+    pub fn is_recording(&self) -> bool {
+        lock(&self.recording).is_some()
+    }
+
+    /// Reports what the policy does, or that there is none.
+    pub fn set_policy(&self, policy: Option<PolicyStatus>) {
+        *lock(&self.policy) = policy;
     }
 
     /// Reports the last file finished.
@@ -207,10 +226,11 @@ impl Board {
             rig: self.rig.clone(),
             taken,
             uptime: taken.since(self.started),
-            mask: PhysicalMask(self.mask.load(Ordering::Relaxed)),
+            mask: self.mask(),
             mask_sequence: self.mask_sequence.load(Ordering::Relaxed),
             devices: devices.collect(),
             recording: lock(&self.recording).clone(),
+            policy: lock(&self.policy).clone(),
             last_episode,
             last_verdict: last_verdict.unwrap_or_default(),
             log: lock(&self.log).iter().cloned().collect(),

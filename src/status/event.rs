@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use serde::Serialize;
 
-use super::{Grade, Level, SlotState, Verdict};
+use super::{Chunk, Grade, Level, SlotState, Verdict};
 use crate::modality::ModalityId;
 use crate::provenance::{KernelDriver, Negotiated};
 use crate::registry::UsbIdentity;
@@ -136,6 +136,51 @@ pub enum What {
         /// What is there and what is lost, for people.
         text: String,
     },
+    /// A policy was loaded and runs from now on.
+    Policy {
+        /// What its bundle calls itself.
+        policy: String,
+        /// Folder of the bundle.
+        #[serde(serialize_with = "text::lossy")]
+        folder: PathBuf,
+        /// Names the bundle's contents.
+        hash: String,
+        /// Where onnxruntime comes from.
+        library: String,
+        /// Ticks of its control grid a second.
+        hz: f64,
+        /// Nothing is carried out.
+        dry_run: bool,
+    },
+    /// The policy gave actions.
+    Chunk(Box<Chunk>),
+    /// The policy does nothing from this moment on.
+    Hold {
+        /// The modality whose absence is the reason, or empty.
+        device: String,
+        /// Why.
+        reason: String,
+    },
+    /// The policy acts again, or for the first time.
+    Act {
+        /// Tick of the control grid.
+        tick: u64,
+    },
+    /// The policy ended.
+    PolicyEnd {
+        /// Ticks with an action.
+        actions: u64,
+        /// Ticks without.
+        held: u64,
+        /// Chunks that were used.
+        chunks: u64,
+        /// Answers that were not used or never came.
+        unused: u64,
+        /// From the observation to the chunk, ms: half of them were faster.
+        latency_p50_ms: f64,
+        /// Of a hundred one was slower.
+        latency_p99_ms: f64,
+    },
     /// A line of the log that has no event of its own.
     Log {
         /// Severity.
@@ -197,6 +242,28 @@ impl What {
                 (level, text)
             }
             Self::Unregistered { device, reason } => (Level::Info, format!("{device} is not used: {reason}")),
+            Self::Policy { policy, hz, dry_run, library, .. } => {
+                let dry = if *dry_run { ", dry run: nothing moves" } else { "" };
+                (Level::Info, format!("policy {policy} at {hz} Hz, onnxruntime {library}{dry}"))
+            }
+            Self::Chunk(chunk) => {
+                let late = if chunk.skipped > 0 { format!(", {} actions late", chunk.skipped) } else { String::new() };
+                let text =
+                    format!("chunk of tick {}: {:.1} ms{late}, mask {}", chunk.tick, chunk.latency_ms, chunk.mask);
+                (if chunk.skipped > 0 { Level::Warn } else { Level::Debug }, text)
+            }
+            Self::Hold { device, reason } => {
+                let device = if device.is_empty() { String::new() } else { format!(": {device}") };
+                (Level::Warn, format!("policy holds: {reason}{device}"))
+            }
+            Self::Act { tick } => (Level::Info, format!("policy acts from tick {tick}")),
+            Self::PolicyEnd { actions, held, chunks, unused, latency_p50_ms, latency_p99_ms } => {
+                let text = format!(
+                    "policy ended: {actions} actions, {held} ticks held, {chunks} chunks, {unused} not used, latency p50 \
+                     {latency_p50_ms:.1} ms p99 {latency_p99_ms:.1} ms"
+                );
+                (Level::Info, text)
+            }
             Self::Recording { file } => (Level::Info, format!("recording {}", file.display())),
             Self::Episode { file, seconds, error: Some(error), verdict, .. } => {
                 let word = if self.is_cut_short() { "cut short" } else { "not whole" };

@@ -126,6 +126,7 @@ pub(crate) fn board(names: &[&str]) -> Board {
         depth: 8,
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
+        action: None,
         verdict: crate::registry::VerdictSpec::of(
             crate::modality::ModalityKind::Image,
             Duration::from_millis(500),

@@ -8,6 +8,7 @@ pub mod board;
 mod event;
 #[cfg(test)]
 pub(crate) mod literal;
+mod policy;
 pub mod rates;
 mod verdict;
 
@@ -24,6 +25,7 @@ use crate::time::Stamp;
 
 pub use board::{Board, EpisodeEnd};
 pub use event::{Event, Provenance, What};
+pub use policy::{Chunk, ObservedSamples, PolicyStatus};
 pub use verdict::{Grade, Verdict};
 
 /// What the device of a modality is doing.
@@ -158,6 +160,8 @@ pub struct Snapshot {
     pub devices: Vec<DeviceStatus>,
     /// The recording in progress.
     pub recording: Option<RecordingStatus>,
+    /// The policy at the controls, if one is.
+    pub policy: Option<PolicyStatus>,
     /// The last file finished.
     #[serde(serialize_with = "text::lossy_option")]
     pub last_episode: Option<PathBuf>,

@@ -5,11 +5,11 @@ use std::time::Duration;
 
 use super::program::Programs;
 use super::verdict::{VerdictTable, Whose};
-use super::{node, process, verdict};
+use super::{action, node, process, verdict};
 use crate::modality::ModalityId;
 use crate::registry::diagnostic::did_you_mean;
 use crate::registry::section::{At, Problems, Section};
-use crate::registry::spec::{DeviceSpec, IdentitySpec, Mount, NodeSpec, Opens, WhenStale};
+use crate::registry::spec::{ActionSpec, DeviceSpec, IdentitySpec, Mount, NodeSpec, Opens, WhenStale};
 
 /// Kinds of node this version has a driver for.
 pub(super) const BUILT_IN: [(&str, Kind); 2] = [("camera", Kind::Camera), ("serial", Kind::Serial)];
@@ -17,7 +17,7 @@ pub(super) const BUILT_IN: [(&str, Kind); 2] = [("camera", Kind::Camera), ("seri
 const PLANNED: [&str; 2] = ["can", "lan"];
 /// Keys that only planned kinds of node have.
 const PLANNED_KEYS: [&str; 4] = ["can", "lan", "on_attach", "on_detach"];
-const KEYS: [&str; 17] = [
+const KEYS: [&str; 18] = [
     "vid",
     "pid",
     "serial",
@@ -35,6 +35,7 @@ const KEYS: [&str; 17] = [
     "camera",
     "process",
     "verdict",
+    "action",
 ];
 
 /// The mask is 64 bits wide.
@@ -71,6 +72,7 @@ pub(super) struct Draft<'a> {
     when_stale: WhenStale,
     latency: Duration,
     verdict: VerdictTable,
+    pub(super) action: Option<ActionSpec>,
 }
 
 impl Draft<'_> {
@@ -91,6 +93,7 @@ impl Draft<'_> {
             depth: usize::try_from(self.depth).ok()?,
             when_stale: self.when_stale,
             latency: self.latency,
+            action: self.action,
         })
     }
 
@@ -179,6 +182,7 @@ pub(super) fn read<'a>(
         when_stale,
         latency,
         verdict: verdict::read(&section, Whose::Device, problems),
+        action: action::action(&section, problems),
         node: settings,
         section,
     }

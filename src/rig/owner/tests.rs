@@ -7,6 +7,7 @@ use futures::channel::mpsc::{UnboundedSender, unbounded};
 use tokio::sync::broadcast;
 
 use super::*;
+use crate::hotplug::HotplugError;
 use crate::registry::scenario::{SimDevice, SimSource};
 use crate::registry::{
     DeviceNode, Framing, IdentitySpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbIdentity, WhenStale,
@@ -33,6 +34,7 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
         depth: 16,
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
+        action: None,
         verdict: crate::registry::VerdictSpec::of(
             crate::modality::ModalityKind::Image,
             Duration::from_millis(500),

@@ -1,0 +1,160 @@
+"""Writes policy.json and README.md of a bundle."""
+
+import hashlib
+import json
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+
+from . import Unsupported
+from .checkpoint import Checkpoint
+from .config import Config
+from .graphs import CONDITION, MASK
+
+FORMAT = "rapid-policy/1"
+
+
+@dataclass
+class Options:
+    """What a checkpoint does not say of the rig."""
+
+    name: str
+    hz: float
+    # Modality of each observation, and the entry that is moved.
+    modalities: dict[str, str]
+    actuator: str
+    mask_aware: bool = False
+    # Cameras without which the policy does not run; all of them if the bundle is not mask-aware.
+    required: set[str] = field(default_factory=set)
+    max_age_ms: int = 300
+    action_names: list[str] = field(default_factory=list)
+    action_units: list[str] = field(default_factory=list)
+    # The data's own meta/stats.json, instead of the checkpoint's copy, for the limits of the actions.
+    dataset_stats: dict | None = None
+
+
+def input_names(config: Config) -> dict[str, str]:
+    """The name in the bundle of each observation: the last part of LeRobot's key, `observation.images.top` -> `top`."""
+    names = {key: key.rsplit(".", 1)[-1] for key in config.keys}
+    taken = {MASK: "the mask", CONDITION: "the encoder's output"}
+    for key, name in names.items():
+        if name in taken:
+            raise Unsupported(
+                f"{config.folder / 'config.json'}: input_features.{key}: {taken[name]} has the name {name}, too"
+            )
+        taken[name] = key
+    return names
+
+
+def write_policy(checkpoint: Checkpoint, options: Options, graphs: dict[str, str], folder: Path) -> dict:
+    """Writes policy.json beside the graphs it names, and returns what is in it."""
+    config, names = checkpoint.config, input_names(checkpoint.config)
+    observations = []
+    for key in config.keys:
+        observation = {"key": names[key], "kind": "vector", "modality": options.modalities[key], "required": True}
+        if key in config.cameras:
+            observation |= {"kind": "image", "required": not options.mask_aware or key in options.required}
+            # Resize and crop are in the graph.
+            observation |= {
+                "shape": config.cameras[key],
+                "color": "rgb",
+                "resize": None,
+                "crop": None,
+                "operation": None,
+            }
+        else:
+            observation |= {"shape": [config.state_len]}
+        observations.append(observation | {"normalization": checkpoint.normalization(key)})
+    mask = None
+    if options.mask_aware:
+        order = [options.modalities[key] for key in config.cameras]
+        mask = {"input": MASK, "order": order, "absent": "zero_embedding"}
+    policy = {
+        "format": FORMAT,
+        "name": options.name,
+        "mask_aware": options.mask_aware,
+        "n_obs_steps": config.n_obs_steps,
+        "horizon": config.horizon,
+        "n_action_steps": config.n_action_steps,
+        # LeRobot's first predicted action is that of the oldest observation.
+        "action_start": config.n_obs_steps - 1,
+        "control_hz": options.hz,
+        "max_observation_age_ms": options.max_age_ms,
+        "observations": observations,
+        "mask": mask,
+        "action": {
+            "actuator": options.actuator,
+            "shape": [config.action_len],
+            "names": options.action_names or [f"a{i}" for i in range(config.action_len)],
+            "units": options.action_units or ["1"] * config.action_len,
+            "representation": "absolute",
+            "limits": checkpoint.action_limits(options.dataset_stats),
+            "normalization": checkpoint.action_normalization(),
+        },
+        "scheduler": checkpoint.scheduler(),
+        "graphs": {name: {"file": file, "sha256": sha256(folder / file)} for name, file in graphs.items()},
+        "training": provenance(config),
+    }
+    save(policy, folder)
+    return policy
+
+
+def provenance(config: Config) -> dict:
+    weights = config.folder / "model.safetensors"
+    return {
+        "source": "LeRobot DiffusionPolicy checkpoint",
+        "weights_sha256": sha256(weights),
+        "exported_with": {name: version(name) for name in ("lerobot", "torch", "onnx")},
+        "config": config.raw,
+    }
+
+
+def save(policy: dict, folder: Path) -> None:
+    text = json.dumps(policy, indent=2, ensure_ascii=False, allow_nan=False)
+    (folder / "policy.json").write_text(text + "\n", encoding="utf-8")
+
+
+def sha256(file: Path) -> str:
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def write_card(policy: dict, folder: Path) -> None:
+    """README.md: the model card, from what policy.json says."""
+    action, scheduler, training = policy["action"], policy["scheduler"], policy["training"]
+    rows = []
+    for spec in policy["observations"]:
+        what = f"{spec['kind']} {' x '.join(str(n) for n in spec['shape'])}"
+        need = "required" if spec["required"] else "may be absent"
+        rows.append(f"| `{spec['key']}` | `{spec['modality']}` | {what} | {spec['normalization']['mode']} | {need} |")
+    executed = f"{policy['n_action_steps']} of them, from number {policy['action_start']} on"
+    values = ", ".join(f"`{name}` [{unit}]" for name, unit in zip(action["names"], action["units"], strict=True))
+    steps = f"{scheduler['num_inference_steps']} of {scheduler['num_train_timesteps']} steps"
+    differences = ", ".join(f"{name} {value:.1e}" for name, value in training["verification"].items())
+    if policy["mask_aware"]:
+        mask = (
+            "Mask-aware by request: an absent camera's embedding is replaced by zeros. That serves only a policy that "
+            "was trained with cameras left out in the same way; nothing in the checkpoint tells whether this one was."
+        )
+    else:
+        mask = "Not mask-aware: every observation is required."
+    (folder / "README.md").write_text(
+        f"""# {policy["name"]}
+
+A LeRobot DiffusionPolicy, exported by `models/export_lerobot.py`. `policy.json` has every number below.
+
+| observation | modality | what | normalisation | presence |
+|---|---|---|---|---|
+{chr(10).join(rows)}
+
+{policy["n_obs_steps"]} observations at {policy["control_hz"]:g} Hz give {policy["horizon"]} actions. {executed},
+are executed by `{action["actuator"]}`, within the range of the training data: {values}.
+{mask}
+
+Scheduler: {scheduler["type"]}, {steps}, {scheduler["beta_schedule"]}, predicts {scheduler["prediction_type"]}.
+
+Weights: SHA-256 `{training["weights_sha256"]}`. Largest difference from LeRobot at export, over random
+observations: {differences}. How well the policy does its task was not measured.
+""",
+        encoding="utf-8",
+    )

@@ -1,0 +1,48 @@
+//! What the actuator is told: the topic of actions, for the one stream that reads the device.
+
+use iceoryx2::port::subscriber::Subscriber;
+
+use super::{BusError, Service, TopicFactory, TopicSpec, topic_error};
+use crate::action::MAX_ACTION;
+use crate::sample::{Encoding, SampleHeader};
+
+/// The consumer of actions.
+pub struct Actions {
+    topic: String,
+    depth: usize,
+    subscriber: Subscriber<Service, [u8], SampleHeader>,
+}
+
+impl std::fmt::Debug for Actions {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Actions").field("topic", &self.topic).finish_non_exhaustive()
+    }
+}
+
+impl Actions {
+    pub(super) fn open(spec: &TopicSpec, factory: &TopicFactory) -> Result<Self, BusError> {
+        let subscriber = factory.subscriber_builder().buffer_size(spec.depth).create();
+        let subscriber = subscriber.map_err(|error| topic_error(&spec.name, &error))?;
+        Ok(Self { topic: spec.name.clone(), depth: spec.depth, subscriber })
+    }
+
+    /// Writes the newest action that waits into `action` and forgets the older ones; `None` if none waits.
+    /// What is no list of at most [`MAX_ACTION`] finite numbers is no action, whoever published it.
+    pub fn newest<'a>(&self, action: &'a mut [f64; MAX_ACTION]) -> Option<&'a [f64]> {
+        let mut axes = None;
+        for _ in 0..self.depth {
+            let Ok(Some(sample)) = self.subscriber.receive() else { break };
+            let (numbers, rest) = sample.payload().as_chunks::<8>();
+            let is_numbers = sample.user_header().encoding == Encoding::F64 as u32 && rest.is_empty();
+            let finite = numbers.iter().all(|number| f64::from_le_bytes(*number).is_finite());
+            if !is_numbers || !finite || numbers.is_empty() || numbers.len() > MAX_ACTION {
+                continue;
+            }
+            for (place, number) in action.iter_mut().zip(numbers) {
+                *place = f64::from_le_bytes(*number);
+            }
+            axes = Some(numbers.len());
+        }
+        action.get(..axes?)
+    }
+}

@@ -1,0 +1,88 @@
+//! `rapid --sim task --expert --record`: demonstrations of the simulated task, recorded faster than they
+//! would take.
+
+use std::io::{self, Write};
+use std::sync::Arc;
+use std::time::Instant;
+
+use serde_json::json;
+
+use super::Format;
+use super::progress::Bar;
+use crate::driver::sim::task::Texture;
+use crate::lockstep::STEP;
+use crate::lockstep::collect::{self, CollectError};
+use crate::record::EpisodeRequest;
+use crate::registry::Registry;
+use crate::status::{Board, Grade};
+use crate::text;
+
+/// Why not all of them were recorded.
+#[derive(Debug, thiserror::Error)]
+pub enum DemonstrateError {
+    /// A demonstration.
+    #[error(transparent)]
+    Collect(#[from] CollectError),
+    /// An episode's file is not whole.
+    #[error("{0}")]
+    Episode(String),
+    /// The output.
+    #[error("output: {0}")]
+    Output(#[from] io::Error),
+}
+
+/// Records `count` demonstrations from seed `first` on, half of them of each texture, and says what they
+/// are. Stops between two of them when `stop` says so.
+///
+/// # Errors
+/// When one cannot be recorded; those before it are whole.
+pub fn run(
+    request: &EpisodeRequest,
+    first: u64,
+    count: usize,
+    format: Format,
+    stop: &dyn Fn() -> bool,
+    out: &mut dyn Write,
+) -> Result<(), DemonstrateError> {
+    let registry = Arc::new(Registry::task());
+    let board = Arc::new(Board::new(&registry));
+    let begun = Instant::now();
+    let mut bar = Bar::new("episodes", count, format == Format::Text);
+    let (mut done, mut steps, mut triangular, mut good) = (0, 0, 0, 0);
+    for seed in collect::seeds(first, count) {
+        if stop() {
+            break;
+        }
+        bar.at(done);
+        let demonstration = collect::demonstrate(&registry, &board, request, seed)?;
+        if let Some(error) = demonstration.report.error {
+            return Err(DemonstrateError::Episode(error));
+        }
+        done += 1;
+        steps += demonstration.steps;
+        triangular += usize::from(demonstration.texture == Texture::Triangular);
+        good += usize::from(demonstration.report.verdict.grade == Grade::Good);
+        if format == Format::Json {
+            let report = &demonstration.report;
+            let texture = if demonstration.texture == Texture::Triangular { "triangular" } else { "hexagonal" };
+            let said = json!({"event": "demonstration", "seed": seed, "texture": texture,
+                "steps": demonstration.steps, "file": report.file.to_string_lossy(), "verdict": report.verdict.grade});
+            writeln!(out, "{said}")?;
+        }
+    }
+    bar.clear();
+    if format == Format::Text {
+        let (recorded, taken) = (STEP * steps, begun.elapsed());
+        let times = recorded.as_secs_f64() / taken.as_secs_f64().max(1e-9);
+        let folder = text::plain(&request.out.to_string_lossy()).into_owned();
+        writeln!(
+            out,
+            "{done} demonstrations in {folder}: {triangular} triangular, {} hexagonal, {good} GOOD; {steps} steps, {} of \
+             robot time in {:.1} s ({times:.0} times as fast)",
+            done - triangular,
+            text::clock(recorded),
+            taken.as_secs_f64(),
+        )?;
+    }
+    Ok(())
+}

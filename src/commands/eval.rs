@@ -1,0 +1,224 @@
+//! `rapid eval`: closed-loop trials of a policy on the simulated task, as the paper's table of hot-plug
+//! robustness has them.
+
+use std::io::{self, Write};
+use std::path::PathBuf;
+use std::time::Instant;
+
+use serde_json::json;
+
+use super::Format;
+use super::progress::Bar;
+use crate::driver::sim::task::Outcome;
+use crate::lockstep::evaluate::{Bench, Condition, Configuration, Status, Trial, TrialError, robot_time, wilson};
+use crate::policy::bundle::{Bundle, BundleErrors};
+use crate::policy::library::{Environment, LibraryError};
+use crate::policy::model::Model;
+use crate::policy::sampler::PolicyError;
+use crate::registry::Registry;
+use crate::text;
+
+/// What is evaluated.
+#[derive(Debug, Clone)]
+pub struct EvalOptions {
+    /// Folder of the policy.
+    pub bundle: PathBuf,
+    /// Trials a condition.
+    pub trials: usize,
+    /// Number of the first trial.
+    pub seed: u64,
+    /// Which conditions.
+    pub conditions: Vec<Condition>,
+    /// Which sensors a run expects.
+    pub configuration: Configuration,
+    /// Steps of denoising instead of the bundle's own.
+    pub denoising_steps: Option<usize>,
+    /// Library of onnxruntime instead of the one inside.
+    pub library: Option<PathBuf>,
+}
+
+/// Why there is no result.
+#[derive(Debug, thiserror::Error)]
+pub enum EvalError {
+    /// The bundle.
+    #[error(transparent)]
+    Bundle(#[from] BundleErrors),
+    /// onnxruntime.
+    #[error(transparent)]
+    Library(#[from] LibraryError),
+    /// The graphs.
+    #[error(transparent)]
+    Policy(#[from] PolicyError),
+    /// A trial.
+    #[error(transparent)]
+    Trial(#[from] TrialError),
+    /// The output.
+    #[error("output: {0}")]
+    Output(#[from] io::Error),
+}
+
+/// What a condition came to.
+struct Row {
+    condition: Condition,
+    trials: Vec<Trial>,
+}
+
+/// Score and status in the paper's table (25 trials each), and those of its baseline with a static
+/// configuration.
+const fn paper(condition: Condition, configuration: Configuration) -> (Option<f64>, &'static str) {
+    match (condition, configuration) {
+        (Condition::Full, _) => (Some(0.92), "Normal"),
+        (Condition::NoTactile, _) => (Some(0.52), "Degraded"),
+        (_, Configuration::Static) => (None, "Crash"),
+        (Condition::HotUnplug, Configuration::Dynamic) => (Some(0.56), "Degraded"),
+        (Condition::HotReplug, Configuration::Dynamic) => (Some(0.84), "Normal"),
+    }
+}
+
+/// Runs the trials and prints what came of them. Stops between two trials when `stop` says so, and prints
+/// what there is.
+///
+/// # Errors
+/// When the policy cannot be loaded or run.
+pub fn run(
+    options: &EvalOptions,
+    format: Format,
+    stop: &dyn Fn() -> bool,
+    out: &mut dyn Write,
+) -> Result<(), EvalError> {
+    let bundle = Bundle::load(&options.bundle)?;
+    let registry = Registry::task();
+    bundle.check_registry(&registry)?;
+    let actuators: Vec<_> =
+        registry.actuator().into_iter().map(|(device, action)| (device.name.as_str(), action.names.len())).collect();
+    bundle.check_actuators(&actuators)?;
+    let environment = Environment::open(options.library.as_deref())?;
+    let mut model = Model::load(&bundle, &environment, options.denoising_steps)?;
+    let configuration = options.configuration;
+    let mut bench = Bench { bundle: &bundle, registry: &registry, model: &mut model, configuration };
+    let begun = Instant::now();
+    let mut bar = Bar::new("trials", options.trials * options.conditions.len(), format == Format::Text);
+    let mut rows: Vec<Row> = Vec::new();
+    let mut done = 0;
+    'all: for condition in &options.conditions {
+        rows.push(Row { condition: *condition, trials: Vec::new() });
+        for seed in (options.seed..).take(options.trials) {
+            if stop() {
+                break 'all;
+            }
+            bar.at(done);
+            let trial = bench.run(*condition, seed)?;
+            done += 1;
+            if format == Format::Json {
+                writeln!(out, "{}", tagged("trial", &json!(trial)))?;
+            }
+            if let Some(row) = rows.last_mut() {
+                row.trials.push(trial);
+            }
+        }
+    }
+    bar.clear();
+    rows.retain(|row| !row.trials.is_empty());
+    match format {
+        Format::Json => {
+            for row in &rows {
+                writeln!(out, "{}", tagged("condition", &row.json(&bundle, configuration)))?;
+            }
+        }
+        Format::Text => table(&rows, &bundle, options, begun.elapsed().as_secs_f64(), out)?,
+    }
+    Ok(())
+}
+
+fn tagged(event: &str, value: &serde_json::Value) -> serde_json::Value {
+    let mut value = value.clone();
+    value["event"] = event.into();
+    value
+}
+
+impl Row {
+    fn count(&self, outcome: Outcome) -> usize {
+        self.trials.iter().filter(|trial| trial.status != Status::Crash && trial.outcome == outcome).count()
+    }
+
+    fn crashes(&self) -> usize {
+        self.trials.iter().filter(|trial| trial.status == Status::Crash).count()
+    }
+
+    /// The worst that happened; a sensor that came back is as one that was there.
+    fn status(&self) -> Status {
+        let worst = self.trials.iter().map(|trial| trial.status).max().unwrap_or(Status::Normal);
+        if worst == Status::Degraded && self.condition == Condition::HotReplug { Status::Normal } else { worst }
+    }
+
+    fn json(&self, bundle: &Bundle, configuration: Configuration) -> serde_json::Value {
+        let (total, successes) = (self.trials.len(), self.count(Outcome::Success));
+        let (low, high) = wilson(successes, total);
+        let (paper, paper_status) = paper(self.condition, configuration);
+        json!({
+            "condition": self.condition, "configuration": configuration, "trials": total, "success": successes,
+            "wrong_bin": self.count(Outcome::WrongBin), "incomplete": self.count(Outcome::Incomplete),
+            "crash": self.crashes(), "score": successes as f64 / total.max(1) as f64, "interval": [low, high],
+            "status": self.status(), "paper_score": paper, "paper_status": paper_status, "policy": bundle.name,
+            "policy_hash": bundle.hash,
+        })
+    }
+}
+
+fn table(
+    rows: &[Row],
+    bundle: &Bundle,
+    options: &EvalOptions,
+    taken: f64,
+    out: &mut dyn Write,
+) -> Result<(), io::Error> {
+    let kind = match options.configuration {
+        Configuration::Dynamic => "the mask decides",
+        Configuration::Static => "static configuration: a missing sensor is fatal",
+    };
+    writeln!(
+        out,
+        "{}  {} trials a condition from seed {}; {kind}\n",
+        text::plain(&bundle.name),
+        options.trials,
+        options.seed
+    )?;
+    writeln!(out, "condition     score  95 %          success  wrong bin  incomplete  crash  status    paper")?;
+    for row in rows {
+        let (total, successes) = (row.trials.len(), row.count(Outcome::Success));
+        let (low, high) = wilson(successes, total);
+        let (paper, paper_status) = paper(row.condition, options.configuration);
+        let paper = paper.map_or_else(|| "-   ".to_owned(), |score| format!("{score:.2}"));
+        writeln!(
+            out,
+            "{:<12}  {:>5.2}  {low:.2} to {high:.2}  {successes:>7}  {:>9}  {:>10}  {:>5}  {:<8}  {paper} {paper_status}",
+            row.condition.word(),
+            successes as f64 / total as f64,
+            row.count(Outcome::WrongBin),
+            row.count(Outcome::Incomplete),
+            row.crashes(),
+            word(row.status()),
+        )?;
+    }
+    let steps: u64 = rows.iter().flat_map(|row| &row.trials).map(|trial| u64::from(trial.steps)).sum();
+    let robot = robot_time(steps);
+    writeln!(
+        out,
+        "\n{} of robot time in {taken:.1} s ({:.0} times as fast)",
+        text::clock(robot),
+        robot.as_secs_f64() / taken.max(1e-9)
+    )?;
+    for trial in rows.iter().flat_map(|row| &row.trials).filter(|trial| trial.failure.is_some()).take(5) {
+        let reason = trial.failure.as_deref().unwrap_or_default();
+        writeln!(out, "trial {} ({}): {}", trial.seed, trial.condition.word(), text::plain(reason))?;
+    }
+    Ok(())
+}
+
+const fn word(status: Status) -> &'static str {
+    match status {
+        Status::Normal => "Normal",
+        Status::Degraded => "Degraded",
+        Status::Crash => "Crash",
+    }
+}

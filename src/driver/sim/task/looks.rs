@@ -1,0 +1,185 @@
+//! What the cameras of the task see: pictures of 96 x 96 pixels, 8-bit RGB.
+//!
+//! The wrist camera looks down between the fingers; nothing in its picture depends on the texture. The
+//! tactile camera looks at a gel from behind: plain, until it is pressed on the block.
+
+use std::f64::consts::{PI, TAU};
+
+use super::world::{Texture, World, stream};
+use crate::random::Random;
+
+/// Pixels a side.
+pub const SIDE_PIXELS: u32 = 96;
+/// The same, to count with.
+pub const SIDE: usize = SIDE_PIXELS as usize;
+const PIXELS: usize = SIDE * SIDE;
+/// Half the block's edge.
+const HALF_EDGE: f64 = 0.12;
+const WRIST_GRAIN: f32 = 0.015;
+const TACTILE_GRAIN: f32 = 0.02;
+
+/// The looks of one trial, drawn from its seed once.
+#[derive(Debug)]
+pub struct Looks {
+    table: [f32; 3],
+    block: [f32; 3],
+    phases: [f64; 3],
+    gain: f32,
+    /// The gel at rest, and what full pressure adds: RGB of each pixel.
+    gel: Vec<[f32; 3]>,
+    imprint: Vec<[f32; 3]>,
+    wrist_grain: Random,
+    tactile_grain: Random,
+}
+
+/// Offset of a pixel from the middle of the picture.
+fn offset(pixel: usize) -> f64 {
+    pixel as f64 - (SIDE as f64 - 1.0) / 2.0
+}
+
+impl Looks {
+    /// The looks of trial `seed`, in which the block feels like `texture`.
+    #[must_use]
+    pub fn new(seed: u64, texture: Texture) -> Self {
+        let mut random = Random::new(seed, stream::LOOKS);
+        let mut colour = |low, high| [(); 3].map(|()| narrow(random.uniform(low, high)));
+        let table = colour(0.35, 0.6);
+        let tint = colour(-0.08, 0.08);
+        let block = [0.75 + tint[0], 0.55 + tint[1], 0.2 + tint[2]];
+        let base = colour(-0.05, 0.05);
+        let base = [0.42 + base[0], 0.45 + base[1], 0.48 + base[2]];
+        let slant = [colour(-0.06, 0.06), colour(-0.06, 0.06)];
+        let phases = [(); 3].map(|()| random.uniform(0.0, TAU));
+        let gain = narrow(random.uniform(0.85, 1.15));
+        let gel = pixels()
+            .map(|(u, v)| {
+                let (u, v) = (narrow(u / 48.0), narrow(v / 48.0));
+                std::array::from_fn(|channel| base[channel] + slant[0][channel] * u + slant[1][channel] * v)
+            })
+            .collect();
+        Self {
+            table,
+            block,
+            phases,
+            gain,
+            gel,
+            imprint: imprint(texture, &mut random),
+            wrist_grain: Random::new(seed, stream::WRIST_NOISE),
+            tactile_grain: Random::new(seed, stream::TACTILE_NOISE),
+        }
+    }
+
+    /// Renders what the wrist camera sees into `picture`, 96 x 96 x 3 bytes.
+    pub fn wrist(&mut self, world: &World, picture: &mut Vec<u8>) {
+        let scale = 75.0 / (world.position[2] + 0.45);
+        let [p0, p1, p2] = self.phases;
+        // The pattern of the table is a sum of waves along x, along y and along both: each needs its sines
+        // once a column and once a row.
+        let column: [[f64; 3]; SIDE] = std::array::from_fn(|pixel| {
+            let x = world.position[0] + offset(pixel) / scale;
+            [0.05 * (5.0 * x + p0).sin(), (9.0 * x).sin(), (9.0 * x).cos()]
+        });
+        let row: [[f64; 3]; SIDE] = std::array::from_fn(|pixel| {
+            let y = world.position[1] - offset(pixel) / scale;
+            [0.05 * (6.0 * y + p1).sin(), (9.0 * y + p2).sin(), (9.0 * y + p2).cos()]
+        });
+        let (middle, size) = if world.held {
+            ([0.0, 0.0], 150.0)
+        } else {
+            let away = [world.block[0] - world.position[0], world.block[1] - world.position[1]];
+            ([away[0] * scale, -away[1] * scale], scale)
+        };
+        let (sin, cos) = world.yaw.sin_cos();
+        let half = HALF_EDGE * size;
+        let fingers = 14.0 + 14.0 * world.grip;
+        picture.clear();
+        for (v, row) in row.iter().enumerate() {
+            for (u, column) in column.iter().enumerate() {
+                let (across, down) = (offset(u) - middle[0], offset(v) - middle[1]);
+                let (a, b) = (cos * across + sin * down, cos * down - sin * across);
+                let colour = if (offset(u).abs() - fingers - 5.0).abs() < 5.0 && offset(v).abs() < 16.0 {
+                    [0.12; 3]
+                } else if a.abs() < half && b.abs() < half {
+                    self.block.map(|channel| channel * narrow(0.9 + 0.1 * a / half))
+                } else {
+                    let wave = column[0] + row[0] + 0.03 * (column[1] * row[2] + column[2] * row[1]);
+                    self.table.map(|channel| channel + narrow(wave))
+                };
+                let grain = WRIST_GRAIN * self.wrist_grain.normal();
+                picture.extend(colour.map(|channel| byte(channel * self.gain + grain)));
+            }
+        }
+    }
+
+    /// Renders what the tactile camera sees into `picture`, 96 x 96 x 3 bytes.
+    pub fn tactile(&mut self, world: &World, picture: &mut Vec<u8>) {
+        let pressure = narrow(world.pressure);
+        picture.clear();
+        for (gel, imprint) in self.gel.iter().zip(&self.imprint) {
+            for channel in 0..3 {
+                let grain = TACTILE_GRAIN * self.tactile_grain.normal();
+                picture.push(byte(gel[channel] + pressure * imprint[channel] + grain));
+            }
+        }
+    }
+}
+
+/// Offsets across and down of every pixel, row by row.
+fn pixels() -> impl Iterator<Item = (f64, f64)> {
+    (0..PIXELS).map(|at| (offset(at % SIDE), offset(at / SIDE)))
+}
+
+/// What the texture adds to the picture of the gel at full pressure, lit by three coloured lights from three
+/// sides: the slope of the surface towards each.
+fn imprint(texture: Texture, random: &mut Random) -> Vec<[f32; 3]> {
+    let (angle, period) = (random.uniform(0.0, PI), random.uniform(15.0, 19.0));
+    let shift = [random.uniform(-20.0, 20.0), random.uniform(-20.0, 20.0)];
+    let middle = [random.uniform(-8.0, 8.0), random.uniform(-8.0, 8.0)];
+    let radius = random.uniform(34.0, 42.0);
+    let (glow, turn) = (random.uniform(0.8, 1.2), random.uniform(-0.3, 0.3));
+    let contact: Vec<f64> =
+        pixels().map(|(u, v)| 1.0 / (1.0 + (((u - middle[0]).hypot(v - middle[1]) - radius) / 3.0).exp())).collect();
+    let height: Vec<f64> = pixels()
+        .zip(&contact)
+        .map(|((u, v), contact)| {
+            let waves: [f64; 3] = std::array::from_fn(|family| {
+                let (sin, cos) = (angle + family as f64 * TAU / 3.0).sin_cos();
+                (TAU / period * (cos * (u - shift[0]) + sin * (v - shift[1]))).cos()
+            });
+            let relief = match texture {
+                // Ridges where one of three families of lines runs.
+                Texture::Triangular => (waves.into_iter().fold(f64::MIN, f64::max) - 0.75) / 0.25,
+                // The borders between the points of a triangular lattice are a honeycomb.
+                Texture::Hexagonal => (-waves.iter().sum::<f64>() - 0.35) / 0.65,
+            };
+            contact * (0.5 + relief.clamp(0.0, 1.0))
+        })
+        .collect();
+    let at = |u: usize, v: usize| height.get(v * SIDE + u).copied().unwrap_or(0.0);
+    (0..PIXELS)
+        .map(|pixel| {
+            let (u, v) = (pixel % SIDE, pixel / SIDE);
+            // Central differences, one-sided at the edges.
+            let slope = |low: f64, high: f64, steps: usize| (high - low) / steps.max(1) as f64;
+            let (left, right) = (u.saturating_sub(1), (u + 1).min(SIDE - 1));
+            let (up, down) = (v.saturating_sub(1), (v + 1).min(SIDE - 1));
+            let across = slope(at(left, v), at(right, v), right - left);
+            let along = slope(at(u, up), at(u, down), down - up);
+            std::array::from_fn(|light| {
+                let (sin, cos) = (turn + light as f64 * TAU / 3.0).sin_cos();
+                let shade = 1.1 * glow * (cos * across + sin * along);
+                narrow(shade + 0.06 * contact.get(pixel).copied().unwrap_or(0.0))
+            })
+        })
+        .collect()
+}
+
+#[expect(clippy::cast_possible_truncation, reason = "a colour needs no more than 32 bits")]
+fn narrow(value: f64) -> f32 {
+    value as f32
+}
+
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to what a byte holds")]
+fn byte(value: f32) -> u8 {
+    (value.clamp(0.0, 1.0) * 255.0) as u8
+}

@@ -1,0 +1,120 @@
+//! Demonstrations of the simulated task: the expert acts, the recorder records.
+
+use std::sync::Arc;
+
+use super::{Lockstep, Taker};
+use crate::bus::TopicId;
+use crate::driver::DriverError;
+use crate::driver::sim::task::{Expert, Outcome, Texture, World};
+use crate::record::stepped::Stepped;
+use crate::record::{EpisodeReport, EpisodeRequest, RecordError};
+use crate::registry::Registry;
+use crate::registry::scenario::Scenario;
+use crate::sample::SampleHeader;
+use crate::status::{Board, Event};
+use crate::time::{Stamp, WallClock};
+
+/// By how much the gripper misses while it demonstrates, so that the demonstrations show how to correct.
+const SHAKE: f64 = 0.006;
+/// Steps in which everything is plugged in and seen, before an episode begins.
+const SETTLE: u32 = 3;
+/// Steps recorded after the block is in its bin: what to do then is part of the task.
+const TAIL: u32 = 8;
+
+/// Why no demonstration was recorded.
+#[derive(Debug, thiserror::Error)]
+pub enum CollectError {
+    /// The simulation.
+    #[error(transparent)]
+    Simulation(#[from] DriverError),
+    /// The recorder.
+    #[error(transparent)]
+    Record(#[from] RecordError),
+}
+
+/// A recorded demonstration.
+#[derive(Debug)]
+pub struct Demonstration {
+    /// Seed of its trial.
+    pub seed: u64,
+    /// Of the block.
+    pub texture: Texture,
+    /// Steps recorded.
+    pub steps: u32,
+    /// The file.
+    pub report: EpisodeReport,
+}
+
+/// The seeds of `count` demonstrations from `first` on, as many of one texture as of the other; of an odd
+/// count one more of that which comes first. Seeds whose demonstration would fail are left out.
+pub fn seeds(first: u64, count: usize) -> impl Iterator<Item = u64> {
+    let mut left = [count.div_ceil(2), count.div_ceil(2)];
+    let wanted = move |seed: &u64| {
+        let world = World::new(*seed);
+        let left = &mut left[usize::from(world.texture == Texture::Hexagonal)];
+        let taken = *left > 0 && succeeds(world, *seed);
+        *left -= usize::from(taken);
+        taken
+    };
+    (first..).filter(wanted).take(count)
+}
+
+fn succeeds(mut world: World, seed: u64) -> bool {
+    let mut expert = Expert::new(seed);
+    while !world.is_done() {
+        let action = expert.act(&world);
+        world.step(action, SHAKE);
+    }
+    world.outcome() == Outcome::Success
+}
+
+/// Records the demonstration of trial `seed`.
+///
+/// # Errors
+/// When its file cannot be made.
+pub fn demonstrate(
+    registry: &Arc<Registry>,
+    board: &Arc<Board>,
+    request: &EpisodeRequest,
+    seed: u64,
+) -> Result<Demonstration, CollectError> {
+    let begun = Stamp::now();
+    let mut recorder = Stepped::new(Arc::clone(registry), Arc::clone(board), WallClock::now());
+    let mut rig = Lockstep::new(registry, Scenario::task(registry, seed), begun)?;
+    let mut expert = Expert::new(seed);
+    let texture = rig.trial().trial().world.texture;
+    for _ in 0..SETTLE {
+        rig.deliver(&mut recorder)?;
+        rig.pass(&mut recorder);
+    }
+    let mut request = request.clone();
+    let word = if texture == Texture::Triangular { "triangular" } else { "hexagonal" };
+    request.tags.extend([("seed".to_owned(), seed.to_string()), ("texture".to_owned(), word.to_owned())]);
+    recorder.begin(&request, rig.now())?;
+    let (mut steps, mut tail) = (0, TAIL);
+    while tail > 0 {
+        rig.deliver(&mut recorder)?;
+        let (action, done) = {
+            let trial = rig.trial().trial();
+            (expert.act(&trial.world), trial.world.is_done())
+        };
+        rig.act(action, &mut recorder);
+        rig.trial().trial().step(SHAKE);
+        rig.pass(&mut recorder);
+        recorder.advance(rig.now());
+        steps += 1;
+        tail -= u32::from(done);
+    }
+    let report = recorder.finish(rig.now()).ok_or(RecordError::Idle)?;
+    Ok(Demonstration { seed, texture, steps, report })
+}
+
+impl Taker for Stepped {
+    fn take(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
+        Stepped::take(self, topic, header, payload);
+    }
+
+    fn event(&mut self, event: &Event) {
+        Stepped::event(self, event);
+    }
+}

@@ -1,0 +1,324 @@
+//! Closed-loop trials of a policy on the simulated task, with a sensor that is pulled out.
+//!
+//! The policy is asked at a tick and its answer is there at the next one, as in a run in real time, where
+//! a chunk takes a tenth of a tick.
+
+use std::time::Duration;
+
+use serde::Serialize;
+
+use super::{Lockstep, STEP, Taker};
+use crate::bus::TopicId;
+use crate::driver::DriverError;
+use crate::driver::sim::task::{AXES, Outcome, Texture};
+use crate::mask::PhysicalMask;
+use crate::policy::bundle::Bundle;
+use crate::policy::horizon::{Counts, WithoutMask};
+use crate::policy::model::{AnswerError, Model};
+use crate::policy::pilot::Pilot;
+use crate::policy::request::Request;
+use crate::random::Random;
+use crate::registry::scenario::{Scenario, ScenarioAction, ScenarioEvent};
+use crate::registry::{Registry, task};
+use crate::sample::SampleHeader;
+use crate::status::Event;
+use crate::time::Stamp;
+
+/// The stream of a trial's seed that decides when cables are pulled.
+const WINDOWS: u64 = 0x7769_6e64_6f77;
+/// The device that is pulled out.
+const PULLED: &str = task::PARTS[1].0;
+/// Steps in which everything is plugged in and seen, before the policy begins.
+const SETTLE: u32 = 3;
+
+/// What happens to the tactile sensor (paper, table "Hot-plug robustness").
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Condition {
+    /// Nothing.
+    Full,
+    /// It is not there.
+    NoTactile,
+    /// It is pulled out at a step of 30 to 74: the block is touched at 35 to 45, the ways to the bins part
+    /// at 60 to 70.
+    HotUnplug,
+    /// It is pulled out at a step of 10 to 29 and plugged in again 15 to 29 steps later.
+    HotReplug,
+}
+
+impl Condition {
+    /// All of them, in the order of the paper's table.
+    pub const ALL: [Self; 4] = [Self::Full, Self::NoTactile, Self::HotUnplug, Self::HotReplug];
+
+    /// As it is written on the command line.
+    #[must_use]
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::Full => "full",
+            Self::NoTactile => "no-tactile",
+            Self::HotUnplug => "hot-unplug",
+            Self::HotReplug => "hot-replug",
+        }
+    }
+
+    /// The steps at which the sensor is pulled out and plugged in again in trial `seed`.
+    #[must_use]
+    pub fn windows(self, seed: u64) -> (Option<u32>, Option<u32>) {
+        let mut random = Random::new(seed, WINDOWS);
+        let mut step = |low: u32, high: u32| low + u32::try_from(random.below(u64::from(high - low))).unwrap_or(0);
+        match self {
+            Self::Full | Self::NoTactile => (None, None),
+            Self::HotUnplug => (Some(step(30, 75)), None),
+            Self::HotReplug => {
+                let out = step(10, 30);
+                (Some(out), Some(out + step(15, 30)))
+            }
+        }
+    }
+
+    fn scenario(self, registry: &Registry, seed: u64) -> Scenario {
+        let mut scenario = Scenario::task(registry, seed);
+        if self == Self::NoTactile {
+            for device in scenario.devices.iter_mut().filter(|device| device.name == PULLED) {
+                device.plugged = false;
+            }
+        }
+        let (out, back) = self.windows(seed);
+        // Between two ticks: at the tick of that step the bit is clear.
+        let at = |step: u32| STEP * (SETTLE + step) - STEP / 2;
+        let event = |step, action| ScenarioEvent { at: at(step), device: PULLED.to_owned(), action };
+        scenario.events.extend(out.map(|step| event(step, ScenarioAction::Unplug)));
+        scenario.events.extend(back.map(|step| event(step, ScenarioAction::Plug { port: None })));
+        scenario
+    }
+}
+
+/// Which sensors a run expects.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Configuration {
+    /// Those that are there.
+    Dynamic,
+    /// Those that were there when it began: one that is missing later ends it, as a configuration file
+    /// and a driver that raises do.
+    Static,
+}
+
+/// How a run took what happened.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Status {
+    /// All sensors were there.
+    Normal,
+    /// It went on without one.
+    Degraded,
+    /// It ended.
+    Crash,
+}
+
+/// One trial.
+#[derive(Debug, Clone, Serialize)]
+pub struct Trial {
+    /// Its number, which decides all of it.
+    pub seed: u64,
+    /// What happened to the sensor.
+    pub condition: Condition,
+    /// Of the block: true if triangular.
+    pub triangular: bool,
+    /// Step at which the sensor was pulled out.
+    pub unplugged_at: Option<u32>,
+    /// Step at which it was plugged in again.
+    pub plugged_at: Option<u32>,
+    /// How it ended.
+    pub outcome: Outcome,
+    /// How the run took it.
+    pub status: Status,
+    /// Steps of the task.
+    pub steps: u32,
+    /// What the executor counted.
+    pub counts: Counts,
+    /// Answers that failed, the last reason.
+    pub failure: Option<String>,
+}
+
+/// Why a trial cannot be run.
+#[derive(Debug, thiserror::Error)]
+pub enum TrialError {
+    /// The simulation.
+    #[error(transparent)]
+    Simulation(#[from] DriverError),
+}
+
+/// What a trial is run with.
+#[derive(Debug)]
+pub struct Bench<'a> {
+    /// The policy.
+    pub bundle: &'a Bundle,
+    /// The rig of the task.
+    pub registry: &'a Registry,
+    /// Its graphs.
+    pub model: &'a mut Model,
+    /// Which sensors are expected.
+    pub configuration: Configuration,
+}
+
+impl Bench<'_> {
+    /// Runs trial `seed`.
+    ///
+    /// # Errors
+    /// When the simulation fails; what a policy does wrong is in the result.
+    pub fn run(&mut self, condition: Condition, seed: u64) -> Result<Trial, TrialError> {
+        let mut rig = Lockstep::new(self.registry, condition.scenario(self.registry, seed), Stamp(1_000_000_000))?;
+        self.model.reset();
+        let mut seen = Seen { pilot: Pilot::new(self.bundle, self.registry, WithoutMask::Hold, seed) };
+        let mut request = Request::new(self.bundle);
+        let mut chunk = vec![0.0; self.model.chunk_len()];
+        for _ in 0..SETTLE {
+            rig.deliver(&mut seen)?;
+            rig.pass(&mut seen);
+        }
+        let launched = rig.mask();
+        let (mut status, mut failure) = (Status::Normal, None);
+        let mut tick = 0;
+        while !rig.trial().trial().world.is_done() {
+            rig.deliver(&mut seen)?;
+            if self.configuration == Configuration::Static && missing(launched, rig.mask()) {
+                status = Status::Crash;
+                break;
+            }
+            if missing(everything(self.registry), rig.mask()) {
+                status = Status::Degraded;
+            }
+            let answer = seen.pilot.look(tick, rig.now(), rig.now()).then(|| {
+                seen.pilot.fill(tick, rig.now(), &mut request);
+                self.model.answer(&request, &mut chunk)
+            });
+            let action = seen.pilot.step(tick).action.and_then(axes);
+            if let Some(action) = action {
+                rig.act(action, &mut seen);
+            }
+            rig.trial().trial().step(0.0);
+            rig.pass(&mut seen);
+            take(answer, &mut seen.pilot, request.tick, &chunk, &mut failure);
+            tick += 1;
+        }
+        let trial = rig.trial().trial();
+        let (unplugged_at, plugged_at) = condition.windows(seed);
+        Ok(Trial {
+            seed,
+            condition,
+            triangular: trial.world.texture == Texture::Triangular,
+            unplugged_at,
+            plugged_at,
+            outcome: trial.world.outcome(),
+            status,
+            steps: trial.world.steps(),
+            counts: seen.pilot.counts(),
+            failure,
+        })
+    }
+}
+
+fn take(
+    answer: Option<Result<(), AnswerError>>,
+    pilot: &mut Pilot,
+    asked: u64,
+    chunk: &[f32],
+    failure: &mut Option<String>,
+) {
+    match answer {
+        Some(Ok(())) => {
+            if let Err(refused) = pilot.answer(asked, chunk) {
+                *failure = Some(refused.to_string());
+            }
+        }
+        Some(Err(error)) => {
+            pilot.failed(asked);
+            *failure = Some(error.to_string());
+        }
+        None => {}
+    }
+}
+
+fn everything(registry: &Registry) -> PhysicalMask {
+    registry.devices.iter().fold(PhysicalMask::EMPTY, |mask, device| mask.with(device.id, true))
+}
+
+fn missing(expected: PhysicalMask, there: PhysicalMask) -> bool {
+    expected.0 & !there.0 != 0
+}
+
+/// The targets of the arm.
+fn axes(action: &[f32]) -> Option<[f64; AXES]> {
+    let action: [f32; AXES] = action.try_into().ok()?;
+    Some(action.map(f64::from))
+}
+
+/// What the policy is told of the rig.
+struct Seen {
+    pilot: Pilot,
+}
+
+impl Taker for Seen {
+    fn take(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
+        match topic {
+            TopicId::Modality(id) => self.pilot.sample(id, header, payload),
+            TopicId::Mask => {
+                if let Some(mask) = payload.first_chunk() {
+                    self.pilot.mask(PhysicalMask(u64::from_le_bytes(*mask)));
+                }
+            }
+            TopicId::Action => {}
+        }
+    }
+
+    fn event(&mut self, _: &Event) {}
+}
+
+/// 95 % interval of a share `count / total` (Wilson 1927).
+#[must_use]
+pub fn wilson(count: usize, total: usize) -> (f64, f64) {
+    const Z: f64 = 1.959_964;
+    if total == 0 {
+        return (0.0, 1.0);
+    }
+    let (n, share) = (total as f64, count as f64 / total as f64);
+    let middle = share + Z * Z / (2.0 * n);
+    let reach = Z * (share * (1.0 - share) / n + Z * Z / (4.0 * n * n)).sqrt();
+    let scale = 1.0 + Z * Z / n;
+    (((middle - reach) / scale).max(0.0), ((middle + reach) / scale).min(1.0))
+}
+
+/// How long a trial's step stands for.
+#[must_use]
+pub fn robot_time(steps: u64) -> Duration {
+    Duration::from_secs_f64(STEP.as_secs_f64() * steps as f64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_interval_is_wilsons() {
+        let near = |(low, high): (f64, f64), expected: (f64, f64)| {
+            assert!((low - expected.0).abs() < 5e-4 && (high - expected.1).abs() < 5e-4, "{low} {high}");
+        };
+        // Newcombe (1998), table I: 81 of 263, and 0 of 20.
+        near(wilson(81, 263), (0.2553, 0.3662));
+        near(wilson(0, 20), (0.0, 0.1611));
+        near(wilson(20, 20), (0.8389, 1.0));
+        near(wilson(0, 0), (0.0, 1.0));
+    }
+
+    #[test]
+    fn cables_are_pulled_when_the_condition_says() {
+        for seed in 0..500 {
+            assert_eq!(Condition::Full.windows(seed), (None, None));
+            let (out, back) = Condition::HotUnplug.windows(seed);
+            assert!(out.is_some_and(|out| (30..75).contains(&out)) && back.is_none());
+            let (Some(out), Some(back)) = Condition::HotReplug.windows(seed) else { panic!("none") };
+            assert!((10..30).contains(&out) && (15..30).contains(&(back - out)), "{out} {back}");
+        }
+    }
+}

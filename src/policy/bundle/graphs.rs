@@ -1,0 +1,165 @@
+//! What the graphs say of their own inputs and outputs, against what `policy.json` says of them.
+
+use std::fmt;
+
+use super::files::Graph;
+use super::read::Problems;
+use super::spec::{Bundle, BundleErrors, ObservationInput};
+use crate::registry::did_you_mean;
+
+/// Channels of a picture.
+const CHANNELS: usize = 3;
+
+/// The interface of a graph.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct GraphShape {
+    /// The file's name, for messages: `encoder.onnx`.
+    pub name: String,
+    /// Its inputs, in the graph's order.
+    pub inputs: Vec<TensorShape>,
+    /// Its outputs, in the graph's order.
+    pub outputs: Vec<TensorShape>,
+}
+
+/// One input or output of a graph.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TensorShape {
+    /// Its name in the graph.
+    pub name: String,
+    /// The type of its elements.
+    pub element: Element,
+    /// Its dimensions; `None` is one that the graph leaves open.
+    pub dims: Vec<Option<u64>>,
+}
+
+/// The type of a tensor's elements.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Element {
+    /// 32-bit floats.
+    F32,
+    /// 64-bit signed integers.
+    I64,
+    /// Any other, by a name for people: `f16`. No graph of a bundle has such inputs or outputs.
+    Other(String),
+}
+
+impl fmt::Display for Element {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::F32 => f.write_str("f32"),
+            Self::I64 => f.write_str("i64"),
+            Self::Other(name) => f.write_str(name),
+        }
+    }
+}
+
+/// What a tensor of a bundle's graph must be.
+struct Wanted<'a> {
+    /// Any name will do if there is none.
+    name: Option<&'a str>,
+    element: Element,
+    /// After the batch dimension; `None` is one that the file says nothing of.
+    dims: Vec<Option<u64>>,
+}
+
+impl<'a> Wanted<'a> {
+    fn new(name: &'a str, element: Element, dims: &[usize]) -> Self {
+        Self { name: Some(name), element, dims: dims.iter().map(|dim| Some(*dim as u64)).collect() }
+    }
+
+    fn shape(&self) -> String {
+        let batch = std::iter::once("B".to_owned());
+        let dims = batch.chain(self.dims.iter().map(|dim| shown(*dim)));
+        format!("{} [{}]", self.element, dims.collect::<Vec<_>>().join(", "))
+    }
+
+    /// A batch of one must be possible; a dimension left open fits.
+    fn fits(&self, found: &TensorShape) -> bool {
+        let batch = std::iter::once(Some(1));
+        let wanted = batch.chain(self.dims.iter().copied());
+        self.element == found.element
+            && self.dims.len() + 1 == found.dims.len()
+            && wanted.zip(&found.dims).all(|pair| !matches!(pair, (Some(a), Some(b)) if a != *b))
+    }
+}
+
+impl Bundle {
+    /// Are the graphs' inputs and outputs those that this bundle describes? The batch dimension is
+    /// open or 1; the length of `global_cond` is the graphs' own affair, if they agree on it.
+    ///
+    /// # Errors
+    /// Every input and output that is missing, superfluous, or of another type or shape.
+    pub fn check_graphs(&self, encoder: &GraphShape, denoiser: &GraphShape) -> Result<(), BundleErrors> {
+        let mut problems = Problems::new(&self.label());
+        let steps = self.n_obs_steps;
+        let mut inputs: Vec<Wanted> = self
+            .observations
+            .iter()
+            .map(|observation| match &observation.input {
+                ObservationInput::Image(image) => {
+                    Wanted::new(&observation.key, Element::F32, &[steps, CHANNELS, image.height, image.width])
+                }
+                ObservationInput::Vector(vector) => Wanted::new(&observation.key, Element::F32, &[steps, vector.len]),
+            })
+            .collect();
+        if let Some(mask) = &self.mask {
+            inputs.push(Wanted::new(&mask.input, Element::F32, &[mask.order.len()]));
+        }
+        let condition = |len| Wanted { name: Some("global_cond"), element: Element::F32, dims: vec![len] };
+        let actions = [self.horizon, self.action.len()];
+        compare(Graph::Encoder, encoder, "input", &inputs, &mut problems);
+        compare(Graph::Encoder, encoder, "output", &[condition(None)], &mut problems);
+        let given = encoder.outputs.iter().find(|output| output.name == "global_cond");
+        let given = given.and_then(|output| output.dims.get(1).copied().flatten());
+        let inputs = [
+            Wanted::new("sample", Element::F32, &actions),
+            Wanted { name: Some("timestep"), element: Element::I64, dims: Vec::new() },
+            condition(given),
+        ];
+        compare(Graph::Denoiser, denoiser, "input", &inputs, &mut problems);
+        let prediction = Wanted { name: None, ..Wanted::new("", Element::F32, &actions) };
+        compare(Graph::Denoiser, denoiser, "output", &[prediction], &mut problems);
+        problems.check()
+    }
+}
+
+/// Notes where the inputs or outputs (`what`) of a graph are not those `wanted`.
+fn compare(graph: Graph, shape: &GraphShape, what: &str, wanted: &[Wanted], problems: &mut Problems) {
+    let entry = format!("graphs.{}", graph.key());
+    let (name, found) = (&shape.name, if what == "input" { &shape.inputs } else { &shape.outputs });
+    let names: Vec<&str> = found.iter().map(|tensor| tensor.name.as_str()).collect();
+    for wanted in wanted {
+        let tensor = match wanted.name {
+            Some(wanted) => found.iter().find(|tensor| tensor.name == wanted),
+            None => found.first(),
+        };
+        let label = wanted.name.map_or_else(|| what.to_owned(), |wanted| format!("{what} \"{wanted}\""));
+        let Some(tensor) = tensor else {
+            let fix = wanted.name.map_or_else(
+                || "export the graph again".to_owned(),
+                |wanted| did_you_mean(wanted, &names, &format!("its {what}s are")),
+            );
+            problems.report(&entry, format!("{name} has no {label}, {} is expected", wanted.shape()), fix);
+            continue;
+        };
+        if !wanted.fits(tensor) {
+            let dims: Vec<String> = tensor.dims.iter().map(|dim| shown(*dim)).collect();
+            let is = format!("{} [{}]", tensor.element, dims.join(", "));
+            let message = format!("{name}: {label} is {is}, by policy.json it is {}", wanted.shape());
+            problems.report(&entry, message, "export the graph again, or correct policy.json: B is open or 1");
+        }
+    }
+    let superfluous =
+        |tensor: &&TensorShape| wanted.iter().all(|wanted| wanted.name.is_some_and(|name| name != tensor.name));
+    // Whatever its name, the one output of a denoiser is the first.
+    let unnamed = usize::from(wanted.iter().any(|wanted| wanted.name.is_none()));
+    let others = found.iter().skip(unnamed).filter(|tensor| unnamed == 1 || superfluous(tensor));
+    for tensor in others {
+        let message = format!("{name} has the {what} \"{}\", which policy.json does not know", tensor.name);
+        problems.report(&entry, message, "export the graph again, or add what is missing to policy.json");
+    }
+}
+
+fn shown(dim: Option<u64>) -> String {
+    dim.map_or_else(|| "?".to_owned(), |dim| dim.to_string())
+}

@@ -1,0 +1,299 @@
+//! What `policy.json` says once it has been checked.
+//!
+//! Invariant: every number is finite and within the range its comment states; every length agrees
+//! with every other.
+
+use std::ops::Range;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use serde::Serialize;
+
+use crate::registry::Diagnostic;
+
+/// A checked bundle.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Bundle {
+    /// The folder it was read from.
+    pub folder: PathBuf,
+    /// SHA-256 over the bytes of `policy.json` and the hashes of both graphs as they stand in it,
+    /// encoder first; lower-case hexadecimal. Names in a recording what has run.
+    pub hash: String,
+    /// `name`: what the bundle calls itself.
+    pub name: String,
+    /// `mask_aware`: trained with modalities left out, so that it can go on without one. One that
+    /// was not gains nothing from zeros in place of what is missing.
+    pub mask_aware: bool,
+    /// `n_obs_steps`, To: observations a chunk is computed from, `1..=64`. Step i of To is tick
+    /// k - (To - 1) + i of the control grid.
+    pub n_obs_steps: usize,
+    /// `horizon`, Tp: actions in a chunk, `1..=1024`.
+    pub horizon: usize,
+    /// `n_action_steps`: actions executed before the next chunk is asked for,
+    /// `1..=horizon - action_start`.
+    pub n_action_steps: usize,
+    /// `action_start`: the index in a chunk of the action of the tick of its last observation, below
+    /// `horizon`. To - 1 in the original diffusion policy and in `LeRobot`, 0 in UMI.
+    pub action_start: usize,
+    /// `control_hz`: ticks of the control grid a second, `0.1..=1000`.
+    pub control_hz: f64,
+    /// `max_observation_age_ms`: of an observation older than this no chunk is computed.
+    pub max_observation_age: Duration,
+    /// `observations`: at least one, keys unique, in the order of the file.
+    pub observations: Vec<ObservationSpec>,
+    /// `mask`: the encoder's mask input. `None` only if the bundle is not mask-aware.
+    pub mask: Option<MaskSpec>,
+    /// `action`.
+    pub action: BundleAction,
+    /// `scheduler`.
+    pub scheduler: SchedulerSpec,
+    /// `graphs.encoder`.
+    pub encoder: GraphFile,
+    /// `graphs.denoiser`.
+    pub denoiser: GraphFile,
+    /// `training`: where the bundle comes from, free in form.
+    pub training: serde_json::Value,
+}
+
+/// One of `observations`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ObservationSpec {
+    /// `key`: the name of the encoder's input.
+    pub key: String,
+    /// `modality`: the name of the entry in `devices.toml`.
+    pub modality: String,
+    /// `required`: without this modality the policy does not start, and holds when it leaves.
+    pub required: bool,
+    /// `kind` and what goes with it.
+    pub input: ObservationInput,
+    /// `normalization`, one entry per channel of a picture or per value of a vector.
+    pub normalization: Normalization,
+}
+
+/// What kind of samples an observation is made of, and how.
+#[derive(Debug, Clone, PartialEq)]
+pub enum ObservationInput {
+    /// `"image"`: f32 `[B, To, 3, height, width]`.
+    Image(ImageSpec),
+    /// `"vector"`: f32 `[B, To, len]`.
+    Vector(VectorSpec),
+}
+
+/// How a picture becomes an observation: decoded to 8 bits in the order of `color`, divided by 255,
+/// resized, cropped, `operation`, normalised.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ImageSpec {
+    /// `shape`: pixels after all of this, `1..=8192`. The channels are always 3.
+    pub height: usize,
+    /// See `height`.
+    pub width: usize,
+    /// `color`.
+    pub color: ColorOrder,
+    /// `resize`: [height, width] to resize to, bilinear with half-pixel centres and no antialiasing.
+    /// `None` leaves the device's size.
+    pub resize: Option<[usize; 2]>,
+    /// `crop`: [height, width] of the middle to keep, after the resize. `None` keeps all.
+    pub crop: Option<[usize; 2]>,
+    /// `operation`.
+    pub operation: Option<Operation>,
+}
+
+/// How a sample's numbers become an observation.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct VectorSpec {
+    /// `shape`: how many numbers, `1..=4096`.
+    pub len: usize,
+    /// `slice`: which of the sample's numbers, `len` of them. `None` is all, and the sample has
+    /// `len`.
+    pub slice: Option<Range<usize>>,
+}
+
+/// Order of the channels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ColorOrder {
+    /// Red first.
+    Rgb,
+    /// Blue first, as `OpenCV` reads pictures.
+    Bgr,
+}
+
+/// What is done to a picture before it is normalised.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Operation {
+    /// `(v - ref) / 2 + 0.5`, with v and ref in 0..1; ref is the first picture of that modality in
+    /// the run or episode, kept across unplugs.
+    DiffToReference,
+}
+
+/// How numbers are mapped to the range a network was trained on, one entry per dimension.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(tag = "mode", rename_all = "snake_case")]
+pub enum Normalization {
+    /// `(v - min) / (max - min) * 2 - 1`.
+    MinMax {
+        /// Smallest values.
+        min: Vec<f32>,
+        /// Largest values, each above the smallest.
+        max: Vec<f32>,
+    },
+    /// `(v - mean) / (std + eps)`.
+    MeanStd {
+        /// Means.
+        mean: Vec<f32>,
+        /// Standard deviations, at least 0; with `eps` added above 0.
+        std: Vec<f32>,
+        /// At least 0; 0 if the file gives none.
+        eps: f32,
+    },
+    /// `v`.
+    Identity,
+}
+
+/// `mask`: the encoder's mask input, f32 `[B, M]`, 1.0 for what is present. What an absent modality
+/// means is done inside the encoder: its embedding is replaced by zeros.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct MaskSpec {
+    /// `input`: the name of the encoder's input.
+    pub input: String,
+    /// `order`: the modality of each element, each once, each one of an observation.
+    pub order: Vec<String>,
+}
+
+/// `action`: what the denoiser's output means, once it is normalised back.
+#[derive(Debug, Clone, PartialEq)]
+pub struct BundleAction {
+    /// `actuator`: the name of the entry in `devices.toml` that is moved.
+    pub actuator: String,
+    /// `names` of the values, Da of them. `shape` is `[Da]`, `1..=1024`.
+    pub names: Vec<String>,
+    /// `units` of the values, Da of them.
+    pub units: Vec<String>,
+    /// `limits.min`: no value below is executed, Da of them.
+    pub min: Vec<f32>,
+    /// `limits.max`: no value above is executed, Da of them, none below its `min`.
+    pub max: Vec<f32>,
+    /// `normalization`: ascending slices that cover every value exactly once.
+    pub normalization: Vec<SliceNormalization>,
+}
+
+impl BundleAction {
+    /// Values of one action, Da.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.names.len()
+    }
+
+    /// Never true of a checked bundle.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.names.is_empty()
+    }
+}
+
+/// The normalisation of some values of an action.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SliceNormalization {
+    /// `slice`: which values.
+    pub slice: Range<usize>,
+    /// `mode` and its arrays, as long as the slice.
+    pub normalization: Normalization,
+}
+
+/// `scheduler`: the diffusion process the denoiser was trained with, in the words of the
+/// `diffusers` library, and how it is run backwards.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct SchedulerSpec {
+    /// `type`.
+    #[serde(rename = "type")]
+    pub kind: SchedulerKind,
+    /// Steps of the forward process, `1..=10000`.
+    pub num_train_timesteps: usize,
+    /// How the noise grows.
+    pub beta_schedule: BetaSchedule,
+    /// First beta, `1e-6..=0.999`; not used by `squaredcos_cap_v2`.
+    pub beta_start: f64,
+    /// Last beta, within the same and not below the first; not used by `squaredcos_cap_v2`.
+    pub beta_end: f64,
+    /// What the denoiser predicts.
+    pub prediction_type: PredictionType,
+    /// Is the predicted clean sample clipped?
+    pub clip_sample: bool,
+    /// To plus and minus this, above 0.
+    pub clip_sample_range: f32,
+    /// DDIM: is the last step's alpha 1 rather than that of timestep 0?
+    pub set_alpha_to_one: bool,
+    /// Added to every timestep with `leading` spacing.
+    pub steps_offset: usize,
+    /// Which timesteps are visited.
+    pub timestep_spacing: TimestepSpacing,
+    /// How many are visited, `1..=num_train_timesteps`.
+    pub num_inference_steps: usize,
+}
+
+/// How a sample is taken from one timestep to the one before.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub enum SchedulerKind {
+    /// Deterministic (Song et al., "Denoising Diffusion Implicit Models", eta = 0).
+    #[serde(rename = "DDIM")]
+    Ddim,
+    /// With fresh noise at each step (Ho et al., "Denoising Diffusion Probabilistic Models"), of the
+    /// variance `diffusers` calls `fixed_small`.
+    #[serde(rename = "DDPM")]
+    Ddpm,
+}
+
+/// How the noise of the forward process grows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum BetaSchedule {
+    /// Cosine (Nichol and Dhariwal), betas capped at 0.999.
+    #[serde(rename = "squaredcos_cap_v2")]
+    SquaredcosCapV2,
+    /// Betas evenly spaced.
+    Linear,
+    /// Their roots evenly spaced.
+    ScaledLinear,
+}
+
+/// What a denoiser predicts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PredictionType {
+    /// The noise.
+    Epsilon,
+    /// The clean sample.
+    Sample,
+    /// The velocity (Salimans and Ho).
+    VPrediction,
+}
+
+/// Which timesteps are visited.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum TimestepSpacing {
+    /// From 0 up in strides of the integer T / n.
+    Leading,
+    /// From the last down in strides of T / n.
+    Trailing,
+    /// From the first to the last.
+    Linspace,
+}
+
+/// One of `graphs`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct GraphFile {
+    /// `file`: its name in the bundle's folder.
+    pub file: String,
+    /// `sha256` of its bytes, lower-case hexadecimal.
+    pub sha256: String,
+}
+
+/// Everything that is wrong with a bundle. Never empty.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{}", self.diagnostics.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n"))]
+pub struct BundleErrors {
+    /// The problems; the `entry` of each is the key in `policy.json`: `action.limits.min[2]`.
+    pub diagnostics: Vec<Diagnostic>,
+}

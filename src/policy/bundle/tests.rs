@@ -1,0 +1,201 @@
+//! A bundle against its files, its rig and its graphs. What the file itself says is tested in
+//! `tests/bundle.rs`.
+
+use super::example::{POLICY, write, write_changed};
+use super::*;
+use crate::registry::Registry;
+
+fn bundle() -> Bundle {
+    Bundle::parse(POLICY, "policy.json").unwrap_or_else(|errors| panic!("{errors}"))
+}
+
+fn told<T: std::fmt::Debug>(result: Result<T, BundleErrors>) -> Vec<String> {
+    result.unwrap_err().diagnostics.iter().map(|found| format!("{found}").replacen("policy.json: ", "", 1)).collect()
+}
+
+#[test]
+fn a_bundle_is_read_with_its_graphs() {
+    let folder = tempfile::tempdir().unwrap();
+    let bundle = write(folder.path(), b"one", b"two");
+    assert_eq!(bundle.read_graph(Graph::Encoder).unwrap(), b"one");
+    assert_eq!(bundle.read_graph(Graph::Denoiser).unwrap(), b"two");
+    // sha256sum of "one".
+    assert_eq!(bundle.encoder.sha256, "7692c3ad3540bb803c020b3aee66cd8887123234ea0c6e7143c0add73ff431ed");
+}
+
+#[test]
+fn the_hash_depends_on_the_file_and_on_the_graphs() {
+    let [a, b, c, d] = std::array::from_fn(|_| tempfile::tempdir().unwrap());
+    let first = write(a.path(), b"one", b"two").hash;
+    assert_eq!(write(b.path(), b"one", b"two").hash, first);
+    assert_ne!(write(c.path(), b"one", b"other").hash, first);
+    assert_ne!(write_changed(d.path(), b"one", b"two", |policy| policy["training"]["seed"] = 1.into()).hash, first);
+    assert_eq!(first.len(), 64);
+}
+
+#[test]
+fn graphs_that_are_not_those_of_the_file_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let bundle = write(folder.path(), b"one", b"two");
+    std::fs::write(folder.path().join("encoder.onnx"), b"One").unwrap();
+    std::fs::remove_file(folder.path().join("denoiser.onnx")).unwrap();
+    let errors = told(Bundle::load(folder.path()));
+    assert_eq!(errors.len(), 2);
+    assert!(errors[0].contains("[graphs.encoder] encoder.onnx has the SHA-256 "), "{}", errors[0]);
+    assert!(errors[1].contains("[graphs.denoiser] denoiser.onnx cannot be read: No such file"), "{}", errors[1]);
+    assert_eq!(told(bundle.read_graph(Graph::Encoder)).len(), 1, "changed after it was loaded");
+    // Only files are read: a pipe would have us wait.
+    std::fs::create_dir(folder.path().join("denoiser.onnx")).unwrap();
+    assert!(told(Bundle::load(folder.path()))[1].contains("it is not a file"));
+}
+
+#[test]
+fn a_folder_that_is_no_bundle_is_told_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let errors = told(Bundle::load(folder.path()));
+    assert!(errors[0].contains("No such file"), "{}", errors[0]);
+    assert!(errors[0].contains("fix: name the folder of a policy bundle"), "{}", errors[0]);
+}
+
+/// The rig of the example; `cam` and `arm` are what follows in those entries.
+fn registry(cam: &str, arm: &str) -> Registry {
+    let text = format!(
+        "[device.cam_wrist]\nvid = \"1\"\npid = \"1\"\nnode = \"camera\"\n[device.cam_wrist.camera]\n{cam}\n\
+         [device.tactile_tip]\nvid = \"1\"\npid = \"2\"\nnode = \"camera\"\n\
+         [device.tactile_tip.camera]\nwidth = 96\nheight = 96\n\
+         [device.arm]\nvid = \"1\"\npid = \"3\"\n{arm}\n"
+    );
+    Registry::parse(&text, None).unwrap_or_else(|errors| panic!("{errors}")).registry
+}
+
+const CAM: &str = "width = 96\nheight = 96";
+const ARM: &str = "node = \"serial\"\n[device.arm.serial]\nchannels = 4";
+
+#[test]
+fn a_rig_with_all_of_it_is_accepted() {
+    bundle().check_registry(&registry(CAM, ARM)).unwrap();
+    // More numbers than the slice wants, and a picture that is resized or cropped, will do.
+    let mut resized = bundle();
+    let ObservationInput::Image(image) = &mut resized.observations[0].input else { panic!("an image") };
+    image.resize = Some([96, 96]);
+    let large = registry("width = 640\nheight = 480", "node = \"serial\"\n[device.arm.serial]\nchannels = 9");
+    resized.check_registry(&large).unwrap();
+    let ObservationInput::Image(image) = &mut resized.observations[0].input else { panic!("an image") };
+    (image.resize, image.crop) = (None, Some([96, 96]));
+    resized.check_registry(&large).unwrap();
+}
+
+#[test]
+fn every_difference_from_the_rig_is_told() {
+    let mut strange = bundle();
+    strange.observations[1].modality = "tactile_tpi".to_owned();
+    let serial = "node = \"serial\"\n[device.arm.serial]\nchannels = 3";
+    assert_eq!(
+        told(strange.check_registry(&registry("width = 640\nheight = 480", serial))),
+        [
+            "[observations[0]] wants pictures of 96x96 (height x width), but \"cam_wrist\" gives 480x640\n    \
+             fix: set width = 96 and height = 96 in devices.toml, or \"resize\": [96, 96] here",
+            "[observations[1]] modality \"tactile_tpi\" is not in devices.toml\n    fix: did you mean \"tactile_tip\"?",
+            "[observations[2]] slice ends at 4, but \"arm\" gives 3 numbers\n    \
+             fix: correct the slice, or channels of \"arm\" in devices.toml",
+        ]
+    );
+    let mut whole = bundle();
+    whole.observations[0].modality = "arm".to_owned();
+    let ObservationInput::Vector(vector) = &mut whole.observations[2].input else { panic!("a vector") };
+    vector.slice = None;
+    let raw = "node = \"serial\"\n[device.arm.serial]\nparse = \"raw\"";
+    let told_raw = told(whole.check_registry(&registry(CAM, raw)));
+    assert_eq!(
+        told_raw,
+        [
+            "[observations[0]] wants pictures, but the device \"arm\" gives bytes that nobody looks into\n    \
+             fix: give [device.arm] in devices.toml a device that gives pictures",
+            "[observations[2]] wants numbers, but the device \"arm\" gives bytes that nobody looks into\n    \
+             fix: give [device.arm] in devices.toml a device that gives numbers",
+        ]
+    );
+    let five = "node = \"serial\"\n[device.arm.serial]\nchannels = 5";
+    let told_five = told(whole.check_registry(&registry(CAM, five)));
+    assert!(told_five[1].starts_with("[observations[2]] wants 4 numbers, but \"arm\" gives 5"), "{}", told_five[1]);
+}
+
+#[test]
+fn the_actuator_must_be_there_and_take_as_many_values() {
+    bundle().check_actuators(&[("other", 2), ("arm", 4)]).unwrap();
+    let one = |actuators| told(bundle().check_actuators(actuators)).remove(0);
+    assert!(one(&[("arm", 6)]).starts_with("[action] has 4 values, but \"arm\" takes 6"));
+    assert!(one(&[("arn", 4)]).ends_with("fix: did you mean \"arn\"?"));
+    assert!(one(&[]).ends_with("fix: add [device.arm.action] to devices.toml: no device there takes actions"));
+}
+
+fn tensor(name: &str, element: Element, dims: &[u64]) -> TensorShape {
+    // 0 stands for an open dimension.
+    let dims = dims.iter().map(|dim| (*dim > 0).then_some(*dim)).collect();
+    TensorShape { name: name.to_owned(), element, dims }
+}
+
+fn graphs() -> (GraphShape, GraphShape) {
+    let encoder = GraphShape {
+        name: "encoder.onnx".to_owned(),
+        inputs: vec![
+            tensor("mask", Element::F32, &[0, 2]),
+            tensor("state", Element::F32, &[0, 2, 4]),
+            tensor("tactile", Element::F32, &[1, 2, 3, 96, 96]),
+            tensor("wrist", Element::F32, &[0, 2, 3, 96, 96]),
+        ],
+        outputs: vec![tensor("global_cond", Element::F32, &[0, 264])],
+    };
+    let denoiser = GraphShape {
+        name: "denoiser.onnx".to_owned(),
+        inputs: vec![
+            tensor("sample", Element::F32, &[0, 16, 4]),
+            tensor("timestep", Element::I64, &[0]),
+            tensor("global_cond", Element::F32, &[0, 264]),
+        ],
+        outputs: vec![tensor("whatever", Element::F32, &[0, 16, 4])],
+    };
+    (encoder, denoiser)
+}
+
+#[test]
+fn graphs_as_described_are_accepted() {
+    let (encoder, mut denoiser) = graphs();
+    bundle().check_graphs(&encoder, &denoiser).unwrap();
+    denoiser.outputs[0].dims = vec![None, None, None];
+    bundle().check_graphs(&encoder, &denoiser).unwrap();
+}
+
+#[test]
+fn every_difference_from_the_graphs_is_told() {
+    let (mut encoder, mut denoiser) = graphs();
+    encoder.inputs[0].dims = vec![None, Some(3)];
+    encoder.inputs[1].name = "stat".to_owned();
+    encoder.inputs[2].dims = vec![Some(8), Some(2), Some(3), Some(64), Some(96)];
+    encoder.inputs[3].element = Element::Other("f16".to_owned());
+    denoiser.inputs[1].element = Element::F32;
+    denoiser.inputs[2].dims = vec![None, Some(200)];
+    denoiser.outputs.push(tensor("extra", Element::F32, &[1]));
+    let first_lines: Vec<String> = told(bundle().check_graphs(&encoder, &denoiser))
+        .iter()
+        .map(|told| told.lines().next().unwrap_or_default().to_owned())
+        .collect();
+    assert_eq!(
+        first_lines,
+        [
+            "[graphs.encoder] encoder.onnx: input \"wrist\" is f16 [?, 2, 3, 96, 96], \
+             by policy.json it is f32 [B, 2, 3, 96, 96]",
+            "[graphs.encoder] encoder.onnx: input \"tactile\" is f32 [8, 2, 3, 64, 96], \
+             by policy.json it is f32 [B, 2, 3, 96, 96]",
+            "[graphs.encoder] encoder.onnx has no input \"state\", f32 [B, 2, 4] is expected",
+            "[graphs.encoder] encoder.onnx: input \"mask\" is f32 [?, 3], by policy.json it is f32 [B, 2]",
+            "[graphs.encoder] encoder.onnx has the input \"stat\", which policy.json does not know",
+            "[graphs.denoiser] denoiser.onnx: input \"timestep\" is f32 [?], by policy.json it is i64 [B]",
+            "[graphs.denoiser] denoiser.onnx: input \"global_cond\" is f32 [?, 200], by policy.json it is f32 [B, 264]",
+            "[graphs.denoiser] denoiser.onnx has the output \"extra\", which policy.json does not know",
+        ]
+    );
+    denoiser.outputs.clear();
+    let told = told(bundle().check_graphs(&graphs().0, &denoiser));
+    assert!(told.last().unwrap().contains("denoiser.onnx has no output, f32 [B, 16, 4] is expected"), "{told:?}");
+}

@@ -1,0 +1,265 @@
+//! Graphs: the networks of a bundle, loaded and run.
+//!
+//! [`LoadedGraph::load`] reads one, which says of itself what it takes and gives ([`LoadedGraph::shape`]). Held
+//! against its bundle, it is [bound](LoadedGraph::bind) to memory for one batch of every tensor, which every
+//! later run reads and writes in place.
+//!
+//! Invariant: a run on bound memory allocates nothing on this side of the library.
+
+use ort::memory::Allocator;
+use ort::session::builder::{GraphOptimizationLevel, SessionBuilder};
+use ort::session::{HasSelectedOutputs, OutputSelector, RunOptions, Session, SessionInputValue};
+use ort::value::{DynValue, Outlet, PrimitiveTensorElementType, Tensor, TensorElementType, ValueType};
+
+use super::bundle::{Element, GraphShape, TensorShape};
+use super::library::Environment;
+
+/// Why a graph cannot be loaded or run.
+#[derive(Debug, thiserror::Error)]
+pub enum GraphError {
+    /// The file is no graph, or one this onnxruntime cannot run.
+    #[error("{name}: onnxruntime cannot load it: {error}")]
+    Load {
+        /// The graph's file.
+        name: String,
+        /// In onnxruntime's words.
+        error: String,
+    },
+    /// A tensor of a kind that no bundle has.
+    #[error("{name}: `{tensor}` is not a tensor of 32-bit floats or 64-bit integers with at most 2^31 elements")]
+    Kind {
+        /// The graph's file.
+        name: String,
+        /// The input or output.
+        tensor: String,
+    },
+    /// An input is missing.
+    #[error("{name}: there is no input `{input}`")]
+    NoInput {
+        /// The graph's file.
+        name: String,
+        /// The input's name.
+        input: String,
+    },
+    /// What is written to an input does not suit it.
+    #[error("{name}: input {index} does not take what it is given")]
+    Input {
+        /// The graph's file.
+        name: String,
+        /// The place among the inputs.
+        index: usize,
+    },
+    /// A run failed.
+    #[error("{name}: {error}")]
+    Run {
+        /// The graph's file.
+        name: String,
+        /// In onnxruntime's words.
+        error: String,
+    },
+}
+
+/// A graph that has been loaded.
+#[derive(Debug)]
+pub struct LoadedGraph {
+    name: String,
+    session: Session,
+}
+
+impl LoadedGraph {
+    /// Reads a graph from the bytes of the file called `name`. It will run on `threads` threads, the
+    /// calling one among them, at least 1.
+    ///
+    /// # Errors
+    /// When the bytes are no graph that this onnxruntime can run.
+    pub fn load(environment: &Environment, name: &str, bytes: &[u8], threads: usize) -> Result<Self, GraphError> {
+        let session = Session::builder(environment.ort())
+            .and_then(|builder| configure(builder, name, threads))
+            .and_then(|mut builder| builder.commit_from_memory(bytes))
+            .map_err(|error| GraphError::Load { name: name.to_owned(), error: error.to_string() })?;
+        Ok(Self { name: name.to_owned(), session })
+    }
+
+    /// What it takes and gives.
+    #[must_use]
+    pub fn shape(&self) -> GraphShape {
+        GraphShape {
+            name: self.name.clone(),
+            inputs: self.session.inputs().iter().map(tensor_shape).collect(),
+            outputs: self.session.outputs().iter().map(tensor_shape).collect(),
+        }
+    }
+
+    /// Makes the memory of its inputs, filled with zeros, and of its outputs. Dimensions that it
+    /// leaves open become 1.
+    ///
+    /// # Errors
+    /// When it has tensors that no bundle has, or there is no memory.
+    pub fn bind(self) -> Result<BoundGraph, GraphError> {
+        let Self { name, session } = self;
+        let inputs = session
+            .inputs()
+            .iter()
+            .map(|input| make_input(&name, &tensor_shape(input)).map(SessionInputValue::Owned))
+            .collect::<Result<Vec<_>, _>>()?;
+        let mut selector = OutputSelector::default();
+        for output in session.outputs() {
+            selector = selector.preallocate(output.name(), make_output(&name, &tensor_shape(output))?);
+        }
+        let options = RunOptions::new().map_err(|error| run_error(&name, &error))?.with_outputs(selector);
+        Ok(BoundGraph { name, session, inputs, options })
+    }
+}
+
+/// A graph with memory for one batch of each of its tensors.
+pub struct BoundGraph {
+    name: String,
+    session: Session,
+    inputs: Vec<SessionInputValue<'static>>,
+    options: RunOptions<HasSelectedOutputs>,
+}
+
+impl BoundGraph {
+    /// The place among the inputs of the one called `name`.
+    ///
+    /// # Errors
+    /// When there is none.
+    pub fn input_index(&self, name: &str) -> Result<usize, GraphError> {
+        let place = self.session.inputs().iter().position(|input| input.name() == name);
+        place.ok_or_else(|| GraphError::NoInput { name: self.name.clone(), input: name.to_owned() })
+    }
+
+    /// Writes the numbers of an input.
+    ///
+    /// # Errors
+    /// When there is no such input, or it holds others or not so many.
+    pub fn write(&mut self, index: usize, values: &[f32]) -> Result<(), GraphError> {
+        self.fill(index, |place: &mut [f32]| {
+            let fits = place.len() == values.len();
+            if fits {
+                place.copy_from_slice(values);
+            }
+            fits
+        })
+    }
+
+    /// Writes the same whole number all over an input.
+    ///
+    /// # Errors
+    /// When there is no such input, or it holds others.
+    pub fn write_integer(&mut self, index: usize, value: i64) -> Result<(), GraphError> {
+        self.fill(index, |place: &mut [i64]| {
+            place.fill(value);
+            true
+        })
+    }
+
+    fn fill<T: PrimitiveTensorElementType>(
+        &mut self,
+        index: usize,
+        fill: impl FnOnce(&mut [T]) -> bool,
+    ) -> Result<(), GraphError> {
+        let filled = match self.inputs.get_mut(index) {
+            Some(SessionInputValue::Owned(value)) => value.try_extract_tensor_mut().map(|(_, place)| fill(place)),
+            _ => Ok(false),
+        };
+        match filled {
+            Ok(true) => Ok(()),
+            Ok(false) => Err(GraphError::Input { name: self.name.clone(), index }),
+            Err(error) => Err(run_error(&self.name, &error)),
+        }
+    }
+
+    /// Runs the graph on what its inputs hold, and hands over its first output.
+    ///
+    /// # Errors
+    /// When onnxruntime says so.
+    pub fn run<T>(&mut self, read: impl FnOnce(&[f32]) -> T) -> Result<T, GraphError> {
+        let outputs = self.session.run_with_options(self.inputs.as_slice(), &self.options);
+        outputs
+            .and_then(|outputs| match outputs.values().next() {
+                Some(output) => output.try_extract_tensor().map(|(_, values)| read(values)),
+                None => Err(ort::Error::new("the graph has no output")),
+            })
+            .map_err(|error| run_error(&self.name, &error))
+    }
+}
+
+impl std::fmt::Debug for BoundGraph {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("BoundGraph").field("name", &self.name).finish_non_exhaustive()
+    }
+}
+
+/// One node after the other, on as few threads as were asked for, none of which burns time while it
+/// has nothing to do: the rig's other tasks want the processor too.
+fn configure(builder: SessionBuilder, name: &str, threads: usize) -> ort::Result<SessionBuilder> {
+    Ok(builder
+        .with_intra_threads(threads.max(1))?
+        .with_inter_threads(1)?
+        .with_parallel_execution(false)?
+        .with_intra_op_spinning(false)?
+        .with_inter_op_spinning(false)?
+        .with_optimization_level(GraphOptimizationLevel::All)?
+        .with_log_level(ort::logging::LogLevel::Warning)?
+        .with_log_id(name)?)
+}
+
+fn tensor_shape(outlet: &Outlet) -> TensorShape {
+    let (element, dims) = match outlet.dtype() {
+        ValueType::Tensor { ty, shape, .. } => {
+            let element = match ty {
+                TensorElementType::Float32 => Element::F32,
+                TensorElementType::Int64 => Element::I64,
+                other => Element::Other(other.to_string()),
+            };
+            (element, shape.iter().map(|dim| u64::try_from(*dim).ok()).collect())
+        }
+        other => (Element::Other(other.to_string()), Vec::new()),
+    };
+    TensorShape { name: outlet.name().to_owned(), element, dims }
+}
+
+/// The shape of a tensor's memory, and how many elements that is.
+fn dims(graph: &str, shape: &TensorShape) -> Result<(Vec<i64>, usize), GraphError> {
+    const MOST: usize = 1 << 31;
+    let mut dims = Vec::with_capacity(shape.dims.len());
+    let mut len = Some(1_usize);
+    for dim in &shape.dims {
+        let dim = dim.unwrap_or(1);
+        dims.push(i64::try_from(dim).unwrap_or(i64::MAX));
+        len = usize::try_from(dim).ok().and_then(|dim| len?.checked_mul(dim));
+    }
+    match len {
+        Some(len @ 1..=MOST) => Ok((dims, len)),
+        _ => Err(kind(graph, shape)),
+    }
+}
+
+fn make_input(graph: &str, shape: &TensorShape) -> Result<DynValue, GraphError> {
+    let (dims, len) = dims(graph, shape)?;
+    let value = match shape.element {
+        Element::F32 => Tensor::from_array((dims, vec![0_f32; len])).map(Tensor::into_dyn),
+        Element::I64 => Tensor::from_array((dims, vec![0_i64; len])).map(Tensor::into_dyn),
+        Element::Other(_) => return Err(kind(graph, shape)),
+    };
+    value.map_err(|error| run_error(graph, &error))
+}
+
+/// Memory that a run writes before anybody reads it.
+fn make_output(graph: &str, shape: &TensorShape) -> Result<DynValue, GraphError> {
+    let (dims, _) = dims(graph, shape)?;
+    if shape.element != Element::F32 {
+        return Err(kind(graph, shape));
+    }
+    let value = Tensor::<f32>::new(&Allocator::default(), dims).map_err(|error| run_error(graph, &error))?;
+    Ok(value.into_dyn())
+}
+
+fn kind(graph: &str, shape: &TensorShape) -> GraphError {
+    GraphError::Kind { name: graph.to_owned(), tensor: shape.name.clone() }
+}
+
+fn run_error(graph: &str, error: &ort::Error) -> GraphError {
+    GraphError::Run { name: graph.to_owned(), error: error.to_string() }
+}

@@ -1,0 +1,256 @@
+//! onnxruntime: which library it is, and how it comes into the process.
+//!
+//! The program carries the library, packed by `build.rs`. It is unpacked into memory that has no
+//! name in any file system (`memfd_create`) and loaded from there, so that nothing is installed and
+//! nothing is left behind. Another library is taken when it is named, by `--ort-lib` or, as other
+//! programs with onnxruntime do it, by `ORT_DYLIB_PATH`.
+//!
+//! Invariant: nothing is unpacked, loaded or started before [`Environment::open`] is called.
+//! Invariant: a library that was named is taken or the error says why not; no other one is taken
+//! instead.
+
+use std::fs::File;
+use std::io;
+use std::os::fd::AsRawFd as _;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use ort::logging::LogLevel;
+use rustix::fs::{MemfdFlags, memfd_create};
+use rustix::io::Errno;
+
+/// The packed library; empty in a build without.
+static INSIDE: &[u8] = include_bytes!(env!("RAPID_ONNXRUNTIME"));
+/// The variable that names another library.
+const VARIABLE: &str = "ORT_DYLIB_PATH";
+/// The oldest onnxruntime that serves: feature `api-24` of the crate `ort`.
+const OLDEST: u32 = ort::MINOR_VERSION;
+
+/// What this process has loaded. Only one environment may ever be made in a process.
+static LOADED: Mutex<Option<Environment>> = Mutex::new(None);
+
+/// The loaded library, ready for graphs. Clones share it.
+#[derive(Debug, Clone)]
+pub struct Environment {
+    ort: ort::environment::Environment,
+    origin: Origin,
+}
+
+/// Where a library comes from.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Origin {
+    /// `--ort-lib`.
+    Option(PathBuf),
+    /// `ORT_DYLIB_PATH`.
+    Variable(PathBuf),
+    /// This program.
+    Inside,
+}
+
+impl std::fmt::Display for Origin {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Option(path) => write!(f, "{} (--ort-lib)", path.display()),
+            Self::Variable(path) => write!(f, "{} ({VARIABLE})", path.display()),
+            Self::Inside => f.write_str("the library inside rapid"),
+        }
+    }
+}
+
+/// Why there is no onnxruntime.
+#[derive(Debug, thiserror::Error)]
+#[error("onnxruntime: {origin}: {cause}; {}", cause.fix(origin))]
+pub struct LibraryError {
+    /// What was tried.
+    pub origin: Origin,
+    /// Why that failed.
+    pub cause: Cause,
+}
+
+/// What can be wrong with a library.
+#[derive(Debug, thiserror::Error)]
+pub enum Cause {
+    /// This program was built without one.
+    #[error("this rapid was built without one")]
+    LeftOut,
+    /// There is no such file.
+    #[error("there is no such file")]
+    Missing,
+    /// It cannot be loaded, in the loader's words.
+    #[error("it cannot be loaded: {0}")]
+    Unloadable(String),
+    /// It is older than this program can use.
+    #[error("it is version {0}, and 1.{OLDEST} is the oldest that serves")]
+    TooOld(String),
+    /// There is no memory that code may be loaded from.
+    #[error("it cannot be unpacked into memory: {0}")]
+    Memory(#[source] io::Error),
+    /// It was loaded and does not start.
+    #[error("it does not start: {0}")]
+    Unusable(String),
+}
+
+impl Cause {
+    fn fix(&self, origin: &Origin) -> String {
+        let name_one = format!(
+            "name a libonnxruntime.so of version 1.{OLDEST} or later with --ort-lib PATH or {VARIABLE} (the Python package \
+             `onnxruntime` holds one, in its folder `capi`)"
+        );
+        match (self, origin) {
+            (Self::LeftOut, _) => format!("run `make setup` and build again, or {name_one}"),
+            (_, Origin::Option(_)) if !INSIDE.is_empty() => {
+                format!("{name_one}, or leave --ort-lib out: rapid carries one")
+            }
+            (_, Origin::Variable(_)) if !INSIDE.is_empty() => format!("{name_one}, or unset it: rapid carries one"),
+            _ => name_one,
+        }
+    }
+}
+
+impl Environment {
+    /// Loads onnxruntime: the file `named` by `--ort-lib`, else the one that `ORT_DYLIB_PATH` names,
+    /// else the one inside. A process loads it once: later calls get what the first one loaded.
+    ///
+    /// # Errors
+    /// When that library cannot be used. The message says what was tried and what to do.
+    pub fn open(named: Option<&Path>) -> Result<Self, LibraryError> {
+        let mut loaded = LOADED.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(environment) = &*loaded {
+            return Ok(environment.clone());
+        }
+        let origin = choose(named, std::env::var_os(VARIABLE).map(PathBuf::from));
+        let environment = match load(&origin) {
+            Ok(ort) => Self { ort, origin },
+            Err(cause) => return Err(LibraryError { origin, cause }),
+        };
+        tracing::debug!(origin = %environment.origin, "onnxruntime loaded");
+        Ok(loaded.insert(environment).clone())
+    }
+
+    /// Where the library comes from.
+    #[must_use]
+    pub fn origin(&self) -> &Origin {
+        &self.origin
+    }
+
+    /// For graphs.
+    pub(super) fn ort(&self) -> &ort::environment::Environment {
+        &self.ort
+    }
+}
+
+/// Which library is meant. An empty variable is one that is not set.
+fn choose(named: Option<&Path>, variable: Option<PathBuf>) -> Origin {
+    match (named, variable.filter(|path| !path.as_os_str().is_empty())) {
+        (Some(path), _) => Origin::Option(path.to_owned()),
+        (None, Some(path)) => Origin::Variable(path),
+        (None, None) => Origin::Inside,
+    }
+}
+
+fn load(origin: &Origin) -> Result<ort::environment::Environment, Cause> {
+    match origin {
+        Origin::Option(path) | Origin::Variable(path) => {
+            if !path.exists() {
+                return Err(Cause::Missing);
+            }
+            // `ort` looks for a relative path beside the program first.
+            start(&std::path::absolute(path).unwrap_or_else(|_| path.clone()))
+        }
+        Origin::Inside if INSIDE.is_empty() => Err(Cause::LeftOut),
+        Origin::Inside => {
+            let memory = unpack(INSIDE).map_err(Cause::Memory)?;
+            // The loader maps the memory; the descriptor is not needed any longer.
+            start(Path::new(&format!("/proc/self/fd/{}", memory.as_raw_fd())))
+        }
+    }
+}
+
+/// Memory with a descriptor, and the library in it.
+fn unpack(packed: &[u8]) -> io::Result<File> {
+    // Sealed against being run as a program, which it is not: a kernel that allows no programs in
+    // such memory (sysctl vm.memfd_noexec) still allows this. Kernels before 6.3 know neither.
+    let memory = match memfd_create("libonnxruntime.so", MemfdFlags::CLOEXEC | MemfdFlags::NOEXEC_SEAL) {
+        Err(Errno::INVAL) => memfd_create("libonnxruntime.so", MemfdFlags::CLOEXEC),
+        other => other,
+    }?;
+    let mut memory = File::from(memory);
+    zstd::stream::copy_decode(packed, &mut memory)?;
+    Ok(memory)
+}
+
+fn start(path: &Path) -> Result<ort::environment::Environment, Cause> {
+    let builder = ort::init_from(path).map_err(|error| match error {
+        ort::LoadDynamicError::BadVersion { version_str, .. } => Cause::TooOld(version_str),
+        ort::LoadDynamicError::Dlopen { error, .. } => Cause::Unloadable(error.to_string()),
+        ort::LoadDynamicError::MissingApi { .. } | ort::LoadDynamicError::InvalidVersionString => {
+            Cause::Unloadable("it is not onnxruntime".to_owned())
+        }
+    })?;
+    let environment = builder
+        .with_name("rapid")
+        .with_telemetry(false)
+        .with_logger(Arc::new(log))
+        .build()
+        .map_err(|error| Cause::Unusable(error.to_string()))?;
+    // Anything below would be formatted at every run only to be thrown away.
+    environment.set_log_level(LogLevel::Warning);
+    Ok(environment)
+}
+
+fn log(level: LogLevel, _category: &str, graph: &str, _location: &str, message: &str) {
+    match level {
+        LogLevel::Fatal | LogLevel::Error => tracing::error!(graph, "onnxruntime: {message}"),
+        LogLevel::Warning => tracing::warn!(graph, "onnxruntime: {message}"),
+        LogLevel::Info | LogLevel::Verbose => tracing::debug!(graph, "onnxruntime: {message}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_named_library_comes_before_the_variable_and_that_before_the_one_inside() {
+        let variable = || Some(PathBuf::from("/v/libonnxruntime.so"));
+        let named = Path::new("/n/libonnxruntime.so");
+        assert_eq!(choose(Some(named), variable()), Origin::Option(named.to_owned()));
+        assert_eq!(choose(None, variable()), Origin::Variable(PathBuf::from("/v/libonnxruntime.so")));
+        assert_eq!(choose(None, Some(PathBuf::new())), Origin::Inside);
+        assert_eq!(choose(None, None), Origin::Inside);
+    }
+
+    #[test]
+    fn what_does_not_load_says_what_was_tried_and_what_to_do() {
+        let folder = tempfile::tempdir().unwrap();
+        let text = folder.path().join("libonnxruntime.so");
+        std::fs::write(&text, "no library").unwrap();
+        let missing = folder.path().join("missing.so");
+        for (path, why) in [(&text, "it cannot be loaded: "), (&missing, "there is no such file")] {
+            let origin = Origin::Option(path.clone());
+            let error = LibraryError { cause: load(&origin).unwrap_err(), origin }.to_string();
+            assert!(error.starts_with(&format!("onnxruntime: {} (--ort-lib): {why}", path.display())), "{error}");
+            assert!(error.contains("name a libonnxruntime.so of version 1.24 or later"), "{error}");
+        }
+    }
+
+    #[test]
+    fn every_cause_has_a_fix() {
+        let causes = [Cause::LeftOut, Cause::Missing, Cause::TooOld("1.20.1".to_owned())];
+        for cause in causes {
+            let error = LibraryError { origin: Origin::Variable("/v.so".into()), cause }.to_string();
+            assert!(error.contains("--ort-lib PATH or ORT_DYLIB_PATH"), "{error}");
+        }
+    }
+
+    #[test]
+    fn the_library_inside_is_whole_and_is_loaded_once() {
+        assert!(!INSIDE.is_empty(), "built without onnxruntime, which `make setup` fetches");
+        let memory = unpack(INSIDE).unwrap();
+        assert!(memory.metadata().unwrap().len() > 10_000_000);
+        drop(memory);
+        let first = Environment::open(None).unwrap();
+        let second = Environment::open(Some(Path::new("/no/such/file"))).unwrap();
+        assert_eq!(first.origin(), second.origin());
+    }
+}

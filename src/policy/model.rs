@@ -1,0 +1,151 @@
+//! A policy that answers: requests in, action chunks out.
+//!
+//! Invariant: the same request gives the same chunk, given the same pictures before the first one of each
+//! modality that is compared with a reference.
+//! Invariant: of an absent modality nothing is read: its numbers are zeros and its element of the mask is 0.
+
+use super::bundle::{Bundle, ObservationInput};
+use super::library::Environment;
+use super::observation::{ObservationTensors, VectorError};
+use super::picture::{Picture, PictureError, Preprocessor};
+use super::request::{Cell, Request};
+use super::sampler::{PolicyError, Sampler};
+use crate::sample::Encoding;
+
+/// Why a request has no answer.
+#[derive(Debug, thiserror::Error)]
+pub enum AnswerError {
+    /// A picture cannot be used.
+    #[error("{modality}: {reason}")]
+    Picture {
+        /// The modality.
+        modality: String,
+        /// Why.
+        reason: PictureError,
+    },
+    /// A vector cannot be used.
+    #[error("{modality}: {reason}")]
+    Vector {
+        /// The modality.
+        modality: String,
+        /// Why.
+        reason: VectorError,
+    },
+    /// A sample is of a kind that no policy takes.
+    #[error("{modality}: samples of an unknown encoding")]
+    Encoding {
+        /// The modality.
+        modality: String,
+    },
+    /// The graphs.
+    #[error(transparent)]
+    Policy(#[from] PolicyError),
+}
+
+/// See the module's comment.
+#[derive(Debug)]
+pub struct Model {
+    lanes: Vec<Lane>,
+    tensors: ObservationTensors,
+    sampler: Sampler,
+}
+
+#[derive(Debug)]
+struct Lane {
+    modality: String,
+    /// None of a vector.
+    pictures: Option<Preprocessor>,
+    /// Of a vector.
+    numbers: Vec<f64>,
+}
+
+impl Model {
+    /// Loads the graphs of a bundle. `steps` of denoising instead of the bundle's own.
+    ///
+    /// # Errors
+    /// When the graphs are not those of the bundle.
+    pub fn load(bundle: &Bundle, environment: &Environment, steps: Option<usize>) -> Result<Self, PolicyError> {
+        let lanes = bundle.observations.iter().map(|observation| Lane {
+            modality: observation.modality.clone(),
+            pictures: match observation.input {
+                ObservationInput::Image(image) => Some(Preprocessor::new(image, &observation.normalization)),
+                ObservationInput::Vector(_) => None,
+            },
+            numbers: Vec::new(),
+        });
+        let sampler = Sampler::new(bundle, environment, steps, 1)?;
+        Ok(Self { lanes: lanes.collect(), tensors: ObservationTensors::new(bundle), sampler })
+    }
+
+    /// Numbers of a chunk.
+    #[must_use]
+    pub fn chunk_len(&self) -> usize {
+        self.sampler.chunk_len()
+    }
+
+    /// Another episode: the next picture of each camera is its reference.
+    pub fn reset(&mut self) {
+        for lane in &mut self.lanes {
+            if let Some(reference) = lane.pictures.as_mut().and_then(Preprocessor::reference) {
+                reference.reset();
+            }
+        }
+    }
+
+    /// Writes the chunk that answers `request` into `chunk`, action by action.
+    ///
+    /// # Errors
+    /// When a sample cannot be used or onnxruntime fails.
+    pub fn answer(&mut self, request: &Request, chunk: &mut [f32]) -> Result<(), AnswerError> {
+        self.observe(request)?;
+        Ok(self.sampler.chunk(&self.tensors, request.seed, chunk)?)
+    }
+
+    /// Fills the tensors.
+    ///
+    /// # Errors
+    /// When a sample cannot be used.
+    pub fn observe(&mut self, request: &Request) -> Result<&ObservationTensors, AnswerError> {
+        for (at, lane) in self.lanes.iter_mut().enumerate() {
+            let present = request.is_present(at);
+            self.tensors.set_present(at, present);
+            if !present {
+                continue;
+            }
+            for step in 0..request.steps() {
+                if let Some(cell) = request.cell(at, step) {
+                    lane.write(cell, at, step, &mut self.tensors)?;
+                }
+            }
+        }
+        Ok(&self.tensors)
+    }
+}
+
+impl Lane {
+    fn write(
+        &mut self,
+        cell: &Cell,
+        at: usize,
+        step: usize,
+        tensors: &mut ObservationTensors,
+    ) -> Result<(), AnswerError> {
+        let Some(encoding) = cell.encoding else {
+            return Err(AnswerError::Encoding { modality: self.modality.clone() });
+        };
+        if let Some(pictures) = &mut self.pictures {
+            let Some(place) = tensors.step_mut(at, step) else { return Ok(()) };
+            let picture = Picture { encoding, width: cell.width, height: cell.height, bytes: &cell.bytes };
+            let written = pictures.write(&picture, place);
+            return written.map_err(|reason| AnswerError::Picture { modality: self.modality.clone(), reason });
+        }
+        let (numbers, rest) = cell.bytes.as_chunks::<8>();
+        if encoding != Encoding::F64 || !rest.is_empty() {
+            return Err(AnswerError::Encoding { modality: self.modality.clone() });
+        }
+        self.numbers.clear();
+        self.numbers.extend(numbers.iter().map(|number| f64::from_le_bytes(*number)));
+        let written = tensors.write_vector(at, step, &self.numbers);
+        written.map_err(|reason| AnswerError::Vector { modality: self.modality.clone(), reason })
+    }
+}

@@ -1,0 +1,187 @@
+//! Numbers as a network was trained on them, and back.
+//!
+//! `min_max`: `(v - min) / (max - min) * 2 - 1`. `mean_std`: `(v - mean) / (std + eps)`. `identity`:
+//! `v`. Arithmetic is that of 32-bit floats, as in training.
+//!
+//! Invariant: nothing here allocates after construction, and no input makes it panic.
+
+use super::bundle::{BundleAction, Normalization};
+
+/// The statistics of one normalisation, dimension by dimension.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Normalizer {
+    dimensions: Vec<Dimension>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Dimension {
+    /// Taken off first: what is near it must not lose its digits.
+    offset: f32,
+    width: f32,
+    low: f32,
+    span: f32,
+}
+
+impl Dimension {
+    const IDENTITY: Self = Self { offset: 0.0, width: 1.0, low: 0.0, span: 1.0 };
+
+    fn forward(self, value: f32) -> f32 {
+        (value - self.offset) / self.width * self.span + self.low
+    }
+
+    fn inverse(self, normalized: f32) -> f32 {
+        (normalized - self.low) / self.span * self.width + self.offset
+    }
+}
+
+impl Normalizer {
+    /// For `len` dimensions: channels of a picture, values of a vector. What the statistics lack is
+    /// left as it is; those of a checked bundle lack nothing.
+    #[must_use]
+    pub fn new(normalization: &Normalization, len: usize) -> Self {
+        let mut dimensions = vec![Dimension::IDENTITY; len];
+        fill(&mut dimensions, normalization);
+        Self { dimensions }
+    }
+
+    /// For an action, slice by slice.
+    #[must_use]
+    pub fn of_action(action: &BundleAction) -> Self {
+        let mut dimensions = vec![Dimension::IDENTITY; action.len()];
+        for part in &action.normalization {
+            fill(dimensions.get_mut(part.slice.clone()).unwrap_or_default(), &part.normalization);
+        }
+        Self { dimensions }
+    }
+
+    /// Number of dimensions.
+    #[must_use]
+    pub fn dimensions(&self) -> usize {
+        self.dimensions.len()
+    }
+
+    /// Normalises vectors that lie one after the other, `[.., D]`, into `out` of the same length.
+    pub fn forward(&self, values: &[f32], out: &mut [f32]) {
+        for (values, out) in self.vectors(values, out) {
+            for ((dimension, value), out) in self.dimensions.iter().zip(values).zip(out) {
+                *out = dimension.forward(*value);
+            }
+        }
+    }
+
+    /// The inverse of [`Self::forward`], as for a denoiser's output `[Tp, Da]`.
+    pub fn inverse(&self, normalized: &[f32], out: &mut [f32]) {
+        for (normalized, out) in self.vectors(normalized, out) {
+            for ((dimension, value), out) in self.dimensions.iter().zip(normalized).zip(out) {
+                *out = dimension.inverse(*value);
+            }
+        }
+    }
+
+    /// [`Self::inverse`] in place.
+    pub fn invert(&self, values: &mut [f32]) {
+        for vector in values.chunks_exact_mut(self.dimensions.len().max(1)) {
+            for (dimension, value) in self.dimensions.iter().zip(vector) {
+                *value = dimension.inverse(*value);
+            }
+        }
+    }
+
+    /// Normalises a picture whose channels lie one after the other, `[C, H * W]`, in place.
+    pub fn normalize_planes(&self, picture: &mut [f32]) {
+        let plane = (picture.len() / self.dimensions.len().max(1)).max(1);
+        for (dimension, plane) in self.dimensions.iter().zip(picture.chunks_exact_mut(plane)) {
+            for value in plane {
+                *value = dimension.forward(*value);
+            }
+        }
+    }
+
+    fn vectors<'v>(&self, from: &'v [f32], to: &'v mut [f32]) -> impl Iterator<Item = (&'v [f32], &'v mut [f32])> {
+        let len = self.dimensions.len().max(1);
+        from.chunks_exact(len).zip(to.chunks_exact_mut(len))
+    }
+}
+
+fn fill(dimensions: &mut [Dimension], normalization: &Normalization) {
+    match normalization {
+        Normalization::MinMax { min, max } => {
+            for (dimension, (min, max)) in dimensions.iter_mut().zip(min.iter().zip(max)) {
+                *dimension = Dimension { offset: *min, width: max - min, low: -1.0, span: 2.0 };
+            }
+        }
+        Normalization::MeanStd { mean, std, eps } => {
+            for (dimension, (mean, std)) in dimensions.iter_mut().zip(mean.iter().zip(std)) {
+                *dimension = Dimension { offset: *mean, width: std + eps, low: 0.0, span: 1.0 };
+            }
+        }
+        Normalization::Identity => {}
+    }
+}
+
+#[cfg(test)]
+#[expect(clippy::float_cmp, reason = "numbers that 32-bit floats hold exactly")]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn min_max() -> Normalization {
+        Normalization::MinMax { min: vec![0.0, -2.0], max: vec![1.0, 6.0] }
+    }
+
+    #[test]
+    fn every_mode_does_what_its_formula_says() {
+        let normalizer = Normalizer::new(&min_max(), 2);
+        let mut out = [0.0; 6];
+        normalizer.forward(&[0.0, -2.0, 1.0, 6.0, 0.5, 0.0], &mut out);
+        assert_eq!(out, [-1.0, -1.0, 1.0, 1.0, 0.0, -0.5]);
+        let mean_std = Normalization::MeanStd { mean: vec![1.0, 2.0], std: vec![1.5, 0.0], eps: 0.5 };
+        let mut out = [0.0; 2];
+        Normalizer::new(&mean_std, 2).forward(&[5.0, 3.0], &mut out);
+        assert_eq!(out, [2.0, 2.0]);
+        Normalizer::new(&mean_std, 2).inverse(&[2.0, 2.0], &mut out);
+        assert_eq!(out, [5.0, 3.0]);
+        Normalizer::new(&Normalization::Identity, 2).forward(&[0.1, f32::MAX], &mut out);
+        assert_eq!(out, [0.1, f32::MAX]);
+    }
+
+    #[test]
+    fn a_picture_is_normalised_channel_by_channel() {
+        let mean_std = Normalization::MeanStd { mean: vec![0.0, 1.0, 2.0], std: vec![1.0, 2.0, 4.0], eps: 0.0 };
+        let mut picture = [1.0, 2.0, 1.0, 3.0, 2.0, 6.0];
+        Normalizer::new(&mean_std, 3).normalize_planes(&mut picture);
+        assert_eq!(picture, [1.0, 2.0, 0.0, 1.0, 0.0, 1.0]);
+    }
+
+    #[test]
+    fn slices_of_an_action_have_their_own_modes() {
+        let mut action =
+            crate::policy::bundle::Bundle::parse(crate::policy::bundle::example::POLICY, "").unwrap().action;
+        let slice = |slice, normalization| crate::policy::bundle::SliceNormalization { slice, normalization };
+        action.normalization = vec![
+            slice(0..2, min_max()),
+            slice(2..3, Normalization::Identity),
+            slice(3..4, Normalization::MeanStd { mean: vec![3.0], std: vec![2.0], eps: 0.0 }),
+        ];
+        let mut chunk = [-1.0, 1.0, 0.25, 2.0, 1.0, -1.0, 0.5, -1.0];
+        Normalizer::of_action(&action).invert(&mut chunk);
+        assert_eq!(chunk, [0.0, 6.0, 0.25, 7.0, 1.0, -2.0, 0.5, 1.0]);
+    }
+
+    proptest! {
+        #[test]
+        fn back_is_where_it_came_from(value in -10.0_f32..10.0, min in -5.0_f32..5.0, width in 0.01_f32..10.0) {
+            for normalization in [
+                Normalization::MinMax { min: vec![min], max: vec![min + width] },
+                Normalization::MeanStd { mean: vec![min], std: vec![width], eps: 1e-8 },
+            ] {
+                let normalizer = Normalizer::new(&normalization, 1);
+                let (mut there, mut back) = ([0.0], [0.0]);
+                normalizer.forward(&[value], &mut there);
+                normalizer.inverse(&there, &mut back);
+                prop_assert!((back[0] - value).abs() <= 1e-5 * (1.0 + value.abs()), "{value} -> {} -> {}", there[0], back[0]);
+            }
+        }
+    }
+}

@@ -1,0 +1,132 @@
+//! What a policy looks at for one chunk: numbers of every observation key, and the mask.
+//!
+//! Invariant: the memory is made once, and is as long as the bundle says.
+//! Invariant: what is absent is zeros after normalisation, and its element of the mask is 0.
+
+use super::bundle::{Bundle, ObservationInput, VectorSpec};
+use super::normalize::Normalizer;
+
+/// Why a sample's numbers are no observation.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum VectorError {
+    /// The observation is made of pictures.
+    #[error("observation `{0}` is made of pictures, not of numbers")]
+    Pictures(String),
+    /// The sample has other numbers than the policy takes.
+    #[error("a sample of {found} numbers, where observation `{key}` takes {wanted}: see its `slice` in policy.json")]
+    Length {
+        /// The observation.
+        key: String,
+        /// Numbers in the sample.
+        found: usize,
+        /// Those that are wanted, in words.
+        wanted: String,
+    },
+}
+
+/// The observations of one chunk. An observation is named by its place in the bundle's list.
+#[derive(Debug, Clone)]
+pub struct ObservationTensors {
+    tensors: Vec<Tensor>,
+    mask: Vec<f32>,
+}
+
+#[derive(Debug, Clone)]
+struct Tensor {
+    key: String,
+    /// Observation steps one after the other, the oldest first.
+    values: Vec<f32>,
+    /// Numbers of one step.
+    step: usize,
+    vector: Option<(VectorSpec, Normalizer)>,
+    /// Its modality's element of the mask.
+    mask: Option<usize>,
+}
+
+impl ObservationTensors {
+    /// Zeros, everything absent.
+    #[must_use]
+    pub fn new(bundle: &Bundle) -> Self {
+        let order = bundle.mask.as_ref().map_or(&[][..], |mask| &mask.order);
+        let tensors = bundle.observations.iter().map(|observation| {
+            let (step, vector) = match &observation.input {
+                ObservationInput::Image(image) => (3 * image.height * image.width, None),
+                ObservationInput::Vector(vector) => {
+                    let normalizer = Normalizer::new(&observation.normalization, vector.len);
+                    (vector.len, Some((vector.clone(), normalizer)))
+                }
+            };
+            Tensor {
+                key: observation.key.clone(),
+                values: vec![0.0; bundle.n_obs_steps * step],
+                step,
+                vector,
+                mask: order.iter().position(|modality| *modality == observation.modality),
+            }
+        });
+        Self { tensors: tensors.collect(), mask: vec![0.0; order.len()] }
+    }
+
+    /// Where to write step `step`, 0 the oldest, of an observation, as a
+    /// [`Preprocessor`](super::picture::Preprocessor) does. `None` if there is no such place.
+    pub fn step_mut(&mut self, observation: usize, step: usize) -> Option<&mut [f32]> {
+        let tensor = self.tensors.get_mut(observation)?;
+        let begin = tensor.step.checked_mul(step)?;
+        tensor.values.get_mut(begin..begin.checked_add(tensor.step)?)
+    }
+
+    /// Writes step `step` of an observation that is a vector, from the numbers of a sample. A place
+    /// that there is not stays unwritten.
+    ///
+    /// # Errors
+    /// When the sample has other numbers than the bundle says.
+    pub fn write_vector(&mut self, observation: usize, step: usize, sample: &[f64]) -> Result<(), VectorError> {
+        let Some(tensor) = self.tensors.get_mut(observation) else { return Ok(()) };
+        let Some((spec, normalizer)) = &tensor.vector else { return Err(VectorError::Pictures(tensor.key.clone())) };
+        let wanted = match &spec.slice {
+            Some(slice) => sample.get(slice.clone()),
+            None => (sample.len() == spec.len).then_some(sample),
+        };
+        let Some(wanted) = wanted else {
+            let wanted = match &spec.slice {
+                Some(slice) => format!("numbers {} to {} of at least {}", slice.start, slice.end, slice.end),
+                None => spec.len.to_string(),
+            };
+            return Err(VectorError::Length { key: tensor.key.clone(), found: sample.len(), wanted });
+        };
+        if let Some(place) = tensor.values.chunks_exact_mut(tensor.step.max(1)).nth(step) {
+            for (value, number) in place.iter_mut().zip(wanted) {
+                #[expect(clippy::cast_possible_truncation, reason = "networks compute with 32 bits")]
+                {
+                    *value = *number as f32;
+                }
+            }
+            normalizer.normalize_planes(place);
+        }
+        Ok(())
+    }
+
+    /// Says whether an observation's modality is there. One that is not is zeros from here on, until
+    /// it is written again.
+    pub fn set_present(&mut self, observation: usize, present: bool) {
+        let Some(tensor) = self.tensors.get_mut(observation) else { return };
+        if !present {
+            tensor.values.fill(0.0);
+        }
+        if let Some(element) = tensor.mask.and_then(|place| self.mask.get_mut(place)) {
+            *element = f32::from(u8::from(present));
+        }
+    }
+
+    /// The numbers of an observation, all steps.
+    #[must_use]
+    pub fn values(&self, observation: usize) -> &[f32] {
+        self.tensors.get(observation).map_or(&[], |tensor| &tensor.values)
+    }
+
+    /// The mask, in the order of the bundle; empty if it has none.
+    #[must_use]
+    pub fn mask(&self) -> &[f32] {
+        &self.mask
+    }
+}

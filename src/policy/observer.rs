@@ -1,0 +1,171 @@
+//! What a policy sees at a tick of the control grid: the samples that `sync` chooses, of the last ticks.
+//!
+//! Samples are kept as they came, one copy of each; what a tick chose is remembered for as many ticks as an
+//! observation has steps. A step without a sample of its own (before the first tick, or before a modality
+//! was plugged in) is given the sample of the step after it, as in training.
+//!
+//! Invariant: nothing here allocates once the places of the samples have grown to the largest.
+
+use std::time::Duration;
+
+use super::bundle::Bundle;
+use super::request::Request;
+use crate::mask::PhysicalMask;
+use crate::modality::ModalityId;
+use crate::registry::{Registry, WhenStale};
+use crate::sample::{Epoch, FLAG_ERROR, SampleHeader};
+use crate::sync::{SyncModality, SyncSample, Synchronizer};
+use crate::time::Stamp;
+
+/// See the module's comment.
+#[derive(Debug)]
+pub struct Observer {
+    sync: Synchronizer<usize>,
+    lanes: Vec<Lane>,
+    /// Steps of an observation.
+    steps: usize,
+}
+
+/// One observation of the bundle.
+#[derive(Debug)]
+struct Lane {
+    id: Option<ModalityId>,
+    /// The newest samples, each in the place that the ring's entry names.
+    places: Vec<Place>,
+    next: usize,
+    /// What the last ticks chose, the newest first.
+    chosen: Vec<Option<Chosen>>,
+}
+
+#[derive(Debug, Clone, Default)]
+struct Place {
+    header: SampleHeader,
+    bytes: Vec<u8>,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Chosen {
+    place: usize,
+    seq: u64,
+    age_ns: i64,
+}
+
+impl Observer {
+    /// For the observations of a bundle that fits the registry.
+    #[must_use]
+    pub fn new(bundle: &Bundle, registry: &Registry) -> Self {
+        let devices = || bundle.observations.iter().map(|observation| registry.named(&observation.modality));
+        let modalities: Vec<SyncModality> = devices()
+            .flatten()
+            .map(|device| SyncModality {
+                id: device.id,
+                // Whether a sample is too old is the policy's to judge.
+                when_stale: WhenStale::Hold,
+                latency: device.latency,
+                capacity: device.depth,
+            })
+            .collect();
+        let lanes = devices().map(|device| Lane {
+            id: device.map(|device| device.id),
+            places: vec![Place::default(); device.map_or(0, |device| device.depth)],
+            next: 0,
+            chosen: vec![None; bundle.n_obs_steps],
+        });
+        Self {
+            lanes: lanes.collect(),
+            sync: Synchronizer::new(&modalities, registry.rig.sync_window),
+            steps: bundle.n_obs_steps,
+        }
+    }
+
+    /// Keeps a sample; one of a modality that the policy does not observe, or that its device says is
+    /// damaged, is not kept.
+    pub fn push(&mut self, id: ModalityId, header: &SampleHeader, payload: &[u8]) {
+        if header.flags & FLAG_ERROR != 0 {
+            return;
+        }
+        // Observations of one modality (two ways to look at one camera) take their places in step: the first
+        // of them is the ring's.
+        let mut kept = None;
+        for lane in self.lanes.iter_mut().filter(|lane| lane.id == Some(id)) {
+            let at = lane.next;
+            let Some(place) = lane.places.get_mut(at) else { continue };
+            place.header = *header;
+            place.bytes.clear();
+            place.bytes.extend_from_slice(payload);
+            lane.next = (at + 1) % lane.places.len();
+            kept = Some(at);
+        }
+        let Some(keep) = kept else { return };
+        let (capture, recv, epoch) = (Stamp(header.capture_ns), Stamp(header.recv_ns), Epoch(header.epoch));
+        self.sync.push(id, SyncSample { capture, recv, seq: header.seq, epoch, keep });
+    }
+
+    /// The capture of the newest sample, once every modality that is present has sent one.
+    #[must_use]
+    pub fn first_sight(&self, mask: PhysicalMask) -> Option<Stamp> {
+        let present = self.lanes.iter().filter(|lane| lane.id.is_some_and(|id| mask.contains(id)));
+        let newest = |lane: &Lane| lane.places.iter().map(|place| place.header.capture_ns).max().filter(|ns| *ns > 0);
+        // One that has sent nothing makes all of it nothing.
+        let newest = present.map(newest).collect::<Option<Vec<u64>>>()?;
+        newest.into_iter().max().map(Stamp)
+    }
+
+    /// Looks at a tick, by what is known `now`. Returns the age of the oldest sample of what is present;
+    /// `None` if something present has no sample at all, or nothing is present.
+    pub fn look(&mut self, tick: Stamp, now: Stamp, mask: PhysicalMask) -> Option<Duration> {
+        self.sync.observe(tick, now, mask);
+        let mut oldest = None;
+        let mut whole = true;
+        for lane in &mut self.lanes {
+            lane.chosen.rotate_right(1);
+            let Some(newest) = lane.chosen.first_mut() else { continue };
+            *newest = None;
+            let Some(slot) = lane.id.and_then(|id| self.sync.observation().slot(id)).filter(|slot| slot.present) else {
+                continue;
+            };
+            let sample = self.sync.sample(slot);
+            *newest = sample.map(|sample| Chosen { place: sample.keep, seq: sample.seq, age_ns: slot.age_ns });
+            whole &= newest.is_some();
+            let age = Duration::from_nanos(u64::try_from(slot.age_ns).unwrap_or(0));
+            oldest = oldest.max(Some(age));
+        }
+        oldest.filter(|_| whole)
+    }
+
+    /// Fills `request` with what the last ticks chose, the newest of which is its tick.
+    pub fn fill(&self, request: &mut Request) {
+        for (at, lane) in self.lanes.iter().enumerate() {
+            let present = lane.chosen.first().is_some_and(Option::is_some);
+            request.set_present(at, present);
+            if !present {
+                continue;
+            }
+            let mut chosen = None;
+            // From the newest step back: a step without a sample takes that of the step after it, and one whose
+            // sample has been overwritten since.
+            for (back, step) in (0..self.steps).rev().enumerate() {
+                let kept = lane.chosen.get(back).copied().flatten();
+                let kept =
+                    kept.filter(|kept| lane.places.get(kept.place).is_some_and(|place| place.header.seq == kept.seq));
+                chosen = kept.or(chosen);
+                let (Some(kept), Some(cell)) = (chosen, request.cell_mut(at, step)) else { continue };
+                if let Some(place) = lane.places.get(kept.place) {
+                    cell.set(&place.header, kept.age_ns, &place.bytes);
+                }
+            }
+        }
+    }
+
+    /// Forgets what was seen.
+    pub fn clear(&mut self) {
+        self.sync.clear();
+        for lane in &mut self.lanes {
+            lane.chosen.fill(None);
+            lane.next = 0;
+            for place in &mut lane.places {
+                place.header = SampleHeader::default();
+            }
+        }
+    }
+}

@@ -1,0 +1,312 @@
+//! Pictures: from what a camera sent to what an encoder reads.
+//!
+//! Decoded to 8-bit colours, divided by 255, resized (bilinear, half-pixel centres, no antialiasing),
+//! cropped to the middle, compared with a reference if the policy was trained so, normalised. All of
+//! it in memory that is made once; the JPEG decoder alone makes its own for every picture.
+//!
+//! Invariant: a picture that is refused has changed nothing: not the observation, not the reference.
+
+use zune_jpeg::JpegDecoder;
+use zune_jpeg::zune_core::bytestream::ZCursor;
+use zune_jpeg::zune_core::colorspace::ColorSpace;
+use zune_jpeg::zune_core::options::DecoderOptions;
+
+use super::bundle::{ColorOrder, ImageSpec, Normalization, Operation};
+use super::normalize::Normalizer;
+use crate::calibration::with_mark;
+use crate::sample::Encoding;
+
+const CHANNELS: usize = 3;
+/// Pixels a picture may have along a side, as in the registry.
+const LARGEST: usize = 8192;
+
+/// Why a picture is no observation.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum PictureError {
+    /// The samples are none.
+    #[error("the samples are no pictures but {0:?}")]
+    NoPicture(Encoding),
+    /// It cannot be decoded.
+    #[error("damaged picture: {0}")]
+    Damaged(String),
+    /// Not as many bytes as pixels of this format have.
+    #[error("{found} bytes, where a picture of {width}x{height} has {expected}")]
+    Length {
+        /// Bytes there are.
+        found: usize,
+        /// Bytes there should be.
+        expected: usize,
+        /// Pixels a row.
+        width: usize,
+        /// Rows.
+        height: usize,
+    },
+    /// The size does not suit the policy.
+    #[error(
+        "a picture of {width}x{height}, where the policy takes {wanted_width}x{wanted_height}: set the camera to that, \
+         or `resize` in policy.json"
+    )]
+    Size {
+        /// Pixels a row.
+        width: usize,
+        /// Rows.
+        height: usize,
+        /// Pixels a row that are wanted, at least so many if the picture is cropped.
+        wanted_width: usize,
+        /// Rows that are wanted.
+        wanted_height: usize,
+    },
+}
+
+/// A picture as the bus brings it.
+#[derive(Debug, Clone, Copy)]
+pub struct Picture<'a> {
+    /// How `bytes` are encoded.
+    pub encoding: Encoding,
+    /// Pixels a row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// The payload.
+    pub bytes: &'a [u8],
+}
+
+/// Makes observations of one camera's pictures.
+#[derive(Debug)]
+pub struct Preprocessor {
+    spec: ImageSpec,
+    normalizer: Normalizer,
+    reference: Option<Reference>,
+    /// The picture with the mark that its decoder looks for.
+    jpeg: Vec<u8>,
+    /// Red, green, blue, row by row.
+    pixels: Vec<u8>,
+    /// The size that `columns` and `rows` are for.
+    size: [usize; 2],
+    columns: Vec<Tap>,
+    rows: Vec<Tap>,
+}
+
+/// Where along an axis a value comes from: the share of `high`, the rest of `low`.
+#[derive(Debug, Clone, Copy)]
+struct Tap {
+    low: usize,
+    high: usize,
+    share: f32,
+}
+
+/// What later pictures are compared with: the first one, be the camera unplugged or not.
+#[derive(Debug)]
+pub struct Reference {
+    values: Vec<f32>,
+    taken: bool,
+}
+
+impl Reference {
+    fn new(len: usize) -> Self {
+        Self { values: vec![0.0; len], taken: false }
+    }
+
+    /// A new episode: the next picture is the reference.
+    pub fn reset(&mut self) {
+        self.taken = false;
+    }
+
+    /// Is there one?
+    #[must_use]
+    pub fn is_taken(&self) -> bool {
+        self.taken
+    }
+
+    /// `(v - reference) / 2 + 0.5`.
+    fn compare(&mut self, values: &mut [f32]) {
+        if !self.taken {
+            self.values.copy_from_slice(values);
+            self.taken = true;
+        }
+        for (value, reference) in values.iter_mut().zip(&self.values) {
+            *value = (*value - reference) / 2.0 + 0.5;
+        }
+    }
+}
+
+impl Preprocessor {
+    /// For pictures of `spec`, whose normalisation has one entry a channel.
+    #[must_use]
+    pub fn new(spec: ImageSpec, normalization: &Normalization) -> Self {
+        let len = CHANNELS * spec.height * spec.width;
+        Self {
+            spec,
+            normalizer: Normalizer::new(normalization, CHANNELS),
+            reference: (spec.operation == Some(Operation::DiffToReference)).then(|| Reference::new(len)),
+            jpeg: Vec::new(),
+            pixels: Vec::new(),
+            size: [0, 0],
+            columns: Vec::with_capacity(spec.width),
+            rows: Vec::with_capacity(spec.height),
+        }
+    }
+
+    /// Numbers of one observation: 3 x height x width.
+    #[must_use]
+    pub fn output_len(&self) -> usize {
+        CHANNELS * self.spec.height * self.spec.width
+    }
+
+    /// The reference that pictures are compared with, if this policy does so.
+    pub fn reference(&mut self) -> Option<&mut Reference> {
+        self.reference.as_mut()
+    }
+
+    /// Writes the observation of a picture, channel by channel, row by row. The first one is the
+    /// reference of all others.
+    ///
+    /// # Errors
+    /// When the picture is damaged or of another size than the policy takes. `out` is as it was.
+    ///
+    /// # Panics
+    /// When `out` is not [`Self::output_len`] long.
+    pub fn write(&mut self, picture: &Picture<'_>, out: &mut [f32]) -> Result<(), PictureError> {
+        assert_eq!(out.len(), self.output_len(), "an observation's place is as long as the bundle says");
+        let size = self.decode(picture)?;
+        if self.size != size {
+            self.fit(size)?;
+        }
+        self.sample(out);
+        if let Some(reference) = &mut self.reference {
+            reference.compare(out);
+        }
+        self.normalizer.normalize_planes(out);
+        Ok(())
+    }
+
+    /// Fills `pixels`; returns height and width.
+    fn decode(&mut self, picture: &Picture<'_>) -> Result<[usize; 2], PictureError> {
+        let side = |side: u32| usize::try_from(side).unwrap_or(usize::MAX);
+        let (width, height) = (side(picture.width), side(picture.height));
+        if !(1..=LARGEST).contains(&width) || !(1..=LARGEST).contains(&height) {
+            return Err(PictureError::Damaged(format!("{width}x{height} pixels")));
+        }
+        let whole = |bytes_per_pixel: usize| {
+            let (found, expected) = (picture.bytes.len(), bytes_per_pixel * width * height);
+            let error = PictureError::Length { found, expected, width, height };
+            if found == expected { Ok(()) } else { Err(error) }
+        };
+        match picture.encoding {
+            Encoding::Grey => {
+                whole(1)?;
+                self.pixels.clear();
+                self.pixels.extend(picture.bytes.iter().flat_map(|grey| [*grey; CHANNELS]));
+            }
+            Encoding::Yuyv => {
+                whole(2)?;
+                self.pixels.clear();
+                self.pixels.extend(picture.bytes.chunks_exact(4).flat_map(colors));
+                if self.pixels.len() != CHANNELS * width * height {
+                    return Err(PictureError::Damaged("an odd number of pixels in YUYV".to_owned()));
+                }
+            }
+            Encoding::Mjpeg => self.decode_jpeg(picture.bytes, width, height)?,
+            other => return Err(PictureError::NoPicture(other)),
+        }
+        Ok([height, width])
+    }
+
+    fn decode_jpeg(&mut self, bytes: &[u8], width: usize, height: usize) -> Result<(), PictureError> {
+        with_mark(bytes, &mut self.jpeg);
+        // Strict: what is cut short is refused, and not shown with grey in place of what is missing.
+        let options = DecoderOptions::default()
+            .jpeg_set_out_colorspace(ColorSpace::RGB)
+            .set_max_width(LARGEST)
+            .set_max_height(LARGEST)
+            .set_strict_mode(true);
+        let mut decoder = JpegDecoder::new_with_options(ZCursor::new(&self.jpeg), options);
+        let damaged = |error: zune_jpeg::errors::DecodeErrors| PictureError::Damaged(error.to_string());
+        decoder.decode_headers().map_err(damaged)?;
+        if decoder.dimensions() != Some((width, height)) {
+            let (wide, high) = decoder.dimensions().unwrap_or_default();
+            return Err(PictureError::Damaged(format!("{wide}x{high} pixels in a sample of {width}x{height}")));
+        }
+        self.pixels.resize(CHANNELS * width * height, 0);
+        decoder.decode_into(&mut self.pixels).map_err(damaged)
+    }
+
+    /// Works out which pixels of a picture of this size each value comes from.
+    fn fit(&mut self, size: [usize; 2]) -> Result<(), PictureError> {
+        let resized = self.spec.resize.unwrap_or(size);
+        let wanted = [self.spec.height, self.spec.width];
+        let suits = match self.spec.crop {
+            Some(_) => resized[0] >= wanted[0] && resized[1] >= wanted[1],
+            None => resized == wanted,
+        };
+        if !suits {
+            let ([height, width], [wanted_height, wanted_width]) = (size, wanted);
+            return Err(PictureError::Size { width, height, wanted_width, wanted_height });
+        }
+        taps(size[0], resized[0], wanted[0], &mut self.rows);
+        taps(size[1], resized[1], wanted[1], &mut self.columns);
+        self.size = size;
+        Ok(())
+    }
+
+    /// Values in 0..1, resized and cropped, channel by channel.
+    fn sample(&self, out: &mut [f32]) {
+        let (height, width) = (self.spec.height, self.spec.width);
+        let stride = CHANNELS * self.size[1];
+        for (place, plane) in out.chunks_exact_mut(height * width).enumerate() {
+            let channel = match self.spec.color {
+                ColorOrder::Rgb => place,
+                ColorOrder::Bgr => CHANNELS - 1 - place,
+            };
+            for (values, row) in plane.chunks_exact_mut(width).zip(&self.rows) {
+                let low = &self.pixels[row.low * stride..][..stride];
+                let high = &self.pixels[row.high * stride..][..stride];
+                for (value, column) in values.iter_mut().zip(&self.columns) {
+                    let (left, right) = (CHANNELS * column.low + channel, CHANNELS * column.high + channel);
+                    let mix = |line: &[u8]| {
+                        let (left, right) = (f32::from(line[left]), f32::from(line[right]));
+                        left * (1.0 - column.share) + right * column.share
+                    };
+                    *value = (mix(low) * (1.0 - row.share) + mix(high) * row.share) / 255.0;
+                }
+            }
+        }
+    }
+}
+
+/// The taps of the middle `wanted` of `resized` values made of `size`.
+fn taps(size: usize, resized: usize, wanted: usize, taps: &mut Vec<Tap>) {
+    let start = crop_start(resized, wanted);
+    let scale = size as f64 / resized as f64;
+    taps.clear();
+    taps.extend((start..start + wanted).map(|at| {
+        let place = ((at as f64 + 0.5) * scale - 0.5).max(0.0);
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "between 0 and the size")]
+        let low = (place.floor() as usize).min(size - 1);
+        #[expect(clippy::cast_possible_truncation, reason = "a share needs no more")]
+        let share = (place - low as f64).min(1.0) as f32;
+        Tap { low, high: (low + 1).min(size - 1), share }
+    }));
+}
+
+/// Where the middle begins: an odd rest is halved to the even side, as torchvision's `CenterCrop` does.
+fn crop_start(size: usize, wanted: usize) -> usize {
+    let rest = size - wanted;
+    rest / 2 + usize::from(rest % 4 == 3)
+}
+
+/// Two pixels of YUYV in red, green and blue: ITU-R BT.601 of limited range, what V4L2 means by YUYV
+/// unless it says otherwise; coefficients in 1/65536.
+fn colors(yuyv: &[u8]) -> [u8; 2 * CHANNELS] {
+    let at = |index: usize| yuyv.get(index).copied().map_or(0, i32::from);
+    let (u, v) = (at(1) - 128, at(3) - 128);
+    let [first, second] = [at(0), at(2)].map(|y| {
+        let y = 76_309 * (y - 16);
+        [y + 104_597 * v, y - 25_675 * u - 53_279 * v, y + 132_201 * u]
+            .map(|color| u8::try_from(((color + 32_768) >> 16).clamp(0, 255)).unwrap_or(u8::MAX))
+    });
+    [first[0], first[1], first[2], second[0], second[1], second[2]]
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,145 @@
+//! Action chunks: from observations and a seed.
+//!
+//! The encoder runs once. The denoiser then takes the noise out of a sample step by step, as the
+//! scheduler says, and the last sample is mapped back to the units of the action.
+//!
+//! Invariant: the same observations and the same seed give the same chunk, on the same machine with
+//! the same onnxruntime and number of threads.
+//! Invariant: a number that is not finite is passed on as it is: whoever executes actions refuses it.
+//! Invariant: a chunk is computed without an allocation on this side of onnxruntime.
+
+use super::bundle::{Bundle, BundleErrors, Graph};
+use super::graphs::{BoundGraph, GraphError, LoadedGraph};
+use super::library::Environment;
+use super::normalize::Normalizer;
+use super::observation::ObservationTensors;
+use super::scheduler::{Scheduler, SchedulerError};
+use crate::random::Random;
+
+/// The stream of a seed that the noise is drawn from.
+const NOISE: u64 = 0x706f_6c69_6379;
+
+/// Why a policy cannot be run.
+#[derive(Debug, thiserror::Error)]
+pub enum PolicyError {
+    /// The graphs are not what `policy.json` says.
+    #[error(transparent)]
+    Bundle(#[from] BundleErrors),
+    /// A graph cannot be loaded or run.
+    #[error(transparent)]
+    Graph(#[from] GraphError),
+    /// The schedule cannot be run.
+    #[error(transparent)]
+    Scheduler(#[from] SchedulerError),
+    /// There is not the place that a chunk takes.
+    #[error("a chunk of {expected} numbers does not go into {found}")]
+    Place {
+        /// Numbers of a chunk.
+        expected: usize,
+        /// Numbers there is place for.
+        found: usize,
+    },
+}
+
+/// A policy, ready to run.
+#[derive(Debug)]
+pub struct Sampler {
+    encoder: BoundGraph,
+    denoiser: BoundGraph,
+    /// Inputs of the encoder: one for each observation of the bundle.
+    observations: Vec<usize>,
+    mask: Option<usize>,
+    /// Inputs of the denoiser.
+    sample: usize,
+    timestep: usize,
+    condition: usize,
+    scheduler: Scheduler,
+    normalizer: Normalizer,
+    /// Of one step, where the scheduler adds some.
+    noise: Vec<f32>,
+}
+
+impl Sampler {
+    /// Loads the graphs of a bundle and makes all memory. `steps` of denoising instead of the
+    /// bundle's own number; `threads` that onnxruntime computes on, 1 unless there is reason for
+    /// more.
+    ///
+    /// # Errors
+    /// When the graphs are not those of the bundle, or the schedule has not so many steps.
+    pub fn new(
+        bundle: &Bundle,
+        environment: &Environment,
+        steps: Option<usize>,
+        threads: usize,
+    ) -> Result<Self, PolicyError> {
+        let load = |graph: Graph| {
+            let bytes = bundle.read_graph(graph)?;
+            Ok::<_, PolicyError>(LoadedGraph::load(environment, &bundle.graph(graph).file, &bytes, threads)?)
+        };
+        let (encoder, denoiser) = (load(Graph::Encoder)?, load(Graph::Denoiser)?);
+        bundle.check_graphs(&encoder.shape(), &denoiser.shape())?;
+        let (encoder, denoiser) = (encoder.bind()?, denoiser.bind()?);
+        let names = bundle.observations.iter().map(|observation| &observation.key);
+        Ok(Self {
+            observations: names.map(|name| encoder.input_index(name)).collect::<Result<_, _>>()?,
+            mask: bundle.mask.as_ref().map(|mask| encoder.input_index(&mask.input)).transpose()?,
+            sample: denoiser.input_index("sample")?,
+            timestep: denoiser.input_index("timestep")?,
+            condition: denoiser.input_index("global_cond")?,
+            scheduler: Scheduler::new(&bundle.scheduler, steps.unwrap_or(bundle.scheduler.num_inference_steps))?,
+            normalizer: Normalizer::of_action(&bundle.action),
+            noise: vec![0.0; bundle.horizon * bundle.action.len()],
+            encoder,
+            denoiser,
+        })
+    }
+
+    /// Numbers of a chunk: horizon x values of an action.
+    #[must_use]
+    pub fn chunk_len(&self) -> usize {
+        self.noise.len()
+    }
+
+    /// Steps of denoising.
+    #[must_use]
+    pub fn steps(&self) -> usize {
+        self.scheduler.len()
+    }
+
+    /// Writes a chunk, action by action, in the units of the action. The noise is the seed's.
+    ///
+    /// # Errors
+    /// When onnxruntime fails, the observations are of another bundle, or `out` is not
+    /// [`Self::chunk_len`] long. `out` is then of no use.
+    pub fn chunk(
+        &mut self,
+        observation: &ObservationTensors,
+        noise_seed: u64,
+        out: &mut [f32],
+    ) -> Result<(), PolicyError> {
+        if out.len() != self.noise.len() {
+            return Err(PolicyError::Place { expected: self.noise.len(), found: out.len() });
+        }
+        for (at, input) in self.observations.iter().enumerate() {
+            self.encoder.write(*input, observation.values(at))?;
+        }
+        if let Some(mask) = self.mask {
+            self.encoder.write(mask, observation.mask())?;
+        }
+        self.encoder.run(|condition| self.denoiser.write(self.condition, condition))??;
+
+        let mut random = Random::new(noise_seed, NOISE);
+        random.fill_normal(out);
+        for (at, timestep) in self.scheduler.timesteps().enumerate() {
+            let noise = self.scheduler.wants_noise(at).then(|| {
+                random.fill_normal(&mut self.noise);
+                &*self.noise
+            });
+            self.denoiser.write(self.sample, out)?;
+            self.denoiser.write_integer(self.timestep, timestep)?;
+            self.denoiser.run(|prediction| self.scheduler.step(at, out, prediction, noise))?;
+        }
+        self.normalizer.invert(out);
+        Ok(())
+    }
+}

@@ -1,0 +1,92 @@
+//! An episode recorded by whoever owns the clock: the same session and the same file as the `writer`
+//! thread's, without thread, bus and real time.
+//!
+//! Invariant: the moments handed in never go back.
+
+use std::sync::Arc;
+
+use super::RecordError;
+use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest};
+use super::file::Sink;
+use super::provenance::Attached;
+use super::session::{Beginning, Session};
+use super::streams::Streams;
+use crate::bus::TopicId;
+use crate::registry::Registry;
+use crate::sample::SampleHeader;
+use crate::status::{Board, Event};
+use crate::time::{Stamp, WallClock};
+
+/// What passes before an episode and during it.
+pub struct Stepped {
+    registry: Arc<Registry>,
+    board: Arc<Board>,
+    clock: WallClock,
+    streams: Streams,
+    attached: Attached,
+    session: Option<Session>,
+}
+
+impl std::fmt::Debug for Stepped {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Stepped").field("recording", &self.session.is_some()).finish_non_exhaustive()
+    }
+}
+
+impl Stepped {
+    /// A recorder without an episode. `clock` says what the moments handed in are on the wall clock.
+    #[must_use]
+    pub fn new(registry: Arc<Registry>, board: Arc<Board>, clock: WallClock) -> Self {
+        Self { registry, board, clock, streams: Streams::new(), attached: Attached::default(), session: None }
+    }
+
+    /// Begins an episode.
+    ///
+    /// # Errors
+    /// When its file cannot be made or written.
+    pub fn begin(&mut self, request: &EpisodeRequest, begin: Stamp) -> Result<(), RecordError> {
+        let path = EpisodePath::create(&request.out, &request.task, self.clock.wall_ns(begin))?;
+        let partial = path.partial.clone();
+        let failed = |source| RecordError::Io { path: partial.clone(), source };
+        let sink: Box<dyn Sink> = Box::new(path.file.try_clone().map_err(failed)?);
+        let beginning = Beginning {
+            registry: Arc::clone(&self.registry),
+            board: Arc::clone(&self.board),
+            request,
+            path,
+            sink,
+            attached: &self.attached,
+            clock: self.clock,
+            begin,
+        };
+        self.session = Some(Session::begin(beginning, &self.streams.masks).map_err(failed)?);
+        Ok(())
+    }
+
+    /// Takes a sample, a publication of the mask, or an action.
+    pub fn take(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
+        self.streams.take(self.session.as_mut(), topic, header, payload);
+    }
+
+    /// Takes an event.
+    pub fn event(&mut self, event: &Event) {
+        self.attached.take(event);
+        if let Some(session) = &mut self.session {
+            session.event(event);
+        }
+    }
+
+    /// Writes what is due by `now`.
+    pub fn advance(&mut self, now: Stamp) {
+        if let Some(session) = &mut self.session {
+            session.advance(now, &self.streams.masks);
+        }
+    }
+
+    /// Ends the episode with what was captured before `end`; `None` if there is none.
+    pub fn finish(&mut self, end: Stamp) -> Option<EpisodeReport> {
+        let mut session = self.session.take()?;
+        session.end_at(end);
+        Some(session.finish(end, &self.streams.masks, None))
+    }
+}

@@ -1,0 +1,41 @@
+//! `[device.NAME.action]`: that a device is an actuator, and what it may be told.
+
+use crate::action::MAX_ACTION;
+use crate::registry::section::{Problems, Section};
+use crate::registry::spec::ActionSpec;
+
+const KEYS: [&str; 4] = ["names", "units", "min", "max"];
+
+/// Reads the table; `None` without one, or if a problem with it was reported.
+pub(super) fn action(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<ActionSpec> {
+    let table = section.table(problems, "action")?;
+    table.allow(problems, &KEYS);
+    for key in KEYS {
+        if !table.has(key) {
+            table.missing(problems, key, &format!("write {key} = a list with one entry an axis"));
+        }
+    }
+    let names = table.texts(problems, "names")?;
+    let units = table.texts(problems, "units")?;
+    let (min, max) = (table.numbers(problems, "min")?, table.numbers(problems, "max")?);
+    if names.is_empty() || names.len() > MAX_ACTION {
+        let fix = format!("name 1 to {MAX_ACTION} axes");
+        table.report(problems, "names", format!("{} axes", names.len()), fix);
+        return None;
+    }
+    for (key, length) in [("units", units.len()), ("min", min.len()), ("max", max.len())] {
+        if length != names.len() {
+            let message = format!("{length} entries for {} axes", names.len());
+            table.report(problems, key, message, "give each axis one entry");
+            return None;
+        }
+    }
+    for (name, (low, high)) in names.iter().zip(min.iter().zip(&max)) {
+        if !(low.is_finite() && high.is_finite() && low < high) {
+            let message = format!("{name} from {low} to {high} is no range");
+            table.report(problems, "max", message, "write finite numbers, max above min");
+            return None;
+        }
+    }
+    Some(ActionSpec { names, units, min, max })
+}

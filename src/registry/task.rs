@@ -1,0 +1,53 @@
+//! The rig of the simulated task: its registry, and what of it is plugged in when a trial begins.
+
+use std::sync::{Arc, OnceLock};
+
+use super::scenario::{Scenario, ScenarioDevice, Scene, SimSource, TaskPart};
+use super::spec::Registry;
+
+const TEXT: &str = include_str!("task.toml");
+
+/// The entries of the registry and which part of the task each of them is.
+pub const PARTS: [(&str, TaskPart); 3] =
+    [("cam_wrist", TaskPart::Wrist), ("tactile_tip", TaskPart::Tactile), ("arm", TaskPart::Arm)];
+
+impl Registry {
+    /// The registry of the simulated task.
+    ///
+    /// # Panics
+    /// Never: the text is part of the program, and a test parses it.
+    #[must_use]
+    #[expect(clippy::expect_used, reason = "a text fixed at build time, parsed by a test")]
+    pub fn task() -> Self {
+        Self::parse(TEXT, None).expect("the registry of the simulated task is valid").registry
+    }
+}
+
+impl Scenario {
+    /// Trial `seed` of the simulated task, for [`Registry::task`]: everything is plugged in, and stays so.
+    #[must_use]
+    pub fn task(registry: &Registry, seed: u64) -> Self {
+        let scene = Arc::new(Scene { seed, trial: OnceLock::new() });
+        let device = |device: ScenarioDevice| {
+            let (_, part) = PARTS.into_iter().find(|(name, _)| *name == device.name)?;
+            Some(ScenarioDevice { source: SimSource::Task { part, scene: Arc::clone(&scene) }, ..device })
+        };
+        let devices = Self::quiet(registry).devices.into_iter().filter_map(device).collect();
+        Self { devices, events: Vec::new(), repeat: None }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_rig_of_the_task_has_its_parts_and_one_actuator() {
+        let registry = Registry::task();
+        assert!(PARTS.iter().all(|(name, _)| registry.named(name).is_some()));
+        assert_eq!(registry.devices.len(), PARTS.len());
+        let (device, action) = registry.actuator().unwrap();
+        assert_eq!((device.name.as_str(), action.names.len()), ("arm", 4));
+        assert_eq!(Scenario::task(&registry, 7).devices.len(), PARTS.len());
+    }
+}

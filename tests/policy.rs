@@ -1,0 +1,269 @@
+//! A policy from its files to action chunks, on a bundle that can be worked out by hand
+//! (`support/onnx.rs`), with the real onnxruntime: the one inside the program. And what that
+//! allocates once it has warmed up: nothing on this side of onnxruntime; the JPEG decoder makes its
+//! buffers anew for every picture.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "what fails here fails a test")]
+
+#[path = "support/onnx.rs"]
+mod onnx;
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+
+use onnx::{ACTION, CONDITION_SHARE, Change, HORIZON, SAMPLE_SHARE, SIDE, STEPS, TIMESTEP_SHARE, write_bundle};
+use rapid::policy::bundle::{Bundle, ImageSpec, ObservationInput};
+use rapid::policy::graphs::LoadedGraph;
+use rapid::policy::library::Environment;
+use rapid::policy::observation::ObservationTensors;
+use rapid::policy::picture::{Picture, Preprocessor};
+use rapid::policy::sampler::{PolicyError, Sampler};
+use rapid::sample::Encoding;
+
+/// Counts the allocations of each thread.
+struct Counting;
+
+thread_local! {
+    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
+}
+
+// SAFETY: every call is handed to the system's allocator as it came; the counter is a plain cell
+// without a destructor, so it can be touched at any time in a thread's life.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        ALLOCATIONS.set(ALLOCATIONS.get() + 1);
+        // SAFETY: the caller's promise, passed on.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: the caller's promise, passed on.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+
+    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        ALLOCATIONS.set(ALLOCATIONS.get() + 1);
+        // SAFETY: the caller's promise, passed on.
+        unsafe { System.realloc(pointer, layout, size) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+fn allocations(of: impl FnOnce()) -> u64 {
+    let before = ALLOCATIONS.get();
+    of();
+    ALLOCATIONS.get() - before
+}
+
+fn bundle(changes: &[Change<'_>]) -> (tempfile::TempDir, Bundle) {
+    let folder = tempfile::tempdir().unwrap();
+    write_bundle(folder.path(), changes);
+    let bundle = Bundle::load(folder.path()).unwrap();
+    (folder, bundle)
+}
+
+fn sampler(bundle: &Bundle, steps: Option<usize>) -> Sampler {
+    let environment = Environment::open(None).expect("`make setup` fetches the library; then build again");
+    Sampler::new(bundle, &environment, steps, 1).unwrap()
+}
+
+fn chunk(sampler: &mut Sampler, observation: &ObservationTensors, seed: u64) -> Vec<f32> {
+    let mut chunk = vec![f32::NAN; sampler.chunk_len()];
+    sampler.chunk(observation, seed, &mut chunk).unwrap();
+    chunk
+}
+
+/// Numbers in the place of pictures, and a state.
+fn observation(bundle: &Bundle) -> ObservationTensors {
+    let mut observation = ObservationTensors::new(bundle);
+    for key in 0..3 {
+        observation.set_present(key, true);
+    }
+    for step in 0..STEPS {
+        observation.step_mut(0, step).unwrap().fill(0.25 + 0.5 * step as f32);
+        observation.step_mut(1, step).unwrap().fill(-0.75);
+        observation.write_vector(2, step, &[0.5, 1.0, 1.5, 2.0]).unwrap();
+    }
+    observation
+}
+
+/// DDIM by its definition (Song et al. 2020, equation 12, eta 0), on the linear network.
+fn by_hand(condition: f64, noise: &[f64], steps: usize) -> Vec<f64> {
+    let mut alpha = 1.0;
+    let alphas: Vec<f64> = (0..100)
+        .map(|at| {
+            alpha *= 1.0 - (0.0001 + (0.02 - 0.0001) * f64::from(at) / 99.0);
+            alpha
+        })
+        .collect();
+    let stride = 100 / steps;
+    let mut sample = noise.to_vec();
+    for timestep in (0..steps).rev().map(|step| step * stride) {
+        let alpha = alphas[timestep];
+        let before = if timestep >= stride { alphas[timestep - stride] } else { 1.0 };
+        for x in &mut sample {
+            let epsilon = f64::from(SAMPLE_SHARE) * *x
+                + f64::from(CONDITION_SHARE) * condition
+                + f64::from(TIMESTEP_SHARE) * timestep as f64;
+            let clean = (*x - (1.0 - alpha).sqrt() * epsilon) / alpha.sqrt();
+            *x = before.sqrt() * clean + (1.0 - before).sqrt() * epsilon;
+        }
+    }
+    sample
+}
+
+/// To the units of the action, as POLICY has them.
+fn in_units(sample: &[f64]) -> Vec<f64> {
+    let to_units = |(at, x): (usize, &f64)| match at % ACTION {
+        0 => *x,
+        1 => (x + 1.0) * 2.0,
+        2 => 2.0 + (x + 1.0) / 2.0,
+        _ => 0.5 + 0.25 * x,
+    };
+    sample.iter().enumerate().map(to_units).collect()
+}
+
+#[track_caller]
+fn close(found: &[f32], expected: &[f64]) {
+    assert_eq!(found.len(), expected.len());
+    for (at, (found, expected)) in found.iter().zip(expected).enumerate() {
+        assert!((f64::from(*found) - expected).abs() < 1e-4, "at {at}: {found}, expected {expected}");
+    }
+}
+
+#[test]
+fn a_chunk_is_what_its_definition_says() {
+    let (_folder, bundle) = bundle(&[]);
+    let mut sampler = sampler(&bundle, None);
+    let mut observation = observation(&bundle);
+    assert_eq!((sampler.chunk_len(), sampler.steps()), (HORIZON * ACTION, 10));
+    let noise = |seed| {
+        let mut noise = vec![0.0; HORIZON * ACTION];
+        rapid::random::Random::new(seed, 0x706f_6c69_6379).fill_normal(&mut noise);
+        noise.into_iter().map(f64::from).collect::<Vec<_>>()
+    };
+    // Means of the inputs: wrist 0.5, tactile -0.75, state (0.5..2 of 0..2, so -0.5..1) 0.25.
+    let conditions = [([true, true], 0.5 - 0.75 + 0.25), ([true, false], 0.5 + 0.25), ([false, false], 0.25)];
+    for (present, condition) in conditions {
+        observation.set_present(0, present[0]);
+        observation.set_present(1, present[1]);
+        for seed in [0, 7] {
+            let found = chunk(&mut sampler, &observation, seed);
+            close(&found, &in_units(&by_hand(condition / 3.0, &noise(seed), 10)));
+            assert_eq!(found, chunk(&mut sampler, &observation, seed), "the same seed");
+        }
+    }
+    let mut four = self::sampler(&bundle, Some(4));
+    close(&chunk(&mut four, &observation, 3), &in_units(&by_hand(0.25 / 3.0, &noise(3), 4)));
+    assert!(matches!(
+        Sampler::new(&bundle, &Environment::open(None).unwrap(), Some(101), 1),
+        Err(PolicyError::Scheduler(_))
+    ));
+}
+
+#[test]
+fn what_is_not_a_number_is_passed_on_unless_the_mask_says_it_is_not_there() {
+    let (_folder, bundle) = bundle(&[]);
+    let mut sampler = sampler(&bundle, None);
+    let mut observation = observation(&bundle);
+    observation.set_present(1, false);
+    let without = chunk(&mut sampler, &observation, 1);
+    observation.step_mut(1, 0).unwrap().fill(f32::NAN);
+    assert_eq!(chunk(&mut sampler, &observation, 1), without, "what the mask calls absent does not count");
+    observation.step_mut(0, 0).unwrap()[0] = f32::NAN;
+    assert!(chunk(&mut sampler, &observation, 1).iter().all(|value| value.is_nan()));
+    // And nothing of it is left in the next chunk.
+    observation.step_mut(0, 0).unwrap().fill(0.25);
+    assert_eq!(chunk(&mut sampler, &observation, 1), without);
+}
+
+#[test]
+fn with_ddpm_the_noise_of_the_steps_is_the_seeds_too() {
+    let (_folder, bundle) = bundle(&[Change { what: "\"DDIM\"", with: "\"DDPM\"" }]);
+    let mut sampler = sampler(&bundle, Some(20));
+    let observation = observation(&bundle);
+    let first = chunk(&mut sampler, &observation, 5);
+    assert_eq!(first, chunk(&mut sampler, &observation, 5));
+    assert_ne!(first, chunk(&mut sampler, &observation, 6));
+}
+
+#[test]
+fn what_is_no_graph_or_not_this_bundles_is_refused_by_name() {
+    let environment = Environment::open(None).unwrap();
+    let error = LoadedGraph::load(&environment, "encoder.onnx", b"no graph", 1).unwrap_err().to_string();
+    assert!(error.starts_with("encoder.onnx: onnxruntime cannot load it: "), "{error}");
+
+    let (_folder, bundle) = bundle(&[
+        Change { what: "\"horizon\": 16", with: "\"horizon\": 12" },
+        Change { what: "\"key\": \"tactile\"", with: "\"key\": \"finger\"" },
+    ]);
+    let Err(PolicyError::Bundle(errors)) = Sampler::new(&bundle, &environment, None, 1) else {
+        panic!("graphs that do not suit are taken");
+    };
+    let errors = errors.to_string();
+    for word in ["finger", "12", "16"] {
+        assert!(errors.contains(word), "{word}: {errors}");
+    }
+}
+
+#[test]
+fn numbers_that_do_not_suit_are_refused_by_name() {
+    let (_folder, bundle) = bundle(&[]);
+    let mut sampler = sampler(&bundle, None);
+    let mut observation = observation(&bundle);
+    let error = observation.write_vector(2, 0, &[1.0, 2.0, 3.0]).unwrap_err().to_string();
+    assert!(error.starts_with("a sample of 3 numbers, where observation `state` takes numbers 0 to 4"), "{error}");
+    assert!(observation.write_vector(0, 0, &[1.0]).is_err() && observation.step_mut(0, STEPS).is_none());
+    assert!(matches!(
+        sampler.chunk(&observation, 0, &mut [0.0; 3]),
+        Err(PolicyError::Place { expected: 64, found: 3 })
+    ));
+}
+
+#[test]
+fn chunks_and_plain_pictures_allocate_nothing_once_warm() {
+    let (_folder, bundle) = bundle(&[Change { what: "\"DDIM\"", with: "\"DDPM\"" }]);
+    let mut sampler = sampler(&bundle, None);
+    let mut observation = observation(&bundle);
+    let ObservationInput::Image(spec) = bundle.observations[1].input else { panic!("a picture") };
+    let mut preprocessor = Preprocessor::new(spec, &bundle.observations[1].normalization);
+    let mut out = vec![0.0; sampler.chunk_len()];
+    let yuyv = [90_u8; 2 * 32 * 24];
+    let picture = Picture { encoding: Encoding::Yuyv, width: 32, height: 24, bytes: &yuyv };
+    let mut cycle = |seed: u64| {
+        preprocessor.write(&picture, observation.step_mut(1, 1).unwrap()).unwrap();
+        observation.write_vector(2, 1, &[0.1, 0.2, 0.3, seed as f64]).unwrap();
+        observation.set_present(0, seed.is_multiple_of(2));
+        sampler.chunk(&observation, seed, &mut out).unwrap();
+    };
+    cycle(0);
+    assert!(allocations(|| drop(vec![1])) == 1, "nothing is counted");
+    assert_eq!(allocations(|| (0..100).for_each(&mut cycle)), 0);
+}
+
+/// Buffers of the decoder: they grow with the picture's width, and do not with what came before.
+#[test]
+fn a_jpeg_costs_the_decoders_buffers_and_no_more() {
+    let spec = ImageSpec {
+        height: SIDE,
+        width: SIDE,
+        color: rapid::policy::bundle::ColorOrder::Rgb,
+        resize: Some([SIDE, SIDE]),
+        crop: None,
+        operation: None,
+    };
+    let mut preprocessor = Preprocessor::new(spec, &rapid::policy::bundle::Normalization::Identity);
+    let mut jpeg = Vec::new();
+    jpeg_encoder::Encoder::new(&mut jpeg, 85)
+        .encode(&vec![90; 3 * 320 * 240], 320, 240, jpeg_encoder::ColorType::Rgb)
+        .unwrap();
+    let picture = Picture { encoding: Encoding::Mjpeg, width: 320, height: 240, bytes: &jpeg };
+    let mut out = vec![0.0; preprocessor.output_len()];
+    let mut write = || preprocessor.write(&picture, &mut out).unwrap();
+    write();
+    let once = allocations(&mut write);
+    assert!((1..=40).contains(&once), "{once} allocations for a picture");
+    assert_eq!(allocations(|| (0..50).for_each(|_| write())), 50 * once);
+}
