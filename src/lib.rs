@@ -87,6 +87,7 @@ pub mod bus;
 pub mod calibration;
 pub mod cli;
 pub mod commands;
+pub mod compare;
 pub mod dispatch;
 pub mod driver;
 pub mod episode_format;

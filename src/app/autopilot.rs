@@ -165,10 +165,9 @@ impl Flight {
         board.set_policy(None);
         match ended {
             Ok(Ok(())) if stop.is_cancelled() => Ok(()),
-            // It ends by itself only when one of its threads is gone.
-            Ok(Ok(())) => Err(AppError::Panicked("the policy")),
             Ok(Err(thread)) => Err(AppError::Panicked(thread)),
-            Err(_) => Err(AppError::Panicked("the policy")),
+            // It ends by itself only when one of its threads is gone.
+            Ok(Ok(())) | Err(_) => Err(AppError::Panicked("the policy")),
         }
     }
 }

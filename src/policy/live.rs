@@ -84,7 +84,7 @@ impl Live {
         let policy =
             std::thread::Builder::new().name("policy".to_owned()).spawn(move || compute(model, &asked, &tell))?;
         let latencies = Histogram::new_with_bounds(1, LONGEST_US, 3).map_err(io::Error::other)?;
-        let control = Control::new(options, registry, inbox, actions, board, (ask, told), request, latencies);
+        let control = Control::new(options, registry, (inbox, actions, board), (ask, told), request, latencies);
         let (stopped, guard) = (stop.clone(), ended.clone().drop_guard());
         let control = std::thread::Builder::new().name("control".to_owned()).spawn(move || {
             // Dropped by a panic too.
@@ -162,9 +162,7 @@ impl Control {
     fn new(
         options: LiveOptions,
         registry: &Registry,
-        inbox: Inbox,
-        actions: Option<Arc<Writer>>,
-        board: Arc<Board>,
+        (inbox, actions, board): (Inbox, Option<Arc<Writer>>, Arc<Board>),
         (ask, told): (SyncSender<Exchange>, Receiver<Exchange>),
         exchange: Exchange,
         latencies: Histogram<u64>,

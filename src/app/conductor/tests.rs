@@ -78,6 +78,7 @@ impl Bench {
             begin_episode: record,
         };
         let running = Running {
+            autopilot: None,
             rig: never(),
             rig_ended: CancellationToken::new(),
             rig_stop: CancellationToken::new(),
