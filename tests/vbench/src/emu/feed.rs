@@ -37,7 +37,10 @@ pub fn pack<R: AsRef<[u8]>>(records: impl IntoIterator<Item = R>) -> Vec<u8> {
 /// Reads a feed, which has one record at least.
 pub fn load(path: &Path) -> Result<Records, FeedError> {
     let packed = std::fs::read(path).map_err(|error| FeedError::Io(path.into(), error))?;
-    unpack(&packed).filter(|records| !records.is_empty()).map(Records::new).ok_or_else(|| FeedError::Records(path.into()))
+    unpack(&packed)
+        .filter(|records| !records.is_empty())
+        .map(Records::new)
+        .ok_or_else(|| FeedError::Records(path.into()))
 }
 
 fn unpack(mut packed: &[u8]) -> Option<Vec<Vec<u8>>> {

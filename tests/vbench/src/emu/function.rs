@@ -175,12 +175,7 @@ impl Function {
     }
 }
 
-fn camera(
-    modes: &[Mode],
-    first: u32,
-    given: Option<Records>,
-    store: &mut PictureStore,
-) -> Result<Uvc, ContentError> {
+fn camera(modes: &[Mode], first: u32, given: Option<Records>, store: &mut PictureStore) -> Result<Uvc, ContentError> {
     let default = [Mode { format: Format::Mjpg, width: 640, height: 480, fps: vec![30] }];
     let modes = if modes.is_empty() { &default } else { modes };
     let mut with_pictures = Vec::with_capacity(modes.len());
