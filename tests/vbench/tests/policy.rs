@@ -38,13 +38,13 @@ const SCRIPT: &str = r#"
 # used MASK: how many chunks were computed with this mask. await_used N MASK: until there are more than N.
 used() { grep -F '"event":"chunk"' $out/rapid.jsonl | grep -cF "\"mask\":\"$1\""; }
 more_than() { [ "$(used "$2")" -gt "$1" ]; }
-await_used() { wait_for 60 more_than "$1" "$2" || fail "$(used "$2") chunks with the mask $2"; }
+await_used() { wait_for 120 more_than "$1" "$2" || fail "$(used "$2") chunks with the mask $2"; }
 emu plug 0 1 2
-wait_for 60 attached 0 1 2 || fail 'not attached'
+wait_for 120 attached 0 1 2 || fail 'not attached'
 udevadm settle
 rapid_start --infer /tmp/bench/bundle --wait --denoising-steps $(cat /tmp/bench/steps) --record --out $out/rec \
   --config /tmp/bench/devices.toml --json
-await_rapid 60 '"event":"act"' || fail 'the policy does not act'
+await_rapid 180 '"event":"act"' || fail 'the policy does not act'
 await_used 1 0x07
 emu unplug 1
 await_used 1 0x05
@@ -231,7 +231,7 @@ fn scenario(demonstration: &Recording, feeds: &[(&str, Vec<Vec<u8>>); 2]) -> Sce
         .file("tactile", feed::pack(&feeds[1].1))
         .file("arm", feed::pack(demonstration.rows(ARM).iter().map(line)))
         .file("steps", DENOISING_STEPS)
-        .limit(Duration::from_secs(240))
+        .limit(Duration::from_secs(480))
         .script(SCRIPT);
     for name in ["policy.json", "encoder.onnx", "denoiser.onnx"] {
         let file = Path::new(BUNDLE).join(name);
