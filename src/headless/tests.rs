@@ -77,6 +77,7 @@ fn chunk(skipped: u64) -> What {
         mask: "0x05".to_owned(),
         seed: 7,
         latency_ms: 34.52,
+        used: true,
         skipped,
         samples: Vec::new(),
         actions: vec![0.5; 4],

@@ -294,6 +294,7 @@ impl Bench<'_> {
             mask: request.mask.hex(self.registry.devices.len()),
             seed: request.seed,
             latency_ms: STEP.as_secs_f64() * 1e3,
+            used: true,
             skipped,
             samples: request.samples(self.bundle),
             actions: actions.to_vec(),

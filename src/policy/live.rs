@@ -277,26 +277,29 @@ impl Control {
         let request = &exchange.request;
         let latency = exchange.done.since(request.stamp);
         match &exchange.outcome {
-            Ok(()) => match self.pilot.answer(request.tick, &exchange.chunk) {
-                Ok(skipped) => {
-                    let latency_ms = latency.as_secs_f64() * 1e3;
-                    self.last_latency_ms = Some(latency_ms);
-                    let us = u64::try_from(latency.as_micros()).unwrap_or(LONGEST_US);
-                    self.latencies.saturating_record(us.clamp(1, LONGEST_US));
-                    let chunk = Chunk {
-                        tick: request.tick,
-                        observed_ns: request.stamp.0,
-                        mask: request.mask.hex(0),
-                        seed: request.seed,
-                        latency_ms,
-                        skipped,
-                        samples: request.samples(&self.options.bundle),
-                        actions: exchange.chunk.clone(),
-                    };
-                    self.board.announce(What::Chunk(Box::new(chunk)));
+            Ok(()) => {
+                let answered = self.pilot.answer(request.tick, &exchange.chunk);
+                let latency_ms = latency.as_secs_f64() * 1e3;
+                self.last_latency_ms = Some(latency_ms);
+                let us = u64::try_from(latency.as_micros()).unwrap_or(LONGEST_US);
+                self.latencies.saturating_record(us.clamp(1, LONGEST_US));
+                // Also of one that is not used: its pictures may have become the reference of all later ones.
+                let chunk = Chunk {
+                    tick: request.tick,
+                    observed_ns: request.stamp.0,
+                    mask: request.mask.hex(0),
+                    seed: request.seed,
+                    latency_ms,
+                    used: answered.is_ok(),
+                    skipped: answered.unwrap_or(0),
+                    samples: request.samples(&self.options.bundle),
+                    actions: exchange.chunk.clone(),
+                };
+                self.board.announce(What::Chunk(Box::new(chunk)));
+                if let Err(refused) = answered {
+                    self.complain(&format!("policy: not used: {refused}"));
                 }
-                Err(refused) => self.complain(&format!("policy: not used: {refused}")),
-            },
+            }
             Err(reason) => {
                 self.failures += 1;
                 self.pilot.failed(request.tick);

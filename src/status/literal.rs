@@ -42,7 +42,6 @@ pub(crate) fn snapshot(devices: Vec<DeviceStatus>) -> Snapshot {
         mask.with(device.id, matches!(device.state, SlotState::Streaming | SlotState::Stalled))
     });
     Snapshot {
-        policy: None,
         rig: "bench-1".to_owned(),
         taken: TAKEN,
         uptime: Duration::from_secs(754),

@@ -125,7 +125,6 @@ mod tests {
 
     fn at(ms: u64, samples: u64, newest_ms: u64, recorded: Option<u64>) -> Snapshot {
         Snapshot {
-            policy: None,
             rig: "rig".to_owned(),
             taken: Stamp(ms * MS),
             uptime: Duration::from_millis(ms),

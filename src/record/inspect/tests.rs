@@ -121,6 +121,7 @@ async fn a_policy_is_told_of_with_its_bundle_and_its_holds() {
             mask: "0x03".to_owned(),
             seed: 0,
             latency_ms,
+            used: true,
             skipped,
             samples: Vec::new(),
             actions: vec![0.5; 4],
