@@ -20,7 +20,7 @@ use hdrhistogram::Histogram;
 use tokio_util::sync::CancellationToken;
 
 use super::bundle::Bundle;
-use super::horizon::{Counts, HoldReason, WithoutMask};
+use super::horizon::{Counts, WithoutMask};
 use super::model::Model;
 use super::pilot::Pilot;
 use super::request::Request;
@@ -150,7 +150,8 @@ struct Control {
     latencies: Histogram<u64>,
     last_latency_ms: Option<f64>,
     chunk_age: Option<u64>,
-    hold: Option<HoldReason>,
+    /// Why nothing is done, as a screen says it.
+    hold: Option<String>,
     acting: bool,
     complained: Option<Stamp>,
     reported: Stamp,
@@ -323,10 +324,14 @@ impl Control {
         if let Some(reason) = step.hold
             && step.hold_is_news
         {
-            let device = step.missing.unwrap_or_default().to_owned();
-            self.board.announce(What::Hold { device, reason: reason.to_string() });
+            let (device, reason) = (step.missing.unwrap_or_default().to_owned(), reason.to_string());
+            let colon = if device.is_empty() { "" } else { ": " };
+            self.hold = Some(format!("{reason}{colon}{device}"));
+            self.board.announce(What::Hold { device, reason });
         }
-        self.hold = step.hold;
+        if step.hold.is_none() {
+            self.hold = None;
+        }
         if step.clamped_is_news {
             let text = "policy: an action beyond its limits: the limit is executed".to_owned();
             self.board.announce(What::Log { level: Level::Warn, text });
@@ -385,7 +390,7 @@ impl Control {
             latency_ms: self.last_latency_ms,
             chunk_age: self.chunk_age,
             action: axes.map(|((name, unit), value)| (name.clone(), f64::from(*value), unit.clone())).collect(),
-            hold: self.hold.map(|reason| reason.to_string()),
+            hold: self.hold.clone(),
             actions: counts.actions,
             held: counts.held_ticks,
             chunks: counts.chunks,

@@ -143,6 +143,7 @@ mod tests {
                 bytes: 0,
                 newest: (samples > 0).then_some(Stamp(newest_ms * MS)),
             }],
+            policy: None,
             recording: recorded.map(|bytes| RecordingStatus {
                 file: "a.mcap".into(),
                 elapsed: Duration::ZERO,
