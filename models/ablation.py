@@ -191,18 +191,22 @@ def markdown(report: dict[str, Any]) -> str:
         "Five configurations of the policy, each trained on the demonstrations of `make train` and then run by the program",
         f"(`rapid eval`) for {report['trials']} trials with everything plugged in, with seeds that no demonstration has:",
         f"{report['first_seed']} and on, {report['configurations'][0]['triangular']:.0%} of the blocks triangular. Success:",
-        "the block ends in the bin of its texture. Left: it ends in the bin of the triangular ones, whichever it is.",
-        "Interval: Wilson's.",
+        "the block ends in the bin of its texture, with Wilson's interval; incomplete: it ends in no bin. Of those in a bin:",
+        "the share in the right one, which is what the policy knows of the texture. Left: the block ends in the bin of the",
+        "triangular ones, whichever it is.",
         "",
-        "| configuration | episodes | dropout | success | 95 % | wrong bin | incomplete | left | paper |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| configuration | episodes | dropout | iterations | success | 95 % | wrong bin | incomplete | of those in a bin | left"
+        " | paper |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in report["configurations"]:
         dropout = max(row["dropout"].values()) or "-"
         low, high = row["interval"]
+        binned = row["success"] + row["wrong_bin"]
+        right = f"{row['success'] / binned:.2f}" if binned else "-"
         lines.append(
-            f"| {row['title']} (`{row['name']}`) | {row['episodes']}, {row['data']} | {dropout} | {row['success']:.2f} |"
-            f" {low:.2f}-{high:.2f} | {row['wrong_bin']:.2f} | {row['incomplete']:.2f} |"
+            f"| {row['title']} (`{row['name']}`) | {row['episodes']}, {row['data']} | {dropout} | {row['iterations']} |"
+            f" {row['success']:.2f} | {low:.2f}-{high:.2f} | {row['wrong_bin']:.2f} | {row['incomplete']:.2f} | {right} |"
             f" {row['put_left']:.2f} | {row['paper']:.2f} |"
         )
     missing = [c.name for c in CONFIGURATIONS if c.name not in {row["name"] for row in report["configurations"]}]
