@@ -8,8 +8,10 @@ use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::parser::ValueSource;
 use clap::{ArgAction, ArgMatches, Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueHint};
 
+mod compare;
 mod policy;
 
+pub use compare::CompareArgs;
 pub use policy::{EvalArgs, PolicyArgs};
 
 /// Records robot demonstrations from sensors that come and go
@@ -208,7 +210,7 @@ pub enum Command {
         paths: Vec<PathBuf>,
     },
     /// Plays an episode as if its devices were plugged in
-    #[command(after_help = "The registry is the one in the episode; --config is not looked at.")]
+    #[command(after_help = compare::REPLAY)]
     Replay {
         /// Episode
         #[arg(value_hint = ValueHint::FilePath)]
@@ -216,6 +218,9 @@ pub enum Command {
         /// Options of the run.
         #[command(flatten)]
         run: RunArgs,
+        /// Options of a comparison.
+        #[command(flatten)]
+        compare: CompareArgs,
     },
     /// Tries a policy on the simulated task, with a sensor that is pulled out
     #[command(after_help = policy::EVAL)]
@@ -273,6 +278,11 @@ impl Cli {
                 }
                 _ => format!("--{option} is an option of a run, and `rapid {name}` runs nothing: leave it out"),
             };
+            return Err(command.error(ErrorKind::ArgumentConflict, text));
+        }
+        if let Some(("replay", typed)) = matches.subcommand()
+            && let Some(text) = compare::conflict(typed)
+        {
             return Err(command.error(ErrorKind::ArgumentConflict, text));
         }
         if let Some(Some(file)) = &cli.simulation.sim

@@ -45,7 +45,10 @@ const LARGEST_JSON: u64 = 1 << 20;
 pub fn dispatch(cli: Cli) -> ExitCode {
     let outcome = match cli.command {
         None => run(&cli.global, &cli.run, Source::of(cli.simulation), Some(cli.policy)),
-        Some(Command::Replay { file, run: ref args }) => run(&cli.global, args, Source::Episode(file), None),
+        Some(Command::Replay { file, run: ref args, compare }) => match compare.compare_with.clone() {
+            Some(bundle) => policy::compare(&cli.global, file, bundle, compare),
+            None => run(&cli.global, args, Source::Episode(file), None),
+        },
         Some(command) => print(&cli.global, cli.simulation, command),
     };
     match outcome {

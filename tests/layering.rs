@@ -24,7 +24,7 @@ const LAYERS: &[&[&str]] = &[
     &["registry", "status", "text", "outlet", "folder", "episode_format", "fault", "panics"],
     &["hotplug", "driver", "bus", "sync", "calibration"],
     &["rig", "record", "policy", "control"],
-    &["app", "lockstep", "tui", "headless", "logging"],
+    &["app", "lockstep", "compare", "tui", "headless", "logging"],
     &["main", "dispatch", "cli", "commands"],
 ];
 

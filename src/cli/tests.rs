@@ -42,6 +42,8 @@ fn options_stand_before_or_after_a_command_or_it_is_said_where() {
     assert_eq!(simulation.sim, Some(Some("x.toml".into())));
     for (words, expected) in [
         ("--headless replay a.mcap", "write it after: rapid replay FILE --headless"),
+        ("replay a.mcap --infer --record", "--record is an option of a run, and --infer compares"),
+        ("replay a.mcap --tolerance 1", "--infer"),
         ("--record inspect a.mcap", "`rapid inspect` runs nothing"),
         ("--sim devices", "write `rapid devices --sim`"),
         ("--sim mask", "leave --sim out"),
@@ -64,6 +66,8 @@ fn quantities_say_how_they_are_written() {
         ("--rate abc", "a number, for example 30"),
         ("--rate 0", "between 0.1 and 1000 Hz"),
         ("--tag soft", "finger=soft"),
+        ("replay a.mcap --infer --tolerance=-1", "a number from 0 on"),
+        ("replay a.mcap --infer --tolerance NaN", "a number from 0 on"),
         ("--instance a/b", "letters, digits and dashes"),
     ] {
         let said = printed(words);

@@ -3,6 +3,7 @@
 pub mod artifacts;
 pub mod calibrate;
 pub mod check;
+pub mod compare;
 pub mod completions;
 pub mod demonstrate;
 pub mod devices;

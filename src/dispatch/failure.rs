@@ -5,8 +5,10 @@ use std::path::PathBuf;
 
 use crate::app::AppError;
 use crate::commands;
+use crate::commands::compare::CompareFailure;
 use crate::commands::eval::EvalError;
 use crate::commands::inspect::InspectFailure;
+use crate::compare::CompareError;
 use crate::driver::DriverError;
 use crate::policy::bundle::BundleErrors;
 use crate::record::RecordError;
@@ -61,6 +63,8 @@ pub(super) enum Failure {
     )]
     NoPolicy(Vec<PathBuf>),
     #[error(transparent)]
+    Compare(#[from] CompareFailure),
+    #[error(transparent)]
     Demonstrate(#[from] commands::demonstrate::DemonstrateError),
     /// What was typed makes no sense together.
     #[error("{0}")]
@@ -98,6 +102,15 @@ impl Failure {
             | Self::Arguments(_)
             | Self::Bundle(_)
             | Self::Eval(EvalError::Bundle(_))
+            | Self::Compare(
+                CompareFailure::Bundle(_)
+                | CompareFailure::Compare(
+                    CompareError::File(_)
+                    | CompareError::Registry { .. }
+                    | CompareError::Unsuited { .. }
+                    | CompareError::Nothing(_),
+                ),
+            )
             | Self::Told => 2,
             Self::Inspect(InspectError::Io { source, .. })
                 if matches!(source.kind(), io::ErrorKind::NotFound | io::ErrorKind::IsADirectory) =>

@@ -8,7 +8,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use super::failure::Failure;
 use super::{Source, block_on, prepare};
 use crate::app::PolicyOptions;
-use crate::cli::{EvalArgs, Global, PolicyArgs, RunArgs};
+use crate::cli::{CompareArgs, EvalArgs, Global, PolicyArgs, RunArgs};
+use crate::commands::compare::CompareOptions;
 use crate::commands::eval::EvalOptions;
 use crate::commands::{self, Format};
 use crate::lockstep::evaluate::{Condition, Configuration};
@@ -55,6 +56,24 @@ pub(super) fn eval(args: EvalArgs, format: Format) -> Result<(), Failure> {
         library: args.ort_lib,
     };
     interruptible(move |stop| commands::eval::run(&options, format, stop, &mut io::stdout()))
+}
+
+/// A policy beside an episode.
+pub(super) fn compare(
+    global: &Global,
+    file: PathBuf,
+    bundle: Option<PathBuf>,
+    args: CompareArgs,
+) -> Result<(), Failure> {
+    let options = CompareOptions {
+        file,
+        bundle: find(bundle)?,
+        tolerance: args.tolerance,
+        denoising_steps: args.denoising_steps,
+        library: args.ort_lib,
+    };
+    let format = if global.json { Format::Json } else { Format::Text };
+    interruptible(move |stop| commands::compare::run(&options, format, stop, &mut io::stdout()))
 }
 
 /// Demonstrations of the simulated task.

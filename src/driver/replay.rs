@@ -10,6 +10,7 @@
 
 mod episode;
 mod scenario;
+pub mod tape;
 mod wire;
 
 use std::fs::File;

@@ -91,14 +91,14 @@ pub fn demonstrate(
     let word = if texture == Texture::Triangular { "triangular" } else { "hexagonal" };
     request.tags.extend([("seed".to_owned(), seed.to_string()), ("texture".to_owned(), word.to_owned())]);
     recorder.begin(&request, rig.now())?;
-    let (mut steps, mut tail) = (0, TAIL);
+    let (mut steps, mut tail) = (0_u32, TAIL);
     while tail > 0 {
         rig.deliver(&mut recorder)?;
         let (action, done) = {
             let trial = rig.trial().trial();
             (expert.act(&trial.world), trial.world.is_done())
         };
-        rig.act(action, &mut recorder);
+        rig.act(steps.into(), action, &mut recorder);
         rig.trial().trial().step(SHAKE);
         rig.pass(&mut recorder);
         recorder.advance(rig.now());

@@ -18,10 +18,12 @@ use crate::policy::model::{AnswerError, Model};
 use crate::policy::pilot::Pilot;
 use crate::policy::request::Request;
 use crate::random::Random;
+use crate::record::stepped::Stepped;
+use crate::record::{EpisodeReport, EpisodeRequest, RecordError};
 use crate::registry::scenario::{Scenario, ScenarioAction, ScenarioEvent};
 use crate::registry::{Registry, task};
 use crate::sample::SampleHeader;
-use crate::status::Event;
+use crate::status::{Chunk, Event, What};
 use crate::time::Stamp;
 
 /// The stream of a trial's seed that decides when cables are pulled.
@@ -147,6 +149,22 @@ pub enum TrialError {
     /// The simulation.
     #[error(transparent)]
     Simulation(#[from] DriverError),
+    /// The recorder.
+    #[error(transparent)]
+    Record(#[from] RecordError),
+}
+
+/// Records what a policy does.
+#[derive(Debug)]
+pub struct Recording<'a> {
+    /// Writes the file.
+    pub recorder: &'a mut Stepped,
+    /// What file.
+    pub request: &'a EpisodeRequest,
+    /// Where onnxruntime comes from.
+    pub library: &'a str,
+    /// The moment at which the trial begins.
+    pub begun: Stamp,
 }
 
 /// What a trial is run with.
@@ -168,14 +186,46 @@ impl Bench<'_> {
     /// # Errors
     /// When the simulation fails; what a policy does wrong is in the result.
     pub fn run(&mut self, condition: Condition, seed: u64) -> Result<Trial, TrialError> {
-        let mut rig = Lockstep::new(self.registry, condition.scenario(self.registry, seed), Stamp(1_000_000_000))?;
+        self.carry_out(condition, seed, None).map(|(trial, _)| trial)
+    }
+
+    /// Runs trial `seed` and records it, from the policy's first tick on.
+    ///
+    /// # Errors
+    /// When the simulation fails, or the file cannot be made.
+    pub fn record(
+        &mut self,
+        condition: Condition,
+        seed: u64,
+        recording: Recording<'_>,
+    ) -> Result<(Trial, EpisodeReport), TrialError> {
+        let (trial, report) = self.carry_out(condition, seed, Some(recording))?;
+        Ok((trial, report.ok_or(RecordError::Idle)?))
+    }
+
+    fn carry_out(
+        &mut self,
+        condition: Condition,
+        seed: u64,
+        recording: Option<Recording<'_>>,
+    ) -> Result<(Trial, Option<EpisodeReport>), TrialError> {
+        let begun = recording.as_ref().map_or(Stamp(1_000_000_000), |recording| recording.begun);
+        let mut rig = Lockstep::new(self.registry, condition.scenario(self.registry, seed), begun)?;
         self.model.reset();
-        let mut witness = Seen { pilot: Pilot::new(self.bundle, self.registry, WithoutMask::Hold, seed) };
+        let (recorder, told) = match recording {
+            Some(Recording { recorder, request, library, .. }) => (Some(recorder), Some((request, library))),
+            None => (None, None),
+        };
+        let mut witness = Seen { pilot: Pilot::new(self.bundle, self.registry, WithoutMask::Hold, seed), recorder };
         let mut request = Request::new(self.bundle);
         let mut chunk = vec![0.0; self.model.chunk_len()];
         for _ in 0..SETTLE {
             rig.deliver(&mut witness)?;
             rig.pass(&mut witness);
+        }
+        if let (Some(recorder), Some((request, library))) = (&mut witness.recorder, told) {
+            recorder.begin(request, rig.now())?;
+            recorder.event(&Event { stamp: rig.now(), what: self.begins(library) });
         }
         let launched = rig.mask();
         let (mut status, mut failure) = (Status::Normal, None);
@@ -195,16 +245,23 @@ impl Bench<'_> {
             });
             let action = witness.pilot.step(tick).action.and_then(axes);
             if let Some(action) = action {
-                rig.act(action, &mut witness);
+                rig.act(tick, action, &mut witness);
             }
             rig.trial().trial().step(0.0);
             rig.pass(&mut witness);
-            take(answer, &mut witness.pilot, request.tick, &chunk, &mut failure);
+            let skipped = take(answer, &mut witness.pilot, request.tick, &chunk, &mut failure);
+            if let Some(recorder) = &mut witness.recorder {
+                if let Some(skipped) = skipped {
+                    recorder.event(&Event { stamp: rig.now(), what: self.gave(&request, &chunk, skipped) });
+                }
+                recorder.advance(rig.now());
+            }
             tick += 1;
         }
+        let report = witness.recorder.as_mut().and_then(|recorder| recorder.finish(rig.now()));
         let trial = rig.trial().trial();
         let (unplugged_at, plugged_at) = condition.windows(seed);
-        Ok(Trial {
+        let trial = Trial {
             seed,
             condition,
             triangular: trial.world.texture == Texture::Triangular,
@@ -215,28 +272,58 @@ impl Bench<'_> {
             steps: trial.world.steps(),
             counts: witness.pilot.counts(),
             failure,
-        })
+        };
+        Ok((trial, report))
+    }
+
+    fn begins(&self, library: &str) -> What {
+        What::Policy {
+            policy: self.bundle.name.clone(),
+            folder: self.bundle.folder.clone(),
+            hash: self.bundle.hash.clone(),
+            library: library.to_owned(),
+            hz: self.bundle.control_hz,
+            dry_run: false,
+        }
+    }
+
+    fn gave(&self, request: &Request, actions: &[f32], skipped: u64) -> What {
+        What::Chunk(Box::new(Chunk {
+            tick: request.tick,
+            observed_ns: request.stamp.0,
+            mask: request.mask.hex(self.registry.devices.len()),
+            seed: request.seed,
+            latency_ms: STEP.as_secs_f64() * 1e3,
+            used: true,
+            skipped,
+            samples: request.samples(self.bundle),
+            actions: actions.to_vec(),
+        }))
     }
 }
 
+/// Gives the pilot its answer. Returns how many actions of a chunk came too late; `None` without a chunk.
 fn take(
     answer: Option<Result<(), AnswerError>>,
     pilot: &mut Pilot,
     asked: u64,
     chunk: &[f32],
     failure: &mut Option<String>,
-) {
-    match answer {
-        Some(Ok(())) => {
-            if let Err(refused) = pilot.answer(asked, chunk) {
+) -> Option<u64> {
+    match answer? {
+        Ok(()) => {
+            let taken = pilot.answer(asked, chunk);
+            if let Err(refused) = &taken {
                 *failure = Some(refused.to_string());
             }
+            // One that is not used was computed all the same, and may have been the first with a picture.
+            Some(taken.unwrap_or(0))
         }
-        Some(Err(error)) => {
+        Err(error) => {
             pilot.failed(asked);
             *failure = Some(error.to_string());
+            None
         }
-        None => {}
     }
 }
 
@@ -254,13 +341,17 @@ fn axes(action: &[f32]) -> Option<[f64; AXES]> {
     Some(action.map(f64::from))
 }
 
-/// What the policy is told of the rig.
-struct Seen {
+/// Who is told of the rig: the policy, and the recorder if there is one.
+struct Seen<'a> {
     pilot: Pilot,
+    recorder: Option<&'a mut Stepped>,
 }
 
-impl Taker for Seen {
+impl Taker for Seen<'_> {
     fn take(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
+        if let Some(recorder) = &mut self.recorder {
+            recorder.take(topic, header, payload);
+        }
         match topic {
             TopicId::Modality(id) => self.pilot.sample(id, header, payload),
             TopicId::Mask => {
@@ -272,7 +363,11 @@ impl Taker for Seen {
         }
     }
 
-    fn event(&mut self, _: &Event) {}
+    fn event(&mut self, event: &Event) {
+        if let Some(recorder) = &mut self.recorder {
+            recorder.event(event);
+        }
+    }
 }
 
 /// 95 % interval of a share `count / total` (Wilson 1927).

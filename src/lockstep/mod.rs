@@ -48,7 +48,6 @@ pub struct Lockstep {
     trial: Shared,
     mask: PhysicalMask,
     mask_sequence: u64,
-    action_sequence: u64,
     now: Stamp,
     payload: Vec<u8>,
 }
@@ -85,7 +84,6 @@ impl Lockstep {
             lanes: registry.devices.iter().map(lane).collect(),
             mask: PhysicalMask::EMPTY,
             mask_sequence: 0,
-            action_sequence: 0,
             now: begun,
             payload: Vec::new(),
         })
@@ -141,20 +139,20 @@ impl Lockstep {
         Ok(())
     }
 
-    /// Tells the arm what to do from now on, as a policy does on the topic of actions.
-    pub fn act(&mut self, action: [f64; AXES], taker: &mut dyn Taker) {
+    /// Tells the arm what to do from now on, as a policy does on the topic of actions at tick `number` of its
+    /// control grid.
+    pub fn act(&mut self, number: u64, action: [f64; AXES], taker: &mut dyn Taker) {
         self.trial.trial().command(action);
         self.payload.clear();
         self.payload.extend(action.into_iter().flat_map(f64::to_le_bytes));
         let header = SampleHeader {
-            seq: self.action_sequence,
+            seq: number,
             capture_ns: self.now.0,
             recv_ns: self.now.0,
             encoding: Encoding::F64 as u32,
             width: AXIS_COUNT,
             ..SampleHeader::default()
         };
-        self.action_sequence += 1;
         taker.take(TopicId::Action, &header, &self.payload);
     }
 

@@ -21,11 +21,11 @@ use crate::modality::ModalityId;
 /// them after half an hour.
 const MAX_CHANGES: usize = 1_000_000;
 /// Longest text of a record that is remembered, such as the registry.
-const MAX_TEXT: usize = 16 << 20;
+pub(super) const MAX_TEXT: usize = 16 << 20;
 /// Channel, sequence number and two times stand before a message's data.
-const MESSAGE_HEAD: usize = 2 + 4 + 8 + 8;
+pub(super) const MESSAGE_HEAD: usize = 2 + 4 + 8 + 8;
 /// Bytes read at once.
-const BUFFER_BYTES: usize = 1 << 16;
+pub(super) const BUFFER_BYTES: usize = 1 << 16;
 
 /// What an episode holds.
 #[derive(Debug, Clone, PartialEq)]
@@ -117,7 +117,7 @@ impl Episode {
     }
 }
 
-const NO_MCAP: &str = "not an MCAP file";
+pub(super) const NO_MCAP: &str = "not an MCAP file";
 
 fn fix(path: &Path) -> String {
     format!("`rapid recover {}` makes it whole, `rapid inspect` reads what is there", path.display())
@@ -146,7 +146,7 @@ pub fn read_bytes(bytes: &[u8]) {
 
 /// Channels and schemas, as they come.
 #[derive(Debug, Default)]
-struct Channels {
+pub(super) struct Channels {
     schemas: BTreeMap<u16, String>,
     channels: BTreeMap<u16, Channel>,
 }
@@ -161,7 +161,7 @@ struct Channel {
 
 impl Channels {
     /// Takes a record; one that cannot be read is passed over.
-    fn take(&mut self, opcode: u8, data: &[u8]) -> Option<()> {
+    pub(super) fn take(&mut self, opcode: u8, data: &[u8]) -> Option<()> {
         let mut fields = Fields(data);
         let id = fields.u16()?;
         match opcode {
@@ -180,8 +180,13 @@ impl Channels {
         Some(())
     }
 
+    /// The topic of the channel `id`.
+    pub(super) fn topic(&self, id: u16) -> Option<&str> {
+        self.channels.get(&id).map(|channel| channel.topic.as_str())
+    }
+
     /// What a device could play of the channel `id` of `topic`.
-    fn schema(&self, id: u16, topic: &str) -> Option<Schema> {
+    pub(super) fn schema(&self, id: u16, topic: &str) -> Option<Schema> {
         let channel = self.channels.get(&id).filter(|channel| channel.topic == topic)?;
         Schema::named(&channel.schema).filter(|_| channel.encoding == "protobuf")
     }

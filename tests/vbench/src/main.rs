@@ -24,7 +24,8 @@ usage: usbemu SPEC...                    emulate; commands on stdin (plug, unplu
 
 SPEC: uvc:vid=046d,pid=0825,serial=A,port=0,mode=MJPG-640x480@30[,mode=..]
       acm:vid=2e8a,pid=000a,serial=B,hz=100
-      ftdi:vid=0403,pid=6001,serial=C,hz=50";
+      ftdi:vid=0403,pid=6001,serial=C,hz=50
+      feed=FILE with any of them: send the records of this file";
 
 type Failure = Box<dyn std::error::Error>;
 

@@ -40,6 +40,8 @@ pub struct Message {
     pub channel: u16,
     /// Name of its schema; empty without one.
     pub schema: String,
+    /// Number of the sample, its lower 32 bits.
+    pub sequence: u32,
     /// Capture time on the wall clock, ns.
     pub log_time: u64,
     /// Receive time on the wall clock, ns.
@@ -82,6 +84,7 @@ impl Recording {
                 topic: message.channel.topic.clone(),
                 channel: message.channel.id,
                 schema: message.channel.schema.as_ref().map(|schema| schema.name.clone()).unwrap_or_default(),
+                sequence: message.sequence,
                 log_time: message.log_time,
                 publish_time: message.publish_time,
                 data: message.data.into_owned(),
@@ -167,6 +170,7 @@ mod tests {
             topic: "/rapid/mask".into(),
             channel: 1,
             schema: "rapid.Mask".into(),
+            sequence: 0,
             log_time,
             publish_time: log_time,
             data,

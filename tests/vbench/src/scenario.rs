@@ -41,6 +41,7 @@ pub struct Scenario {
     name: String,
     devices: Vec<(DeviceSpec, bool)>,
     registry: String,
+    files: Vec<(String, Vec<u8>)>,
     play: Play,
     timeline: Vec<(u64, String)>,
     watch_mask: bool,
@@ -63,6 +64,7 @@ impl Scenario {
             name: name.into(),
             devices: Vec::new(),
             registry: String::new(),
+            files: Vec::new(),
             play: Play::Script(String::new()),
             timeline: Vec::new(),
             watch_mask: false,
@@ -128,6 +130,13 @@ impl Scenario {
         self
     }
 
+    /// Puts a file beside `devices.toml`, in `/tmp/bench`; the name may have folders.
+    #[must_use]
+    pub fn file(mut self, name: &str, contents: impl Into<Vec<u8>>) -> Self {
+        self.files.push((name.into(), contents.into()));
+        self
+    }
+
     /// How long the guest's script may take.
     #[must_use]
     pub fn limit(mut self, limit: Duration) -> Self {
@@ -148,21 +157,23 @@ impl Scenario {
         let install = |program: &Path| programs::install(program, &inside, image.suite());
         let usbemu = install(&usbemu)?;
         let rapid = rapid.as_deref().map(install).transpose()?.unwrap_or_default();
-        let write = |name: &str, text: &str| {
+        let write = |name: &str, contents: &[u8]| {
             let path = inside.join(name);
-            fs::write(&path, text).map_err(|error| ScenarioError::Share(path, error))
+            let written = fs::create_dir_all(path.parent().unwrap_or(&path)).and_then(|()| fs::write(&path, contents));
+            written.map_err(|error| ScenarioError::Share(path, error))
         };
         if self.node_program {
             let words = install(&programs::process_node()?)?;
             // It may have to be run through a loader; a registry names one file.
-            write("process_node", &format!("#!/bin/sh\nexec {} \"$@\"\n", self::words(&words)))?;
+            write("process_node", format!("#!/bin/sh\nexec {} \"$@\"\n", self::words(&words)).as_bytes())?;
             let path = inside.join("process_node");
             fs::set_permissions(&path, PermissionsExt::from_mode(0o755))
                 .map_err(|error| ScenarioError::Share(path, error))?;
         }
-        write("bench.sh", WORDS)?;
-        write("devices.toml", &self.registry)?;
-        write("run.sh", &self.guest_script(&usbemu, &rapid))?;
+        write("bench.sh", WORDS.as_bytes())?;
+        write("devices.toml", self.registry.as_bytes())?;
+        self.files.iter().try_for_each(|(name, contents)| write(name, contents))?;
+        write("run.sh", self.guest_script(&usbemu, &rapid).as_bytes())?;
         let boot = image
             .boot(&share, self.limit)
             .inspect_err(|_| eprintln!("vbench: the share is kept in {}", share.display()))?;

@@ -9,6 +9,8 @@ use jpeg_encoder::{ColorType, Encoder, EncodingError};
 
 const COM_TAG: &str = "rapid-vbench";
 const YUYV_TAG: &[u8; 4] = b"RVBF";
+/// Bytes that its identity adds to a JPEG, at most.
+pub const STAMP: usize = 64;
 /// Different pictures a camera cycles through, so that a frozen picture can be told from a live one.
 pub const PICTURES: usize = 6;
 

@@ -3,15 +3,17 @@
 //! Invariant: no clock, no socket, no thread; requests and times come in, answers and packets go out.
 
 use std::collections::HashMap;
+use std::path::Path;
 use std::time::Duration;
 
 use thiserror::Error;
 
 use super::descriptor::{self, Answer, Setup};
+use super::feed::{self, FeedError, Records};
 use super::frame;
 use super::serial::{Flavour, Serial};
 use super::spec::{DeviceSpec, Format, Identity, Kind, Mode};
-use super::uvc::{Pictures, Uvc};
+use super::uvc::{self, Pictures, Uvc};
 
 /// Address of the bulk endpoint that carries every kind's data to the host.
 pub const DATA_IN: u8 = 0x81;
@@ -28,13 +30,25 @@ pub struct Live {
 /// Pictures by size, so that cameras of one size share them.
 pub type PictureStore = HashMap<(u16, u16), Pictures>;
 
-/// A picture that could not be made.
+/// Why there is nothing to send.
 #[derive(Debug, Error)]
-#[error("encoding a {width}x{height} picture: {source}")]
-pub struct PictureError {
-    width: u16,
-    height: u16,
-    source: jpeg_encoder::EncodingError,
+pub enum ContentError {
+    /// A picture could not be made.
+    #[error("encoding a {width}x{height} picture: {source}")]
+    Picture {
+        /// Pixels across.
+        width: u16,
+        /// Pixels down.
+        height: u16,
+        /// Why.
+        source: jpeg_encoder::EncodingError,
+    },
+    /// What was given cannot be read.
+    #[error(transparent)]
+    Feed(#[from] FeedError),
+    /// What was given is no picture of the camera's.
+    #[error("record {0} of the feed is no whole JPEG that fits {1}x{2}")]
+    NotPicture(usize, u16, u16),
 }
 
 /// A device, whichever port it is in.
@@ -52,13 +66,14 @@ enum Role {
 }
 
 impl Function {
-    /// Makes the device a specification describes; encodes the pictures it needs.
+    /// Makes the device a specification describes; encodes the pictures it needs, or reads what it is to send.
     /// Its frames or lines are numbered from `first`.
-    pub fn new(spec: &DeviceSpec, first: u32, store: &mut PictureStore) -> Result<Self, PictureError> {
+    pub fn new(spec: &DeviceSpec, first: u32, store: &mut PictureStore) -> Result<Self, ContentError> {
+        let given = (!spec.feed.is_empty()).then(|| feed::load(Path::new(&spec.feed))).transpose()?;
         let role = match &spec.kind {
-            Kind::Uvc(modes) => Role::Uvc(camera(modes, first, store)?),
-            Kind::Acm { hz } => Role::Serial(Serial::new(Flavour::Acm, *hz, first)),
-            Kind::Ftdi { hz } => Role::Serial(Serial::new(Flavour::Ftdi, *hz, first)),
+            Kind::Uvc(modes) => Role::Uvc(camera(modes, first, given, store)?),
+            Kind::Acm { hz } => Role::Serial(Serial::new(Flavour::Acm, *hz, first, given)),
+            Kind::Ftdi { hz } => Role::Serial(Serial::new(Flavour::Ftdi, *hz, first, given)),
         };
         Ok(Self { identity: spec.identity.clone(), configured: 0, role })
     }
@@ -160,17 +175,25 @@ impl Function {
     }
 }
 
-fn camera(modes: &[Mode], first: u32, store: &mut PictureStore) -> Result<Uvc, PictureError> {
+fn camera(modes: &[Mode], first: u32, given: Option<Records>, store: &mut PictureStore) -> Result<Uvc, ContentError> {
     let default = [Mode { format: Format::Mjpg, width: 640, height: 480, fps: vec![30] }];
     let modes = if modes.is_empty() { &default } else { modes };
     let mut with_pictures = Vec::with_capacity(modes.len());
     for mode in modes {
         let size @ (width, height) = (mode.width, mode.height);
-        let pictures = match (mode.format, store.get(&size)) {
-            (Format::Yuyv, _) => Pictures::default(),
-            (Format::Mjpg, Some(known)) => known.clone(),
-            (Format::Mjpg, None) => {
-                let made = frame::jpegs(width, height).map_err(|source| PictureError { width, height, source })?;
+        let pictures = match (mode.format, &given, store.get(&size)) {
+            (Format::Yuyv, ..) => Pictures::default(),
+            (Format::Mjpg, Some(given), _) => {
+                let fits = |jpeg: &Vec<u8>| frame::is_whole_jpeg(jpeg) && jpeg.len() + frame::STAMP <= uvc::room(mode);
+                match given.iter().position(|jpeg| !fits(jpeg)) {
+                    Some(record) => return Err(ContentError::NotPicture(record, width, height)),
+                    None => given.clone(),
+                }
+            }
+            (Format::Mjpg, None, Some(known)) => known.clone(),
+            (Format::Mjpg, None, None) => {
+                let failed = |source| ContentError::Picture { width, height, source };
+                let made = frame::jpegs(width, height).map_err(failed)?;
                 store.entry(size).or_insert(Pictures::new(made)).clone()
             }
         };

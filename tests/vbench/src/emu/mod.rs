@@ -9,6 +9,7 @@
 
 pub mod descriptor;
 pub mod device;
+pub mod feed;
 pub mod frame;
 pub mod function;
 pub mod log;

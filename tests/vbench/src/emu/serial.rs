@@ -1,11 +1,13 @@
 //! Serial devices that send lines of text: CDC-ACM and FTDI.
 //!
-//! A line is `SEQ,MONO_NS,sin,cos\n`: a counter, the send time, and two values that change. What the host sends is ignored.
+//! A line is `SEQ,MONO_NS,sin,cos\n`: a counter, the send time, and two values that change; or one of those it was given.
+//! What the host sends is ignored.
 
 use std::fmt::Write;
 use std::time::Duration;
 
 use super::descriptor::{Answer, BULK_PACKET, CS_INTERFACE, Configuration, DeviceClass, Setup};
+use super::feed::Records;
 use super::function::{DATA_IN, Live};
 
 const DATA_OUT: u8 = 0x02;
@@ -27,16 +29,20 @@ pub enum Flavour {
 pub struct Serial {
     flavour: Flavour,
     period: Duration,
+    first_line: u64,
     next_line: u64,
+    feed: Option<Records>,
     line_coding: [u8; 7],
 }
 
 impl Serial {
-    /// A device that sends `hz` lines a second, numbered from `first`.
-    pub fn new(flavour: Flavour, hz: f64, first: u32) -> Self {
+    /// A device that sends `hz` lines a second, numbered from `first`: those of `feed`, if it is given one.
+    pub fn new(flavour: Flavour, hz: f64, first: u32, feed: Option<Records>) -> Self {
         // 115200 8N1, what a host reads before it sets its own.
         let line_coding = [0x00, 0xc2, 0x01, 0x00, 0, 0, 8];
-        Self { flavour, period: Duration::from_secs_f64(1.0 / hz), next_line: first.into(), line_coding }
+        let first = first.into();
+        let period = Duration::from_secs_f64(1.0 / hz);
+        Self { flavour, period, first_line: first, next_line: first, feed, line_coding }
     }
 
     /// Class codes of the device.
@@ -92,11 +98,16 @@ impl Serial {
 
     /// Writes the next line over `out`.
     pub fn line(&self, sent_ns: u64, out: &mut Vec<u8>) {
+        out.clear();
+        if let Some(feed) = &self.feed {
+            let place = (self.next_line - self.first_line) as usize % feed.len();
+            out.extend_from_slice(&feed[place]);
+            return;
+        }
         let phase = self.next_line as f64 / 100.0;
         let mut text = String::with_capacity(64);
         let infallible = writeln!(text, "{},{sent_ns},{:.6},{:.6}", self.next_line, phase.sin(), phase.cos());
         infallible.expect("writing to a string cannot fail");
-        out.clear();
         out.extend_from_slice(text.as_bytes());
     }
 
@@ -124,13 +135,13 @@ mod tests {
     #[test]
     fn configuration_lengths_add_up() {
         for flavour in [Flavour::Acm, Flavour::Ftdi] {
-            check_configuration(&Serial::new(flavour, 100.0, 0).configuration());
+            check_configuration(&Serial::new(flavour, 100.0, 0, None).configuration());
         }
     }
 
     #[test]
     fn lines_count_only_when_sent() {
-        let mut serial = Serial::new(Flavour::Acm, 100.0, 0);
+        let mut serial = Serial::new(Flavour::Acm, 100.0, 0, None);
         let mut line = Vec::new();
         serial.line(5, &mut line);
         serial.line(6, &mut line);
@@ -141,9 +152,23 @@ mod tests {
     }
 
     #[test]
+    fn given_lines_go_round() {
+        let feed = Records::new(vec![b"1,2\n".to_vec(), b"3,4\n".to_vec()]);
+        let mut serial = Serial::new(Flavour::Acm, 10.0, 2_000_001, Some(feed));
+        let mut line = Vec::new();
+        let mut lines = String::new();
+        for _ in 0..3 {
+            serial.line(5, &mut line);
+            lines.push_str(std::str::from_utf8(&line).unwrap());
+            serial.sent();
+        }
+        assert_eq!(lines, "1,2\n3,4\n1,2\n");
+    }
+
+    #[test]
     fn ftdi_packets_start_with_status() {
         let mut packet = Vec::new();
-        let serial = Serial::new(Flavour::Ftdi, 100.0, 0);
+        let serial = Serial::new(Flavour::Ftdi, 100.0, 0, None);
         assert_eq!(serial.packet(b"abc", 0, 512, &mut packet), 3);
         assert_eq!(packet, [FTDI_STATUS[0], FTDI_STATUS[1], b'a', b'b', b'c']);
         packet.clear();

@@ -4,6 +4,7 @@
 //! uvc:port=0,vid=046d,pid=0825,serial=CAM00A1,product=Wrist,mode=MJPG-640x480@30,mode=YUYV-320x240@30/15
 //! acm:port=2,vid=2e8a,pid=000a,serial=TOF1,hz=100
 //! ftdi:port=3,vid=0403,pid=6001,serial=FT1,hz=50
+//! uvc:mode=MJPG-96x96@10,feed=/tmp/bench/wrist.feed
 //! ```
 //!
 //! A comma, a per cent sign or a control character in a string is written as in a URL: `%2c`.
@@ -30,6 +31,8 @@ pub struct DeviceSpec {
     pub port: Option<u8>,
     /// How it names itself.
     pub identity: Identity,
+    /// File of what it sends, see `feed`; empty: the bench's own pictures and lines.
+    pub feed: String,
 }
 
 /// What a device says about itself.
@@ -143,6 +146,13 @@ impl DeviceSpec {
         self
     }
 
+    /// Lets it send the records of this file of the guest: MJPEG pictures of a camera, lines of a serial device.
+    #[must_use]
+    pub fn feed(mut self, path: &str) -> Self {
+        self.feed = path.into();
+        self
+    }
+
     /// Plugs it into this port first.
     #[must_use]
     pub fn port(mut self, port: u8) -> Self {
@@ -162,7 +172,7 @@ impl DeviceSpec {
     fn new(kind: Kind, vid: u16, pid: u16) -> Self {
         let product = format!("Virtual {}", kind.name());
         let identity = Identity { vid, pid, serial: String::new(), product, manufacturer: "Bench".into() };
-        Self { kind, port: None, identity }
+        Self { kind, port: None, identity, feed: String::new() }
     }
 }
 
@@ -204,6 +214,7 @@ impl FromStr for DeviceSpec {
                 ("serial", _) => spec.identity.serial = string()?,
                 ("product", _) => spec.identity.product = string()?,
                 ("manufacturer", _) => spec.identity.manufacturer = string()?,
+                ("feed", _) => spec.feed = string()?,
                 ("mode", Kind::Uvc(modes)) if modes.len() < MODES => {
                     modes.push(parse_mode(value).ok_or_else(|| wrong("FORMAT-WxH@FPS[/FPS..], FORMAT MJPG or YUYV"))?);
                 }
@@ -277,6 +288,9 @@ impl fmt::Display for DeviceSpec {
         if let Some(port) = self.port {
             write!(f, ",port={port}")?;
         }
+        if !self.feed.is_empty() {
+            write!(f, ",feed={}", escaped(&self.feed))?;
+        }
         match &self.kind {
             Kind::Uvc(modes) => modes.iter().try_for_each(|mode| {
                 let rates: Vec<String> = mode.fps.iter().map(u32::to_string).collect();
@@ -302,7 +316,7 @@ mod tests {
         for spec in [
             camera,
             hostile,
-            DeviceSpec::acm(0x2e8a, 0x000a, 100.0).serial("TOF1"),
+            DeviceSpec::acm(0x2e8a, 0x000a, 100.0).serial("TOF1").feed("/tmp/bench/a,b"),
             DeviceSpec::ftdi(0x0403, 0x6001, 0.5),
         ] {
             assert_eq!(spec.to_string().parse(), Ok(spec));

@@ -32,6 +32,7 @@ pub struct Uvc {
     committed: Selection,
     stream: Option<u32>,
     streams: u32,
+    first_frame: u32,
     next_frame: u32,
     payload_parity: u8,
 }
@@ -68,6 +69,7 @@ impl Uvc {
             committed: default,
             stream: None,
             streams: 0,
+            first_frame: first,
             next_frame: first,
             payload_parity: 0,
         }
@@ -146,8 +148,9 @@ impl Uvc {
     pub fn frame(&mut self, sent_ns: u64, out: &mut Vec<u8>) {
         let (mode, pictures) = self.mode(self.committed);
         let id = FrameId { number: self.next_frame, sent_ns };
+        let place = self.next_frame.wrapping_sub(self.first_frame) as usize;
         match mode.format {
-            Format::Mjpg => frame::stamp_jpeg(&pictures[id.number as usize % pictures.len()], id, out),
+            Format::Mjpg => frame::stamp_jpeg(&pictures[place % pictures.len()], id, out),
             Format::Yuyv => frame::stamp_yuyv(mode.width, mode.height, id, frame::light(), out),
         }
     }
@@ -235,6 +238,11 @@ impl FormatGroup {
 
 fn interval(fps: u32) -> u32 {
     INTERVALS_PER_SECOND / fps
+}
+
+/// Bytes a frame of this mode may have: the host drops a longer one.
+pub fn room(mode: &Mode) -> usize {
+    frame_bytes(mode) as usize
 }
 
 /// An upper bound for both formats.

@@ -1,0 +1,250 @@
+//! `rapid replay FILE --infer`: a policy beside a recorded episode.
+
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use super::Format;
+use super::progress::Bar;
+use crate::compare::{self, Again, Beside, CompareError, Compared, Comparison, Difference, Spread, Watcher};
+use crate::policy::bundle::{Bundle, BundleErrors};
+use crate::policy::library::{Environment, LibraryError};
+use crate::text;
+
+/// Differences up to this come from the machine: the order in which it adds.
+const USUAL_TOLERANCE: f64 = 1e-4;
+
+/// What is compared.
+#[derive(Debug, Clone)]
+pub struct CompareOptions {
+    /// The episode.
+    pub file: PathBuf,
+    /// Folder of the policy.
+    pub bundle: PathBuf,
+    /// A larger difference of a policy's own episode is a failure.
+    pub tolerance: Option<f64>,
+    /// Steps of denoising instead of the bundle's own.
+    pub denoising_steps: Option<usize>,
+    /// Library of onnxruntime instead of the one inside.
+    pub library: Option<PathBuf>,
+}
+
+/// Why there is no comparison, or what it showed.
+#[derive(Debug, thiserror::Error)]
+pub enum CompareFailure {
+    /// The bundle.
+    #[error(transparent)]
+    Bundle(#[from] BundleErrors),
+    /// onnxruntime.
+    #[error(transparent)]
+    Library(#[from] LibraryError),
+    /// The comparison.
+    #[error(transparent)]
+    Compare(#[from] CompareError),
+    /// A larger difference than allowed.
+    #[error("{file}: the actions differ by {found:.3e}, more than --tolerance {tolerance:e}")]
+    Beyond {
+        /// The episode.
+        file: String,
+        /// The largest.
+        found: f64,
+        /// What was allowed.
+        tolerance: f64,
+    },
+    /// A tolerance, and nothing that it could be about.
+    #[error("{file}: {why}, so there is no difference to hold against --tolerance")]
+    Incomparable {
+        /// The episode.
+        file: String,
+        /// Why.
+        why: &'static str,
+    },
+    /// The output.
+    #[error("output: {0}")]
+    Output(#[from] io::Error),
+}
+
+struct Progress<'a> {
+    bar: Option<Bar>,
+    wanted: bool,
+    stop: &'a dyn Fn() -> bool,
+}
+
+impl Watcher for Progress<'_> {
+    fn at(&mut self, done: usize, total: usize) -> bool {
+        let wanted = self.wanted;
+        self.bar.get_or_insert_with(|| Bar::new("comparing", total, wanted)).at(done);
+        !(self.stop)()
+    }
+}
+
+/// Compares, and prints what came of it. Ends early when `stop` says so, and prints what there is.
+///
+/// # Errors
+/// When the policy or the file cannot be used, or the difference is larger than allowed.
+pub fn run(
+    options: &CompareOptions,
+    format: Format,
+    stop: &dyn Fn() -> bool,
+    out: &mut dyn Write,
+) -> Result<(), CompareFailure> {
+    let bundle = Bundle::load(&options.bundle)?;
+    let environment = Environment::open(options.library.as_deref())?;
+    let mut progress = Progress { bar: None, wanted: format == Format::Text, stop };
+    let compared = compare::compare(&options.file, &bundle, &environment, options.denoising_steps, &mut progress)?;
+    drop(progress);
+    match format {
+        Format::Json => writeln!(out, "{}", json(&compared, &bundle, options)?)?,
+        Format::Text => print(&compared, &bundle, &options.file, options.tolerance, out)?,
+    }
+    judge(&compared, options)
+}
+
+fn judge(compared: &Compared, options: &CompareOptions) -> Result<(), CompareFailure> {
+    let Some(tolerance) = options.tolerance else { return Ok(()) };
+    let file = options.file.display().to_string();
+    let Comparison::Again(again) = &compared.comparison else {
+        return Err(CompareFailure::Incomparable { file, why: "no policy recorded it" });
+    };
+    match again.largest() {
+        None => Err(CompareFailure::Incomparable { file, why: "none of its chunks could be computed again" }),
+        Some(found) if found > tolerance => Err(CompareFailure::Beyond { file, found, tolerance }),
+        Some(_) => Ok(()),
+    }
+}
+
+fn json(compared: &Compared, bundle: &Bundle, options: &CompareOptions) -> Result<String, io::Error> {
+    let mut value = serde_json::to_value(compared)?;
+    value["event"] = "comparison".into();
+    value["file"] = options.file.display().to_string().into();
+    (value["policy"], value["policy_hash"]) = (bundle.name.clone().into(), bundle.hash.clone().into());
+    if let Comparison::Again(again) = &compared.comparison {
+        let tolerance = options.tolerance.unwrap_or(USUAL_TOLERANCE);
+        value["tolerance"] = tolerance.into();
+        value["within"] = again.largest().map(|largest| largest <= tolerance).into();
+    }
+    Ok(text::json(&value)?)
+}
+
+fn print(
+    compared: &Compared,
+    bundle: &Bundle,
+    file: &Path,
+    tolerance: Option<f64>,
+    out: &mut dyn Write,
+) -> io::Result<()> {
+    let (file, name) = (file.display().to_string(), text::plain(&bundle.name));
+    let file = text::plain(&file);
+    match &compared.comparison {
+        Comparison::Again(again) => {
+            let by = compared.recorded_policy.as_deref().unwrap_or("a policy");
+            writeln!(out, "{file}: recorded by {}, computed again by {name}\n", text::plain(by))?;
+            if compared.recorded_policy_hash.as_ref().is_some_and(|hash| *hash != bundle.hash) {
+                writeln!(out, "not the same policy: the bundle is another one than that of the recording\n")?;
+            }
+            print_again(again, tolerance.unwrap_or(USUAL_TOLERANCE), out)?;
+        }
+        Comparison::Beside(beside) => {
+            writeln!(out, "{file}: a demonstration, beside {name}\n")?;
+            print_beside(beside, bundle, out)?;
+        }
+    }
+    if let Some(damage) = &compared.damage {
+        writeln!(out, "\n{}", text::plain(damage))?;
+    }
+    if compared.interrupted {
+        writeln!(out, "\ninterrupted: what is above is a part of the episode")?;
+    }
+    Ok(())
+}
+
+fn print_again(again: &Again, tolerance: f64, out: &mut dyn Write) -> io::Result<()> {
+    writeln!(out, "{} chunks, {} computed again", again.chunks, again.compared)?;
+    let others = [
+        (again.samples_missing, "not: their samples are not all in the file (captured before it began, or lost)"),
+        (
+            again.reference_unknown,
+            "not: the recording began after the policy, and the first picture, which it compares all others with, is \
+             not in the file",
+        ),
+        (again.unlike, "not: of other observations or another length than this policy's"),
+        (again.unreadable, "not: their events cannot be read"),
+        (again.failed, "not: the policy has no answer"),
+    ];
+    print_others(&others, again.failure.as_deref(), out)?;
+    if again.compared > 0 {
+        table(&again.difference, out)?;
+    }
+    let actions = &again.actions;
+    if actions.recorded > 0 {
+        writeln!(out, "\n{} actions, {} beside those of the chunks", actions.recorded, actions.compared)?;
+        print_others(&[(actions.without_chunk, "not: no chunk in the file speaks of their tick")], None, out)?;
+        if actions.compared > 0 {
+            table(&actions.difference, out)?;
+        }
+    }
+    match again.largest() {
+        None => writeln!(out, "\nnothing could be compared"),
+        Some(largest) if largest <= tolerance => writeln!(out, "\nwithin {tolerance:e}"),
+        Some(largest) => writeln!(out, "\nbeyond {tolerance:e}: {largest:.3e}"),
+    }
+}
+
+fn print_beside(beside: &Beside, bundle: &Bundle, out: &mut dyn Write) -> io::Result<()> {
+    let Beside { ticks, compared, recorded, counts, .. } = beside;
+    writeln!(
+        out,
+        "{ticks} ticks at {} Hz, {recorded} recorded actions, {} chunks; {compared} ticks compared",
+        text::hertz(bundle.control_hz),
+        counts.chunks
+    )?;
+    print_others(&[(beside.without_recorded, "not: no action was recorded there")], None, out)?;
+    for (reason, held) in &beside.held {
+        writeln!(out, "  {held} not: {reason}")?;
+    }
+    if let Some(failure) = &beside.failure {
+        writeln!(out, "    {}", text::plain(failure))?;
+    }
+    if *compared > 0 { table(&beside.difference, out) } else { writeln!(out, "\nnothing could be compared") }
+}
+
+fn print_others(others: &[(u64, &str)], failure: Option<&str>, out: &mut dyn Write) -> io::Result<()> {
+    for (count, what) in others.iter().filter(|(count, _)| *count > 0) {
+        writeln!(out, "  {count} {what}")?;
+    }
+    failure.map_or(Ok(()), |failure| writeln!(out, "    {}", text::plain(failure)))
+}
+
+fn table(difference: &Difference, out: &mut dyn Write) -> io::Result<()> {
+    writeln!(out, "\ndifference        mean       largest    at tick")?;
+    let mut line = |name: &str, unit: &str, spread: &Spread| {
+        let (name, unit) = (text::left(&text::plain(name), 12, "…"), text::left(&text::plain(unit), 4, "…"));
+        writeln!(out, "{name} {unit} {:<10} {:<10} {}", number(spread.mean), number(spread.largest), spread.at_tick)
+    };
+    for axis in &difference.axes {
+        line(&axis.name, &axis.unit, &axis.spread)?;
+    }
+    line("all", "", &difference.all)
+}
+
+/// Short, whatever its size.
+fn number(value: f64) -> String {
+    if value == 0.0 {
+        "0".to_owned()
+    } else if (1e-3..1e4).contains(&value) {
+        format!("{value:.4}")
+    } else {
+        format!("{value:.2e}")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_are_short() {
+        for (value, said) in [(0.0, "0"), (0.0123, "0.0123"), (1.19e-7, "1.19e-7"), (f64::INFINITY, "inf")] {
+            assert_eq!(number(value), said);
+        }
+    }
+}

@@ -1,0 +1,352 @@
+//! The chunks of a recorded policy, computed once more from the samples that their events name.
+//!
+//! Chunks are taken in the order in which the policy gave them, so that a picture that later ones are
+//! compared with is the same. A request that had no answer left no event: had it been the first with a
+//! picture, the reference is another one here, and the difference shows it.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::path::Path;
+
+use serde::Serialize;
+
+use super::difference::{Difference, distance};
+use super::reference::Reference;
+use super::survey::{RecordedAction, RecordedChunk, SEQUENCE_BITS, Survey};
+use super::{CompareError, Ended};
+use crate::driver::replay::tape::{Content, Tape};
+use crate::policy::bundle::Bundle;
+use crate::policy::model::Model;
+use crate::policy::request::Request;
+use crate::registry::Registry;
+use crate::sample::{Encoding, SampleHeader};
+
+/// What came of it.
+#[derive(Debug, Clone, Serialize)]
+pub struct Again {
+    /// Chunks in the file.
+    pub chunks: u64,
+    /// Those that were computed again.
+    pub compared: u64,
+    /// Those whose samples are not all in the file: captured before the episode began, or lost.
+    pub samples_missing: u64,
+    /// Those with a picture that is compared with one from before the episode began.
+    pub reference_unknown: u64,
+    /// Those of other observations or another length than the policy's: another policy gave them.
+    pub unlike: u64,
+    /// Those whose event cannot be read.
+    pub unreadable: u64,
+    /// Those that could not be computed.
+    pub failed: u64,
+    /// Why, of the last of them.
+    pub failure: Option<String>,
+    /// Between the chunks in the file and those computed again.
+    pub difference: Difference,
+    /// The actions in the file beside the chunks in the file.
+    pub actions: Actions,
+}
+
+/// The published actions beside those of the chunks, brought within the limits.
+#[derive(Debug, Clone, Serialize)]
+pub struct Actions {
+    /// Actions in the file.
+    pub recorded: u64,
+    /// Those of whose tick a chunk speaks. The nearest counts, where an old chunk and a new one do.
+    pub compared: u64,
+    /// The others.
+    pub without_chunk: u64,
+    /// The difference.
+    pub difference: Difference,
+}
+
+impl Again {
+    /// The largest difference of all that was compared; `None` if nothing was.
+    #[must_use]
+    pub fn largest(&self) -> Option<f64> {
+        let actions = self.actions.difference.all.largest;
+        (self.compared > 0).then(|| self.difference.all.largest.max(actions))
+    }
+}
+
+/// A sample: position of its device in the registry, and the number that the message holds.
+type Key = (usize, u64);
+
+#[derive(Debug)]
+struct Kept {
+    encoding: Encoding,
+    width: u32,
+    height: u32,
+    bytes: Vec<u8>,
+}
+
+/// What is being computed.
+struct Work<'a> {
+    bundle: &'a Bundle,
+    model: &'a mut Model,
+    request: Request,
+    /// Position in the registry of each observation's device.
+    devices: Vec<Option<usize>>,
+    references: Vec<Reference>,
+    samples: BTreeMap<Key, Kept>,
+    /// How many of the chunks still to come are made of a sample that is in the file.
+    uses: BTreeMap<Key, u32>,
+    chunk: Vec<f32>,
+    again: Again,
+}
+
+pub(super) fn compare(
+    file: &Path,
+    survey: &Survey,
+    bundle: &Bundle,
+    registry: &Registry,
+    model: &mut Model,
+    ended: &mut Ended<'_>,
+) -> Result<Again, CompareError> {
+    let device = |name: &str| registry.devices.iter().position(|device| device.name == name);
+    let topics: BTreeMap<&str, usize> =
+        registry.devices.iter().enumerate().map(|(at, device)| (device.topic.as_str(), at)).collect();
+    let difference = || Difference::new(&bundle.action);
+    let again = Again {
+        chunks: survey.chunks.len() as u64 + survey.unreadable,
+        compared: 0,
+        samples_missing: 0,
+        reference_unknown: 0,
+        unlike: 0,
+        unreadable: survey.unreadable,
+        failed: 0,
+        failure: None,
+        difference: difference(),
+        actions: actions(survey, bundle),
+    };
+    let mut work = Work {
+        bundle,
+        request: Request::new(bundle),
+        devices: bundle.observations.iter().map(|observation| device(&observation.modality)).collect(),
+        references: Reference::all(survey, bundle, registry),
+        samples: BTreeMap::new(),
+        uses: BTreeMap::new(),
+        chunk: vec![0.0; model.chunk_len()],
+        model,
+        again,
+    };
+    let mut waiting: VecDeque<&RecordedChunk> = VecDeque::new();
+    for chunk in &survey.chunks {
+        if !work.is_like(chunk) {
+            work.again.unlike += 1;
+            continue;
+        }
+        waiting.push_back(chunk);
+        for key in work.keys(chunk) {
+            let topic = registry.devices.get(key.0).map_or("", |device| &device.topic);
+            if survey.holds(topic, key.1) {
+                *work.uses.entry(key).or_default() += 1;
+            }
+        }
+    }
+    let total = waiting.len();
+    let mut tape = Tape::open(file)?;
+    loop {
+        while let Some(chunk) = waiting.front().copied().filter(|chunk| work.is_ready(chunk)) {
+            if !ended.goes_on(total - waiting.len(), total) {
+                return Ok(work.again);
+            }
+            work.compute(chunk);
+            waiting.pop_front();
+        }
+        if waiting.is_empty() {
+            return Ok(work.again);
+        }
+        let Some(taped) = tape.next_message()? else { break };
+        let Content::Sample { encoding, width, height, bytes } = taped.content else { continue };
+        let Some(device) = topics.get(taped.topic) else { continue };
+        let key = (*device, u64::from(taped.sequence));
+        if work.uses.contains_key(&key) {
+            work.samples.entry(key).or_insert_with(|| Kept { encoding, width, height, bytes: bytes.to_vec() });
+        }
+    }
+    // The file has changed since it was looked through.
+    work.again.samples_missing += waiting.len() as u64;
+    Ok(work.again)
+}
+
+impl Work<'_> {
+    /// Is it of observations and of a length as this policy's?
+    fn is_like(&self, chunk: &RecordedChunk) -> bool {
+        let (observations, steps) = (&self.bundle.observations, self.bundle.n_obs_steps);
+        let same = |(samples, observation): (&super::survey::RecordedSamples, _)| {
+            let observation: &crate::policy::bundle::ObservationSpec = observation;
+            samples.modality == observation.modality && [0, steps].contains(&samples.seqs.len())
+        };
+        chunk.samples.len() == observations.len()
+            && chunk.samples.iter().zip(observations).all(same)
+            && chunk.actions.len() == self.chunk.len()
+    }
+
+    /// The samples it is made of.
+    fn keys(&self, chunk: &RecordedChunk) -> Vec<Key> {
+        let of = |(samples, device): (&super::survey::RecordedSamples, &Option<usize>)| {
+            let device = *device;
+            let key = move |number: &u64| Some((device?, number & SEQUENCE_BITS));
+            samples.seqs.iter().filter_map(key).collect::<Vec<_>>()
+        };
+        chunk.samples.iter().zip(&self.devices).flat_map(of).collect()
+    }
+
+    /// Is there all of it that the file holds?
+    fn is_ready(&self, chunk: &RecordedChunk) -> bool {
+        self.keys(chunk).iter().all(|key| self.samples.contains_key(key) || !self.uses.contains_key(key))
+    }
+
+    fn compute(&mut self, chunk: &RecordedChunk) {
+        let whole = self.fill(chunk);
+        let uses = |reference: &Reference, request: &Request, at: usize, wanted: Reference| {
+            *reference == wanted && request.is_present(at)
+        };
+        let lost = |(at, reference): (usize, &Reference)| uses(reference, &self.request, at, Reference::Lost);
+        if !whole || self.references.iter().enumerate().any(lost) {
+            let counter = if whole { &mut self.again.reference_unknown } else { &mut self.again.samples_missing };
+            *counter += 1;
+            self.take_references(chunk);
+        } else {
+            let answered = self.model.answer(&self.request, &mut self.chunk);
+            let now = if answered.is_ok() { Reference::Known } else { Reference::Lost };
+            for (at, reference) in self.references.iter_mut().enumerate() {
+                if uses(reference, &self.request, at, Reference::Next) {
+                    *reference = now;
+                }
+            }
+            match answered {
+                Ok(()) => self.hold_against(chunk),
+                Err(error) => {
+                    self.again.failed += 1;
+                    self.again.failure = Some(error.to_string());
+                }
+            }
+        }
+        for key in self.keys(chunk) {
+            let Some(uses) = self.uses.get_mut(&key) else { continue };
+            *uses = uses.saturating_sub(1);
+            if *uses == 0 {
+                self.uses.remove(&key);
+                self.samples.remove(&key);
+            }
+        }
+    }
+
+    /// Makes the request of a chunk. Returns whether all of its samples are there.
+    fn fill(&mut self, chunk: &RecordedChunk) -> bool {
+        let mut whole = true;
+        self.request.tick = chunk.tick;
+        self.request.seed = chunk.seed;
+        self.request.mask = chunk.mask().unwrap_or_default();
+        for (at, (samples, device)) in chunk.samples.iter().zip(&self.devices).enumerate() {
+            self.request.set_present(at, !samples.seqs.is_empty());
+            for (step, number) in samples.seqs.iter().enumerate() {
+                let kept = device.and_then(|device| self.samples.get(&(device, number & SEQUENCE_BITS)));
+                let (Some(kept), Some(cell)) = (kept, self.request.cell_mut(at, step)) else {
+                    whole = false;
+                    continue;
+                };
+                let header = SampleHeader {
+                    seq: *number,
+                    encoding: kept.encoding as u32,
+                    width: kept.width,
+                    height: kept.height,
+                    ..SampleHeader::default()
+                };
+                cell.set(&header, 0, &kept.bytes);
+            }
+        }
+        whole
+    }
+
+    /// Of a chunk that cannot be computed: its pictures are the references of later ones all the same.
+    fn take_references(&mut self, chunk: &RecordedChunk) {
+        let present: Vec<bool> = (0..self.references.len()).map(|at| self.request.is_present(at)).collect();
+        for at in 0..present.len() {
+            if self.references.get(at) != Some(&Reference::Next) || present.get(at) != Some(&true) {
+                continue;
+            }
+            let known = self.fill_with_first(chunk, at) && {
+                for other in 0..present.len() {
+                    self.request.set_present(other, other == at);
+                }
+                self.model.observe(&self.request).is_ok()
+            };
+            if let Some(reference) = self.references.get_mut(at) {
+                *reference = if known { Reference::Known } else { Reference::Lost };
+            }
+        }
+    }
+
+    /// Puts the first picture of observation `at` in the place of all of its steps. Is it there?
+    fn fill_with_first(&mut self, chunk: &RecordedChunk, at: usize) -> bool {
+        let number = chunk.samples.get(at).and_then(|samples| samples.seqs.first());
+        let there = |number: &u64| {
+            let device = self.devices.get(at).copied().flatten();
+            device.is_some_and(|device| self.samples.contains_key(&(device, number & SEQUENCE_BITS)))
+        };
+        if !number.is_some_and(there) {
+            return false;
+        }
+        let Some(first) = self.request.cell(at, 0).cloned() else { return false };
+        for step in 1..self.request.steps() {
+            if let Some(cell) = self.request.cell_mut(at, step) {
+                cell.clone_from(&first);
+            }
+        }
+        true
+    }
+
+    fn hold_against(&mut self, chunk: &RecordedChunk) {
+        self.again.compared += 1;
+        let values = self.bundle.action.len();
+        let rows = chunk.actions.chunks(values).zip(self.chunk.chunks(values));
+        for (index, (recorded, computed)) in rows.enumerate() {
+            let tick = chunk.tick.saturating_add(index as u64).saturating_sub(self.bundle.action_start as u64);
+            let recorded = recorded.iter().map(|value| value.map_or(f64::NAN, f64::from));
+            self.again.difference.take(tick, recorded, computed.iter().copied().map(f64::from));
+        }
+    }
+}
+
+/// The recorded actions beside the recorded chunks.
+fn actions(survey: &Survey, bundle: &Bundle) -> Actions {
+    let mut actions =
+        Actions { recorded: 0, compared: 0, without_chunk: 0, difference: Difference::new(&bundle.action) };
+    let chunks: BTreeMap<u64, &RecordedChunk> =
+        survey.chunks.iter().map(|chunk| (chunk.tick & SEQUENCE_BITS, chunk)).collect();
+    for action in &survey.actions {
+        actions.recorded += 1;
+        let tick = u64::from(action.sequence);
+        let speaking = chunks.range(tick.saturating_sub(bundle.horizon as u64)..=tick);
+        let planned = speaking.filter_map(|(_, chunk)| planned(chunk, action, bundle));
+        let apart = |planned: &Vec<f64>| {
+            planned.iter().zip(&action.values).map(|(one, other)| distance(*one, *other)).fold(0.0, f64::max)
+        };
+        match planned.min_by(|one, other| apart(one).total_cmp(&apart(other))) {
+            Some(planned) => {
+                actions.compared += 1;
+                actions.difference.take(action.sequence.into(), planned.into_iter(), action.values.iter().copied());
+            }
+            None => actions.without_chunk += 1,
+        }
+    }
+    actions
+}
+
+/// What `chunk` says of the tick of `action`, within the limits.
+fn planned(chunk: &RecordedChunk, action: &RecordedAction, bundle: &Bundle) -> Option<Vec<f64>> {
+    let age = u64::from(action.sequence).checked_sub(chunk.tick & SEQUENCE_BITS)?;
+    let index = usize::try_from(age).ok()?.checked_add(bundle.action_start)?;
+    let values = bundle.action.len();
+    let row = chunk.actions.get(index.checked_mul(values)?..)?.get(..values)?;
+    if action.values.len() != values {
+        return None;
+    }
+    let limits = bundle.action.min.iter().zip(&bundle.action.max);
+    let clamped = row.iter().zip(limits).map(|(value, (min, max))| match value {
+        Some(value) => f64::from(value.max(*min).min(*max)),
+        None => f64::NAN,
+    });
+    Some(clamped.collect())
+}

@@ -1,0 +1,110 @@
+//! How far two runs of numbers are apart.
+//!
+//! Invariant: a number that is none lies infinitely far from every other, and not from itself.
+
+use serde::Serialize;
+
+use crate::policy::bundle::BundleAction;
+
+/// Distances of one kind.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
+pub struct Spread {
+    /// Their mean.
+    pub mean: f64,
+    /// The largest.
+    pub largest: f64,
+    /// Tick of the action with the largest.
+    pub at_tick: u64,
+    /// How many there are.
+    pub values: u64,
+}
+
+impl Spread {
+    fn take(&mut self, tick: u64, distance: f64) {
+        self.values += 1;
+        if distance > self.largest {
+            (self.largest, self.at_tick) = (distance, tick);
+        }
+        // Once infinite, it stays so.
+        if self.mean.is_finite() {
+            self.mean += (distance - self.mean) / self.values as f64;
+        }
+    }
+}
+
+/// Distances of one axis.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct AxisDifference {
+    /// What it is called.
+    pub name: String,
+    /// Unit of its distances.
+    pub unit: String,
+    /// The distances.
+    #[serde(flatten)]
+    pub spread: Spread,
+}
+
+/// Distances between actions.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Difference {
+    /// Of all axes, whatever their units.
+    #[serde(flatten)]
+    pub all: Spread,
+    /// Of each axis.
+    pub axes: Vec<AxisDifference>,
+}
+
+impl Difference {
+    pub(super) fn new(action: &BundleAction) -> Self {
+        let axis = |(name, unit): (&String, &String)| AxisDifference {
+            name: name.clone(),
+            unit: unit.clone(),
+            spread: Spread::default(),
+        };
+        Self { all: Spread::default(), axes: action.names.iter().zip(&action.units).map(axis).collect() }
+    }
+
+    /// Takes the action of `tick`, once and once more.
+    pub(super) fn take(&mut self, tick: u64, one: impl Iterator<Item = f64>, other: impl Iterator<Item = f64>) {
+        for (axis, (one, other)) in self.axes.iter_mut().zip(one.zip(other)) {
+            let distance = distance(one, other);
+            self.all.take(tick, distance);
+            axis.spread.take(tick, distance);
+        }
+    }
+}
+
+/// See the module's comment.
+pub(super) fn distance(one: f64, other: f64) -> f64 {
+    match (one.is_nan(), other.is_nan()) {
+        (true, true) => 0.0,
+        (false, false) if one.to_bits() == other.to_bits() => 0.0,
+        (false, false) => (one - other).abs(),
+        _ => f64::INFINITY,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_mean_and_the_largest_are_told_with_its_tick() {
+        let mut spread = Spread::default();
+        for (tick, distance) in [(3, 1.0), (4, 4.0), (5, 1.0)] {
+            spread.take(tick, distance);
+        }
+        assert_eq!(spread, Spread { mean: 2.0, largest: 4.0, at_tick: 4, values: 3 });
+        spread.take(6, f64::INFINITY);
+        spread.take(7, 0.0);
+        assert!(spread.mean.is_infinite() && spread.at_tick == 6);
+    }
+
+    #[test]
+    fn what_is_no_number_is_far_from_all_but_itself() {
+        let (nan, far) = (f64::NAN, f64::INFINITY);
+        for (one, other, expected) in [(1.0, 3.0, 2.0), (nan, nan, 0.0), (nan, 1.0, far), (far, far, 0.0)] {
+            assert_eq!(distance(one, other).total_cmp(&expected), std::cmp::Ordering::Equal, "{one} {other}");
+        }
+    }
+}

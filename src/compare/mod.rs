@@ -1,0 +1,145 @@
+//! A policy beside a recorded episode, without rig, bus or clock.
+//!
+//! An episode that a policy recorded holds, for every chunk, which samples it was computed from and the seed
+//! of its noise: [`again`] computes each of them once more. In any other episode [`beside`] lets the
+//! policy watch, and holds what it would have done against what was done.
+//!
+//! Invariant: memory holds samples of a few seconds, not the episode.
+//! Invariant: what cannot be compared is counted with its reason, never compared with a guess.
+
+pub mod again;
+pub mod beside;
+mod difference;
+mod ordered;
+mod reference;
+mod survey;
+#[cfg(test)]
+mod tests;
+
+use std::path::Path;
+
+use serde::Serialize;
+
+pub use self::again::Again;
+pub use self::beside::Beside;
+pub use self::difference::{AxisDifference, Difference, Spread};
+use self::survey::Survey;
+use crate::driver::DriverError;
+use crate::policy::bundle::{Bundle, BundleErrors};
+use crate::policy::library::Environment;
+use crate::policy::model::Model;
+use crate::policy::sampler::PolicyError;
+use crate::registry::Registry;
+
+/// Why there is no comparison.
+#[derive(Debug, thiserror::Error)]
+pub enum CompareError {
+    /// The file.
+    #[error(transparent)]
+    File(#[from] DriverError),
+    /// The file holds no registry that can be read.
+    #[error("{file}: {why}")]
+    Registry {
+        /// The file.
+        file: String,
+        /// What is wrong.
+        why: String,
+    },
+    /// The policy does not suit the rig that the episode was recorded on.
+    #[error("{file}: the policy does not suit the rig of this episode: {errors}")]
+    Unsuited {
+        /// The file.
+        file: String,
+        /// Why.
+        errors: BundleErrors,
+    },
+    /// Nothing in the file can be compared with.
+    #[error("{0}: holds neither chunks of a policy nor actions: there is nothing to compare with")]
+    Nothing(String),
+    /// The graphs.
+    #[error(transparent)]
+    Policy(#[from] PolicyError),
+}
+
+/// A policy beside an episode.
+#[derive(Debug, Clone, Serialize)]
+#[serde(tag = "kind", rename_all = "snake_case")]
+pub enum Comparison {
+    /// A policy recorded the episode, and its chunks were computed again.
+    Again(Again),
+    /// Somebody or something else acted.
+    Beside(Beside),
+}
+
+/// Who wants to know how far it is.
+pub trait Watcher {
+    /// `done` of about `total` pieces are done. Returns whether to go on.
+    fn at(&mut self, done: usize, total: usize) -> bool;
+}
+
+/// A comparison, and what is to be known of the file besides.
+#[derive(Debug, Clone, Serialize)]
+pub struct Compared {
+    /// What came of it.
+    #[serde(flatten)]
+    pub comparison: Comparison,
+    /// Name of the policy that the file says has recorded it.
+    pub recorded_policy: Option<String>,
+    /// What names the contents of its bundle.
+    pub recorded_policy_hash: Option<String>,
+    /// What of the file could not be read.
+    pub damage: Option<String>,
+    /// It was ended before its time.
+    pub interrupted: bool,
+}
+
+/// Holds the policy of `bundle` against the episode in `file`. `steps` of denoising instead of the bundle's own.
+///
+/// # Errors
+/// When the file cannot be read or holds nothing to compare with, or the policy does not suit it.
+pub fn compare(
+    file: &Path,
+    bundle: &Bundle,
+    environment: &Environment,
+    steps: Option<usize>,
+    watcher: &mut dyn Watcher,
+) -> Result<Compared, CompareError> {
+    let name = || file.display().to_string();
+    let survey = Survey::read(file)?;
+    let registry = survey.registry.as_deref().filter(|text| !text.is_empty());
+    let wrong = |why: String| CompareError::Registry { file: name(), why };
+    let text = registry.ok_or_else(|| wrong("holds no registry: it was not recorded by rapid".to_owned()))?;
+    let registry = Registry::parse(text, None)
+        .map_err(|errors| wrong(format!("the registry in it cannot be read: {errors}")))?
+        .registry;
+    let actuators: Vec<_> =
+        registry.actuator().into_iter().map(|(device, action)| (device.name.as_str(), action.names.len())).collect();
+    let suits = bundle.check_registry(&registry).and_then(|()| bundle.check_actuators(&actuators));
+    suits.map_err(|errors| CompareError::Unsuited { file: name(), errors })?;
+    if !survey.is_of_a_policy() && survey.actions.is_empty() {
+        return Err(CompareError::Nothing(name()));
+    }
+    let mut model = Model::load(bundle, environment, steps)?;
+    let mut ended = Ended { watcher, interrupted: false };
+    let comparison = if survey.is_of_a_policy() {
+        Comparison::Again(again::compare(file, &survey, bundle, &registry, &mut model, &mut ended)?)
+    } else {
+        Comparison::Beside(beside::compare(file, &survey, bundle, &registry, &mut model, &mut ended)?)
+    };
+    let interrupted = ended.interrupted;
+    let (recorded_policy, recorded_policy_hash) = survey.policy.unzip();
+    Ok(Compared { comparison, recorded_policy, recorded_policy_hash, damage: survey.damage, interrupted })
+}
+
+/// A watcher, and whether it has ended the work.
+struct Ended<'a> {
+    watcher: &'a mut dyn Watcher,
+    interrupted: bool,
+}
+
+impl Ended<'_> {
+    fn goes_on(&mut self, done: usize, total: usize) -> bool {
+        self.interrupted |= !self.watcher.at(done, total);
+        !self.interrupted
+    }
+}

@@ -1,0 +1,329 @@
+//! A policy that can be worked out by hand records an episode of the simulated task in which the tactile sensor
+//! is pulled out and plugged in again; what is changed of the file must be found, and nothing else.
+
+#[path = "../../tests/support/onnx.rs"]
+mod onnx;
+
+use std::io::Cursor;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use serde_json::Value;
+
+use super::*;
+use crate::action::ACTION_TOPIC;
+use crate::episode_format::wire::protobuf;
+use crate::episode_format::{ABOUT, EVENT_TOPIC};
+use crate::lockstep::evaluate::{Bench, Condition, Configuration, Recording, Trial};
+use crate::record::EpisodeRequest;
+use crate::record::stepped::Stepped;
+use crate::status::Board;
+use crate::time::{Stamp, WallClock};
+
+/// Trial of which the noise is that of a policy that looks on.
+const SEED: u64 = 0;
+const ARM: &str = "/rapid/serial/arm";
+const TACTILE: &str = "/rapid/camera/tactile";
+
+struct Recorded {
+    folder: tempfile::TempDir,
+    bundle: Bundle,
+    environment: Environment,
+    bytes: Vec<u8>,
+    trial: Trial,
+}
+
+/// Goes on to the end.
+struct Patient;
+
+impl Watcher for Patient {
+    fn at(&mut self, _: usize, _: usize) -> bool {
+        true
+    }
+}
+
+/// One message of a file, to be changed.
+struct Message {
+    topic: String,
+    sequence: u32,
+    log_time: u64,
+    data: Vec<u8>,
+}
+
+impl Message {
+    /// The event in it.
+    fn event(&self) -> Option<Value> {
+        let json = protobuf(&self.data).find(|(field, _)| *field == 5)?.1.text();
+        (self.topic == EVENT_TOPIC).then(|| serde_json::from_str(&json).unwrap())
+    }
+
+    fn is_chunk(&self) -> bool {
+        self.event().is_some_and(|event| event["event"] == "chunk")
+    }
+
+    /// Adds to the first of its numbers, the last bytes of a `rapid.Scalars` of four.
+    fn add(&mut self, sum: f64) {
+        let at = self.data.len() - 4 * 8;
+        let number: [u8; 8] = self.data[at..at + 8].try_into().unwrap();
+        self.data[at..at + 8].copy_from_slice(&(f64::from_le_bytes(number) + sum).to_le_bytes());
+    }
+}
+
+impl Recorded {
+    fn new() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        onnx::write_bundle(&folder.path().join("bundle"), &[]);
+        let bundle = Bundle::load(&folder.path().join("bundle")).unwrap();
+        let environment = Environment::open(None).expect("`make setup` fetches the library; then build again");
+        let registry = Arc::new(Registry::task());
+        let mut model = Model::load(&bundle, &environment, None).unwrap();
+        let configuration = Configuration::Dynamic;
+        let mut bench = Bench { bundle: &bundle, registry: &registry, model: &mut model, configuration };
+        let board = Arc::new(Board::new(&registry));
+        let mut recorder = Stepped::new(Arc::clone(&registry), board, WallClock::now());
+        let out = folder.path().to_owned();
+        let request = EpisodeRequest { out, task: "sort".into(), tags: Vec::new(), duration: None };
+        let library = &environment.origin().to_string();
+        let recording = Recording { recorder: &mut recorder, request: &request, library, begun: Stamp(9_000_000_000) };
+        let (trial, report) = bench.record(Condition::HotReplug, SEED, recording).unwrap();
+        assert!(trial.failure.is_none() && trial.counts.chunks > 5, "{trial:?}");
+        let bytes = std::fs::read(&report.file).unwrap();
+        Self { folder, bundle, environment, bytes, trial }
+    }
+
+    /// The file with its messages changed by `edit`, which says which of them are kept, and its metadata by `about`.
+    fn edited(
+        &self,
+        mut edit: impl FnMut(&mut Message) -> bool,
+        about: impl Fn(&mut std::collections::BTreeMap<String, String>),
+    ) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        let mut writer = mcap::WriteOptions::new().compression(None).create(Cursor::new(&mut bytes)).unwrap();
+        for record in mcap::read::LinearReader::new(&self.bytes).unwrap() {
+            if let mcap::records::Record::Metadata(mut metadata) = record.unwrap()
+                && metadata.name == ABOUT
+            {
+                about(&mut metadata.metadata);
+                writer.write_metadata(&metadata).unwrap();
+            }
+        }
+        for message in mcap::MessageStream::new(&self.bytes).unwrap() {
+            let mut message = message.unwrap();
+            let (topic, data) = (message.channel.topic.clone(), message.data.to_vec());
+            let mut changed = Message { topic, sequence: message.sequence, log_time: message.log_time, data };
+            if edit(&mut changed) {
+                message.data = changed.data.into();
+                writer.write(&message).unwrap();
+            }
+        }
+        writer.finish().unwrap();
+        drop(writer);
+        bytes
+    }
+
+    fn messages(&self) -> Vec<Message> {
+        let mut messages = Vec::new();
+        self.edited(
+            |message| {
+                let Message { topic, sequence, log_time, data } = message;
+                let (topic, data) = (topic.clone(), data.clone());
+                messages.push(Message { topic, sequence: *sequence, log_time: *log_time, data });
+                true
+            },
+            |_| {},
+        );
+        messages
+    }
+
+    fn chunks(&self) -> Vec<Value> {
+        let chunks = self.messages().into_iter().filter(Message::is_chunk);
+        chunks.map(|message| message.event().unwrap()).collect()
+    }
+
+    /// Number of the first sample of observation `at` of a chunk.
+    fn sample(chunk: &Value, at: usize) -> Option<u64> {
+        chunk["samples"][at]["seqs"][0].as_u64()
+    }
+
+    fn file(&self, bytes: &[u8]) -> PathBuf {
+        let file = self.folder.path().join("changed.mcap");
+        std::fs::write(&file, bytes).unwrap();
+        file
+    }
+
+    fn compared(&self, bytes: &[u8]) -> Result<Compared, CompareError> {
+        compare(&self.file(bytes), &self.bundle, &self.environment, None, &mut Patient)
+    }
+
+    fn again(&self, bytes: &[u8]) -> Again {
+        match self.compared(bytes).unwrap().comparison {
+            Comparison::Again(again) => again,
+            Comparison::Beside(beside) => panic!("a demonstration: {beside:?}"),
+        }
+    }
+}
+
+#[test]
+fn what_a_policy_recorded_is_computed_again_and_changes_are_found() {
+    let recorded = Recorded::new();
+    let chunks = recorded.chunks();
+    assert_eq!(chunks.len() as u64, recorded.trial.counts.chunks);
+    let blind = chunks.iter().filter(|chunk| Recorded::sample(chunk, 1).is_none()).count() as u64;
+    assert!((1..chunks.len() as u64).contains(&blind), "some without the tactile sensor: {blind}");
+
+    let compared = recorded.compared(&recorded.bytes).unwrap();
+    assert_eq!(compared.recorded_policy.as_deref(), Some("by-hand"));
+    assert_eq!(compared.recorded_policy_hash.as_deref(), Some(recorded.bundle.hash.as_str()));
+    assert!(compared.damage.is_none() && !compared.interrupted);
+    let whole = recorded.again(&recorded.bytes);
+    assert_eq!((whole.chunks, whole.compared), (chunks.len() as u64, chunks.len() as u64), "{whole:?}");
+    assert!(whole.largest().unwrap() < 1e-6, "{whole:?}");
+    assert_eq!(whole.difference.all.values, whole.compared * (onnx::HORIZON * onnx::ACTION) as u64);
+    let actions = &whole.actions;
+    assert_eq!((actions.compared, actions.without_chunk), (recorded.trial.counts.actions, 0), "{actions:?}");
+
+    // An action that is not that of the chunk.
+    let tick = 20;
+    let edit = |message: &mut Message| {
+        if message.topic == ACTION_TOPIC && message.sequence == tick {
+            message.add(0.25);
+        }
+        true
+    };
+    let changed = recorded.again(&recorded.edited(edit, |_| {}));
+    let found = changed.actions.difference.axes[0].spread;
+    assert!((found.largest - 0.25).abs() < 1e-6 && found.at_tick == u64::from(tick), "{found:?}");
+    assert!(changed.difference.all.largest < 1e-6 && changed.actions.difference.axes[1].spread.largest < 1e-6);
+
+    // Numbers of the arm that one chunk was computed from.
+    let number = Recorded::sample(&chunks[3], 2).unwrap();
+    let edit = |message: &mut Message| {
+        if message.topic == ARM && u64::from(message.sequence) == number {
+            message.add(0.5);
+        }
+        true
+    };
+    let changed = recorded.again(&recorded.edited(edit, |_| {}));
+    assert!(changed.difference.all.largest > 1e-3 && changed.compared == whole.compared, "{changed:?}");
+
+    // Without them it cannot be computed, and the others can.
+    let keep = |message: &mut Message| message.topic != ARM || u64::from(message.sequence) != number;
+    let changed = recorded.again(&recorded.edited(keep, |_| {}));
+    let made_of = |chunk: &&Value| chunk["samples"][2]["seqs"].as_array().unwrap().contains(&number.into());
+    let missing = chunks.iter().filter(made_of).count() as u64;
+    assert_eq!((changed.samples_missing, changed.compared), (missing, whole.compared - missing), "{changed:?}");
+    assert!(changed.difference.all.largest < 1e-6, "{changed:?}");
+}
+
+#[test]
+fn the_picture_that_others_are_compared_with_is_the_first_one_or_unknown() {
+    let recorded = Recorded::new();
+    let chunks = recorded.chunks();
+    let feeling: Vec<&Value> = chunks.iter().filter(|chunk| Recorded::sample(chunk, 1).is_some()).collect();
+    let total = chunks.len() as u64;
+
+    // The first chunk cannot be computed, its tactile picture is the reference all the same.
+    let arm = Recorded::sample(&chunks[0], 2).unwrap();
+    let keep = |message: &mut Message| message.topic != ARM || u64::from(message.sequence) != arm;
+    let changed = recorded.again(&recorded.edited(keep, |_| {}));
+    assert_eq!((changed.samples_missing, changed.compared), (1, total - 1), "{changed:?}");
+    assert!(changed.difference.all.largest < 1e-6, "{changed:?}");
+
+    // Without that picture all that is compared with it is unknown.
+    let first = Recorded::sample(feeling[0], 1).unwrap();
+    let keep = |message: &mut Message| message.topic != TACTILE || u64::from(message.sequence) != first;
+    let changed = recorded.again(&recorded.edited(keep, |_| {}));
+    assert_eq!((changed.samples_missing, changed.reference_unknown), (1, feeling.len() as u64 - 1), "{changed:?}");
+    assert_eq!(changed.compared, total - feeling.len() as u64);
+    assert!(changed.difference.all.largest < 1e-6, "{changed:?}");
+
+    // The recording begins when the policy has long been running.
+    let begin = recorded.messages().into_iter().filter(Message::is_chunk).nth(1).unwrap().log_time;
+    let keep = |message: &mut Message| message.log_time >= begin;
+    let about = |about: &mut std::collections::BTreeMap<String, String>| {
+        let number = |key: &str| about[key].parse::<u64>().unwrap();
+        let (wall, monotonic) = (number("begin_wall_ns"), number("begin_monotonic_ns"));
+        about.insert("begin_wall_ns".into(), begin.to_string());
+        about.insert("begin_monotonic_ns".into(), (monotonic + begin - wall).to_string());
+    };
+    let changed = recorded.again(&recorded.edited(keep, about));
+    assert_eq!(changed.chunks, total - 1);
+    assert!(changed.reference_unknown > 0 && changed.compared > 0 && changed.actions.without_chunk == 0, "{changed:?}");
+    assert_eq!(changed.compared, total - feeling.len() as u64, "{changed:?}");
+    assert!(changed.difference.all.largest < 1e-6, "{changed:?}");
+}
+
+#[test]
+fn a_policy_that_looks_on_does_what_it_would_have_done() {
+    let recorded = Recorded::new();
+    // Its own actions without its chunks; those of the ticks at which it was asked came from the chunk before.
+    let asked: Vec<u64> = recorded.chunks().iter().map(|chunk| chunk["tick"].as_u64().unwrap()).collect();
+    let mut kept = 0;
+    let keep = |message: &mut Message| {
+        let is_action = message.topic == ACTION_TOPIC;
+        let dropped = message.is_chunk() || is_action && asked.contains(&message.sequence.into());
+        kept += u64::from(is_action && !dropped);
+        !dropped
+    };
+    let bytes = recorded.edited(keep, |_| {});
+    let compared = recorded.compared(&bytes).unwrap();
+    let Comparison::Beside(beside) = compared.comparison else { panic!("of a policy") };
+    assert_eq!((beside.recorded, beside.compared, beside.held.len()), (kept, kept, 0), "{beside:?}");
+    assert_eq!((beside.ticks, beside.without_recorded), (recorded.trial.steps.into(), asked.len() as u64));
+    assert!(beside.difference.all.largest < 1e-6, "{beside:?}");
+
+    let tick = 30;
+    assert!(!asked.contains(&tick));
+    let edit = |message: &mut Message| {
+        if message.topic == ACTION_TOPIC && u64::from(message.sequence) == tick {
+            message.add(-0.5);
+        }
+        !message.is_chunk() && (message.topic != ACTION_TOPIC || !asked.contains(&message.sequence.into()))
+    };
+    let Comparison::Beside(beside) = recorded.compared(&recorded.edited(edit, |_| {})).unwrap().comparison else {
+        panic!("of a policy")
+    };
+    let found = beside.difference.axes[0].spread;
+    assert!((found.largest - 0.5).abs() < 1e-6 && found.at_tick == tick, "{found:?}");
+
+    // Without the mask nothing is there.
+    let keep = |message: &mut Message| !message.is_chunk() && message.topic != crate::mask::MASK_TOPIC;
+    let Comparison::Beside(beside) = recorded.compared(&recorded.edited(keep, |_| {})).unwrap().comparison else {
+        panic!("of a policy")
+    };
+    assert!(beside.compared == 0 && beside.held.values().sum::<u64>() == beside.ticks, "{beside:?}");
+}
+
+#[test]
+fn a_damaged_file_is_compared_as_far_as_it_goes_and_a_foreign_one_refused_by_name() {
+    let recorded = Recorded::new();
+    let cut = recorded.compared(&recorded.bytes[..recorded.bytes.len() * 2 / 3]).unwrap();
+    assert!(cut.damage.as_ref().is_some_and(|damage| damage.contains("ends within a record")), "{cut:?}");
+    let Comparison::Again(again) = &cut.comparison else { panic!("{cut:?}") };
+    assert!(again.compared > 0 && again.largest().unwrap() < 1e-6, "{again:?}");
+    // Any bytes may be wrong.
+    for at in (0..recorded.bytes.len()).step_by(recorded.bytes.len() / 12) {
+        let mut bytes = recorded.bytes.clone();
+        bytes[at] ^= 0x55;
+        if let Ok(Compared { comparison: Comparison::Again(again), .. }) = recorded.compared(&bytes) {
+            assert!(again.difference.all.largest < 1e-6, "at {at}: {again:?}");
+        }
+    }
+
+    let nothing = recorded.edited(|message| message.topic != ACTION_TOPIC && !message.is_chunk(), |_| {});
+    let foreign = recorded.edited(|_| true, std::collections::BTreeMap::clear);
+    let renamed = |about: &mut std::collections::BTreeMap<String, String>| {
+        let registry = about["registry"].replace("tactile_tip", "fingertip");
+        about.insert("registry".into(), registry);
+    };
+    let other = recorded.edited(|_| true, renamed);
+    for (bytes, expected) in [
+        (nothing, "nothing to compare with"),
+        (foreign, "holds no registry"),
+        (other, "\"tactile_tip\" is not in devices.toml"),
+        (b"no episode".to_vec(), "not an MCAP file"),
+    ] {
+        let error = recorded.compared(&bytes).unwrap_err().to_string();
+        assert!(error.contains("changed.mcap: ") && error.contains(expected), "{error}");
+    }
+}

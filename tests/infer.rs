@@ -1,0 +1,209 @@
+//! `rapid --infer` from the command line to the recording: the trained policy on simulated devices that
+//! come and go.
+
+#![allow(clippy::expect_used, reason = "what fails here fails a test")]
+mod support;
+
+use std::path::Path;
+
+use serde_json::Value;
+use support::{Episode, EventMessage, Place, events};
+
+/// What the policy observes. A replugged device may be started at once.
+const REGISTRY: &str = r#"
+[rig]
+name = "infer"
+observation_hz = 10
+cooldown = "0ms"
+
+[device.cam_wrist]
+vid = "1209"
+pid = "7a01"
+node = "camera"
+bit = 0
+[device.cam_wrist.camera]
+width = 96
+height = 96
+fps = 30
+
+[device.tactile_tip]
+vid = "1209"
+pid = "7a02"
+node = "camera"
+bit = 1
+[device.tactile_tip.camera]
+width = 96
+height = 96
+fps = 30
+
+[device.arm]
+vid = "1209"
+pid = "7a03"
+node = "serial"
+bit = 2
+[device.arm.serial]
+channels = 4
+[device.arm.action]
+names = ["x", "y", "z", "grip"]
+units = ["dm", "dm", "dm", "1"]
+min = [-1.1, -1.0, 0.03, 0.0]
+max = [1.0, 1.0, 0.9, 1.0]
+"#;
+
+/// The tactile sensor is pulled out for a second.
+const PULLED: &str = "[[device]]\nname = \"cam_wrist\"\n[[device]]\nname = \"tactile_tip\"\n[[device]]\nname = \"arm\"\n\
+                      [[event]]\nat = \"3s\"\nunplug = \"tactile_tip\"\n[[event]]\nat = \"5s\"\nplug = \"tactile_tip\"\n";
+
+/// The folder of the policy of the repository.
+const BUNDLE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/models/tactile-id");
+
+/// Runs a policy in `place` and gives the exit code, the events and standard error.
+fn infer(place: &Place, bundle: &str, scenario: &str, more: &[&str]) -> (Option<i32>, Vec<Value>, String) {
+    let registry = place.write("rig.toml", REGISTRY).display().to_string();
+    let scenario = place.write("play.toml", scenario).display().to_string();
+    let arguments = ["--json", "--infer", bundle, "--config", &registry, "--sim", &scenario];
+    let output = place.run(&[&arguments[..], more].concat());
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    (output.status.code(), events(&text), String::from_utf8_lossy(&output.stderr).into_owned())
+}
+
+fn of<'a>(events: &'a [Value], event: &'a str) -> impl Iterator<Item = &'a Value> {
+    events.iter().filter(move |said| said["event"] == event)
+}
+
+/// Numbers of the samples of a modality that a chunk was computed from.
+fn samples(chunk: &Value, modality: &str) -> usize {
+    let samples = chunk["samples"].as_array().expect("samples");
+    let of = samples.iter().find(|of| of["modality"] == modality).expect("the modality");
+    of["seqs"].as_array().expect("numbers").len()
+}
+
+/// Holds for another reason than that the machine is slow.
+fn holds(events: &[Value]) -> Vec<&Value> {
+    of(events, "hold").filter(|hold| hold["reason"] != "the next actions are still being computed").collect()
+}
+
+/// A copy of the policy in `place` whose `policy.json` says `to` in place of `from`.
+fn changed(place: &Place, from: &str, to: &str) -> String {
+    let folder = place.path("policy");
+    std::fs::create_dir(&folder).expect("folder");
+    for file in ["encoder.onnx", "denoiser.onnx"] {
+        std::fs::copy(Path::new(BUNDLE).join(file), folder.join(file)).expect("graph");
+    }
+    let text = std::fs::read_to_string(Path::new(BUNDLE).join("policy.json")).expect("policy.json");
+    assert!(text.contains(from), "{from}");
+    std::fs::write(folder.join("policy.json"), text.replacen(from, to, 1)).expect("policy.json");
+    folder.display().to_string()
+}
+
+#[test]
+fn a_pulled_sensor_is_left_out_at_the_next_tick_and_actions_go_on() {
+    let place = Place::new();
+    let (code, said, stderr) = infer(&place, BUNDLE, PULLED, &["--record", "--duration", "8s", "--out", "out"]);
+    assert_eq!(code, Some(0), "{stderr}");
+    let policy = of(&said, "policy").next().expect("the policy says what it is");
+    assert_eq!((&policy["policy"], &policy["dry_run"]), (&"tactile-id".into(), &false.into()));
+    assert!(holds(&said).is_empty(), "{:?}", holds(&said));
+    let masks: Vec<_> =
+        of(&said, "chunk").map(|chunk| (chunk["mask"].as_str(), samples(chunk, "tactile_tip"))).collect();
+    assert!(masks.contains(&(Some("0x07"), 2)) && masks.contains(&(Some("0x05"), 0)), "{masks:?}");
+    assert!(masks.iter().all(|mask| matches!(mask, (Some("0x07"), 2) | (Some("0x05"), 0))), "{masks:?}");
+    assert_eq!(masks.last(), Some(&(Some("0x07"), 2)), "it is back");
+
+    // The recording holds what the policy saw and what it did.
+    let files = place.files("out");
+    let episode = Episode::read(&place.path("out").join(files.first().expect("an episode")));
+    let recorded: Vec<Value> = episode
+        .topic("/rapid/event")
+        .map(|message| serde_json::from_str(&message.decode::<EventMessage>().json).expect("JSON"))
+        .collect();
+    let chunks: Vec<_> = recorded.iter().filter(|event| event["event"] == "chunk").collect();
+    assert_eq!(chunks.len(), of(&said, "chunk").count());
+    let actions: Vec<_> = episode.topic("/action").collect();
+    assert!(actions.len() > 40, "{}", actions.len());
+    // An action is recorded at its tick, and the ticks lie on the grid.
+    let first = actions.first().expect("an action");
+    for action in &actions {
+        let ticks = u64::from(action.sequence - first.sequence);
+        assert_eq!(action.log_time - first.log_time, ticks * 100_000_000);
+    }
+    // While the bit was clear, actions went on.
+    let edges = episode.mask_edges();
+    let out = edges.iter().position(|(_, mask)| *mask == 0x05).expect("it was pulled out");
+    let (from, until) = (edges[out].0, edges[out + 1].0);
+    let meanwhile = actions.iter().filter(|action| (from..until).contains(&action.log_time)).count();
+    assert!(meanwhile > 5, "{meanwhile}");
+
+    // The first tick after the bit was cleared asks without it, unless a chunk is being computed at that time.
+    let asked = chunks.iter().filter(|chunk| chunk["mask"] == "0x05").filter_map(|chunk| chunk["tick"].as_u64()).min();
+    let begin = first.log_time - u64::from(first.sequence) * 100_000_000;
+    let cleared = (from - begin).div_ceil(100_000_000);
+    let before = chunks.iter().filter_map(|chunk| chunk["tick"].as_u64()).filter(|tick| *tick < cleared).max();
+    let busy = before.is_some_and(|tick| {
+        let late = chunks.iter().find(|chunk| chunk["tick"] == tick).and_then(|chunk| chunk["latency_ms"].as_f64());
+        late.is_some_and(|ms| tick as f64 + ms / 100.0 > cleared as f64)
+    });
+    assert!(busy || asked == Some(cleared), "cleared at tick {cleared}, asked at {asked:?}");
+}
+
+#[test]
+fn without_what_it_requires_it_does_not_start_unless_it_may_wait() {
+    let place = Place::new();
+    let arm_later = "[[device]]\nname = \"cam_wrist\"\n[[device]]\nname = \"tactile_tip\"\n[[device]]\nname = \"arm\"\n\
+                     plugged = false\n[[event]]\nat = \"5s\"\nplug = \"arm\"\n";
+    let (code, said, stderr) = infer(&place, BUNDLE, arm_later, &["--duration", "20s"]);
+    assert_eq!(code, Some(3), "{stderr}");
+    assert!(stderr.contains("the policy needs arm") && stderr.contains("--wait"), "{stderr}");
+    assert_eq!(of(&said, "policy").count(), 0);
+
+    let (code, said, stderr) = infer(&place, BUNDLE, arm_later, &["--duration", "10s", "--wait"]);
+    assert_eq!(code, Some(0), "{stderr}");
+    let waits = |said: &Value| said["event"] == "log" && said["text"] == "the policy waits for arm";
+    assert!(said.iter().any(waits) && of(&said, "act").count() > 0, "{said:?}");
+}
+
+#[test]
+fn a_dry_run_computes_and_moves_nothing() {
+    let place = Place::new();
+    let all = "[[device]]\nname = \"cam_wrist\"\n[[device]]\nname = \"tactile_tip\"\n[[device]]\nname = \"arm\"\n";
+    let more = ["--dry-run", "--record", "--duration", "4s", "--out", "out"];
+    let (code, said, stderr) = infer(&place, BUNDLE, all, &more);
+    assert_eq!(code, Some(0), "{stderr}");
+    assert!(of(&said, "chunk").count() > 0 && of(&said, "act").count() > 0);
+    let files = place.files("out");
+    let episode = Episode::read(&place.path("out").join(files.first().expect("an episode")));
+    assert_eq!(episode.topic("/action").count(), 0);
+}
+
+#[test]
+fn a_policy_that_was_not_trained_without_a_sensor_holds_until_it_is_back_or_is_told_to_go_on() {
+    let place = Place::new();
+    let bundle = changed(&place, "\"mask_aware\": true", "\"mask_aware\": false");
+    let (code, said, stderr) = infer(&place, &bundle, PULLED, &["--duration", "8s"]);
+    assert_eq!(code, Some(0), "{stderr}");
+    let [hold] = holds(&said)[..] else { panic!("{:?}", holds(&said)) };
+    assert_eq!(hold["device"], "tactile_tip");
+    let acted = said.iter().rposition(|event| event["event"] == "act");
+    let held = said.iter().position(|event| std::ptr::eq(event, hold));
+    assert!(acted > held, "it goes on when the sensor is back");
+
+    let (code, said, stderr) = infer(&place, &bundle, PULLED, &["--duration", "8s", "--go-on"]);
+    assert_eq!(code, Some(0), "{stderr}");
+    assert!(holds(&said).is_empty(), "{:?}", holds(&said));
+    assert!(of(&said, "chunk").any(|chunk| chunk["mask"] == "0x05"));
+}
+
+#[test]
+fn a_policy_that_is_none_or_not_for_this_rig_is_refused_by_name() {
+    let place = Place::new();
+    let (code, _, stderr) = infer(&place, "nowhere", "", &[]);
+    assert_eq!(code, Some(2), "{stderr}");
+    assert!(stderr.contains("nowhere/policy.json"), "{stderr}");
+    let bundle = changed(&place, "\"modality\": \"tactile_tip\"", "\"modality\": \"tactile_top\"");
+    let (code, _, stderr) = infer(&place, &bundle, "", &[]);
+    assert_eq!(code, Some(2), "{stderr}");
+    assert!(stderr.contains("tactile_top"), "{stderr}");
+    let (code, _, stderr) = infer(&place, BUNDLE, "", &["--ort-lib", "/nowhere/libonnxruntime.so", "--duration", "5s"]);
+    assert_eq!(code, Some(1), "{stderr}");
+    assert!(stderr.contains("/nowhere/libonnxruntime.so"), "{stderr}");
+}
