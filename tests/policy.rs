@@ -5,12 +5,12 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "what fails here fails a test")]
 
+#[path = "support/allocations.rs"]
+mod allocations;
 #[path = "support/onnx.rs"]
 mod onnx;
 
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
-
+use allocations::allocations;
 use onnx::{ACTION, CONDITION_SHARE, Change, HORIZON, SAMPLE_SHARE, SIDE, STEPS, TIMESTEP_SHARE, write_bundle};
 use rapid::policy::bundle::{Bundle, ImageSpec, ObservationInput};
 use rapid::policy::graphs::LoadedGraph;
@@ -19,43 +19,6 @@ use rapid::policy::observation::ObservationTensors;
 use rapid::policy::picture::{Picture, Preprocessor};
 use rapid::policy::sampler::{PolicyError, Sampler};
 use rapid::sample::Encoding;
-
-/// Counts the allocations of each thread.
-struct Counting;
-
-thread_local! {
-    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
-}
-
-// SAFETY: every call is handed to the system's allocator as it came; the counter is a plain cell
-// without a destructor, so it can be touched at any time in a thread's life.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.set(ALLOCATIONS.get() + 1);
-        // SAFETY: the caller's promise, passed on.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller's promise, passed on.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-
-    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        ALLOCATIONS.set(ALLOCATIONS.get() + 1);
-        // SAFETY: the caller's promise, passed on.
-        unsafe { System.realloc(pointer, layout, size) }
-    }
-}
-
-#[global_allocator]
-static ALLOCATOR: Counting = Counting;
-
-fn allocations(of: impl FnOnce()) -> u64 {
-    let before = ALLOCATIONS.get();
-    of();
-    ALLOCATIONS.get() - before
-}
 
 fn bundle(changes: &[Change<'_>]) -> (tempfile::TempDir, Bundle) {
     let folder = tempfile::tempdir().unwrap();

@@ -21,6 +21,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::Failure;
 use crate::feed::{self, Feed};
+use crate::heap;
 use crate::process::Running;
 
 /// Bytes of a chunk, as the recorder has it.
@@ -46,6 +47,14 @@ pub(crate) enum Child {
     Devices {
         /// How long
         seconds: u64,
+    },
+    /// A policy computes chunks, and says what memory it kept
+    #[command(hide = true)]
+    Chunks {
+        /// Of the policy
+        bundle: PathBuf,
+        /// How many
+        count: usize,
     },
 }
 
@@ -73,11 +82,12 @@ impl Spent {
 impl Child {
     /// Does it and says what it took.
     pub(crate) fn run(&self) -> Result<(), Failure> {
-        let spent = match self {
-            Self::Mcap { folder, seconds } => mcap_alone(folder, *seconds)?,
-            Self::Devices { seconds } => devices_alone(*seconds)?,
+        let said = match self {
+            Self::Mcap { folder, seconds } => serde_json::to_string(&mcap_alone(folder, *seconds)?)?,
+            Self::Devices { seconds } => serde_json::to_string(&devices_alone(*seconds)?)?,
+            Self::Chunks { bundle, count } => serde_json::to_string(&heap::grown(bundle, *count)?)?,
         };
-        Ok(writeln!(std::io::stdout(), "{}", serde_json::to_string(&spent)?)?)
+        Ok(writeln!(std::io::stdout(), "{said}")?)
     }
 }
 

@@ -115,7 +115,8 @@ fn one(bench: &Bench) -> Result<Run, Failure> {
     })
 }
 
-fn kind(line: &str) -> Option<String> {
+/// Of an event's line, which event it is.
+pub(crate) fn kind(line: &str) -> Option<String> {
     Some(serde_json::from_str::<Value>(line).ok()?.get("event")?.as_str()?.to_owned())
 }
 

@@ -7,12 +7,19 @@
 
 mod beat;
 mod child;
+mod control;
+mod eager;
+mod eval;
 mod feed;
 mod figure;
 mod frame;
+mod heap;
+mod infer;
 mod load;
 mod mask;
 mod others;
+mod picture;
+mod policy;
 mod process;
 mod replug;
 mod start;
@@ -34,7 +41,7 @@ type Failure = Box<dyn std::error::Error>;
 /// Figures of rapid on this machine, each beside a baseline measured in the same run. Nothing passes or fails.
 #[derive(Debug, Parser)]
 #[command(
-    after_help = "Examples:\n  rapid-bench                     everything, some 20 minutes\n  rapid-bench --quick             \
+    after_help = "Examples:\n  rapid-bench                     everything, some 30 minutes\n  rapid-bench --quick             \
                         short runs: see that it works\n  rapid-bench --only sync write   two sections\n  rapid-bench --json            \
                         one JSON object a figure and line"
 )]
@@ -60,6 +67,9 @@ struct Cli {
     /// Where episodes are written for the time of the run; a real disk, not memory
     #[arg(long, value_name = "FOLDER")]
     scratch: Option<PathBuf>,
+    /// The policy whose figures are taken
+    #[arg(long, value_name = "FOLDER", default_value = "models/tactile-id")]
+    bundle: PathBuf,
     #[command(subcommand)]
     child: Option<child::Child>,
 }
@@ -73,6 +83,11 @@ enum Section {
     Write,
     Sync,
     Start,
+    Policy,
+    Picture,
+    Infer,
+    Control,
+    Eval,
     Unplug,
     Cycles,
     Deaf,
@@ -80,9 +95,14 @@ enum Section {
 
 impl Section {
     /// In this order: what must not be disturbed comes before what leaves dirty pages behind.
-    const ALL: [Self; 10] = [
+    const ALL: [Self; 15] = [
         Self::Start,
+        Self::Infer,
         Self::Sync,
+        Self::Picture,
+        Self::Policy,
+        Self::Control,
+        Self::Eval,
         Self::Frame,
         Self::Replug,
         Self::Unplug,
@@ -102,10 +122,20 @@ impl Section {
             Self::Write => "write",
             Self::Sync => "sync",
             Self::Start => "start",
+            Self::Policy => "policy",
+            Self::Picture => "picture",
+            Self::Infer => "infer",
+            Self::Control => "control",
+            Self::Eval => "eval",
             Self::Unplug => "unplug",
             Self::Cycles => "cycles",
             Self::Deaf => "deaf",
         }
+    }
+
+    /// Trials in closed loop take a minute however few: of short runs only if they are named.
+    fn is_asked_for(self, cli: &Cli) -> bool {
+        if cli.only.is_empty() { !(cli.quick && self == Self::Eval) } else { cli.only.contains(&self) }
     }
 
     fn measure(self, bench: &Bench) -> Result<Vec<Figure>, Failure> {
@@ -117,6 +147,11 @@ impl Section {
             Self::Write => write::measure(bench),
             Self::Sync => sync::measure(bench),
             Self::Start => start::measure(bench),
+            Self::Policy => policy::measure(bench),
+            Self::Picture => picture::measure(bench),
+            Self::Infer => infer::measure(bench),
+            Self::Control => control::measure(bench),
+            Self::Eval => eval::measure(bench),
             Self::Unplug => others::unplug(bench),
             Self::Cycles => others::cycles(bench),
             Self::Deaf => others::deaf(bench),
@@ -131,6 +166,8 @@ pub(crate) struct Bench {
     /// Where this program and its siblings lie.
     programs: PathBuf,
     scratch: tempfile::TempDir,
+    /// The policy's folder.
+    bundle: PathBuf,
     quick: bool,
     runs: usize,
     load: Duration,
@@ -149,6 +186,7 @@ impl Bench {
         Ok(Self {
             rapid,
             programs,
+            bundle: cli.bundle.clone(),
             scratch: tempfile::Builder::new().prefix("rapid-bench-").tempdir_in(scratch)?,
             quick: cli.quick,
             runs: cli.runs.unwrap_or(if cli.quick { 2 } else { 5 }).max(1),
@@ -193,8 +231,7 @@ fn main() -> ExitCode {
 
 fn run(cli: &Cli) -> Result<(), Failure> {
     let bench = Bench::new(cli)?;
-    let sections: Vec<Section> =
-        Section::ALL.into_iter().filter(|section| cli.only.is_empty() || cli.only.contains(section)).collect();
+    let sections: Vec<Section> = Section::ALL.into_iter().filter(|section| section.is_asked_for(cli)).collect();
     show(cli, "host", &host(&bench, "at the beginning"))?;
     for (place, section) in sections.iter().enumerate() {
         let name = section.name();

@@ -24,7 +24,7 @@ pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
         if start % 10 == 0 {
             bench.progress(&format!("start: {start} of {starts}"));
         }
-        masks.push(to_mask(bench)?);
+        masks.push(to_mask(bench, &["--sim"])?);
         let begun = Instant::now();
         Command::new(&bench.rapid).arg("--version").stdout(Stdio::null()).status()?;
         versions.push(ms(begun));
@@ -44,11 +44,12 @@ pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     Ok(figures)
 }
 
-fn to_mask(bench: &Bench) -> Result<f64, Failure> {
+/// From the start of `rapid` with `options` to its first mask, ms.
+pub(crate) fn to_mask(bench: &Bench, options: &[&str]) -> Result<f64, Failure> {
     let instance = format!("bench-start-{}", std::process::id());
     let path = mask_path(Some(&instance));
     let mut command = Command::new(&bench.rapid);
-    command.args(["--sim", "--headless", "--json", "--instance", &instance]);
+    command.args(options).args(["--headless", "--json", "--instance", &instance]);
     let begun = Instant::now();
     let program = Running::start(&mut command)?;
     while !read_mask(&path).is_ok_and(|record| record.sequence >= 1) {
@@ -62,6 +63,7 @@ fn to_mask(bench: &Bench) -> Result<f64, Failure> {
     Ok(taken)
 }
 
-fn ms(begun: Instant) -> f64 {
+/// Time since then, ms.
+pub(crate) fn ms(begun: Instant) -> f64 {
     begun.elapsed().as_secs_f64() * 1e3
 }

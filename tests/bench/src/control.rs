@@ -1,0 +1,148 @@
+//! How well a control loop keeps its grid while chunks are computed, against a bare thread at the same time.
+//!
+//! An action's header says when its tick was due (`capture_ns`) and when it was published (`recv_ns`).
+
+use std::path::PathBuf;
+use std::process::Command;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use rapid::bus::{Bus, TopicId};
+use rapid::registry::Registry;
+use rapid::time::Stamp;
+use serde_json::Value;
+
+use crate::beat::sleep_until;
+use crate::figure::Figure;
+use crate::load::kind;
+use crate::process::Running;
+use crate::stats::{Sorted, median};
+use crate::{Bench, Failure};
+
+/// Ticks a second.
+const HZ: u32 = 30;
+/// More than usual: a chunk takes longer than a tick, and the next one is asked for as soon as it is there.
+const DENOISING_STEPS: &str = "25";
+const LIMIT: Duration = Duration::from_secs(30);
+/// The longest wait for what the bus brings.
+const WAIT: Duration = Duration::from_millis(20);
+
+/// What one run came to; times in ms.
+struct Run {
+    late: Sorted,
+    bare: Sorted,
+    /// Ticks without an action.
+    missing: u64,
+    chunks: usize,
+    /// Of the time in which a chunk was computed, %.
+    computing: f64,
+}
+
+pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
+    let length = bench.choose(Duration::from_secs(20), Duration::from_secs(4));
+    let folder = faster(bench)?;
+    let mut runs = Vec::new();
+    for run in 0..bench.runs {
+        bench.progress(&format!("control: run {} of {}, {} s each", run + 1, bench.runs, length.as_secs()));
+        runs.push(one(bench, &folder, length)?);
+    }
+    let of = |value: &dyn Fn(&Run) -> Option<f64>| median(&runs.iter().filter_map(value).collect::<Vec<_>>());
+    let ticks: usize = runs.iter().map(|run| run.late.len()).sum();
+    let chunks: usize = runs.iter().map(|run| run.chunks).sum();
+    let missing: u64 = runs.iter().map(|run| run.missing).sum();
+    let note = format!(
+        "{ticks} ticks at {HZ} Hz, from the tick to the publishing of its action, {chunks} chunks of {DENOISING_STEPS} steps \
+         meanwhile, which took {:.0} % of the time; {missing} ticks had no action. Baseline: a thread that sleeps to the same \
+         grid in a process of its own, at the same time",
+        of(&|run| Some(run.computing)).unwrap_or_default()
+    );
+    let figures = [("p50", 0.5), ("p99", 0.99), ("max", 1.0)].into_iter().map(|(label, share)| {
+        let figure = Figure::new(format!("control/tick late, {label}"), "ms", of(&|run| run.late.quantile(share)))
+            .baseline(of(&|run| run.bare.quantile(share)));
+        match label {
+            "p50" => figure.note(&note),
+            "p99" => figure.target("< 2"),
+            _ => figure,
+        }
+    });
+    Ok(figures.collect())
+}
+
+/// The policy with a control grid of [`HZ`], asked at every tick that it is free. Its cameras stay as they are: it sees
+/// older pictures.
+fn faster(bench: &Bench) -> Result<PathBuf, Failure> {
+    let folder = bench.scratch.path().join("faster");
+    std::fs::create_dir_all(&folder)?;
+    for entry in std::fs::read_dir(&bench.bundle)? {
+        let entry = entry?;
+        std::fs::copy(entry.path(), folder.join(entry.file_name()))?;
+    }
+    let file = folder.join("policy.json");
+    let mut policy: Value = serde_json::from_slice(&std::fs::read(&file)?)?;
+    policy["control_hz"] = HZ.into();
+    policy["n_action_steps"] = 1.into();
+    std::fs::write(file, serde_json::to_vec(&policy)?)?;
+    Ok(folder)
+}
+
+fn one(bench: &Bench, folder: &std::path::Path, length: Duration) -> Result<Run, Failure> {
+    let instance = format!("bench-control-{}", std::process::id());
+    let mut command = Command::new(&bench.rapid);
+    command.arg("--infer").arg(folder).args(["--denoising-steps", DENOISING_STEPS]);
+    command.args(["--sim", "task", "--headless", "--json", "--instance", &instance]);
+    let mut program = Running::start(&mut command)?;
+    program.wait_for(LIMIT, |line| kind(line).as_deref() == Some("act"))?;
+
+    let bus = Bus::open(&Registry::task(), Some(&instance))?;
+    let inbox = bus.inbox()?;
+    let stop = Arc::new(AtomicBool::new(false));
+    let bare = std::thread::spawn({
+        let stop = Arc::clone(&stop);
+        move || beat(&stop)
+    });
+    // Number of the tick, and how late it was, ms.
+    let mut ticks: Vec<(u64, f64)> = Vec::new();
+    let begun = Instant::now();
+    while begun.elapsed() < length {
+        inbox.wait(WAIT)?;
+        inbox.drain(&mut |topic, header, _| {
+            if topic == TopicId::Action {
+                let late = Stamp(header.recv_ns).since(Stamp(header.capture_ns));
+                ticks.push((header.seq, late.as_secs_f64() * 1e3));
+            }
+        })?;
+    }
+    let seconds = begun.elapsed().as_secs_f64();
+    stop.store(true, Ordering::Relaxed);
+    let bare = bare.join().map_err(|_| "the bare thread panicked")?;
+    drop((inbox, bus));
+    let usage = program.stop()?;
+    let (Some((first, _)), Some((last, _))) = (ticks.first(), ticks.last()) else {
+        return Err(format!("no action was published: {}", usage.output).into());
+    };
+    let missing = (last - first + 1).saturating_sub(ticks.len() as u64);
+    let chunks: Vec<f64> = usage.output.lines().filter_map(latency_ms).collect();
+    // Chunks are counted from the start of the loop, a little before the first tick seen here.
+    let computing = (chunks.iter().sum::<f64>() / 10.0 / seconds).min(100.0);
+    let late = Sorted::new(ticks.into_iter().map(|(_, late)| late));
+    Ok(Run { late, bare: Sorted::new(bare), missing, chunks: chunks.len(), computing })
+}
+
+/// Wakes at every tick, and nothing else: how late each time, ms.
+fn beat(stop: &AtomicBool) -> Vec<f64> {
+    let mut late = Vec::with_capacity(1 << 12);
+    let mut due = Stamp::now();
+    while !stop.load(Ordering::Relaxed) {
+        due = due.after(Duration::from_secs(1) / HZ);
+        sleep_until(due);
+        late.push(Stamp::now().since(due).as_secs_f64() * 1e3);
+    }
+    late
+}
+
+/// Of a line that tells of a chunk.
+fn latency_ms(line: &str) -> Option<f64> {
+    let line: Value = serde_json::from_str(line).ok()?;
+    (line.get("event")?.as_str()? == "chunk").then(|| line.get("latency_ms")?.as_f64())?
+}

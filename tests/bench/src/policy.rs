@@ -1,0 +1,213 @@
+//! From an observation to a chunk of actions, against onnxruntime alone on the same graphs.
+//!
+//! What is compared runs in turn, one chunk each, so that whatever else the machine does hits both.
+
+use std::hint::black_box;
+use std::time::Instant;
+
+use rapid::driver::sim::task::{Expert, Trial, layout};
+use rapid::policy::bundle::{Bundle, Graph};
+use rapid::policy::graphs::{BoundGraph, LoadedGraph};
+use rapid::policy::library::Environment;
+use rapid::policy::model::Model;
+use rapid::policy::observation::ObservationTensors;
+use rapid::policy::request::Request;
+use rapid::policy::sampler::Sampler;
+use rapid::random::Random;
+use rapid::registry::task::PARTS;
+use rapid::sample::SampleHeader;
+
+use crate::child::thread_cpu_s;
+use crate::figure::Figure;
+use crate::start::ms;
+use crate::stats::Sorted;
+use crate::{Bench, Failure, eager, heap};
+
+/// Chunks before the first one that counts.
+const WARM_UP: usize = 20;
+/// The trial whose samples are observed, and the step at which: on the way to the block.
+const SEED: u64 = 50_000;
+const STEPS: usize = 20;
+
+pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
+    let bundle = Bundle::load(&bench.bundle)?;
+    let mut subject = Subject::load(&bundle)?;
+    let chunks = bench.choose(500, 40);
+    bench.progress(&format!("policy: {chunks} chunks"));
+    let seen = subject.run(chunks)?;
+    let p50 = |samples: &[f64]| Sorted::new(samples.iter().copied()).quantile(0.5);
+    let p99 = |samples: &[f64]| Sorted::new(samples.iter().copied()).quantile(0.99);
+    let ratio = |ours: &[f64]| p50(&ours.iter().zip(&seen.bare).map(|(ours, bare)| ours / bare).collect::<Vec<_>>());
+    let work = p50(&seen.sampler_cpu.iter().zip(&seen.bare_cpu).map(|(ours, bare)| ours / bare).collect::<Vec<_>>());
+    let note = format!(
+        "{chunks} times, one thread, {} steps of denoising: {} pictures and states of the simulated task, decoded, \
+         compared, normalised, and the sampler; baseline: onnxruntime alone, the encoder once and the denoiser {} times \
+         on memory that is filled already",
+        subject.sampler.steps(),
+        bundle.observations.len() * bundle.n_obs_steps,
+        subject.sampler.steps()
+    );
+    let mut figures = vec![
+        Figure::new("policy/observation to chunk, p50", "ms", p50(&seen.answer)).baseline(p50(&seen.bare)).note(note),
+        Figure::new("policy/observation to chunk, p99", "ms", p99(&seen.answer)).baseline(p99(&seen.bare)),
+        Figure::new("policy/of it observation, p50", "ms", p50(&seen.observe)).note("from a filled request to tensors"),
+        Figure::new("policy/of it sampler, p50", "ms", p50(&seen.sampler)).baseline(p50(&seen.bare)),
+        Figure::new("policy/of it sampler, cpu p50", "ms", p50(&seen.sampler_cpu))
+            .baseline(p50(&seen.bare_cpu))
+            .note("the thread's own time: what another program takes does not count"),
+        Figure::new("policy/sampler, multiple of baseline", "x", ratio(&seen.sampler))
+            .target("<= 1.1")
+            .note("the median of pairs, by the clock on the wall"),
+        Figure::new("policy/sampler, multiple of baseline, cpu", "x", work).note("the same by the thread's own time"),
+        Figure::new("policy/observation to chunk, multiple of baseline", "x", ratio(&seen.answer)),
+    ];
+    figures.extend(eager::figures(bench, || subject.run(chunks / 2).map(|seen| (seen.sampler, seen.sampler_cpu))));
+    figures.push(heap::figure(bench).unwrap_or_else(|error| Figure::missing("policy/heap", error.to_string())));
+    Ok(figures)
+}
+
+/// The policy, and the bare graphs beside it.
+struct Subject {
+    model: Model,
+    /// The parts of an answer by themselves.
+    observer: Model,
+    sampler: Sampler,
+    bare: Bare,
+    request: Request,
+    chunk: Vec<f32>,
+}
+
+/// What each time took, ms.
+#[derive(Default)]
+struct Seen {
+    answer: Vec<f64>,
+    observe: Vec<f64>,
+    sampler: Vec<f64>,
+    bare: Vec<f64>,
+    sampler_cpu: Vec<f64>,
+    bare_cpu: Vec<f64>,
+}
+
+impl Subject {
+    fn load(bundle: &Bundle) -> Result<Self, Failure> {
+        let environment = Environment::open(None)?;
+        let mut observer = Model::load(bundle, &environment, None)?;
+        let request = request(bundle)?;
+        let sampler = Sampler::new(bundle, &environment, None, 1)?;
+        let bare = Bare::load(bundle, &environment, observer.observe(&request)?, sampler.steps())?;
+        let chunk = vec![0.0; sampler.chunk_len()];
+        Ok(Self { model: Model::load(bundle, &environment, None)?, observer, sampler, bare, request, chunk })
+    }
+
+    fn run(&mut self, chunks: usize) -> Result<Seen, Failure> {
+        let mut seen = Seen::default();
+        for number in 0..WARM_UP + chunks {
+            if number == WARM_UP {
+                seen = Seen::default();
+            }
+            // Neither comes always first.
+            if number.is_multiple_of(2) {
+                self.own(&mut seen)?;
+                self.alone(&mut seen)?;
+            } else {
+                self.alone(&mut seen)?;
+                self.own(&mut seen)?;
+            }
+            let begun = Instant::now();
+            self.model.answer(black_box(&self.request), &mut self.chunk)?;
+            seen.answer.push(ms(begun));
+        }
+        Ok(seen)
+    }
+
+    fn own(&mut self, seen: &mut Seen) -> Result<(), Failure> {
+        let begun = Instant::now();
+        let tensors = self.observer.observe(black_box(&self.request))?;
+        seen.observe.push(ms(begun));
+        let (begun, cpu) = (Instant::now(), thread_cpu_s());
+        self.sampler.chunk(tensors, self.request.seed, &mut self.chunk)?;
+        seen.sampler_cpu.push((thread_cpu_s() - cpu) * 1e3);
+        seen.sampler.push(ms(begun));
+        Ok(())
+    }
+
+    fn alone(&mut self, seen: &mut Seen) -> Result<(), Failure> {
+        let (begun, cpu) = (Instant::now(), thread_cpu_s());
+        self.bare.chunk()?;
+        seen.bare_cpu.push((thread_cpu_s() - cpu) * 1e3);
+        seen.bare.push(ms(begun));
+        Ok(())
+    }
+}
+
+/// The graphs alone, on inputs that are written once.
+struct Bare {
+    encoder: BoundGraph,
+    denoiser: BoundGraph,
+    steps: usize,
+}
+
+impl Bare {
+    fn load(
+        bundle: &Bundle,
+        environment: &Environment,
+        observation: &ObservationTensors,
+        steps: usize,
+    ) -> Result<Self, Failure> {
+        let load = |graph: Graph| -> Result<BoundGraph, Failure> {
+            let bytes = bundle.read_graph(graph)?;
+            Ok(LoadedGraph::load(environment, &bundle.graph(graph).file, &bytes, 1)?.bind()?)
+        };
+        let (mut encoder, mut denoiser) = (load(Graph::Encoder)?, load(Graph::Denoiser)?);
+        for (at, spec) in bundle.observations.iter().enumerate() {
+            encoder.write(encoder.input_index(&spec.key)?, observation.values(at))?;
+        }
+        if let Some(mask) = &bundle.mask {
+            encoder.write(encoder.input_index(&mask.input)?, observation.mask())?;
+        }
+        let condition = denoiser.input_index("global_cond")?;
+        encoder.run(|values| denoiser.write(condition, values))??;
+        let mut noise = vec![0.0; bundle.horizon * bundle.action.len()];
+        Random::new(SEED, 0).fill_normal(&mut noise);
+        denoiser.write(denoiser.input_index("sample")?, &noise)?;
+        denoiser.write_integer(denoiser.input_index("timestep")?, 50)?;
+        Ok(Self { encoder, denoiser, steps })
+    }
+
+    fn chunk(&mut self) -> Result<(), Failure> {
+        self.encoder.run(|condition| {
+            black_box(condition);
+        })?;
+        for _ in 0..self.steps {
+            self.denoiser.run(|prediction| {
+                black_box(prediction);
+            })?;
+        }
+        Ok(())
+    }
+}
+
+/// A question as the simulated task puts it: everything present.
+pub(crate) fn request(bundle: &Bundle) -> Result<Request, Failure> {
+    let mut request = Request::new(bundle);
+    let (mut trial, mut expert) = (Trial::new(SEED), Expert::new(SEED));
+    let mut payload = Vec::new();
+    for number in 0..STEPS + request.steps() {
+        let target = expert.act(&trial.world);
+        trial.command(target);
+        trial.step(0.0);
+        let Some(step) = number.checked_sub(STEPS) else { continue };
+        for (at, observation) in bundle.observations.iter().enumerate() {
+            let part = PARTS.iter().find(|(name, _)| *name == observation.modality);
+            let (_, part) = part.ok_or_else(|| format!("the simulated task has no `{}`", observation.modality))?;
+            trial.sample(*part, &mut payload)?;
+            let (encoding, width, height) = layout(*part);
+            let encoding = encoding as u32;
+            let header = SampleHeader { seq: number as u64, encoding, width, height, ..SampleHeader::default() };
+            request.cell_mut(at, step).ok_or("a request without its cells")?.set(&header, 0, &payload);
+            request.set_present(at, true);
+        }
+    }
+    request.seed = SEED;
+    Ok(request)
+}
