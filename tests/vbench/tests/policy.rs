@@ -86,7 +86,7 @@ fn a_policy_goes_on_without_the_tactile_camera_and_takes_it_back() {
     for (when, from, to) in [("before", 0, fell), ("while", fell, rose), ("after", rose, u64::MAX)] {
         let acted = ticks.iter().filter(|(_, time)| (from..to).contains(time)).count();
         println!("{acted} actions {when} the camera was away");
-        assert!(acted >= 4, "{acted} actions {when} the camera was away");
+        assert!(acted >= 2, "{acted} actions {when} the camera was away");
     }
 
     // What each chunk was computed from.
