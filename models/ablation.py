@@ -4,8 +4,8 @@
     ablation.py EPISODES --rapid target/release/rapid [--only NAME]... [--trials 100] [--iterations 3900]
 
 The configurations are those of the RAPID paper's appendix. Each is trained, exported and then judged by `rapid eval`,
-that is by the program that runs policies, with everything plugged in. What is trained or judged already under --runs is
-not done again; the results are written anew after every configuration, with those that are there.
+that is by the program that runs policies, with everything plugged in. What is trained already
+under --runs is not trained again; the results are written anew after every configuration, with those that are there.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import math
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +39,8 @@ FIRST_SEED = 50_000
 class Configuration:
     """One row of the table."""
 
+    title: str
+    """What it is called in the paper."""
     spec: Callable[[], Spec]
     data: str
     """All episodes, or those of one texture."""
@@ -57,12 +60,12 @@ class Configuration:
 
 
 CONFIGURATIONS = (
-    Configuration(lambda: Spec("vision", (wrist(), arm()), mask_aware=False), ALL, 0.5),
+    Configuration("vision only", lambda: Spec("vision", (wrist(), arm()), mask_aware=False), ALL, 0.5),
     # With a single picture to take away it is the arm's own state that remains.
-    Configuration(lambda: Spec("vision-mask", (wrist(dropout=0.3), arm())), ALL, 0.5),
-    Configuration(tactile_id, ALL, 1.0, shipped=True),
-    Configuration(lambda: unmasked("vision-diff-one"), ONE, 0.5),
-    Configuration(lambda: unmasked("vision-diff"), ALL, 1.0),
+    Configuration("vision + mask", lambda: Spec("vision-mask", (wrist(dropout=0.3), arm())), ALL, 0.5),
+    Configuration("vision + mask + diff", tactile_id, ALL, 1.0, shipped=True),
+    Configuration("vision + diff", lambda: unmasked("vision-diff-one"), ONE, 0.5),
+    Configuration("vision + diff", lambda: unmasked("vision-diff"), ALL, 1.0),
 )
 
 
@@ -93,7 +96,7 @@ def main() -> None:
                 judge(configuration, args)
             except (OSError, EpisodeError, ValueError, subprocess.CalledProcessError) as error:
                 sys.exit(f"ablation: {configuration.name}: {error}")
-        summarize(args)
+            summarize(args)
 
 
 def learn(configuration: Configuration, args: argparse.Namespace) -> None:
@@ -122,14 +125,14 @@ def wanted(configuration: Configuration, episode: Episode) -> bool:
 def judge(configuration: Configuration, args: argparse.Namespace) -> None:
     """Runs the bundle in the program, with everything plugged in: RUNS/NAME/eval.json."""
     run_folder = args.runs / configuration.name
-    if (run_folder / "eval.json").exists():
-        return
     command = [str(args.rapid), "eval", str(configuration.bundle(args.runs)), "--json", "--trials", str(args.trials)]
     command += ["--condition", "full", "--seed", str(FIRST_SEED)]
     run_folder.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()
     said = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
-    record = {"command": " ".join(["rapid", *command[1:]]), "seconds": round(time.monotonic() - started, 1), "said": said}
+    told = f"rapid eval BUNDLE --condition full --trials {args.trials} --seed {FIRST_SEED} --json"
+    lines = [json.loads(line) for line in said.splitlines()]
+    record = {"command": told, "seconds": round(time.monotonic() - started, 1), "said": lines}
     (run_folder / "eval.json").write_text(json.dumps(record, indent=2), encoding="utf-8")
 
 
@@ -138,7 +141,10 @@ def summarize(args: argparse.Namespace) -> None:
     rows = [row for c in CONFIGURATIONS if (row := summary(c, args.runs)) is not None]
     if not rows:
         return
-    report = {"trials": rows[0]["trials"], "first_seed": FIRST_SEED, "configurations": rows}
+    told = f"ablation.py EPISODES --rapid RAPID --trials {args.trials} --iterations {args.iterations} --seed {args.seed}"
+    if math.isfinite(args.minutes):
+        told += f" --minutes {args.minutes:g}"
+    report = {"command": told, "trials": rows[0]["trials"], "first_seed": FIRST_SEED, "configurations": rows}
     results.write(args.out, "ablation", report, markdown(report))
 
 
@@ -149,9 +155,13 @@ def summary(configuration: Configuration, runs: Path) -> dict[str, Any] | None:
         return None
     judged = json.loads(said.read_text(encoding="utf-8"))
     trained = json.loads((configuration.bundle(runs) / "policy.json").read_text(encoding="utf-8"))["training"]
-    full = json.loads(judged["said"])["conditions"]["full"]
+    trials = [line for line in judged["said"] if line["event"] == "trial"]
+    outcomes = Counter("crash" if t["status"] == "crash" else t["outcome"] for t in trials)
+    # Left is where a triangular block belongs, and where a hexagonal one is wrong.
+    left = [t for t in trials if t["outcome"] == ("success" if t["triangular"] else "wrong_bin")]
     return {
         "name": configuration.name,
+        "title": configuration.title,
         "data": configuration.data,
         "episodes": trained["episodes"],
         "dropout": {o.key: o.dropout for o in configuration.spec().images},
@@ -160,11 +170,15 @@ def summary(configuration: Configuration, runs: Path) -> dict[str, Any] | None:
         "minutes": trained["minutes"],
         "final_loss": trained["final_loss"],
         "seed": trained["seed"],
-        "trials": full["trials"],
-        "success": full["success"] / full["trials"],
-        "wrong_bin": full["wrong_bin"] / full["trials"],
-        "incomplete": full["incomplete"] / full["trials"],
-        "interval": results.wilson(full["success"], full["trials"]),
+        "command": judged["command"],
+        "trials": len(trials),
+        "triangular": sum(t["triangular"] for t in trials) / len(trials),
+        "success": outcomes["success"] / len(trials),
+        "crash": outcomes["crash"] / len(trials),
+        "wrong_bin": outcomes["wrong_bin"] / len(trials),
+        "incomplete": outcomes["incomplete"] / len(trials),
+        "put_left": len(left) / len(trials),
+        "interval": results.wilson(outcomes["success"], len(trials)),
         "paper": configuration.paper,
     }
 
@@ -174,19 +188,26 @@ def markdown(report: dict[str, Any]) -> str:
     lines = [
         "# What each input is worth",
         "",
-        "Five configurations of the policy, each trained on the demonstrations of `make train` and then run by the",
-        f"program (`rapid eval`) for {report['trials']} trials with everything plugged in, seeds from {report['first_seed']}",
-        "on, which no demonstration has. Success: the block ends in the bin of its texture; chance is 0.50.",
+        "Five configurations of the policy, each trained on the demonstrations of `make train` and then run by the program",
+        f"(`rapid eval`) for {report['trials']} trials with everything plugged in, with seeds that no demonstration has:",
+        f"{report['first_seed']} and on, {report['configurations'][0]['triangular']:.0%} of the blocks triangular. Success:",
+        "the block ends in the bin of its texture, with Wilson's interval; incomplete: it ends in no bin. Of those in a bin:",
+        "the share in the right one, which is what the policy knows of the texture. Left: the block ends in the bin of the",
+        "triangular ones, whichever it is.",
         "",
-        "| configuration | data | dropout | success | 95 % | wrong bin | incomplete | paper |",
-        "|---|---|---|---|---|---|---|---|",
+        "| configuration | episodes | dropout | iterations | success | 95 % | wrong bin | incomplete | of those in a bin | left"
+        " | paper |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in report["configurations"]:
         dropout = max(row["dropout"].values()) or "-"
         low, high = row["interval"]
+        binned = row["success"] + row["wrong_bin"]
+        right = f"{row['success'] / binned:.2f}" if binned else "-"
         lines.append(
-            f"| {row['name']} | {row['data']}, {row['episodes']} | {dropout} | {row['success']:.2f} |"
-            f" {low:.2f}-{high:.2f} | {row['wrong_bin']:.2f} | {row['incomplete']:.2f} | {row['paper']:.2f} |"
+            f"| {row['title']} (`{row['name']}`) | {row['episodes']}, {row['data']} | {dropout} | {row['iterations']} |"
+            f" {row['success']:.2f} | {low:.2f}-{high:.2f} | {row['wrong_bin']:.2f} | {row['incomplete']:.2f} | {right} |"
+            f" {row['put_left']:.2f} | {row['paper']:.2f} |"
         )
     missing = [c.name for c in CONFIGURATIONS if c.name not in {row["name"] for row in report["configurations"]}]
     if missing:
@@ -199,9 +220,19 @@ def markdown(report: dict[str, Any]) -> str:
     ]
     lines += [
         "",
-        "`tactile-id` is the bundle of the repository, vision, mask and difference. `vision-mask` has one picture to take",
-        "away, and then only the arm's state is left. `vision-diff-one` is the paper's row on the data of a single",
-        "configuration: there one kind of block, here the demonstrations of one texture. Made with `make ablation`.",
+        "`tactile-id` is the bundle of the repository. `vision-mask` has one picture to take away, and then only the arm's",
+        "state is left. `vision-diff-one` is the paper's row on the data of a single configuration: there the blocks of one",
+        "size, here the demonstrations of one texture. Diff: the tactile picture, as difference to the first one. The fewer",
+        "the iterations, the more trials end incomplete, with the block missed or let go on the way.",
+        "",
+        "Made with `make ablation`, which runs",
+        "",
+        f"    python {report['command']}",
+        "",
+        "where `--minutes` ends a training that has not come to its last iteration, with the learning rate fallen by then;",
+        "and that, for the trials of each,",
+        "",
+        f"    {report['configurations'][0]['command']}",
     ]
     return "\n".join(lines) + "\n"
 

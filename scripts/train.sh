@@ -33,7 +33,7 @@ die() { printf 'train: %s\n' "$*" >&2; exit 1; }
 
 main() {
     local part="${1:-}" rapid
-    rapid="$(realpath -m "${2:-target/release/rapid}")"
+    rapid="$(realpath -m -- "${2:-target/release/rapid}")"
     case "$part" in
         policy) environment; demonstrations "$rapid"; policy ;;
         ablation) environment; demonstrations "$rapid"; ablation "$rapid" ;;
@@ -52,18 +52,21 @@ in_models() {
 environment() {
     local requirements=models/requirements.txt stamp
     stamp=$(sha256sum <"$requirements")
-    if [[ $(cat "$VENV/stamp" 2>/dev/null) = "$stamp" ]] && "$VENV/bin/python" -c 'import torch' 2>/dev/null; then
-        return
-    fi
-    say "making the Python environment of the training: $VENV"
+    # Two runs at once would make it in the same place.
     mkdir -p "$(dirname "$VENV")"
     exec 9>"$VENV.lock"
     flock 9
+    if [[ $(cat "$VENV/stamp" 2>/dev/null) = "$stamp" ]] && "$VENV/bin/python" -c 'import torch' 2>/dev/null; then
+        exec 9>&-
+        return
+    fi
+    say "making the Python environment of the training: $VENV"
     rm -rf "$VENV"
     python3 -m venv "$VENV"
     "$VENV/bin/python" -m pip install --quiet --disable-pip-version-check --only-binary=:all: -r "$requirements"
     "$VENV/bin/python" -c 'import torch'
     echo "$stamp" >"$VENV/stamp"
+    exec 9>&-
 }
 
 demonstrations() {

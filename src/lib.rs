@@ -7,6 +7,7 @@
 //!  L5   main   dispatch   cli   commands         what was typed
 //!  L4   app                                      puts the stages together, and alone knows them all
 //!       tui   headless   logging                 what is shown: Snapshots and Events of `status`
+//!       lockstep   compare                       a rig on a virtual clock; a policy beside a recording
 //!
 //!  L3   rig                                      owns every device's life, and the mask
 //!        |  slot: may it run?  stream: run it    presence: publish the mask
@@ -16,6 +17,7 @@
 //!       pulled out                        shared     |          |     to which tick
 //!                                         memory     v          v
 //!  L3                                                record      one episode, one MCAP file
+//!                                                    policy      observations to actions, on the robot
 //!
 //!  L2   calibration                                how late a sensor is
 //!
@@ -49,6 +51,16 @@
 //!    the tick, and the recorder writes which ones those were, with the mask, beside the samples.
 //!
 //! Other programs subscribe to the same topics on the same terms.
+//!
+//! # One action
+//!
+//! 1. At each tick of the control grid, thread `control` of [`policy::live`] takes what the bus brought, and
+//!    [`policy::observer`] chooses what is seen, with [`sync`]'s rules.
+//! 2. When a chunk is due, or a bit of the mask has changed, the samples go to thread `policy`, which makes
+//!    tensors of them and runs the encoder once and the denoiser step by step.
+//! 3. [`policy::horizon`] says which action of which chunk is that of the tick, or that there is none. It is
+//!    published on the topic of actions.
+//! 4. The stream of the actuator hands it to its driver; the recorder writes it.
 //!
 //! # One unplug
 //!

@@ -184,8 +184,8 @@ fn a_policy_that_was_not_trained_without_a_sensor_holds_until_it_is_back_or_is_t
     let [hold] = holds(&said)[..] else { panic!("{:?}", holds(&said)) };
     assert_eq!(hold["device"], "tactile_tip");
     let acted = said.iter().rposition(|event| event["event"] == "act");
-    let held = said.iter().position(|event| std::ptr::eq(event, hold));
-    assert!(acted > held, "it goes on when the sensor is back");
+    let stopped = said.iter().position(|event| std::ptr::eq(event, hold));
+    assert!(acted > stopped, "it goes on when the sensor is back");
 
     let (code, said, stderr) = infer(&place, &bundle, PULLED, &["--duration", "8s", "--go-on"]);
     assert_eq!(code, Some(0), "{stderr}");

@@ -1,5 +1,6 @@
 """The sampler, and normalisation there and back."""
 
+import json
 import sys
 import unittest
 from pathlib import Path
@@ -13,7 +14,30 @@ from rapid_policy.diffusion import add_noise, alphas_cumprod, betas, ddim, ddim_
 from rapid_policy.normalize import MinMax
 
 
+# What the program's own scheduler is tested with, computed by the diffusers library.
+GOLDEN = Path(__file__).parents[2] / "tests" / "golden" / "scheduler.json"
+OURS = ("ddim_T100_n10_eps", "ddim_T100_n16_eps", "ddim_umi_T50_n16_eps")
+
+
 class Sampler(unittest.TestCase):
+    def test_every_step_is_that_of_diffusers(self):
+        cases = json.loads(GOLDEN.read_text())["cases"]
+        for name in OURS:
+            case = cases[name]
+            timesteps, expected = case["cfg"]["num_train_timesteps"], torch.tensor(case["x"]).reshape(-1, 1, 16, 4)
+            wave = 0.3 * torch.sin(torch.arange(64.0)).reshape(1, 16, 4)
+            seen = []
+
+            def denoise(sample, timestep, wave=wave, timesteps=timesteps, seen=seen):
+                seen.append(sample)
+                return torch.tanh(0.7 * sample + wave - timestep[:, None, None] / timesteps)
+
+            with self.subTest(name):
+                self.assertEqual(ddim_timesteps(case["n"], timesteps), case["timesteps"])
+                torch.testing.assert_close(alphas_cumprod(timesteps), torch.tensor(case["alphas_cumprod"]))
+                last = ddim(denoise, expected[0], case["n"], timesteps)
+                torch.testing.assert_close(torch.stack([*seen, last]), expected, atol=1e-5, rtol=0)
+
     def test_the_tables_fall_and_end_at_their_caps(self):
         table = alphas_cumprod()
         self.assertEqual(len(table), 100)

@@ -8,24 +8,17 @@ use clap::{ArgMatches, Args, ValueHint};
 use super::RunArgs;
 
 pub(super) const REPLAY: &str = "\
-The registry is the one in the episode; --config is not looked at.
-
-With --infer nothing is run: the chunks of an episode that a policy recorded are computed again from
-the samples they name and compared; of any other episode the policy looks on, and its actions are
-compared with those recorded.
-
-Examples:
-  rapid replay --headless episodes/20260101_sort_001.mcap
-  rapid replay episodes/20260101_sort_001.mcap --infer models/tactile-id --tolerance 1e-3";
+The registry is the one in the episode; --config is not looked at. With --infer nothing is run: the
+chunks of a policy's own episode are computed again; beside another episode the policy looks on.";
 
 /// Options of a policy beside an episode.
 #[derive(Debug, Clone, Args)]
 #[command(next_help_heading = "Options of a comparison")]
 pub struct CompareArgs {
-    /// Compare a policy with the episode [default: models/tactile-id here, or where `rapid eval` finds it]
+    /// Compare a policy with the episode [default: as `rapid eval`]
     #[arg(long = "infer", value_name = "BUNDLE", num_args = 0..=1, value_hint = ValueHint::DirPath)]
     pub compare_with: Option<Option<PathBuf>>,
-    /// Exit with 1 if the actions of the policy's own episode differ by more
+    /// Fail if the actions of its own episode differ by more
     #[arg(long, value_name = "DIFFERENCE", value_parser = tolerance, requires = "compare_with")]
     pub tolerance: Option<f64>,
     /// Steps of denoising [default: as the policy says]

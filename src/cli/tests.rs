@@ -66,7 +66,7 @@ fn quantities_say_how_they_are_written() {
         ("--rate abc", "a number, for example 30"),
         ("--rate 0", "between 0.1 and 1000 Hz"),
         ("--tag soft", "finger=soft"),
-        ("replay a.mcap --infer --tolerance -1", "a number from 0 on"),
+        ("replay a.mcap --infer --tolerance=-1", "a number from 0 on"),
         ("replay a.mcap --infer --tolerance NaN", "a number from 0 on"),
         ("--instance a/b", "letters, digits and dashes"),
     ] {

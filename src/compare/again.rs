@@ -155,7 +155,7 @@ pub(super) fn compare(
         if waiting.is_empty() {
             return Ok(work.again);
         }
-        let Some(taped) = tape.next()? else { break };
+        let Some(taped) = tape.next_message()? else { break };
         let Content::Sample { encoding, width, height, bytes } = taped.content else { continue };
         let Some(device) = topics.get(taped.topic) else { continue };
         let key = (*device, u64::from(taped.sequence));

@@ -121,8 +121,8 @@ pub(super) fn compare(
             }
         }
     }
-    // The tick at which the last of it came.
-    if last.is_some_and(|last| grid.tick(watch.tick) == Stamp(last)) {
+    // The moment of the end is a tick too if somebody acted at it.
+    if last.is_some_and(|last| grid.tick(watch.tick) == Stamp(last)) && watch.recorded.contains_key(&watch.tick) {
         watch.tick();
     }
     Ok(watch.end())

@@ -22,12 +22,12 @@ pub struct Spread {
 impl Spread {
     fn take(&mut self, tick: u64, distance: f64) {
         self.values += 1;
-        self.mean += (distance - self.mean) / self.values as f64;
         if distance > self.largest {
             (self.largest, self.at_tick) = (distance, tick);
         }
-        if distance.is_infinite() {
-            self.mean = f64::INFINITY;
+        // Once infinite, it stays so.
+        if self.mean.is_finite() {
+            self.mean += (distance - self.mean) / self.values as f64;
         }
     }
 }

@@ -59,7 +59,7 @@ impl<'a> Ordered<'a> {
             if self.ended || oldest.is_some_and(|oldest| self.newest.saturating_sub(oldest) > SPAN_NS) {
                 return Ok(self.held.pop_first().map(|((at, _), received)| (at, received)));
             }
-            let Some(taped) = self.tape.next()? else {
+            let Some(taped) = self.tape.next_message()? else {
                 self.ended = true;
                 continue;
             };

@@ -90,7 +90,7 @@ impl Survey {
         let mut tape = Tape::open(file)?;
         let mut survey = Self::default();
         let mut first = None;
-        while let Some(taped) = tape.next()? {
+        while let Some(taped) = tape.next_message()? {
             match taped.content {
                 Content::Sample { encoding: Encoding::F64, bytes, .. } if taped.topic == ACTION_TOPIC => {
                     let values = bytes.as_chunks().0.iter().map(|number| f64::from_le_bytes(*number)).collect();

@@ -2,6 +2,7 @@
 
 use serde::Serialize;
 
+use super::policy;
 use super::style::Palette;
 use crate::modality::ModalityId;
 use crate::status::{DeviceStatus, Event, Level, Snapshot, What};
@@ -115,20 +116,14 @@ impl Columns {
                 rest.push_str(&why);
                 (&"episode".to_owned(), None, palette.grade(verdict.grade, &pad(verdict.grade.word())), rest)
             }
-            What::DiskLow { .. }
-            | What::ClockStep { .. }
-            | What::Policy { .. }
-            | What::Chunk(_)
-            | What::Hold { .. }
-            | What::Act { .. }
-            | What::PolicyEnd { .. } => {
+            What::DiskLow { .. } | What::ClockStep { .. } => {
                 let (level, text) = event.what.sentence().unwrap_or((Level::Warn, String::new()));
-                let subject = match event.what {
-                    What::DiskLow { .. } => "disk",
-                    What::ClockStep { .. } => "clock",
-                    _ => "policy",
-                };
+                let subject = if matches!(event.what, What::DiskLow { .. }) { "disk" } else { "clock" };
                 (&subject.to_owned(), None, palette.level(level, &pad(level.word())), text)
+            }
+            What::Policy { .. } | What::Chunk(_) | What::Hold { .. } | What::Act { .. } | What::PolicyEnd { .. } => {
+                let (word, rest) = policy::line(&event.what, palette, pad).unwrap_or_default();
+                (&"policy".to_owned(), None, word, rest)
             }
             What::Recovered { text, .. } => (&"episode".to_owned(), None, palette.warn(&pad("repaired")), text.clone()),
             What::Log { level, text } => {

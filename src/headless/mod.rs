@@ -4,6 +4,7 @@
 //! nothing but this output, and what it missed is said.
 
 mod line;
+mod policy;
 mod progress;
 pub mod style;
 mod tally;
@@ -19,7 +20,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::outlet::Outlet;
 use crate::status::rates::Rates;
-use crate::status::{Board, Event, Snapshot};
+use crate::status::{Board, Event, Snapshot, What};
 use crate::text;
 use crate::time::{Stamp, WallClock};
 use style::{ColourChoice, Palette, Terminal};
@@ -145,7 +146,7 @@ impl Printer {
                 () = shutdown.cancelled() => break,
                 () = outlet.closed() => return outlet.finish(LAST).await,
                 event = events.recv() => match event {
-                    Ok(event) => Some(self.event(&event)?),
+                    Ok(event) => Some(self.event(&event)?).filter(|piece| !piece.is_empty()),
                     Err(RecvError::Lagged(missed)) => Some(self.missed(missed, &board.snapshot())),
                     // The board, which we hold, keeps the channel open.
                     Err(RecvError::Closed) => break,
@@ -185,7 +186,12 @@ impl Printer {
     fn event(&mut self, event: &Event) -> io::Result<String> {
         self.tally.count(event);
         let wall_ns = self.wall.wall_ns(event.stamp);
-        let line = if self.json { line::json(event, wall_ns)? } else { self.columns.line(event, wall_ns) };
+        let line = match &event.what {
+            _ if self.json => line::json(event, wall_ns)?,
+            // They come all the time, and progress says how fast.
+            What::Chunk(chunk) if chunk.skipped == 0 => return Ok(String::new()),
+            _ => self.columns.line(event, wall_ns),
+        };
         Ok(self.whole_line(&line))
     }
 

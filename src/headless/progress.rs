@@ -4,15 +4,17 @@ use std::time::Duration;
 
 use serde::Serialize;
 
+use super::policy::{self, PolicyProgress};
 use crate::status::rates::Rates;
 use crate::status::{SlotState, Snapshot};
 use crate::text;
 
-/// Progress as one line, without a line end: time, mask, rates of what streams, the episode.
+/// Progress as one line, without a line end: time, mask, policy, the episode, rates of what streams.
 pub(super) fn line(snapshot: &Snapshot, rates: &Rates, elapsed: Duration, duration: Option<Duration>) -> String {
     let of = duration.map(|duration| format!("/{}", text::clock(duration))).unwrap_or_default();
     let mut parts = vec![format!("{}{of}", text::clock(elapsed))];
     parts.push(format!("mask {}", snapshot.mask.hex(snapshot.devices.len())));
+    parts.extend(snapshot.policy.as_ref().map(policy::progress));
     // The episode comes before the rates: with many devices it is the end that is cut off.
     if let Some(recording) = &snapshot.recording {
         parts.push(format!(
@@ -44,6 +46,8 @@ struct Progress<'a> {
     devices: Vec<DeviceProgress<'a>>,
     #[serde(skip_serializing_if = "Option::is_none")]
     recording: Option<RecordingProgress>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    policy: Option<PolicyProgress<'a>>,
 }
 
 #[derive(Debug, Serialize)]
@@ -99,5 +103,6 @@ pub(super) fn json(
             dropped: recording.dropped,
             disk_seconds: recording.room.map(|left| left.as_secs()),
         }),
+        policy: snapshot.policy.as_ref().map(|policy| PolicyProgress::of(policy, snapshot.devices.len())),
     })
 }

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use serde::Serialize;
 
+use super::policy::PolicySum;
 use super::style::Palette;
 use crate::modality::MAX_MODALITIES;
 use crate::status::{DeviceStatus, Event, SlotState, Snapshot, Verdict, What};
@@ -21,6 +22,9 @@ pub(super) struct Tally {
     /// Samples that were already counted when the tally began.
     before: Vec<DeviceStatus>,
     episodes: Vec<Episode>,
+    /// What the policy calls itself, and whether nothing moves.
+    policy: Option<(String, bool)>,
+    policy_end: Option<PolicySum>,
     missed: u64,
 }
 
@@ -71,8 +75,19 @@ pub(super) struct Summary {
     seconds: f64,
     devices: Vec<Row>,
     episodes: Vec<Episode>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    policy: Option<PolicyRow>,
     /// Events this output did not see because it was behind.
     missed_events: u64,
+}
+
+/// What the policy came to.
+#[derive(Debug, Serialize)]
+struct PolicyRow {
+    policy: String,
+    dry_run: bool,
+    #[serde(flatten)]
+    sum: PolicySum,
 }
 
 /// What one modality came to.
@@ -96,6 +111,8 @@ impl Tally {
             present: [Presence::default(); MAX_MODALITIES],
             before: snapshot.devices.clone(),
             episodes: Vec::new(),
+            policy: snapshot.policy.as_ref().map(|policy| (policy.name.clone(), policy.dry_run)),
+            policy_end: None,
             missed: 0,
         };
         tally.agree(snapshot);
@@ -131,6 +148,8 @@ impl Tally {
                 error: error.clone(),
                 verdict: verdict.clone(),
             }),
+            What::Policy { policy, dry_run, .. } => self.policy = Some((policy.clone(), *dry_run)),
+            What::PolicyEnd { .. } => self.policy_end = PolicySum::of(&event.what),
             _ => {}
         }
     }
@@ -156,6 +175,10 @@ impl Tally {
             seconds: round(seconds),
             devices: end.devices.iter().map(row).collect(),
             episodes: self.episodes,
+            policy: self.policy_end.map(|sum| {
+                let (policy, dry_run) = self.policy.unwrap_or_default();
+                PolicyRow { policy, dry_run, sum }
+            }),
             missed_events: self.missed,
         }
     }
@@ -205,6 +228,10 @@ impl Summary {
             let reasons = &episode.verdict.reasons;
             let said = if reasons.is_empty() { episode.error.as_slice() } else { reasons };
             lines.extend(said.iter().map(|reason| format!("         {}", text::plain(reason))));
+        }
+        if let Some(PolicyRow { policy, dry_run, sum }) = &self.policy {
+            let dry = if *dry_run { format!("  {}", palette.warn("dry run")) } else { String::new() };
+            lines.push(format!("policy   {}{dry}  {}", palette.bold(&text::plain(policy)), sum.counts()));
         }
         if self.missed_events > 0 {
             let text = format!("{} events are missing above: this output was behind", self.missed_events);

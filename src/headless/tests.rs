@@ -6,8 +6,8 @@ use super::*;
 use crate::provenance::{KernelDriver, Negotiated};
 use crate::registry::UsbIdentity;
 use crate::sample::Epoch;
-use crate::status::literal::{TAKEN, WALL_NS, board, every_state, id, recording, three_streaming};
-use crate::status::{Grade, Level, Provenance, RecordingStatus, SlotState, Verdict, What};
+use crate::status::literal::{TAKEN, WALL_NS, board, every_state, id, policy, recording, three_streaming};
+use crate::status::{Chunk, Grade, Level, PolicyStatus, Provenance, RecordingStatus, SlotState, Verdict, What};
 
 /// An output that keeps what it is given.
 #[derive(Clone, Default)]
@@ -70,6 +70,39 @@ fn usb() -> UsbIdentity {
     }
 }
 
+fn chunk(skipped: u64) -> What {
+    What::Chunk(Box::new(Chunk {
+        tick: 40,
+        observed_ns: 0,
+        mask: "0x05".to_owned(),
+        seed: 7,
+        latency_ms: 34.52,
+        used: true,
+        skipped,
+        samples: Vec::new(),
+        actions: vec![0.5; 4],
+    }))
+}
+
+fn hold(device: &str, reason: &str) -> What {
+    What::Hold { device: device.to_owned(), reason: reason.to_owned() }
+}
+
+fn loaded(dry_run: bool) -> What {
+    What::Policy {
+        policy: "tactile-id".to_owned(),
+        folder: "models/tactile-id".into(),
+        hash: "0123456789abcdef0123456789abcdef".to_owned(),
+        library: "1.22.0".to_owned(),
+        hz: 10.0,
+        dry_run,
+    }
+}
+
+fn policy_end(chunks: u64) -> What {
+    What::PolicyEnd { actions: 812, held: 14, chunks, unused: 0, latency_p50_ms: 34.52, latency_p99_ms: 48.0 }
+}
+
 fn all_events() -> Vec<What> {
     vec![
         What::Attach {
@@ -105,6 +138,16 @@ fn all_events() -> Vec<What> {
         episode(0, Some("disk nearly full")),
         What::DiskLow { folder: "out".into(), free: 1_500_000_000, seconds: 252 },
         What::ClockStep { seconds: -3600.0 },
+        loaded(false),
+        loaded(true),
+        hold("", "the next actions are still being computed"),
+        What::Act { tick: 12 },
+        chunk(0),
+        chunk(1),
+        chunk(3),
+        hold("a\x1b[2Jrm", "a modality that the policy requires is missing"),
+        policy_end(104),
+        policy_end(0),
         What::Log { level: Level::Warn, text: "something".to_owned() },
     ]
 }
@@ -127,6 +170,16 @@ fn lines_for_people_have_their_columns() {
     22:13:20.000Z  episode            BAD           out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped  the file could not be written: disk nearly full
     22:13:20.000Z  disk               warn          out: disk nearly full, 1.5 GB free: the episode will be closed in about 4 min
     22:13:20.000Z  clock              warn          the wall clock was set back by 3600.000 s; times of capture stay as they are
+    22:13:20.000Z  policy             loaded        tactile-id  10 Hz  hash 0123456789ab  onnxruntime 1.22.0
+    22:13:20.000Z  policy             dry run       tactile-id  10 Hz  hash 0123456789ab  onnxruntime 1.22.0  nothing moves
+    22:13:20.000Z  policy             holds         the next actions are still being computed
+    22:13:20.000Z  policy             acts          from tick 12
+    22:13:20.000Z  policy             chunk         tick 40  34.5 ms  mask 0x05
+    22:13:20.000Z  policy             late chunk    tick 40  34.5 ms  mask 0x05  1 action too late
+    22:13:20.000Z  policy             late chunk    tick 40  34.5 ms  mask 0x05  3 actions too late
+    22:13:20.000Z  policy             holds         a modality that the policy requires is missing: a [2Jrm
+    22:13:20.000Z  policy             ended         812 actions  14 ticks held  104 chunks  0 unused  latency p50 34.5 ms  p99 48.0 ms
+    22:13:20.000Z  policy             ended         812 actions  14 ticks held  0 chunks  0 unused
     22:13:20.000Z  log                warn          something
     "#);
 }
@@ -186,6 +239,68 @@ fn progress_names_what_counts_first() {
     assert!(line.contains("2 dropped  disk full in 04:12"), "{line}");
     let json = progress::json(&snapshot, &Rates::default(), Duration::from_secs(12), None, WALL_NS).unwrap();
     assert_eq!(serde_json::from_str::<Value>(&json).unwrap()["recording"]["disk_seconds"], 252);
+}
+
+#[test]
+fn progress_says_what_the_policy_does() {
+    let mut snapshot = three_streaming();
+    let line = |snapshot: &Snapshot| progress::line(snapshot, &Rates::default(), Duration::from_secs(12), None);
+    let json = |snapshot: &Snapshot| -> Value {
+        let json = progress::json(snapshot, &Rates::default(), Duration::from_secs(12), None, WALL_NS).unwrap();
+        serde_json::from_str::<Value>(&json).unwrap()["policy"].clone()
+    };
+    assert_eq!(json(&snapshot), Value::Null);
+    snapshot.policy = Some(policy());
+    assert!(line(&snapshot).starts_with("00:12  mask 0x07  policy acts 35 ms  cam_wrist"), "{}", line(&snapshot));
+    let expected = serde_json::json!({
+        "policy": "tactile-id", "dry_run": false, "mask": "0x05", "hold": null, "latency_ms": 34.52, "chunk_age": 3,
+        "actions": 812, "held": 14, "chunks": 104, "unused": 0,
+    });
+    assert_eq!(json(&snapshot), expected);
+    let hold = Some("a modality is missing: a\x1b[2Jrm".to_owned());
+    snapshot.policy = Some(PolicyStatus { dry_run: true, hold, latency_ms: None, ..policy() });
+    assert!(line(&snapshot).contains("  policy dry holds: a modality is missing: a [2Jrm  "), "{}", line(&snapshot));
+    assert_eq!(
+        (&json(&snapshot)["hold"], &json(&snapshot)["latency_ms"]),
+        (&"a modality is missing: a\x1b[2Jrm".into(), &Value::Null)
+    );
+}
+
+#[test]
+fn the_summary_says_what_the_policy_came_to() {
+    let start = three_streaming();
+    let summary = |events: &[What]| {
+        let mut tally = Tally::new(&start);
+        for what in events {
+            tally.count(&event(what.clone()));
+        }
+        tally.summary(&start)
+    };
+    let whole = summary(&[loaded(true), policy_end(104)]);
+    let object = serde_json::to_value(&whole).unwrap();
+    let expected = serde_json::json!({
+        "policy": "tactile-id", "dry_run": true, "actions": 812, "held": 14, "chunks": 104, "unused": 0,
+        "latency_p50_ms": 34.52, "latency_p99_ms": 48.0,
+    });
+    assert_eq!(object["policy"], expected);
+    let text = whole.text(9, Palette::Plain);
+    let said = "policy   tactile-id  dry run  812 actions  14 ticks held  104 chunks  0 unused  latency p50 34.5 ms  p99 48.0 ms";
+    assert!(text.lines().any(|line| line == said), "{text}");
+    for events in [&[][..], &[loaded(false)]] {
+        assert_eq!(serde_json::to_value(summary(events)).unwrap().get("policy"), None);
+    }
+}
+
+#[test]
+fn chunks_in_time_are_lines_in_json_alone() {
+    let snapshot = three_streaming();
+    let print = |json, what: What| {
+        let options = HeadlessOptions { json, ..HeadlessOptions::default() };
+        Printer::new(&snapshot, &options, Progress::Off, Palette::Plain).event(&event(what)).unwrap()
+    };
+    assert_eq!(print(false, chunk(0)), "");
+    assert!(print(false, chunk(2)).contains("late chunk    tick 40"));
+    assert!(print(true, chunk(0)).contains(r#""event":"chunk""#));
 }
 
 #[test]

@@ -251,8 +251,9 @@ impl Bench<'_> {
             rig.pass(&mut witness);
             let skipped = take(answer, &mut witness.pilot, request.tick, &chunk, &mut failure);
             if let Some(recorder) = &mut witness.recorder {
-                let what = skipped.map(|skipped| self.gave(&request, &chunk, skipped));
-                what.into_iter().for_each(|what| recorder.event(&Event { stamp: rig.now(), what }));
+                if let Some(skipped) = skipped {
+                    recorder.event(&Event { stamp: rig.now(), what: self.gave(&request, &chunk, skipped) });
+                }
                 recorder.advance(rig.now());
             }
             tick += 1;
@@ -293,6 +294,7 @@ impl Bench<'_> {
             mask: request.mask.hex(self.registry.devices.len()),
             seed: request.seed,
             latency_ms: STEP.as_secs_f64() * 1e3,
+            used: true,
             skipped,
             samples: request.samples(self.bundle),
             actions: actions.to_vec(),

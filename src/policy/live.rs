@@ -20,7 +20,7 @@ use hdrhistogram::Histogram;
 use tokio_util::sync::CancellationToken;
 
 use super::bundle::Bundle;
-use super::horizon::{Counts, HoldReason, WithoutMask};
+use super::horizon::{Counts, WithoutMask};
 use super::model::Model;
 use super::pilot::Pilot;
 use super::request::Request;
@@ -150,7 +150,8 @@ struct Control {
     latencies: Histogram<u64>,
     last_latency_ms: Option<f64>,
     chunk_age: Option<u64>,
-    hold: Option<HoldReason>,
+    /// Why nothing is done, as a screen says it.
+    hold: Option<String>,
     acting: bool,
     complained: Option<Stamp>,
     reported: Stamp,
@@ -276,26 +277,29 @@ impl Control {
         let request = &exchange.request;
         let latency = exchange.done.since(request.stamp);
         match &exchange.outcome {
-            Ok(()) => match self.pilot.answer(request.tick, &exchange.chunk) {
-                Ok(skipped) => {
-                    let latency_ms = latency.as_secs_f64() * 1e3;
-                    self.last_latency_ms = Some(latency_ms);
-                    let us = u64::try_from(latency.as_micros()).unwrap_or(LONGEST_US);
-                    self.latencies.saturating_record(us.clamp(1, LONGEST_US));
-                    let chunk = Chunk {
-                        tick: request.tick,
-                        observed_ns: request.stamp.0,
-                        mask: request.mask.hex(0),
-                        seed: request.seed,
-                        latency_ms,
-                        skipped,
-                        samples: request.samples(&self.options.bundle),
-                        actions: exchange.chunk.clone(),
-                    };
-                    self.board.announce(What::Chunk(Box::new(chunk)));
+            Ok(()) => {
+                let answered = self.pilot.answer(request.tick, &exchange.chunk);
+                let latency_ms = latency.as_secs_f64() * 1e3;
+                self.last_latency_ms = Some(latency_ms);
+                let us = u64::try_from(latency.as_micros()).unwrap_or(LONGEST_US);
+                self.latencies.saturating_record(us.clamp(1, LONGEST_US));
+                // Also of one that is not used: its pictures may have become the reference of all later ones.
+                let chunk = Chunk {
+                    tick: request.tick,
+                    observed_ns: request.stamp.0,
+                    mask: request.mask.hex(0),
+                    seed: request.seed,
+                    latency_ms,
+                    used: answered.is_ok(),
+                    skipped: answered.unwrap_or(0),
+                    samples: request.samples(&self.options.bundle),
+                    actions: exchange.chunk.clone(),
+                };
+                self.board.announce(What::Chunk(Box::new(chunk)));
+                if let Err(refused) = answered {
+                    self.complain(&format!("policy: not used: {refused}"));
                 }
-                Err(refused) => self.complain(&format!("policy: not used: {refused}")),
-            },
+            }
             Err(reason) => {
                 self.failures += 1;
                 self.pilot.failed(request.tick);
@@ -323,10 +327,14 @@ impl Control {
         if let Some(reason) = step.hold
             && step.hold_is_news
         {
-            let device = step.missing.unwrap_or_default().to_owned();
-            self.board.announce(What::Hold { device, reason: reason.to_string() });
+            let (device, reason) = (step.missing.unwrap_or_default().to_owned(), reason.to_string());
+            let colon = if device.is_empty() { "" } else { ": " };
+            self.hold = Some(format!("{reason}{colon}{device}"));
+            self.board.announce(What::Hold { device, reason });
         }
-        self.hold = step.hold;
+        if step.hold.is_none() {
+            self.hold = None;
+        }
         if step.clamped_is_news {
             let text = "policy: an action beyond its limits: the limit is executed".to_owned();
             self.board.announce(What::Log { level: Level::Warn, text });
@@ -385,7 +393,7 @@ impl Control {
             latency_ms: self.last_latency_ms,
             chunk_age: self.chunk_age,
             action: axes.map(|((name, unit), value)| (name.clone(), f64::from(*value), unit.clone())).collect(),
-            hold: self.hold.map(|reason| reason.to_string()),
+            hold: self.hold.clone(),
             actions: counts.actions,
             held: counts.held_ticks,
             chunks: counts.chunks,

@@ -14,12 +14,15 @@ use crate::time::{Stamp, WallClock, nanoseconds};
 
 /// Key of the record at the end: why the episode is not whole.
 pub(super) const CUT_SHORT: &str = "cut_short";
+/// Key of both records: which policy was at the controls.
+pub(super) const POLICY: &str = "policy";
 
 /// The record at the beginning.
 ///
 /// JSON: `layout` `{name: bit}`, `modalities` `[{name, bit, topic, kind, shape, when_stale,
 /// latency_ns}]`, `serials` `{name: serial or null}` of what was attached when the episode began,
-/// `provenance` (see [`Units::epochs`]) of what ran then, `tags` `{key: value}`.
+/// `provenance` (see [`Units::epochs`]) of what ran then, `tags` `{key: value}`, `policy` `{name, hash,
+/// dry_run}` of the policy at the controls, absent if none was.
 ///
 /// A message's `log_time` is its capture time as the kernel gave it. The latency is taken off when
 /// a frame's samples are chosen: a sample stands for the moment `log_time - latency_ns`.
@@ -51,7 +54,7 @@ pub(super) fn beginning(
     let tags: Map<String, Value> =
         request.tags.iter().map(|(key, value)| (key.clone(), value.clone().into())).collect();
     let host = rustix::system::uname();
-    text_map([
+    let mut said = text_map([
         ("software", concat!("rapid ", env!("CARGO_PKG_VERSION")).to_owned()),
         ("rig", registry.rig.name.clone()),
         ("task", request.task.clone()),
@@ -69,7 +72,9 @@ pub(super) fn beginning(
         ("begin_wall_ns", clock.wall_ns(begin).to_string()),
         ("begin_monotonic_ns", begin.0.to_string()),
         ("wall_minus_monotonic_ns", clock.wall_ns(Stamp(0)).to_string()),
-    ])
+    ]);
+    said.extend(units.policy().map(|policy| (POLICY.to_owned(), policy.to_string())));
+    said
 }
 
 /// What the record at the end says.
@@ -105,7 +110,7 @@ pub(super) struct Ending<'a> {
 /// not. `verdict` is GOOD, SUSPECT or BAD. JSON: `reasons` `["..."]`, why it is not GOOD; `modalities`
 /// `{name: {samples, bytes, lost, dropped, damaged, ...}}`, the fields of [`Quality`]; `skew_ms` `{p50,
 /// p95, p99, max}` between the earliest and the latest sample of a frame, or null; `serials` and
-/// `provenance` as at the beginning, of whatever was attached or ran at some time.
+/// `provenance` as at the beginning, of whatever was attached or ran at some time; `policy` likewise.
 pub(super) fn end(ending: &Ending<'_>) -> BTreeMap<String, String> {
     let modalities: Map<String, Value> =
         ending.qualities.iter().map(|(device, quality)| (device.name.clone(), json!(quality))).collect();
@@ -128,6 +133,7 @@ pub(super) fn end(ending: &Ending<'_>) -> BTreeMap<String, String> {
         ("serials", ending.units.serials().to_string()),
         ("provenance", ending.units.epochs(ending.begin).to_string()),
     ]);
+    said.extend(ending.units.policy().map(|policy| (POLICY.to_owned(), policy.to_string())));
     said.extend(ending.cut_short.map(|reason| (CUT_SHORT.to_owned(), reason.to_owned())));
     said
 }

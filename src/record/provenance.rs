@@ -1,12 +1,14 @@
-//! Which unit each modality's samples come from: what runs now, and every epoch of an episode.
+//! Which unit each modality's samples come from, and which policy is at the controls: what runs now, and
+//! what ran in an episode.
 //!
-//! An epoch begins when the device is opened and ends when its slot runs no more. Both are told by
+//! An epoch begins when the device is opened and ends when its slot runs no more. All of it is told by
 //! events, which are in the file too.
 //!
 //! Invariant: pure: what is known is what events told.
 
 use std::collections::BTreeMap;
 
+use serde::Serialize;
 use serde_json::{Value, json};
 
 use crate::status::{Event, Provenance, SlotState, What};
@@ -14,6 +16,21 @@ use crate::time::Stamp;
 
 /// Serial of every device attached, by its modality's name.
 type Serials = BTreeMap<String, Option<String>>;
+
+/// A policy at the controls.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+struct Policy {
+    name: String,
+    hash: String,
+    dry_run: bool,
+}
+
+impl Policy {
+    fn of(what: &What) -> Option<Self> {
+        let What::Policy { policy, hash, dry_run, .. } = what else { return None };
+        Some(Self { name: policy.clone(), hash: hash.clone(), dry_run: *dry_run })
+    }
+}
 
 /// One epoch of a modality.
 #[derive(Debug, Clone)]
@@ -28,6 +45,7 @@ struct Incarnation {
 pub(super) struct Attached {
     serials: Serials,
     running: BTreeMap<String, Incarnation>,
+    policy: Option<Policy>,
 }
 
 impl Attached {
@@ -40,6 +58,8 @@ impl Attached {
                 self.running.insert(device.clone(), opened(event.stamp, provenance));
             }
             What::State { device, state, .. } if has_ended(*state) => drop(self.running.remove(device)),
+            What::Policy { .. } => self.policy = Policy::of(&event.what),
+            What::PolicyEnd { .. } => self.policy = None,
             _ => {}
         }
     }
@@ -52,11 +72,12 @@ impl Attached {
     }
 }
 
-/// Every unit and every epoch of an episode.
+/// Every unit and every epoch of an episode, and its policy.
 #[derive(Debug)]
 pub(super) struct Units {
     serials: Serials,
     epochs: BTreeMap<String, Vec<Incarnation>>,
+    policy: Option<Policy>,
 }
 
 impl Units {
@@ -66,6 +87,7 @@ impl Units {
         Self {
             serials: attached.serials.clone(),
             epochs: running.map(|(device, epoch)| (device.clone(), vec![epoch.clone()])).collect(),
+            policy: attached.policy.clone(),
         }
     }
 
@@ -78,6 +100,7 @@ impl Units {
                 self.epochs.entry(device.clone()).or_default().push(opened(event.stamp, provenance));
             }
             What::State { device, state, .. } if has_ended(*state) => self.end(device, event.stamp),
+            What::Policy { .. } => self.policy = Policy::of(&event.what),
             _ => {}
         }
     }
@@ -91,6 +114,11 @@ impl Units {
     /// `{modality: serial or null}` of what was attached at some time.
     pub(super) fn serials(&self) -> Value {
         json!(self.serials)
+    }
+
+    /// `{name, hash, dry_run}` of the policy that ran at some time, the last if there were several.
+    pub(super) fn policy(&self) -> Option<Value> {
+        self.policy.as_ref().map(|policy| json!(policy))
     }
 
     /// `{modality: [epoch, ...]}` in the order of time: each the event `opened` without its
@@ -194,6 +222,38 @@ mod tests {
         assert_eq!(said, expected);
         assert_eq!(epochs["cam"][0]["vid"], "046d");
         assert_eq!(units.serials(), json!({"cam": "B"}));
+    }
+
+    fn policy(name: &str) -> Event {
+        let what = What::Policy {
+            policy: name.to_owned(),
+            folder: "models/x".into(),
+            hash: "ff".to_owned(),
+            library: String::new(),
+            hz: 10.0,
+            dry_run: true,
+        };
+        Event { stamp: Stamp(0), what }
+    }
+
+    #[test]
+    fn the_policy_of_an_episode_is_the_one_that_ran_in_it() {
+        let end =
+            What::PolicyEnd { actions: 0, held: 0, chunks: 0, unused: 0, latency_p50_ms: 0.0, latency_p99_ms: 0.0 };
+        let end = Event { stamp: Stamp(0), what: end };
+        let mut attached = Attached::default();
+        assert_eq!(Units::new(&attached).policy(), None);
+        attached.take(&policy("before"));
+        let mut units = Units::new(&attached);
+        let told = |name: &str| Some(json!({"name": name, "hash": "ff", "dry_run": true}));
+        assert_eq!(units.policy(), told("before"));
+        // It ran, although it does no more.
+        units.take(&end);
+        assert_eq!(units.policy(), told("before"));
+        units.take(&policy("within"));
+        assert_eq!(units.policy(), told("within"));
+        attached.take(&end);
+        assert_eq!(Units::new(&attached).policy(), None, "it ended before the episode");
     }
 
     #[test]

@@ -213,6 +213,21 @@ impl Bench {
         self.script.put((TopicId::Mask, header, payload));
     }
 
+    /// Half a second in which nothing is sent and these events are announced, `before` it begins and within.
+    pub(super) async fn half_a_second(&self, before: Vec<What>, within: Vec<What>) -> PathBuf {
+        self.mask(0, 1, Stamp::now().0);
+        self.script.taken().await;
+        for what in before {
+            self.board.announce(what);
+        }
+        let finished = self.recorder.start(self.request(Some(Duration::from_millis(500)))).await.unwrap();
+        for what in within {
+            self.board.announce(what);
+        }
+        self.until_file(&finished).await;
+        finished
+    }
+
     /// One second of a rig, laid out from `t0` on: the camera is away in the middle, the
     /// `tof` loses seven samples itself and one of its is lost on the way, `raw` sends one damaged frame and has no bit in
     /// the mask at first.

@@ -14,7 +14,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::broadcast;
 
-use super::{DeviceStatus, Event, LogLine, PolicyStatus, RecordingStatus, SlotState, Snapshot, Verdict, What};
+use super::{DeviceStatus, Event, Level, LogLine, PolicyStatus, RecordingStatus, SlotState, Snapshot, Verdict, What};
 use crate::mask::PhysicalMask;
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::registry::Registry;
@@ -177,7 +177,9 @@ impl Board {
 
     /// Announces an event, now, to whoever subscribed, and adds it to the log.
     pub fn announce(&self, what: What) {
-        if let Some((level, text)) = what.sentence() {
+        // A policy gives chunks all the time: only a late one is worth a line.
+        let said = what.sentence().filter(|(level, _)| !matches!(what, What::Chunk(_)) || *level > Level::Debug);
+        if let Some((level, text)) = said {
             self.log(LogLine { wall_ns: realtime_ns(), level, text });
         }
         if let What::Episode { file, error, .. } = &what {

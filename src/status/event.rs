@@ -244,10 +244,14 @@ impl What {
             Self::Unregistered { device, reason } => (Level::Info, format!("{device} is not used: {reason}")),
             Self::Policy { policy, hz, dry_run, library, .. } => {
                 let dry = if *dry_run { ", dry run: nothing moves" } else { "" };
-                (Level::Info, format!("policy {policy} at {hz} Hz, onnxruntime {library}{dry}"))
+                (Level::Info, format!("policy {policy} loaded: {hz} Hz, onnxruntime {library}{dry}"))
             }
             Self::Chunk(chunk) => {
-                let late = if chunk.skipped > 0 { format!(", {} actions late", chunk.skipped) } else { String::new() };
+                let late = match chunk.skipped {
+                    0 => String::new(),
+                    1 => ", 1 action too late".to_owned(),
+                    late => format!(", {late} actions too late"),
+                };
                 let text =
                     format!("chunk of tick {}: {:.1} ms{late}, mask {}", chunk.tick, chunk.latency_ms, chunk.mask);
                 (if chunk.skipped > 0 { Level::Warn } else { Level::Debug }, text)
@@ -259,7 +263,7 @@ impl What {
             Self::Act { tick } => (Level::Info, format!("policy acts from tick {tick}")),
             Self::PolicyEnd { actions, held, chunks, unused, latency_p50_ms, latency_p99_ms } => {
                 let text = format!(
-                    "policy ended: {actions} actions, {held} ticks held, {chunks} chunks, {unused} not used, latency p50 \
+                    "policy ended: {actions} actions, {held} ticks held, {chunks} chunks, {unused} unused, latency p50 \
                      {latency_p50_ms:.1} ms p99 {latency_p99_ms:.1} ms"
                 );
                 (Level::Info, text)

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use super::{Board, DeviceStatus, Level, LogLine, RecordingStatus, SlotState, Snapshot};
+use super::{Board, DeviceStatus, Level, LogLine, PolicyStatus, RecordingStatus, SlotState, Snapshot};
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::registry::{CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, WhenStale};
@@ -42,7 +42,6 @@ pub(crate) fn snapshot(devices: Vec<DeviceStatus>) -> Snapshot {
         mask.with(device.id, matches!(device.state, SlotState::Streaming | SlotState::Stalled))
     });
     Snapshot {
-        policy: None,
         rig: "bench-1".to_owned(),
         taken: TAKEN,
         uptime: Duration::from_secs(754),
@@ -50,6 +49,7 @@ pub(crate) fn snapshot(devices: Vec<DeviceStatus>) -> Snapshot {
         mask_sequence: 377_000,
         devices,
         recording: None,
+        policy: None,
         last_episode: None,
         last_verdict: super::Verdict::default(),
         log: Vec::new(),
@@ -91,6 +91,24 @@ pub(crate) fn recording(dropped: u64) -> RecordingStatus {
         bytes: 312_400_000,
         dropped,
         room: None,
+    }
+}
+
+/// A policy that acts on an arm of four axes and saw the first and the third modality.
+pub(crate) fn policy() -> PolicyStatus {
+    let axis = |name: &str, value: f64, unit: &str| (name.to_owned(), value, unit.to_owned());
+    PolicyStatus {
+        name: "tactile-id".to_owned(),
+        dry_run: false,
+        mask: PhysicalMask(0b101),
+        latency_ms: Some(34.52),
+        chunk_age: Some(3),
+        action: vec![axis("x", 0.123_4, "m"), axis("y", -0.021_3, "m"), axis("z", 0.187, "m"), axis("grip", 0.5, "1")],
+        hold: None,
+        actions: 812,
+        held: 14,
+        chunks: 104,
+        unused: 0,
     }
 }
 

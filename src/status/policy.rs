@@ -54,6 +54,8 @@ pub struct Chunk {
     pub seed: u64,
     /// From the tick to the answer, ms.
     pub latency_ms: f64,
+    /// Its actions were fit to be used.
+    pub used: bool,
     /// Its actions whose time had passed when it came.
     pub skipped: u64,
     /// The samples.

@@ -125,7 +125,6 @@ mod tests {
 
     fn at(ms: u64, samples: u64, newest_ms: u64, recorded: Option<u64>) -> Snapshot {
         Snapshot {
-            policy: None,
             rig: "rig".to_owned(),
             taken: Stamp(ms * MS),
             uptime: Duration::from_millis(ms),
@@ -143,6 +142,7 @@ mod tests {
                 bytes: 0,
                 newest: (samples > 0).then_some(Stamp(newest_ms * MS)),
             }],
+            policy: None,
             recording: recorded.map(|bytes| RecordingStatus {
                 file: "a.mcap".into(),
                 elapsed: Duration::ZERO,

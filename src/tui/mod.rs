@@ -15,6 +15,7 @@ mod help;
 mod log;
 mod mask;
 pub mod model;
+mod policy;
 mod recording;
 mod terminal;
 pub mod theme;

@@ -112,6 +112,12 @@ impl Theme {
         self.colour(Color::Red).add_modifier(Modifier::BOLD)
     }
 
+    /// All is as it should be.
+    #[must_use]
+    pub fn good(self) -> Style {
+        self.colour(Color::Green)
+    }
+
     /// An episode is being written.
     #[must_use]
     pub fn recording(self) -> Style {
@@ -122,7 +128,7 @@ impl Theme {
     #[must_use]
     pub fn grade(self, grade: Grade) -> Style {
         match grade {
-            Grade::Good => self.colour(Color::Green),
+            Grade::Good => self.good(),
             Grade::Suspect => self.warning(),
             Grade::Bad => self.alarm(),
         }

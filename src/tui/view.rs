@@ -10,7 +10,7 @@ use ratatui::widgets::Paragraph;
 
 use super::model::Model;
 use super::theme::Theme;
-use super::{devices, footer, header, help, log, mask, recording};
+use super::{devices, footer, header, help, log, mask, policy, recording};
 
 /// Below this the screen only says how large it should be.
 pub const MINIMUM: (u16, u16) = (60, 12);
@@ -20,6 +20,8 @@ const ROOMY: u16 = 32;
 const WITH_SELECTION: u16 = 20;
 /// Least and most lines of log next to a full table.
 const LOG_LINES: (u16, u16) = (1, 5);
+/// Most lines of the policy: on a small terminal, otherwise, on a roomy one.
+const POLICY_LINES: (u16, u16, u16) = (1, 5, 7);
 
 /// Draws everything.
 pub fn draw(frame: &mut Frame<'_>, model: &Model, theme: Theme) {
@@ -31,27 +33,40 @@ pub fn draw(frame: &mut Frame<'_>, model: &Model, theme: Theme) {
     let plan = mask::Plan::new(model, area.width, area.height / 4);
     let selection = u16::from(area.height >= WITH_SELECTION);
     let recording_lines = if area.height >= WITH_SELECTION { 2 } else { 1 };
+    let policy_lines = model.shown().policy.as_ref().map_or(0, |policy| {
+        let (small, usual, roomy) = POLICY_LINES;
+        let most = if gap > 0 { roomy } else { usual };
+        policy::rows(policy, area.width, if area.height >= WITH_SELECTION { most } else { small }, theme)
+    });
+    let policy_rows = if policy_lines > 0 { 1 + policy_lines + gap } else { 0 };
     // A rule above each of the four panels, the head of the table, header and footer.
-    let fixed = 4 + 1 + 2 + 4 * gap + plan.rows() + selection + recording_lines;
-    let rest = area.height.saturating_sub(fixed);
-    let log_least = (rest / 3).clamp(LOG_LINES.0, LOG_LINES.1);
+    let fixed = 4 + 1 + 2 + 4 * gap + plan.rows() + selection + recording_lines + policy_rows;
+    // On the smallest terminals the policy stands in the log's place: why it holds, it says itself.
+    let with_log = policy_rows == 0 || area.height >= fixed + 1 + LOG_LINES.0;
+    let rest = area.height.saturating_sub(if with_log { fixed } else { fixed - 1 });
+    let log_least = if with_log { (rest / 3).clamp(LOG_LINES.0, LOG_LINES.1) } else { 0 };
     let rows =
         u16::try_from(model.shown().devices.len()).unwrap_or(u16::MAX).clamp(1, rest.saturating_sub(log_least).max(1));
 
-    let [header_area, mask_area, devices_area, recording_area, log_area, footer_area] = Layout::vertical([
-        Constraint::Length(1 + gap),
-        Constraint::Length(1 + plan.rows() + gap),
-        Constraint::Length(2 + rows + selection + gap),
-        Constraint::Length(1 + recording_lines + gap),
-        Constraint::Fill(1),
-        Constraint::Length(1),
-    ])
-    .areas(area);
+    let [header_area, mask_area, devices_area, policy_area, recording_area, log_area, footer_area] =
+        Layout::vertical([
+            Constraint::Length(1 + gap),
+            Constraint::Length(1 + plan.rows() + gap),
+            Constraint::Length(2 + rows + selection + gap),
+            Constraint::Length(policy_rows),
+            Constraint::Length(1 + recording_lines + gap),
+            Constraint::Fill(1),
+            Constraint::Length(1),
+        ])
+        .areas(area);
     header::draw(frame, header_area, model, theme);
     mask::draw(frame, mask_area, &plan, model, theme);
     devices::draw(frame, devices_area, (rows, selection), model, theme);
+    policy::draw(frame, policy_area, policy_lines, model, theme);
     recording::draw(frame, recording_area, model, theme);
-    log::draw(frame, log_area, model, theme);
+    if with_log {
+        log::draw(frame, log_area, model, theme);
+    }
     footer::draw(frame, footer_area, model, theme);
     if model.is_help_open() {
         help::draw(frame, area, theme);

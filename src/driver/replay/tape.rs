@@ -97,7 +97,7 @@ impl Tape {
     ///
     /// # Errors
     /// When the disk gives an error.
-    pub fn next(&mut self) -> Result<Option<Taped<'_>>, DriverError> {
+    pub fn next_message(&mut self) -> Result<Option<Taped<'_>>, DriverError> {
         while self.walk.advance().map_err(|error| fatal(&self.path, error))? {
             let record = self.walk.record();
             if record.trust == Trust::Damaged {
@@ -168,6 +168,7 @@ impl Tape {
     }
 }
 
+#[derive(Clone, Copy)]
 enum Kind {
     Sample(Shape),
     Mask(PhysicalMask),

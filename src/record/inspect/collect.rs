@@ -3,9 +3,11 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use super::super::metadata::POLICY;
 use super::super::walk::{Walked, op};
 use super::super::wire::{Fields, protobuf};
 use super::judge::{Ending, Judge, recorded_verdict};
+use super::policy::Gathered;
 use super::units;
 use super::{EventReport, Inspection, Lateness, MaskEdge, ModalityReport, TopicReport};
 use crate::episode_format::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, RECOVERED, SUMMARY};
@@ -35,6 +37,7 @@ pub(super) struct Collected {
     judge: Option<Judge>,
     /// Of those, what `opened` says as JSON.
     opened: Vec<(u64, String)>,
+    policy: Gathered,
 }
 
 #[derive(Debug, Default)]
@@ -157,6 +160,7 @@ impl Collected {
                 3 => event.device = value.text(),
                 4 => event.text = value.text(),
                 5 if event.kind == "opened" && self.opened.len() < MAX_EVENTS => self.opened.push((at, value.text())),
+                5 if Gathered::takes(&event.kind) => self.policy.event(at, &event.kind, &value.text()),
                 _ => {}
             }
         }
@@ -182,6 +186,10 @@ impl Collected {
         let opened =
             std::mem::take(&mut self.opened).into_iter().map(|(at, json)| (from(begin_ns, at), json)).collect();
         let units = units::told(&said(&self.summary, "provenance"), &said(&self.about, "provenance"), opened);
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saturates, as wanted")]
+        let end_ns = begin_ns.saturating_add((seconds * 1e9).round() as u64);
+        let policy =
+            std::mem::take(&mut self.policy).report(end_ns, [self.summary.get(POLICY), self.about.get(POLICY)]);
         let (mut modalities, topics) = self.topics(begin_ns, seconds);
         let ending = Ending { file: walked, seconds, summary: &self.summary, repaired: self.repaired };
         let verdict = judge.as_ref().map(|judge| judge.judge(&mut modalities, &ending)).unwrap_or_default();
@@ -215,6 +223,7 @@ impl Collected {
             skew: judge.and_then(|judge| judge.skew()),
             modalities,
             units,
+            policy,
             topics,
             mask: mask.collect(),
             events: events.into_iter().map(|(_, event)| event).collect(),

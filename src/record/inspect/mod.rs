@@ -8,6 +8,7 @@
 mod collect;
 mod judge;
 mod list;
+mod policy;
 mod render;
 #[cfg(test)]
 mod tests;
@@ -28,6 +29,7 @@ use collect::Collected;
 
 pub use super::walk::FileEnd;
 pub use list::{Listed, episodes, list, render_list};
+pub use policy::{HoldReport, PolicyReport};
 pub use render::{Paint, render};
 
 /// Why a file cannot be inspected.
@@ -102,6 +104,9 @@ pub struct Inspection {
     pub modalities: Vec<ModalityReport>,
     /// By modality, the unit behind each epoch and what was agreed with it, as recorded.
     pub units: BTreeMap<String, Vec<serde_json::Value>>,
+    /// What the policy did that was at the controls, if one was.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub policy: Option<PolicyReport>,
     /// The other topics.
     pub topics: Vec<TopicReport>,
     /// Values of the mask over time: the first one and every change.

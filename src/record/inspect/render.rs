@@ -2,8 +2,8 @@
 
 use std::fmt::Write;
 
-use super::units;
-use super::{FileEnd, Inspection, Lateness, ModalityReport, TopicReport};
+use super::{FileEnd, Inspection, Lateness, ModalityReport, PolicyReport, TopicReport};
+use super::{policy, units};
 use crate::record::Spread;
 use crate::status::{Grade, Verdict};
 use crate::text;
@@ -100,15 +100,32 @@ fn write_all(out: &mut String, inspection: &Inspection, width: usize, paint: Pai
         }
     }
 
-    if !inspection.events.is_empty() {
+    if let Some(policy) = &inspection.policy {
+        write_policy(out, policy, width)?;
+    }
+
+    // What a policy gave all the time is summed up above.
+    let events: Vec<_> = inspection.events.iter().filter(|event| event.kind != "chunk").collect();
+    if !events.is_empty() {
         writeln!(out, "\nevents")?;
-        for event in inspection.events.iter().take(EVENTS) {
+        for event in events.iter().take(EVENTS) {
             let line = format!("{:>10.3} s  {:12} {}", event.at, clean(&event.kind), clean(&event.text));
             writeln!(out, "{}", line.chars().take(width.max(TIMELINE)).collect::<String>())?;
         }
-        if inspection.events.len() > EVENTS {
-            writeln!(out, "{:>10}    {} more", "", inspection.events.len() - EVENTS)?;
+        if events.len() > EVENTS {
+            writeln!(out, "{:>10}    {} more", "", events.len() - EVENTS)?;
         }
+    }
+    Ok(())
+}
+
+fn write_policy(out: &mut String, policy: &PolicyReport, width: usize) -> std::fmt::Result {
+    writeln!(out, "\npolicy   latency p50/99/max")?;
+    let (words, reasons) = policy::words(policy);
+    let words: Vec<_> = words.iter().map(|word| clean(word)).collect();
+    out.push_str(&wrapped("", &words, width));
+    for reason in reasons {
+        writeln!(out, "  {}", clean(&reason))?;
     }
     Ok(())
 }

@@ -5,7 +5,7 @@ use proptest::prelude::*;
 use super::*;
 use crate::episode_format::testing;
 use crate::record::tests::Bench;
-use crate::status::Grade;
+use crate::status::{Chunk, Grade, What};
 
 fn of(bytes: &[u8]) -> Option<Inspection> {
     inspect_from(&mut &*bytes, bytes.len() as u64, Path::new("x.mcap")).unwrap()
@@ -101,6 +101,66 @@ fn whatever_happened_to_a_file_it_is_told_of() {
             }
         });
     }
+}
+
+#[tokio::test]
+async fn a_policy_is_told_of_with_its_bundle_and_its_holds() {
+    let bench = Bench::new();
+    let announced = What::Policy {
+        policy: "tactile-id".to_owned(),
+        folder: "models/tactile-id".into(),
+        hash: "0123456789abcdef".to_owned(),
+        library: "1.22.0".to_owned(),
+        hz: 10.0,
+        dry_run: false,
+    };
+    let chunk = |latency_ms, skipped| {
+        What::Chunk(Box::new(Chunk {
+            tick: 1,
+            observed_ns: 0,
+            mask: "0x03".to_owned(),
+            seed: 0,
+            latency_ms,
+            used: true,
+            skipped,
+            samples: Vec::new(),
+            actions: vec![0.5; 4],
+        }))
+    };
+    // Announced before the episode: its name and hash are in the metadata all the same.
+    let file = bench
+        .half_a_second(
+            vec![announced],
+            vec![
+                What::Hold { device: "arm".to_owned(), reason: "missing".to_owned() },
+                chunk(30.0, 0),
+                chunk(50.0, 2),
+                What::Act { tick: 3 },
+            ],
+        )
+        .await;
+    let said = inspect(&file).unwrap();
+    let policy = said.policy.as_ref().unwrap();
+    assert_eq!((policy.name.as_str(), policy.hash.as_str(), policy.dry_run), ("tactile-id", "0123456789abcdef", false));
+    assert_eq!((policy.chunks, policy.late_chunks), (2, 1));
+    assert_eq!(policy.latency, Some(Lateness { p50: 30.0, p99: 30.0, max: 50.0 }));
+    let [hold] = policy.holds.as_slice() else { panic!("{:?}", policy.holds) };
+    assert_eq!((hold.reason.as_str(), hold.count), ("missing: arm", 1));
+    assert!((0.0..0.5).contains(&hold.seconds), "{}", hold.seconds);
+    let shown = render(&said, 80, Paint::Plain);
+    assert!(shown.contains("tactile-id  hash 0123456789ab  2 chunks  1 late  latency 30.0/30.0/50.0 ms"), "{shown}");
+    assert!(shown.contains("s in 1 hold: missing: arm\n") && !shown.contains("chunk of tick"), "{shown}");
+    assert_eq!(serde_json::to_value(&said).unwrap()["policy"]["hash"], "0123456789abcdef");
+
+    // A killed run leaves what stands at the beginning.
+    let bytes = std::fs::read(&file).unwrap();
+    let summary = bytes.windows(13).position(|window| window == b"rapid/summary").unwrap();
+    let cut = of(&bytes[..summary]).unwrap();
+    assert_eq!(cut.recorded_verdict, None);
+    assert_eq!(cut.policy.map(|policy| policy.name), Some("tactile-id".to_owned()));
+
+    let (_bench, file) = episode().await;
+    assert_eq!(inspect(&file).unwrap().policy, None);
 }
 
 #[test]
@@ -216,14 +276,38 @@ fn the_report_on_a_screen() {
                 serde_json::json!({"epoch": 2, "from_s": 6.2, "to_s": null, "vid": "046d", "pid": "0825", "serial": "B"}),
             ],
         )]),
+        policy: Some(PolicyReport {
+            name: "tactile\x1b[2J-id".to_owned(),
+            hash: "0123456789abcdef0123".to_owned(),
+            dry_run: true,
+            chunks: 96,
+            late_chunks: 1,
+            latency: late,
+            holds: vec![
+                HoldReport {
+                    reason: "a modality that the policy requires is missing: arm".to_owned(),
+                    count: 2,
+                    seconds: 2.94,
+                },
+                HoldReport { reason: "the next actions are still being computed".to_owned(), count: 1, seconds: 0.2 },
+            ],
+        }),
         topics: vec![topic("/rapid/mask", 5000, 0, late)],
         mask: Vec::new(),
-        events: vec![EventReport {
-            at: 3.2,
-            kind: "detach".to_owned(),
-            device: "cam_wrist".to_owned(),
-            text: "cam_wrist detached, told by stream".to_owned(),
-        }],
+        events: vec![
+            EventReport {
+                at: 3.1,
+                kind: "chunk".to_owned(),
+                device: String::new(),
+                text: "chunk of tick 31".to_owned(),
+            },
+            EventReport {
+                at: 3.2,
+                kind: "detach".to_owned(),
+                device: "cam_wrist".to_owned(),
+                text: "cam_wrist detached, told by stream".to_owned(),
+            },
+        ],
     };
     insta::assert_snapshot!(render(&said, 60, Paint::Plain));
 }

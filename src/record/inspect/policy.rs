@@ -1,0 +1,234 @@
+//! What a policy did in an episode, as its events say.
+//!
+//! Invariant: no text of a file makes this panic; what is not as the recorder writes it is left out.
+
+use std::collections::BTreeMap;
+
+use serde::Serialize;
+use serde_json::Value;
+
+use super::Lateness;
+
+/// Reasons kept apart; a file may hold any number of them.
+const MAX_REASONS: usize = 32;
+const OTHER_REASONS: &str = "other reasons";
+/// Digits by which a bundle is told from another.
+const HASH: usize = 12;
+
+/// What a policy did in an episode.
+#[derive(Debug, Clone, PartialEq, Default, Serialize)]
+pub struct PolicyReport {
+    /// What its bundle calls itself; empty if the file does not say.
+    pub name: String,
+    /// Names the bundle's contents; empty if the file does not say.
+    pub hash: String,
+    /// Its actions were not carried out.
+    pub dry_run: bool,
+    /// Chunks of actions it gave.
+    pub chunks: u64,
+    /// Chunks of which some actions came too late.
+    pub late_chunks: u64,
+    /// From the observation to the chunk; absent without chunks.
+    pub latency: Option<Lateness>,
+    /// Why it did nothing, the longest first.
+    pub holds: Vec<HoldReport>,
+}
+
+/// The holds of one reason.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct HoldReport {
+    /// Why, with the modality whose absence is the reason.
+    pub reason: String,
+    /// How often.
+    pub count: u64,
+    /// How long together, seconds.
+    pub seconds: f64,
+}
+
+/// The events of a policy, one by one.
+#[derive(Debug, Default)]
+pub(super) struct Gathered {
+    /// What the last event `policy` says.
+    told: Option<Value>,
+    seen: bool,
+    late: u64,
+    /// From the observation to the chunk, microseconds.
+    latencies: Vec<u32>,
+    /// How often each reason, and how long together, ns.
+    holds: BTreeMap<String, (u64, u64)>,
+    /// The hold in force, with its beginning.
+    open: Option<(u64, String)>,
+}
+
+impl Gathered {
+    /// Is an event of this kind a policy's?
+    pub(super) fn takes(kind: &str) -> bool {
+        matches!(kind, "policy" | "chunk" | "hold" | "act" | "policy_end")
+    }
+
+    /// Takes an event of a policy, with what it says as JSON.
+    pub(super) fn event(&mut self, at_ns: u64, kind: &str, json: &str) {
+        let Ok(said) = serde_json::from_str::<Value>(json) else { return };
+        self.seen = true;
+        match kind {
+            "policy" => self.told = Some(said),
+            "chunk" => self.chunk(&said),
+            "hold" => {
+                self.close(at_ns);
+                let text = |key: &str| said.get(key).and_then(Value::as_str).unwrap_or_default();
+                let (reason, device) = (text("reason"), text("device"));
+                let reason = if device.is_empty() { reason.to_owned() } else { format!("{reason}: {device}") };
+                self.open = Some((at_ns, reason));
+            }
+            _ => self.close(at_ns),
+        }
+    }
+
+    fn chunk(&mut self, said: &Value) {
+        let ms = said.get("latency_ms").and_then(Value::as_f64).unwrap_or(0.0);
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saturates, as wanted")]
+        self.latencies.push((ms * 1e3).round() as u32);
+        self.late += u64::from(said.get("skipped").and_then(Value::as_u64).is_some_and(|skipped| skipped > 0));
+    }
+
+    fn close(&mut self, at_ns: u64) {
+        let Some((since, reason)) = self.open.take() else { return };
+        let known = self.holds.len() < MAX_REASONS || self.holds.contains_key(&reason);
+        let (count, total) = self.holds.entry(if known { reason } else { OTHER_REASONS.to_owned() }).or_default();
+        *count += 1;
+        *total = total.saturating_add(at_ns.saturating_sub(since));
+    }
+
+    /// What the policy did until the end of the episode; `None` if there was none. What no event says
+    /// is what the metadata records `policy` say, the best first.
+    pub(super) fn report(mut self, end_ns: u64, metadata: [Option<&String>; 2]) -> Option<PolicyReport> {
+        self.close(end_ns);
+        let mut recorded = metadata.into_iter().flatten().filter_map(|text| serde_json::from_str::<Value>(text).ok());
+        let recorded = recorded.find(Value::is_object);
+        if !self.seen && recorded.is_none() {
+            return None;
+        }
+        let told = self.told.take();
+        let of = |event: &str, record: &str| {
+            let told = told.as_ref().and_then(|told| told.get(event));
+            told.or_else(|| recorded.as_ref()?.get(record)).cloned().unwrap_or_default()
+        };
+        let text = |event, record| of(event, record).as_str().unwrap_or_default().to_owned();
+        self.latencies.sort_unstable();
+        let at = |percent: usize| {
+            let last = self.latencies.len().checked_sub(1)?;
+            self.latencies.get(last * percent / 100).map(|us| f64::from(*us) / 1e3)
+        };
+        let mut holds: Vec<_> = self
+            .holds
+            .into_iter()
+            .map(|(reason, (count, ns))| HoldReport { reason, count, seconds: ns as f64 / 1e9 })
+            .collect();
+        holds.sort_by(|a, b| b.seconds.total_cmp(&a.seconds));
+        Some(PolicyReport {
+            name: text("policy", "name"),
+            hash: text("hash", "hash"),
+            dry_run: of("dry_run", "dry_run").as_bool().unwrap_or(false),
+            chunks: self.latencies.len() as u64,
+            late_chunks: self.late,
+            latency: (|| Some(Lateness { p50: at(50)?, p99: at(99)?, max: at(100)? }))(),
+            holds,
+        })
+    }
+}
+
+/// What is to be said of a policy, for people; then a line for each reason of its holds.
+pub(super) fn words(policy: &PolicyReport) -> (Vec<String>, Vec<String>) {
+    let or = |text: &str| if text.is_empty() { "?".to_owned() } else { text.to_owned() };
+    let hash: String = policy.hash.chars().take(HASH).collect();
+    let mut words = vec![or(&policy.name), format!("hash {}", or(&hash))];
+    words.extend(policy.dry_run.then(|| "dry run: nothing moved".to_owned()));
+    words.push(counted(policy.chunks, "chunk"));
+    words.extend((policy.late_chunks > 0).then(|| format!("{} late", policy.late_chunks)));
+    words.extend(policy.latency.map(|Lateness { p50, p99, max }| format!("latency {p50:.1}/{p99:.1}/{max:.1} ms")));
+    let (mut count, mut seconds) = (0_u64, 0.0);
+    for hold in &policy.holds {
+        count = count.saturating_add(hold.count);
+        seconds += hold.seconds;
+    }
+    words.push(if count > 0 { format!("{}, {seconds:.1} s", counted(count, "hold")) } else { "no holds".to_owned() });
+    let reasons = policy.holds.iter();
+    let reasons =
+        reasons.map(|hold| format!("{:.1} s in {}: {}", hold.seconds, counted(hold.count, "hold"), hold.reason));
+    (words, reasons.collect())
+}
+
+fn counted(count: u64, what: &str) -> String {
+    if count == 1 { format!("1 {what}") } else { format!("{count} {what}s") }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const S: u64 = 1_000_000_000;
+
+    fn gathered(events: &[(u64, &str, &str)]) -> Gathered {
+        let mut gathered = Gathered::default();
+        for (at, kind, json) in events {
+            assert!(Gathered::takes(kind));
+            gathered.event(at * S, kind, json);
+        }
+        gathered
+    }
+
+    #[test]
+    fn holds_last_until_the_policy_acts_holds_for_another_reason_or_ends() {
+        let gathered = gathered(&[
+            (0, "policy", r#"{"policy": "tactile-id", "hash": "0123456789abcdef", "dry_run": true}"#),
+            (1, "hold", r#"{"device": "", "reason": "waiting"}"#),
+            (2, "chunk", r#"{"latency_ms": 40.0, "skipped": 2}"#),
+            (2, "act", r#"{"tick": 20}"#),
+            (3, "chunk", r#"{"latency_ms": 30.5, "skipped": 0}"#),
+            (5, "hold", r#"{"device": "arm", "reason": "missing"}"#),
+            (8, "hold", r#"{"device": "", "reason": "waiting"}"#),
+            (9, "act", r#"{"tick": 90}"#),
+            (10, "hold", r#"{"device": "arm", "reason": "missing"}"#),
+        ]);
+        let said = gathered.report(12 * S, [None, None]).unwrap();
+        assert_eq!((said.name.as_str(), said.hash.as_str(), said.dry_run), ("tactile-id", "0123456789abcdef", true));
+        assert_eq!((said.chunks, said.late_chunks), (2, 1));
+        assert_eq!(said.latency, Some(Lateness { p50: 30.5, p99: 30.5, max: 40.0 }));
+        let hold = |reason: &str, count, seconds| HoldReport { reason: reason.to_owned(), count, seconds };
+        assert_eq!(said.holds, [hold("missing: arm", 2, 5.0), hold("waiting", 2, 2.0)]);
+        let (line, reasons) = words(&said);
+        assert_eq!(
+            line.join("  "),
+            "tactile-id  hash 0123456789ab  dry run: nothing moved  2 chunks  1 late  latency 30.5/30.5/40.0 ms  4 holds, 7.0 s"
+        );
+        assert_eq!(reasons, ["5.0 s in 2 holds: missing: arm", "2.0 s in 2 holds: waiting"]);
+    }
+
+    #[test]
+    fn what_no_event_says_the_metadata_say() {
+        let record = r#"{"name": "tactile-id", "hash": "ff", "dry_run": true}"#.to_owned();
+        let said = gathered(&[(1, "act", "{}")]).report(S, [None, Some(&record)]).unwrap();
+        assert_eq!((said.name.as_str(), said.hash.as_str(), said.dry_run), ("tactile-id", "ff", true));
+        assert_eq!((said.chunks, said.latency, said.holds.len()), (0, None, 0));
+        assert!(Gathered::default().report(S, [Some(&record), None]).is_some());
+        assert_eq!(Gathered::default().report(S, [Some(&"7".to_owned()), Some(&"x".to_owned())]), None);
+    }
+
+    #[test]
+    fn hostile_text_is_survived() {
+        let mut gathered = gathered(&[
+            (9, "hold", "[]"),
+            (3, "act", "{"),
+            (2, "act", "7"),
+            (1, "chunk", r#"{"latency_ms": -1e300, "skipped": -1}"#),
+            (1, "chunk", r#"{"latency_ms": 1e300, "skipped": "x"}"#),
+            (1, "policy", r#"{"policy": 7, "hash": []}"#),
+        ]);
+        for n in 0..100 {
+            gathered.event(0, "hold", &format!(r#"{{"reason": "{n}"}}"#));
+        }
+        let said = gathered.report(0, [None, None]).unwrap();
+        assert_eq!((said.chunks, said.holds.len()), (2, MAX_REASONS + 1));
+        assert_eq!(words(&said).0.first().map(String::as_str), Some("?"));
+    }
+}

@@ -1,0 +1,96 @@
+//! The simulated task from the command line: demonstrations, and trials of the trained policy.
+
+#![allow(clippy::expect_used, reason = "what fails here fails a test")]
+mod support;
+
+use serde_json::Value;
+use support::{Episode, Place, events};
+
+/// The folder of the policy of the repository.
+const BUNDLE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/models/tactile-id");
+
+fn said(place: &Place, arguments: &[&str]) -> Vec<Value> {
+    let output = place.run(&[&["--json"], arguments].concat());
+    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    events(&String::from_utf8_lossy(&output.stdout))
+}
+
+/// Payloads of a topic.
+fn payloads(episode: &Episode, topic: &str) -> Vec<Vec<u8>> {
+    episode.topic(topic).map(support::Message::payload).collect()
+}
+
+#[test]
+fn demonstrations_are_whole_episodes_and_the_same_seed_gives_the_same_one() {
+    let place = Place::new();
+    let record = |out: &str| {
+        let demonstrate = ["--sim", "task", "--expert", "--record", "--episodes", "2", "--seed", "1000", "--out", out];
+        said(&place, &demonstrate)
+    };
+    let (first, second) = (record("a"), record("b"));
+    let words = |said: &[Value], key: &str| said.iter().map(|one| one[key].clone()).collect::<Vec<_>>();
+    assert_eq!(words(&first, "verdict"), ["GOOD", "GOOD"]);
+    assert_eq!(words(&first, "seed"), words(&second, "seed"));
+    let mut textures = words(&first, "texture");
+    textures.sort_by_key(ToString::to_string);
+    assert_eq!(textures, ["hexagonal", "triangular"], "one of each");
+
+    let read = |folder: &str| {
+        let files = place.files(folder);
+        assert_eq!(files.len(), 2);
+        Episode::read(&place.path(folder).join(&files[0]))
+    };
+    let (a, b) = (read("a"), read("b"));
+    for topic in ["/rapid/camera/wrist", "/rapid/camera/tactile", "/rapid/serial/arm", "/action"] {
+        assert!(!payloads(&a, topic).is_empty() && payloads(&a, topic) == payloads(&b, topic), "{topic}");
+    }
+    // Every tick has its samples, captured at that very moment, and the action that was taken on them.
+    let frames = a.frames();
+    let actions: Vec<u64> = a.topic("/action").map(|action| action.log_time).collect();
+    assert_eq!(frames.iter().map(|(message, _)| message.log_time).collect::<Vec<_>>(), actions);
+    for (message, frame) in &frames {
+        assert_eq!(frame.mask, 0b111);
+        assert!(frame.modalities.iter().all(|one| one.valid && one.age_ns.unwrap_or(0) == 0), "{}", message.log_time);
+    }
+}
+
+#[test]
+fn trials_are_the_same_again_and_a_fixed_set_of_sensors_ends_those_in_which_one_is_pulled() {
+    let place = Place::new();
+    let trials = |more: &[&str]| {
+        let condition = ["--trials", "2", "--condition", "hot-unplug", "--condition", "hot-replug"];
+        said(&place, &[&["eval", BUNDLE], &condition[..], more].concat())
+    };
+    let dynamic = trials(&[]);
+    assert_eq!(dynamic, trials(&[]));
+    let rows: Vec<&Value> = dynamic.iter().filter(|row| row["event"] == "condition").collect();
+    assert_eq!(rows.len(), 2);
+    for row in rows {
+        assert_eq!((&row["trials"], &row["crash"]), (&2.into(), &0.into()));
+        let ends = ["success", "wrong_bin", "incomplete"].map(|end| row[end].as_u64().expect("a count"));
+        assert_eq!(ends.iter().sum::<u64>(), 2);
+    }
+    // The sensor was missed: the policy was asked anew, and acted at every tick but the first.
+    for trial in dynamic.iter().filter(|row| row["event"] == "trial") {
+        assert_eq!((&trial["counts"]["held_ticks"], &trial["failure"]), (&1.into(), &Value::Null), "{trial}");
+        assert!(trial["unplugged_at"].is_u64());
+    }
+    let fixed = trials(&["--static-config"]);
+    for row in fixed.iter().filter(|row| row["event"] == "condition") {
+        assert_eq!((&row["crash"], &row["status"]), (&2.into(), &"crash".into()));
+    }
+}
+
+#[test]
+fn the_expert_knows_the_task_alone_and_says_so() {
+    let place = Place::new();
+    let refused = |arguments: &[&str]| {
+        let output = place.run(arguments);
+        assert_eq!(output.status.code(), Some(2));
+        String::from_utf8_lossy(&output.stderr).into_owned()
+    };
+    assert!(refused(&["--sim", "--expert", "--record"]).contains("--sim task --expert --record"));
+    assert!(refused(&["--sim", "task", "--expert"]).contains("--record"));
+    assert!(refused(&["--sim", "task", "--expert", "--record", "--duration", "3s"]).contains("--duration"));
+    assert!(refused(&["eval", BUNDLE, "--condition", "sometimes"]).contains("hot-unplug"));
+}
