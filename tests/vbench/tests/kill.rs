@@ -33,7 +33,7 @@ for _ in 1 2 3 4 5 6 7 8; do
   wait_for 60 larger_than "$(stat -c %s "$partial")" "$partial" || fail 'the file does not grow'
 done
 sleep 0.3
-held_up=$(cat /proc/$rapid_pid/task/*/schedstat | awk '{ waited += $2 } END { print waited }')
+held_up=$(cat /proc/$rapid_pid/task/*/schedstat | awk '{ waited += $2 } END { printf "%.0f\n", waited }')
 date +%s%N >$out/killed
 kill -9 $rapid_pid
 wait $rapid_pid

@@ -35,8 +35,8 @@ const DENOISING_STEPS: &str = "2";
 const TOLERANCE: f64 = 1e-4;
 
 const SCRIPT: &str = r#"
-# used MASK: how many chunks were computed with this mask. await_used N MASK: until there are more than N.
-used() { grep -F '"event":"chunk"' $out/rapid.jsonl | grep -cF "\"mask\":\"$1\""; }
+# used MASK: how many chunks were computed with this mask and used. await_used N MASK: until there are more than N.
+used() { grep -F '"event":"chunk"' $out/rapid.jsonl | grep -F '"used":true' | grep -cF "\"mask\":\"$1\""; }
 more_than() { [ "$(used "$2")" -gt "$1" ]; }
 await_used() { wait_for 120 more_than "$1" "$2" || fail "$(used "$2") chunks with the mask $2"; }
 emu plug 0 1 2
@@ -86,7 +86,7 @@ fn a_policy_goes_on_without_the_tactile_camera_and_takes_it_back() {
     for (when, from, to) in [("before", 0, fell), ("while", fell, rose), ("after", rose, u64::MAX)] {
         let acted = ticks.iter().filter(|(_, time)| (from..to).contains(time)).count();
         println!("{acted} actions {when} the camera was away");
-        assert!(acted >= 4, "{acted} actions {when} the camera was away");
+        assert!(acted >= 2, "{acted} actions {when} the camera was away");
     }
 
     // What each chunk was computed from.
@@ -142,10 +142,11 @@ fn chunks(outcome: &Outcome) -> Vec<Chunk> {
                 .collect()
         };
         let mask = line["mask"].as_str().and_then(|mask| u64::from_str_radix(mask.strip_prefix("0x")?, 16).ok());
+        let latency_ms = line["latency_ms"].as_f64().expect("a latency");
         Chunk {
             tick: number("tick"),
             mask: mask.expect("a mask"),
-            taken: number("tick") + number("skipped") + 1,
+            taken: number("tick") + (latency_ms * 1e6 / TICK_NS as f64).ceil() as u64,
             tactile: seqs("tactile_tip"),
             others: seqs("cam_wrist").len() + seqs("arm").len(),
         }
