@@ -206,4 +206,8 @@ fn a_policy_that_is_none_or_not_for_this_rig_is_refused_by_name() {
     let (code, _, stderr) = infer(&place, BUNDLE, "", &["--ort-lib", "/nowhere/libonnxruntime.so", "--duration", "5s"]);
     assert_eq!(code, Some(1), "{stderr}");
     assert!(stderr.contains("/nowhere/libonnxruntime.so"), "{stderr}");
+    let text = place.write("libonnxruntime.so", "no library").display().to_string();
+    let (code, _, stderr) = infer(&place, BUNDLE, "", &["--ort-lib", &text, "--duration", "5s"]);
+    assert_eq!(code, Some(1), "{stderr}");
+    assert!(stderr.contains(&format!("{text} (--ort-lib): it cannot be loaded: ")), "{stderr}");
 }

@@ -221,17 +221,13 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_load_says_what_was_tried_and_what_to_do() {
-        let folder = tempfile::tempdir().unwrap();
-        let text = folder.path().join("libonnxruntime.so");
-        std::fs::write(&text, "no library").unwrap();
-        let missing = folder.path().join("missing.so");
-        for (path, why) in [(&text, "it cannot be loaded: "), (&missing, "there is no such file")] {
-            let origin = Origin::Option(path.clone());
-            let error = LibraryError { cause: load(&origin).unwrap_err(), origin }.to_string();
-            assert!(error.starts_with(&format!("onnxruntime: {} (--ort-lib): {why}", path.display())), "{error}");
-            assert!(error.contains("name a libonnxruntime.so of version 1.24 or later"), "{error}");
-        }
+    fn what_is_not_there_says_what_was_tried_and_what_to_do() {
+        let missing = tempfile::tempdir().unwrap().path().join("missing.so");
+        let origin = Origin::Option(missing.clone());
+        let error = LibraryError { cause: load(&origin).unwrap_err(), origin }.to_string();
+        let begin = format!("onnxruntime: {} (--ort-lib): there is no such file", missing.display());
+        assert!(error.starts_with(&begin), "{error}");
+        assert!(error.contains("name a libonnxruntime.so of version 1.24 or later"), "{error}");
     }
 
     #[test]
