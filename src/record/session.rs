@@ -5,7 +5,7 @@
 //! 1. The episode holds what was captured from `begin` on and happened before `end`: a modality's
 //!    latency is how long before its capture what a sample shows happened. `end` is fixed by the
 //!    duration asked for or by the moment of the stop. One mask more is written, captured before
-//!    `begin`: the one in force when the episode began.
+//!    `begin`: the one in force when the episode began, and those of before it that were still on their way.
 //! 2. Tick `k` of the observation grid is `begin + k / observation_hz`; ticks before `end` are
 //!    written.
 //! 3. A tick is evaluated once, of what was received by its deadline, `tick + sync_window +`
@@ -185,7 +185,9 @@ impl Session {
         if let (Some(hole), None) = (hole, &self.failed) {
             self.masks_dropped = self.masks_dropped.saturating_add(self.share(&hole, hole.dropped, Duration::ZERO));
         }
-        if !self.holds(Stamp(header.capture_ns), Duration::ZERO) || self.failed.is_some() {
+        // One of before the beginning that comes only now follows the one that the episode began with.
+        let captured = Stamp(header.capture_ns);
+        if !(captured < self.begin || self.holds(captured, Duration::ZERO)) || self.failed.is_some() {
             return;
         }
         self.failed = self.file.mask(header, mask, sequence).err();
