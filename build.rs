@@ -65,6 +65,9 @@ fn commit() {
 /// needs none.
 fn onnxruntime(out: &Path) -> Result<(), Box<dyn Error>> {
     println!("cargo::rerun-if-changed={PINNED}");
+    // They say where the cache is.
+    println!("cargo::rerun-if-env-changed=XDG_CACHE_HOME");
+    println!("cargo::rerun-if-env-changed=HOME");
     let arch = std::env::var("CARGO_CFG_TARGET_ARCH")?;
     let pinned = std::fs::read_to_string(PINNED)?;
     let entry = pinned.lines().find_map(|line| {

@@ -45,7 +45,7 @@ bit = 2
 channels = 4
 [device.arm.action]
 names = ["x", "y", "z", "grip"]
-units = ["dm", "dm", "dm", "1"]
+units = ["m", "m", "m", "1"]
 min = [-1.1, -1.0, 0.03, 0.0]
 max = [1.0, 1.0, 0.9, 1.0]
 "#;

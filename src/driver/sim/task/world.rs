@@ -3,8 +3,8 @@
 //! The block's texture says which bin it belongs to: triangular to the left, hexagonal to the front. Only
 //! the gel of the tactile fingertip shows the texture, and only while it is pressed on the block.
 //!
-//! Lengths are in units of roughly a decimetre: the table is 2 wide. Everything a world does follows
-//! from its seed and the actions it is given.
+//! Lengths are in metres, of a large table with a large block. Everything a world does follows from its
+//! seed and the actions it is given.
 //!
 //! Invariant: what is drawn of the looks moves nothing of the dynamics, and the reverse: each has a stream
 //! of its own.
