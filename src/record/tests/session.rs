@@ -39,6 +39,24 @@ fn scalars(seq: u64, capture_ms: u64, recv_ms: u64) -> SampleHeader {
     }
 }
 
+/// The mask of before the beginning that is on its way while the episode begins is no hole in the file.
+#[test]
+fn no_mask_is_missing_between_the_one_in_force_and_the_first_of_the_episode() {
+    let folder = tempfile::tempdir().unwrap();
+    let board = Arc::new(Board::new(&registry()));
+    let mut masks = MaskHistory::new();
+    masks.push(&scalars(5, 996, 996), PhysicalMask(0b10), 5);
+    let mut session = session(folder.path(), &board, &masks);
+    for (sequence, capture) in [(6, 998), (7, 1000), (8, 1002)] {
+        session.mask(&scalars(sequence, capture, capture), PhysicalMask(0b10), sequence, None);
+    }
+    session.end_at(Stamp(1002 * MS));
+    let report = session.finish(Stamp(1200 * MS), &masks, None);
+    assert_eq!(report.error, None);
+    let read = read(&report.file);
+    assert_eq!(read.on(crate::mask::MASK_TOPIC).map(|message| message.1).collect::<Vec<_>>(), [5, 6, 7, 8]);
+}
+
 #[test]
 fn what_comes_late_is_recorded_and_what_comes_too_late_belongs_to_no_frame() {
     let folder = tempfile::tempdir().unwrap();
