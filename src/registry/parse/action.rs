@@ -15,9 +15,10 @@ pub(super) fn action(section: &Section<'_>, problems: &mut Problems<'_>) -> Opti
             table.missing(problems, key, &format!("write {key} = a list with one entry an axis"));
         }
     }
-    let names = table.texts(problems, "names")?;
-    let units = table.texts(problems, "units")?;
-    let (min, max) = (table.numbers(problems, "min")?, table.numbers(problems, "max")?);
+    // All of them first: every mistake is told.
+    let (names, units) = (table.texts(problems, "names"), table.texts(problems, "units"));
+    let (min, max) = (table.numbers(problems, "min"), table.numbers(problems, "max"));
+    let (names, units, min, max) = (names?, units?, min?, max?);
     if names.is_empty() || names.len() > MAX_ACTION {
         let fix = format!("name 1 to {MAX_ACTION} axes");
         table.report(problems, "names", format!("{} axes", names.len()), fix);
