@@ -8,6 +8,7 @@
 //! Invariant: a target depends on its input alone, so that an input that broke it breaks it again.
 
 pub mod mutate;
+pub mod policy;
 pub mod rules;
 pub mod seeds;
 pub mod targets;
@@ -36,6 +37,8 @@ pub const TARGETS: &[Target] = &[
     Target { name: "layout", run: targets::layout, seeds: seeds::layouts },
     Target { name: "strings", run: targets::strings, seeds: seeds::strings },
     Target { name: "text", run: targets::text, seeds: seeds::strings },
+    Target { name: "bundle", run: policy::bundle, seeds: policy::bundles },
+    Target { name: "picture", run: policy::picture, seeds: policy::pictures },
 ];
 
 /// The target of this name.

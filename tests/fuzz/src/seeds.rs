@@ -224,7 +224,7 @@ pub fn strings() -> Vec<Vec<u8>> {
 }
 
 /// Files of the repository below `folder` that end so, in the order of their names.
-fn files(folder: &str, end: &str) -> Vec<Vec<u8>> {
+pub(crate) fn files(folder: &str, end: &str) -> Vec<Vec<u8>> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(folder);
     let entries = std::fs::read_dir(&folder).unwrap_or_else(|error| panic!("{}: {error}", folder.display()));
     let mut paths: Vec<_> = entries.flatten().map(|entry| entry.path()).collect();
