@@ -72,7 +72,9 @@ impl Node {
         let has_own = capability.capabilities & V4L2_CAP_DEVICE_CAPS != 0;
         let able = if has_own { capability.device_caps } else { capability.capabilities };
         if able & V4L2_CAP_VIDEO_CAPTURE == 0 || able & V4L2_CAP_STREAMING == 0 {
-            return Err(DriverError::Fatal(format!(
+            // It did when hot-plug told of it. Cameras that are plugged and pulled quickly are given each other's
+            // numbers: what has this path by now is another one, and the removal of the first is on its way.
+            return Err(DriverError::Retry(format!(
                 "{} does not capture pictures (a camera's second node carries metadata only): use its first node",
                 path.display()
             )));
