@@ -21,9 +21,9 @@ use proc_macro2::{Delimiter, TokenStream, TokenTree};
 /// Modules by layer, lowest first. A module sees those of lower layers.
 const LAYERS: &[&[&str]] = &[
     &["modality", "mask", "sample", "time", "action", "random", "provenance", "flash"],
-    &["registry", "status", "text", "outlet", "folder", "episode_format", "fault", "panics"],
+    &["registry", "status", "text", "outlet", "folder", "episode_format", "fault", "panics", "control"],
     &["hotplug", "driver", "bus", "sync", "calibration"],
-    &["rig", "record", "policy", "control"],
+    &["rig", "record", "policy"],
     &["app", "lockstep", "compare", "tui", "headless", "logging"],
     &["main", "dispatch", "cli", "commands"],
 ];
@@ -31,6 +31,7 @@ const LAYERS: &[&[&str]] = &[
 /// Imports within a layer. All nouns of layer 0 may speak of each other besides.
 const SIDEWAYS: &[(&str, &[&str])] = &[
     ("status", &["registry", "text"]),
+    ("control", &["registry"]),
     ("app", &["tui", "headless", "logging"]),
     // Without a screen the log is lines among the lines of the run.
     ("logging", &["headless"]),
@@ -54,7 +55,10 @@ const HOMES: &[(&str, &[&str])] = &[
     ("crossterm", &["tui"]),
     ("futures", &["hotplug", "driver", "bus", "rig", "record", "app", "tui", "headless", "commands"]),
     ("hdrhistogram", &["record/quality", "policy/live"]),
+    ("http_body_util", &["driver/lan"]),
     ("humantime", &["registry", "cli", "commands"]),
+    ("hyper", &["driver/lan"]),
+    ("hyper_util", &["driver/lan"]),
     ("iceoryx2", &["bus"]),
     ("iceoryx2_bb_elementary_traits", &["bus"]),
     ("iceoryx2_cal", &["bus"]),
@@ -62,6 +66,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("libc", &["registry", "hotplug", "driver", "rig", "app"]),
     ("lz4", &["episode_format"]),
     ("mcap", &["record"]),
+    ("mdns_sd", &["hotplug/lan"]),
     ("nokhwa", &["driver/camera"]),
     ("ort", &["policy/library", "policy/graphs"]),
     ("parking_lot", &["bus/shared"]),
@@ -72,6 +77,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("serde", &[ANYWHERE]),
     ("serde_json", &[ABOVE_NOUNS]),
     ("sha2", &["policy/bundle"]),
+    ("socketcan", &["driver/can"]),
     ("strsim", &["registry"]),
     ("thiserror", &[ANYWHERE]),
     ("tokio", &[ABOVE_NOUNS]),
@@ -79,6 +85,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("tokio_util", &[ABOVE_NOUNS]),
     ("thread_priority", &["rig/presence"]),
     ("toml", &["registry"]),
+    ("toml_edit", &["registry"]),
     ("tracing", &[ABOVE_NOUNS]),
     ("tracing_subscriber", &["logging"]),
     ("udev", &["hotplug/udev"]),
