@@ -5,7 +5,7 @@ use crate::modality::ModalityKind;
 /// See the module's comment.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CanSpec {
-    /// How the adapter is spoken to, default SocketCAN.
+    /// How the adapter is spoken to, default `SocketCAN`.
     pub adapter: CanAdapter,
     /// Bits a second on the bus, `10_000..=1_000_000`, default 1,000,000.
     pub bitrate: u32,
