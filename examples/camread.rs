@@ -84,6 +84,7 @@ fn device(arguments: &[String]) -> Result<DeviceSpec, Box<dyn std::error::Error>
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
         action: None,
+        hooks: rapid::registry::Hooks::default(),
         verdict: rapid::registry::VerdictSpec::of(
             rapid::modality::ModalityKind::Image,
             Duration::from_millis(500),

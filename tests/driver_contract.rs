@@ -72,6 +72,7 @@ fn spec(node: NodeSpec) -> DeviceSpec {
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
         action: None,
+        hooks: rapid::registry::Hooks::default(),
         verdict: rapid::registry::VerdictSpec::of(
             rapid::modality::ModalityKind::Image,
             Duration::from_millis(500),

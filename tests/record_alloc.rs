@@ -158,6 +158,7 @@ async fn only_chunks_allocate() {
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
         action: None,
+        hooks: rapid::registry::Hooks::default(),
         verdict: rapid::registry::VerdictSpec::of(
             rapid::modality::ModalityKind::Image,
             Duration::from_millis(500),
