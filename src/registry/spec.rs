@@ -5,12 +5,15 @@
 //! ascending order of bit.
 
 mod can;
+mod hooks;
 mod lan;
 
 use std::path::PathBuf;
 use std::time::Duration;
 
 use serde::Serialize;
+
+pub use hooks::{Hook, Hooks};
 
 use super::limits::VerdictSpec;
 use crate::modality::{Modality, ModalityId, ModalityKind};
@@ -95,6 +98,8 @@ pub struct DeviceSpec {
     pub verdict: VerdictSpec,
     /// The device is an actuator, and takes these actions.
     pub action: Option<ActionSpec>,
+    /// What is run when something happens to it.
+    pub hooks: Hooks,
 }
 
 /// `[device.NAME.action]`: what an actuator may be told. All lists have one entry an axis, `1..=64` of
