@@ -4,6 +4,8 @@
 //! unique; no two entries of one kind of node mean the same unit; `Registry::devices` is in
 //! ascending order of bit.
 
+mod motors;
+
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -12,6 +14,8 @@ use serde::Serialize;
 use super::limits::VerdictSpec;
 use crate::modality::{Modality, ModalityId, ModalityKind};
 use crate::sample::SampleHeader;
+
+pub use motors::{DamiaoSpec, MotorKind, MotorMode, MotorSpec};
 
 /// Samples that the pool of a topic holds beyond its depth: what 8 subscribers hold back, 4 each, the
 /// one being written, and one that is on its way out. The bus reserves them.

@@ -1,0 +1,10 @@
+//! Actuation: from an action to the frames that move motors.
+//!
+//! Owns what may be asked of a motor and when: codecs, limits, interpolation, the deadman and the state
+//! machine of a bus of motors.
+//!
+//! Invariant: pure. Time comes in as an argument, frames go in and out as values; there is no I/O, and
+//! after construction nothing here allocates.
+//! Invariant: bytes from a bus, and numbers from whoever sends actions, never make it panic.
+
+pub mod can;
