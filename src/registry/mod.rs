@@ -26,7 +26,7 @@ pub use identity::{Assigner, Assignment, Detached, Explanation};
 pub use limits::{Limits, VerdictSpec};
 pub use parse::{BUILTIN, Loaded};
 pub use spec::{
-    ActionSpec, CameraSpec, DamiaoSpec, DeviceSpec, Framing, IdentitySpec, MAX_BORROWED, MAX_SUBSCRIBERS, MotorKind,
-    MotorMode, MotorSpec, Mount, NodeSpec, Opens, POOL_SPARE, Parse, PixelFormat, ProcessSpec, Registry, RigSpec,
-    SerialSpec, WhenStale,
+    ActionSpec, CameraSpec, CanAdapter, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, Framing, IdentitySpec,
+    MAX_BORROWED, MAX_SUBSCRIBERS, MotorKind, MotorMode, MotorSpec, Mount, NodeSpec, Opens, POOL_SPARE, Parse,
+    PixelFormat, ProcessSpec, Registry, RigSpec, SerialSpec, WhenStale,
 };

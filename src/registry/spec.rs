@@ -4,6 +4,7 @@
 //! unique; no two entries of one kind of node mean the same unit; `Registry::devices` is in
 //! ascending order of bit.
 
+mod can;
 mod motors;
 
 use std::path::PathBuf;
@@ -15,6 +16,7 @@ use super::limits::VerdictSpec;
 use crate::modality::{Modality, ModalityId, ModalityKind};
 use crate::sample::SampleHeader;
 
+pub use can::{CanAdapter, CanProtocol, CanSpec};
 pub use motors::{DamiaoSpec, MotorKind, MotorMode, MotorSpec};
 
 /// Samples that the pool of a topic holds beyond its depth: what 8 subscribers hold back, 4 each, the
