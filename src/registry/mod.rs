@@ -19,7 +19,7 @@ pub mod trust;
 pub mod units;
 mod words;
 
-pub use attachment::{Attachment, DeviceNode, UsbIdentity};
+pub use attachment::{Attachment, DeviceNode, LanIdentity, Unit, UsbIdentity};
 pub(crate) use diagnostic::did_you_mean;
 pub use diagnostic::{Diagnostic, RegistryErrors};
 pub use identity::{Assigner, Assignment, Detached, Explanation};
@@ -27,6 +27,6 @@ pub use limits::{Limits, VerdictSpec};
 pub use parse::{BUILTIN, Loaded};
 pub use spec::{
     ActionSpec, CameraSpec, CanAdapter, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, Framing, IdentitySpec,
-    MAX_BORROWED, MAX_SUBSCRIBERS, MotorKind, MotorMode, MotorSpec, Mount, NodeSpec, Opens, POOL_SPARE, Parse,
-    PixelFormat, ProcessSpec, Registry, RigSpec, SerialSpec, WhenStale,
+    LanProtocol, LanSpec, MAX_BORROWED, MAX_SUBSCRIBERS, MOTOR_CHANNELS, MotorKind, MotorMode, MotorSpec, Mount,
+    NodeSpec, Opens, POOL_SPARE, Parse, PixelFormat, ProcessSpec, Registry, RigSpec, SerialSpec, UsbSpec, WhenStale,
 };

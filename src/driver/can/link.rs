@@ -19,6 +19,7 @@ use super::line::Line;
 use super::socket::Socket;
 use crate::control::can::CanFrame;
 use crate::driver::DriverError;
+use crate::registry::{CanAdapter, CanSpec, DeviceNode};
 use crate::time::Stamp;
 
 /// An interface that goes down tells it by an error without anything to read.
@@ -89,6 +90,22 @@ pub enum Link {
 }
 
 impl Link {
+    /// Opens the adapter of an entry at its node. May block: keep it off the runtime.
+    ///
+    /// # Errors
+    /// When the node is gone, no adapter of this kind, or cannot be opened.
+    pub fn open(spec: &CanSpec, node: &DeviceNode) -> Result<Self, LinkError> {
+        match (spec.adapter, node) {
+            (CanAdapter::SocketCan, DeviceNode::Net(name)) => Self::open_socket(name, spec.bitrate),
+            (CanAdapter::Slcan, DeviceNode::Tty(path)) => Self::open_slcan(path, spec.bitrate),
+            (CanAdapter::Damiao, DeviceNode::Tty(path)) => Self::open_damiao(path),
+            (adapter, node) => {
+                let text = format!("{} is no CAN adapter of kind \"{adapter}\": correct `adapter`", node.label());
+                Err(LinkError::Fatal(text))
+            }
+        }
+    }
+
     /// Opens the network interface `name` and brings it up with `bitrate`. May block: keep it off the
     /// runtime.
     ///

@@ -1,34 +1,68 @@
-//! CAN buses, as `[device.NAME.can]` tells of them.
+//! `[device.NAME.can]`: a CAN adapter and what is behind it.
 
 use super::motors::DamiaoSpec;
+use crate::modality::ModalityKind;
 
-/// `[device.NAME.can]`.
+/// Numbers in a sample of one motor: position rad, velocity rad/s, torque Nm, temperatures of its
+/// transistors and of its winding °C, and its error code.
+pub const MOTOR_CHANNELS: usize = 6;
+
+/// See the module's comment.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CanSpec {
-    /// How frames go to and from the adapter, default [`CanAdapter::SocketCan`].
+    /// How the adapter is spoken to, default `SocketCAN`.
     pub adapter: CanAdapter,
     /// Bits a second on the bus, `10_000..=1_000_000`, default 1,000,000.
     pub bitrate: u32,
-    /// What the frames mean, default [`CanProtocol::Raw`].
+    /// What is on the bus, default [`CanProtocol::Raw`].
     pub protocol: CanProtocol,
 }
 
-/// How a CAN adapter is talked to.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+/// How a CAN adapter is spoken to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum CanAdapter {
-    /// It is a network interface: gs_usb, PEAK, Kvaser and whatever else the kernel has a driver of.
+    /// The kernel has a driver for it, which makes it a network interface.
     SocketCan,
-    /// It is a serial line that carries frames as text (Lawicel).
+    /// A serial line that speaks slcan (Lawicel's protocol).
     Slcan,
-    /// It is a serial line that carries frames as Damiao's USB2CAN adapter does.
+    /// A serial line with the framing of Damiao's adapter.
     Damiao,
 }
 
-/// What is spoken on a bus.
+/// What is on the bus.
 #[derive(Debug, Clone, PartialEq)]
 pub enum CanProtocol {
-    /// Frames are recorded as they are, and none is sent.
+    /// Frames, not looked into. None is sent.
     Raw,
-    /// Motors.
+    /// Damiao's motors.
     Damiao(DamiaoSpec),
+}
+
+impl CanSpec {
+    /// What its samples hold.
+    #[must_use]
+    pub const fn modality_kind(&self) -> ModalityKind {
+        match self.protocol {
+            CanProtocol::Raw => ModalityKind::Bytes,
+            CanProtocol::Damiao(_) => ModalityKind::Scalars,
+        }
+    }
+
+    /// Scalars: how many. Bytes: empty.
+    #[must_use]
+    pub fn shape(&self) -> Vec<u32> {
+        match self.channels() {
+            0 => Vec::new(),
+            channels => vec![u32::try_from(channels).unwrap_or(u32::MAX)],
+        }
+    }
+
+    /// Numbers in a sample; 0 if it holds bytes.
+    #[must_use]
+    pub fn channels(&self) -> usize {
+        match &self.protocol {
+            CanProtocol::Raw => 0,
+            CanProtocol::Damiao(damiao) => MOTOR_CHANNELS * damiao.motors.len(),
+        }
+    }
 }
