@@ -8,3 +8,4 @@
 //! Invariant: bytes from a bus, and numbers from whoever sends actions, never make it panic.
 
 pub mod can;
+pub mod damiao;
