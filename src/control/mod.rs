@@ -1,7 +1,7 @@
 //! Actuation: from an action to the frames that move motors.
 //!
 //! Owns what may be asked of a motor and when: codecs, limits, interpolation, the deadman and the state
-//! machine of a bus of motors.
+//! machine of a bus of motors ([`motors::MotorBus`]), which puts them together.
 //!
 //! Invariant: pure. Time comes in as an argument, frames go in and out as values; there is no I/O, and
 //! after construction nothing here allocates.
@@ -9,3 +9,7 @@
 
 pub mod can;
 pub mod damiao;
+pub mod deadman;
+pub mod interpolate;
+pub mod limits;
+pub mod motors;

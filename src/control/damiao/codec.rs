@@ -282,8 +282,9 @@ impl Feedback {
     }
 }
 
-/// The data of a frame as motors send it.
-pub(super) fn data_of(frame: &CanFrame) -> Option<[u8; 8]> {
+/// The data of a frame as motors send and take it: eight bytes, under an 11-bit identifier.
+#[must_use]
+pub fn data_of(frame: &CanFrame) -> Option<[u8; 8]> {
     (!frame.extended && !frame.remote && !frame.error && frame.len == 8).then_some(frame.data)
 }
 
@@ -312,9 +313,7 @@ fn single(value: f64) -> Result<[u8; 4], NotFinite> {
 }
 
 fn join(first: [u8; 4], second: [u8; 4]) -> [u8; 8] {
-    let [a, b, c, d] = first;
-    let [e, f, g, h] = second;
-    [a, b, c, d, e, f, g, h]
+    (u64::from(u32::from_le_bytes(first)) | u64::from(u32::from_le_bytes(second)) << 32).to_le_bytes()
 }
 
 #[cfg(test)]

@@ -193,8 +193,9 @@ impl Reply {
     pub fn decode(frame: &CanFrame) -> Option<Self> {
         let [low, high, verb @ (READ | WRITE), rid, value @ ..] = codec::data_of(frame)? else { return None };
         let parameter = Parameter::from_rid(rid)?;
-        Some(Self {
-            slave: u16::from_le_bytes([low, high]),
+        let slave = u16::from_le_bytes([low, high]);
+        (slave <= BROADCAST).then_some(Self {
+            slave,
             written: verb == WRITE,
             parameter,
             value: if parameter.is_float() {
