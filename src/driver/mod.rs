@@ -8,6 +8,7 @@
 //! Invariant: no bytes from a device make a driver panic.
 
 pub mod camera;
+pub mod can;
 pub mod process;
 pub mod replay;
 pub mod serial;

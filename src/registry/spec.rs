@@ -7,6 +7,7 @@
 mod can;
 mod hooks;
 mod lan;
+mod motors;
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -19,8 +20,9 @@ use super::limits::VerdictSpec;
 use crate::modality::{Modality, ModalityId, ModalityKind};
 use crate::sample::SampleHeader;
 
-pub use can::{CanAdapter, CanProtocol, CanSpec};
+pub use can::{CanAdapter, CanProtocol, CanSpec, MOTOR_CHANNELS};
 pub use lan::{LanProtocol, LanSpec};
+pub use motors::{DamiaoSpec, MotorKind, MotorMode, MotorSpec};
 
 /// Samples that the pool of a topic holds beyond its depth: what 8 subscribers hold back, 4 each, the
 /// one being written, and one that is on its way out. The bus reserves them.
