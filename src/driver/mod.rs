@@ -16,9 +16,10 @@ pub mod sim;
 
 use std::sync::Arc;
 
+use crate::action::{ActuatorNotice, Order};
 use crate::provenance::Negotiated;
 use crate::registry::scenario::{SimDevice, SimSource};
-use crate::registry::{DeviceNode, DeviceSpec, NodeSpec};
+use crate::registry::{CanProtocol, DeviceNode, DeviceSpec, NodeSpec};
 use crate::sample::Encoding;
 use crate::status::Episode;
 use crate::time::Stamp;
@@ -63,6 +64,8 @@ pub enum Driver {
     Camera(Box<camera::Camera>),
     /// A serial line.
     Serial(Box<serial::Serial>),
+    /// Motors behind a CAN adapter.
+    Motors(Box<can::motors::Motors>),
     /// A device that exists only in a scenario.
     Sim(Box<sim::Sim>),
     /// One topic of a recorded episode.
@@ -82,6 +85,12 @@ impl Driver {
             (NodeSpec::Serial(serial), DeviceNode::Tty(path)) => {
                 Ok(Self::Serial(Box::new(serial::Serial::open(serial, path, spec.max_bytes).await?)))
             }
+            (NodeSpec::Can(can), DeviceNode::Net(_) | DeviceNode::Tty(_)) => match &can.protocol {
+                CanProtocol::Damiao(motors) => {
+                    Ok(Self::Motors(Box::new(can::motors::Motors::open(can, motors, node).await?)))
+                }
+                CanProtocol::Raw => Err(DriverError::Fatal("frames are not read by this version".to_owned())),
+            },
             (_, DeviceNode::Sim(device)) => Self::open_sim(spec, device).await,
             (NodeSpec::Camera(_), node) => Err(wrong_kind(spec, "camera", node)),
             (NodeSpec::Serial(_), node) => Err(wrong_kind(spec, "serial line", node)),
@@ -109,21 +118,43 @@ impl Driver {
         match self {
             Self::Camera(driver) => driver.read().await,
             Self::Serial(driver) => driver.read().await,
+            Self::Motors(driver) => driver.read().await,
             Self::Sim(driver) => driver.read().await,
             Self::Replay(driver) => driver.read().await,
         }
     }
 
-    /// Tells an actuator where to go: a target an axis, in the order and the units of its table of actions.
+    /// Tells an actuator where to go: a target an axis, in the order and the units of its table of actions, as of
+    /// `tick` of the control grid.
     ///
     /// # Errors
     /// When the device takes no actions, or others.
-    pub fn command(&mut self, target: &[f64]) -> Result<(), DriverError> {
+    pub fn command(&mut self, target: &[f64], tick: Stamp) -> Result<(), DriverError> {
         match self {
+            Self::Motors(driver) => driver.command(target, tick),
             Self::Sim(driver) => driver.command(target),
             Self::Camera(_) | Self::Serial(_) | Self::Replay(_) => {
-                Err(DriverError::Fatal("this version commands simulated actuators alone".to_owned()))
+                Err(DriverError::Fatal("of real devices, motors behind a CAN adapter alone take actions".to_owned()))
             }
+        }
+    }
+
+    /// Lets an actuator move, or stops it. One that needs no leave takes it for said.
+    ///
+    /// # Errors
+    /// When it does not take orders now.
+    pub fn order(&mut self, order: Order) -> Result<(), DriverError> {
+        match self {
+            Self::Motors(driver) => driver.order(order),
+            Self::Camera(_) | Self::Serial(_) | Self::Sim(_) | Self::Replay(_) => Ok(()),
+        }
+    }
+
+    /// What an actuator has to tell, oldest first.
+    pub fn take_notice(&mut self) -> Option<ActuatorNotice> {
+        match self {
+            Self::Motors(driver) => driver.take_notice(),
+            Self::Camera(_) | Self::Serial(_) | Self::Sim(_) | Self::Replay(_) => None,
         }
     }
 
@@ -136,15 +167,15 @@ impl Driver {
     pub fn record(&mut self, episode: Option<&Arc<Episode>>) -> Result<(), DriverError> {
         let _ = episode;
         match self {
-            Self::Camera(_) | Self::Serial(_) | Self::Sim(_) | Self::Replay(_) => Ok(()),
+            Self::Camera(_) | Self::Serial(_) | Self::Motors(_) | Self::Sim(_) | Self::Replay(_) => Ok(()),
         }
     }
 
     /// Ends in order what the device does by itself: the run ends, or the device was unplugged. Is given
     /// up after a moment. A driver that is only dropped has been read to its end, or was given up.
-    #[expect(clippy::unused_async, reason = "devices on a network take time to be told")]
     pub async fn close(self) {
         match self {
+            Self::Motors(driver) => driver.close().await,
             Self::Camera(_) | Self::Serial(_) | Self::Sim(_) | Self::Replay(_) => {}
         }
     }
@@ -155,6 +186,7 @@ impl Driver {
         match self {
             Self::Camera(driver) => driver.description().to_owned(),
             Self::Serial(driver) => driver.description().to_owned(),
+            Self::Motors(driver) => driver.description().to_owned(),
             Self::Sim(driver) => driver.description(),
             Self::Replay(driver) => driver.description().to_owned(),
         }
@@ -167,6 +199,7 @@ impl Driver {
         match self {
             Self::Camera(driver) => driver.negotiated(),
             Self::Serial(driver) => driver.negotiated(),
+            Self::Motors(driver) => driver.negotiated(),
             Self::Sim(driver) => driver.negotiated(),
             Self::Replay(driver) => driver.negotiated(),
         }

@@ -27,7 +27,7 @@ pub use limits::{Limits, VerdictSpec};
 pub use parse::{BUILTIN, Loaded};
 pub use spec::{
     ActionSpec, CameraSpec, CanAdapter, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, Framing, Hook, Hooks,
-    IdentitySpec, LanProtocol, LanSpec, MAX_BORROWED, MAX_SUBSCRIBERS, MOTOR_CHANNELS, MotorKind, MotorMode, MotorSpec,
-    Mount, NodeSpec, Opens, POOL_SPARE, Parse, PixelFormat, ProcessSpec, Registry, RigSpec, SerialSpec, UsbSpec,
-    WhenStale,
+    IdentitySpec, LanProtocol, LanSpec, MAX_BORROWED, MAX_MOTORS, MAX_SUBSCRIBERS, MOTOR_CHANNELS, MotorKind,
+    MotorMode, MotorSpec, Mount, NodeSpec, Opens, POOL_SPARE, Parse, PixelFormat, ProcessSpec, Registry, RigSpec,
+    SerialSpec, UsbSpec, WhenStale,
 };

@@ -22,7 +22,7 @@ use crate::sample::SampleHeader;
 
 pub use can::{CanAdapter, CanProtocol, CanSpec, MOTOR_CHANNELS};
 pub use lan::{LanProtocol, LanSpec};
-pub use motors::{DamiaoSpec, MotorKind, MotorMode, MotorSpec};
+pub use motors::{DamiaoSpec, MAX_MOTORS, MotorKind, MotorMode, MotorSpec};
 
 /// Samples that the pool of a topic holds beyond its depth: what 8 subscribers hold back, 4 each, the
 /// one being written, and one that is on its way out. The bus reserves them.

@@ -7,6 +7,7 @@
 pub mod damiao_serial;
 mod line;
 pub mod link;
+pub mod motors;
 pub mod netlink;
 pub mod slcan;
 mod socket;
