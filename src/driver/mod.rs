@@ -18,7 +18,7 @@ use std::sync::Arc;
 
 use crate::provenance::Negotiated;
 use crate::registry::scenario::{SimDevice, SimSource};
-use crate::registry::{DeviceNode, DeviceSpec, NodeSpec};
+use crate::registry::{CanProtocol, DeviceNode, DeviceSpec, NodeSpec};
 use crate::sample::Encoding;
 use crate::time::Stamp;
 
@@ -62,6 +62,8 @@ pub enum Driver {
     Camera(Box<camera::Camera>),
     /// A serial line.
     Serial(Box<serial::Serial>),
+    /// The frames of a CAN bus.
+    Can(Box<can::raw::Raw>),
     /// A device that exists only in a scenario.
     Sim(Box<sim::Sim>),
     /// One topic of a recorded episode.
@@ -84,6 +86,10 @@ impl Driver {
             (_, DeviceNode::Sim(device)) => Self::open_sim(spec, device).await,
             (NodeSpec::Camera(_), node) => Err(wrong_kind(spec, "camera", node)),
             (NodeSpec::Serial(_), node) => Err(wrong_kind(spec, "serial line", node)),
+            (NodeSpec::Can(can), DeviceNode::Net(_) | DeviceNode::Tty(_)) => match can.protocol {
+                CanProtocol::Raw => Ok(Self::Can(Box::new(can::raw::Raw::open(can, node).await?))),
+                CanProtocol::Damiao(_) => Err(DriverError::Fatal("this version drives no motors".to_owned())),
+            },
             (NodeSpec::Can(_), node) => Err(wrong_kind(spec, "CAN adapter", node)),
             (NodeSpec::Lan(_), node) => Err(wrong_kind(spec, "network device", node)),
             // The rig supervises programs itself: `process` only starts and ends them.
@@ -108,6 +114,7 @@ impl Driver {
         match self {
             Self::Camera(driver) => driver.read().await,
             Self::Serial(driver) => driver.read().await,
+            Self::Can(driver) => driver.read().await,
             Self::Sim(driver) => driver.read().await,
             Self::Replay(driver) => driver.read().await,
         }
@@ -120,7 +127,7 @@ impl Driver {
     pub fn command(&mut self, target: &[f64]) -> Result<(), DriverError> {
         match self {
             Self::Sim(driver) => driver.command(target),
-            Self::Camera(_) | Self::Serial(_) | Self::Replay(_) => {
+            Self::Camera(_) | Self::Serial(_) | Self::Can(_) | Self::Replay(_) => {
                 Err(DriverError::Fatal("this version commands simulated actuators alone".to_owned()))
             }
         }
@@ -132,6 +139,7 @@ impl Driver {
         match self {
             Self::Camera(driver) => driver.description().to_owned(),
             Self::Serial(driver) => driver.description().to_owned(),
+            Self::Can(driver) => driver.description().to_owned(),
             Self::Sim(driver) => driver.description(),
             Self::Replay(driver) => driver.description().to_owned(),
         }
@@ -144,6 +152,7 @@ impl Driver {
         match self {
             Self::Camera(driver) => driver.negotiated(),
             Self::Serial(driver) => driver.negotiated(),
+            Self::Can(driver) => driver.negotiated(),
             Self::Sim(driver) => driver.negotiated(),
             Self::Replay(driver) => driver.negotiated(),
         }

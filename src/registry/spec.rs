@@ -17,7 +17,7 @@ use super::limits::VerdictSpec;
 use crate::modality::{Modality, ModalityId, ModalityKind};
 use crate::sample::SampleHeader;
 
-pub use can::{CanAdapter, CanProtocol, CanSpec, MOTOR_CHANNELS};
+pub use can::{CAN_BATCH, CAN_RECORD, CanAdapter, CanProtocol, CanSpec, MOTOR_CHANNELS, SLCAN_BITRATES};
 pub use lan::{LanProtocol, LanSpec};
 pub use motors::{DamiaoSpec, MotorKind, MotorMode, MotorSpec};
 
