@@ -5,6 +5,7 @@
 //! ascending order of bit.
 
 mod can;
+mod hooks;
 mod lan;
 mod motors;
 
@@ -13,11 +14,15 @@ use std::time::Duration;
 
 use serde::Serialize;
 
+pub use hooks::{Hook, Hooks};
+
 use super::limits::VerdictSpec;
 use crate::modality::{Modality, ModalityId, ModalityKind};
 use crate::sample::SampleHeader;
 
-pub use can::{CAN_BATCH, CAN_RECORD, CanAdapter, CanProtocol, CanSpec, MOTOR_CHANNELS, SLCAN_BITRATES};
+pub use can::{
+    CAN_BATCH, CAN_RECORD, CAN_RESTART_MS, CanAdapter, CanProtocol, CanSpec, MOTOR_CHANNELS, SLCAN_BITRATES,
+};
 pub use lan::{LanProtocol, LanSpec};
 pub use motors::{DamiaoSpec, MotorKind, MotorMode, MotorSpec};
 
@@ -97,6 +102,8 @@ pub struct DeviceSpec {
     pub verdict: VerdictSpec,
     /// The device is an actuator, and takes these actions.
     pub action: Option<ActionSpec>,
+    /// What is run when something happens to it.
+    pub hooks: Hooks,
 }
 
 /// `[device.NAME.action]`: what an actuator may be told. All lists have one entry an axis, `1..=64` of

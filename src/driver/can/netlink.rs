@@ -9,9 +9,7 @@ use socketcan::CanInterface;
 use socketcan::nl::{CanState, InterfaceDetails};
 
 use super::link::LinkError;
-
-/// A controller that left the bus returns after this many ms.
-pub const RESTART_MS: u32 = 100;
+use crate::registry::CAN_RESTART_MS;
 
 /// A CAN interface as it is.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -80,7 +78,7 @@ pub(super) fn bring_up(name: &str, bitrate: u32) -> Result<Ready, LinkError> {
     }
     interface.set_bitrate(bitrate, None).map_err(|error| not_set(name, bitrate, &state, &error))?;
     // Not every driver can.
-    let restart = interface.set_restart_ms(RESTART_MS);
+    let restart = interface.set_restart_ms(CAN_RESTART_MS);
     if let Err(error) = &restart {
         tracing::info!(interface = name, %error, "the interface does not return from bus-off by itself");
     }
@@ -121,7 +119,7 @@ fn read(details: &InterfaceDetails) -> Interface {
 /// The commands that do by hand what was not permitted.
 fn by_hand(name: &str, bitrate: u32, up: bool) -> String {
     let down = if up { format!("sudo ip link set {name} down && ") } else { String::new() };
-    format!("{down}sudo ip link set {name} up type can bitrate {bitrate} restart-ms {RESTART_MS}")
+    format!("{down}sudo ip link set {name} up type can bitrate {bitrate} restart-ms {CAN_RESTART_MS}")
 }
 
 fn not_set(name: &str, bitrate: u32, state: &Interface, error: &socketcan::Error) -> LinkError {

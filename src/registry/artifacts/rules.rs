@@ -13,10 +13,8 @@
 use std::fmt::Write as _;
 
 use super::HEADER;
-use crate::registry::spec::{CanAdapter, DeviceSpec, NodeSpec, Opens, Registry, UsbSpec};
+use crate::registry::spec::{CAN_RESTART_MS, CanAdapter, DeviceSpec, NodeSpec, Opens, Registry, UsbSpec};
 
-/// A controller that left the bus after too many errors returns after this many ms.
-const RESTART_MS: u32 = 100;
 /// What linux/if_arp.h calls a CAN interface (`ARPHRD_CAN`).
 const ARPHRD_CAN: u32 = 280;
 
@@ -103,7 +101,7 @@ fn bring_up(usb: &UsbSpec, identity: &str, bitrate: u32) -> String {
     format!(
         "ACTION==\"add\", SUBSYSTEM==\"net\", ATTR{{type}}==\"{ARPHRD_CAN}\", ATTRS{{idVendor}}==\"{:04x}\", \
          ATTRS{{idProduct}}==\"{:04x}\"{identity}, RUN+=\"/usr/sbin/ip link set dev $name up type can bitrate {bitrate} \
-         restart-ms {RESTART_MS}\"",
+         restart-ms {CAN_RESTART_MS}\"",
         usb.vid, usb.pid,
     )
 }

@@ -19,8 +19,8 @@ use rapid::registry::artifacts::{ArtifactKind, artifacts};
 use rapid::registry::scenario::Scenario;
 use rapid::registry::units::{parse_duration, parse_size, show_duration, show_size};
 use rapid::registry::{
-    Assigner, Assignment, Attachment, DeviceNode, DeviceSpec, Framing, NodeSpec, Opens, Parse, ProcessSpec, Registry,
-    RegistryErrors, SerialSpec, Unit, UsbIdentity,
+    Assigner, Assignment, Attachment, CanAdapter, DeviceNode, DeviceSpec, Framing, NodeSpec, Opens, Parse, ProcessSpec,
+    Registry, RegistryErrors, SerialSpec, Unit, UsbIdentity,
 };
 use rapid::text as shown;
 use yaml_rust2::{Yaml, YamlLoader};
@@ -357,6 +357,12 @@ fn check_artifacts(registry: &Registry) {
             kind: ModalityKind::Bytes,
             shape: Vec::new(),
         });
+    }
+    let bus = |device: &DeviceSpec| {
+        matches!(&device.node, NodeSpec::Can(can) if can.adapter == CanAdapter::SocketCan).then(|| device.node.clone())
+    };
+    if let (Some(bus), Some(last)) = (registry.devices.iter().find_map(bus), harmless.devices.last_mut()) {
+        last.node = bus;
     }
     let expected = unit_without_names(&text_of_unit(&harmless).replace(&harmless.rig.name, ""));
     for artifact in artifacts(registry) {
