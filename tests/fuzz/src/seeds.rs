@@ -44,7 +44,7 @@ pub fn units() -> Vec<Vec<u8>> {
     all.map(|text| text.as_bytes().to_vec()).to_vec()
 }
 
-/// Streams of each framing and content.
+/// Lines of CAN adapters that speak slcan.
 #[must_use]
 pub fn slcan() -> Vec<Vec<u8>> {
     vec![
@@ -65,7 +65,7 @@ pub fn damiao_serial() -> Vec<Vec<u8>> {
     [all, odd, cut].into_iter().map(|bytes| [vec![4], bytes].concat()).collect()
 }
 
-/// Serial lines.
+/// Streams of each framing and content.
 #[must_use]
 pub fn serial() -> Vec<Vec<u8>> {
     let stream =
