@@ -66,6 +66,8 @@ pub enum Driver {
     Serial(Box<serial::Serial>),
     /// Motors behind a CAN adapter.
     Motors(Box<can::motors::Motors>),
+    /// The frames of a CAN bus.
+    Can(Box<can::raw::Raw>),
     /// A device that exists only in a scenario.
     Sim(Box<sim::Sim>),
     /// One topic of a recorded episode.
@@ -89,7 +91,7 @@ impl Driver {
                 CanProtocol::Damiao(motors) => {
                     Ok(Self::Motors(Box::new(can::motors::Motors::open(can, motors, node).await?)))
                 }
-                CanProtocol::Raw => Err(DriverError::Fatal("frames are not read by this version".to_owned())),
+                CanProtocol::Raw => Ok(Self::Can(Box::new(can::raw::Raw::open(can, node).await?))),
             },
             (_, DeviceNode::Sim(device)) => Self::open_sim(spec, device).await,
             (NodeSpec::Camera(_), node) => Err(wrong_kind(spec, "camera", node)),
@@ -119,6 +121,7 @@ impl Driver {
             Self::Camera(driver) => driver.read().await,
             Self::Serial(driver) => driver.read().await,
             Self::Motors(driver) => driver.read().await,
+            Self::Can(driver) => driver.read().await,
             Self::Sim(driver) => driver.read().await,
             Self::Replay(driver) => driver.read().await,
         }
@@ -133,9 +136,7 @@ impl Driver {
         match self {
             Self::Motors(driver) => driver.command(target, tick),
             Self::Sim(driver) => driver.command(target),
-            Self::Camera(_) | Self::Serial(_) | Self::Replay(_) => {
-                Err(DriverError::Fatal("of real devices, motors behind a CAN adapter alone take actions".to_owned()))
-            }
+            _ => Err(DriverError::Fatal("of real devices, motors behind a CAN adapter alone take actions".to_owned())),
         }
     }
 
@@ -146,7 +147,7 @@ impl Driver {
     pub fn order(&mut self, order: Order) -> Result<(), DriverError> {
         match self {
             Self::Motors(driver) => driver.order(order),
-            Self::Camera(_) | Self::Serial(_) | Self::Sim(_) | Self::Replay(_) => Ok(()),
+            _ => Ok(()),
         }
     }
 
@@ -154,7 +155,7 @@ impl Driver {
     pub fn take_notice(&mut self) -> Option<ActuatorNotice> {
         match self {
             Self::Motors(driver) => driver.take_notice(),
-            Self::Camera(_) | Self::Serial(_) | Self::Sim(_) | Self::Replay(_) => None,
+            _ => None,
         }
     }
 
@@ -167,7 +168,7 @@ impl Driver {
     pub fn record(&mut self, episode: Option<&Arc<Episode>>) -> Result<(), DriverError> {
         let _ = episode;
         match self {
-            Self::Camera(_) | Self::Serial(_) | Self::Motors(_) | Self::Sim(_) | Self::Replay(_) => Ok(()),
+            _ => Ok(()),
         }
     }
 
@@ -176,7 +177,7 @@ impl Driver {
     pub async fn close(self) {
         match self {
             Self::Motors(driver) => driver.close().await,
-            Self::Camera(_) | Self::Serial(_) | Self::Sim(_) | Self::Replay(_) => {}
+            _ => {}
         }
     }
 
@@ -187,6 +188,7 @@ impl Driver {
             Self::Camera(driver) => driver.description().to_owned(),
             Self::Serial(driver) => driver.description().to_owned(),
             Self::Motors(driver) => driver.description().to_owned(),
+            Self::Can(driver) => driver.description().to_owned(),
             Self::Sim(driver) => driver.description(),
             Self::Replay(driver) => driver.description().to_owned(),
         }
@@ -200,6 +202,7 @@ impl Driver {
             Self::Camera(driver) => driver.negotiated(),
             Self::Serial(driver) => driver.negotiated(),
             Self::Motors(driver) => driver.negotiated(),
+            Self::Can(driver) => driver.negotiated(),
             Self::Sim(driver) => driver.negotiated(),
             Self::Replay(driver) => driver.negotiated(),
         }

@@ -26,8 +26,8 @@ pub use identity::{Assigner, Assignment, Detached, Explanation};
 pub use limits::{Limits, VerdictSpec};
 pub use parse::{BUILTIN, Loaded};
 pub use spec::{
-    ActionSpec, CameraSpec, CanAdapter, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, Framing, Hook, Hooks,
-    IdentitySpec, LanProtocol, LanSpec, MAX_BORROWED, MAX_MOTORS, MAX_SUBSCRIBERS, MOTOR_CHANNELS, MotorKind,
-    MotorMode, MotorSpec, Mount, NodeSpec, Opens, POOL_SPARE, Parse, PixelFormat, ProcessSpec, Registry, RigSpec,
-    SerialSpec, UsbSpec, WhenStale,
+    ActionSpec, CAN_BATCH, CAN_RECORD, CAN_RESTART_MS, CameraSpec, CanAdapter, CanProtocol, CanSpec, DamiaoSpec,
+    DeviceSpec, Framing, Hook, Hooks, IdentitySpec, LanProtocol, LanSpec, MAX_BORROWED, MAX_MOTORS, MAX_SUBSCRIBERS,
+    MOTOR_CHANNELS, MotorKind, MotorMode, MotorSpec, Mount, NodeSpec, Opens, POOL_SPARE, Parse, PixelFormat,
+    ProcessSpec, Registry, RigSpec, SLCAN_BITRATES, SerialSpec, UsbSpec, WhenStale,
 };

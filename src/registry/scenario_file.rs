@@ -147,7 +147,8 @@ fn standing_for(spec: &DeviceSpec, name: &str) -> ScenarioDevice {
         // Raw lines have no channels; something must be sent all the same.
         NodeSpec::Serial(serial) => SimSource::Serial { channels: serial.channels.max(1), hz: SERIAL_HZ, seed },
         NodeSpec::Process(_) => SimSource::Process,
-        NodeSpec::Can(_) | NodeSpec::Lan(_) => SimSource::Serial { channels: 1, hz: SERIAL_HZ, seed },
+        NodeSpec::Can(can) => SimSource::Serial { channels: can.channels().max(1), hz: SERIAL_HZ, seed },
+        NodeSpec::Lan(_) => SimSource::Serial { channels: 1, hz: SERIAL_HZ, seed },
     };
     let wished = spec.identity.usb();
     let lan = wished.is_none().then(|| LanIdentity {

@@ -20,7 +20,9 @@ use super::limits::VerdictSpec;
 use crate::modality::{Modality, ModalityId, ModalityKind};
 use crate::sample::SampleHeader;
 
-pub use can::{CanAdapter, CanProtocol, CanSpec, MOTOR_CHANNELS};
+pub use can::{
+    CAN_BATCH, CAN_RECORD, CAN_RESTART_MS, CanAdapter, CanProtocol, CanSpec, MOTOR_CHANNELS, SLCAN_BITRATES,
+};
 pub use lan::{LanProtocol, LanSpec};
 pub use motors::{DamiaoSpec, MAX_MOTORS, MotorKind, MotorMode, MotorSpec};
 

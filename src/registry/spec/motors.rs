@@ -128,6 +128,25 @@ impl MotorKind {
         }
     }
 
+    /// PMAX in rad, VMAX in rad/s and TMAX in Nm as the motor leaves the factory. Source: the tables of the
+    /// public drivers `DM_CAN.py` and of `LeRobot`.
+    #[must_use]
+    pub const fn shipped(self) -> [f64; 3] {
+        match self {
+            Self::Dm3507 | Self::Dm4310 => [12.5, 30.0, 10.0],
+            Self::Dm4310V48 => [12.5, 50.0, 10.0],
+            Self::Dm4340 => [12.5, 8.0, 28.0],
+            Self::Dm4340V48 => [12.5, 10.0, 28.0],
+            Self::Dm6006 => [12.5, 45.0, 20.0],
+            Self::Dm8006 => [12.5, 45.0, 40.0],
+            Self::Dm8009 => [12.5, 45.0, 54.0],
+            Self::Dm10010L => [12.5, 25.0, 200.0],
+            Self::Dm10010 => [12.5, 20.0, 200.0],
+            Self::Dmh3510 => [12.5, 280.0, 1.0],
+            Self::Dmh6215 | Self::Dmg6220 => [12.5, 45.0, 10.0],
+        }
+    }
+
     /// The motor of this name.
     #[must_use]
     pub fn named(name: &str) -> Option<Self> {
