@@ -9,7 +9,9 @@ use std::path::{Path, PathBuf};
 use proptest::prelude::*;
 use rapid::modality::ModalityKind;
 use rapid::registry::scenario::Scenario;
-use rapid::registry::{BUILTIN, DeviceSpec, Framing, Hook, Loaded, NodeSpec, Opens, POOL_SPARE, Parse, Registry, VerdictSpec};
+use rapid::registry::{
+    BUILTIN, DeviceSpec, Framing, Hook, Loaded, NodeSpec, Opens, POOL_SPARE, Parse, Registry, VerdictSpec,
+};
 
 fn files(folder: &str) -> Vec<PathBuf> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/registry").join(folder);
