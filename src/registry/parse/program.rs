@@ -76,7 +76,7 @@ impl Programs<'_> {
             For::Node => (
                 format!("node {name:?} is neither built in nor a program"),
                 &super::device::BUILT_IN[..],
-                format!("built in are \"camera\" and \"serial\"; {place}"),
+                format!("built in are camera, serial, can and lan; {place}"),
             ),
             For::Hook(key) => (format!("{key} {name:?} is not a program"), &[][..], place.to_owned()),
         };
