@@ -118,6 +118,7 @@ pub struct Bus {
     topics: Vec<(TopicSpec, TopicFactory)>,
     wake: EventFactory<Service>,
     ingresses: Vec<(ModalityId, Arc<Ingress>)>,
+    instance: Option<String>,
     node: Arc<Node<Service>>,
 }
 
@@ -174,7 +175,14 @@ impl Bus {
             .collect::<Result<Vec<_>, BusError>>()?;
         let actions = topics.iter().find(|(spec, _)| spec.id == TopicId::Action);
         let actions = actions.map(|(spec, factory)| Actions::open(&node, spec, factory).map(Arc::new)).transpose()?;
-        Ok(Self { writers, actions, topics, wake, ingresses, node: Arc::new(node) })
+        let instance = instance.map(str::to_owned);
+        Ok(Self { writers, actions, topics, wake, ingresses, instance, node: Arc::new(node) })
+    }
+
+    /// What keeps this rig apart from others of the machine, if anything does.
+    #[must_use]
+    pub fn instance(&self) -> Option<&str> {
+        self.instance.as_deref()
     }
 
     /// Where the program that reads modality `id` publishes; `None` if no program does.

@@ -8,6 +8,7 @@
 //! Invariant: the end of a stream, by value or by panic, is an event like any other.
 
 mod attendant;
+mod logbook;
 mod output;
 mod owner;
 pub mod presence;

@@ -82,7 +82,7 @@ impl Rig {
     /// A rig with every slot empty, which publishes through `presence`.
     #[must_use]
     pub fn new(registry: &Registry, bus: &Bus, presence: Presence, board: Arc<Board>) -> Self {
-        let programs = Programs::new(registry, &board);
+        let programs = Programs::new(registry, bus, &board);
         let prefix = bus.membership().prefix();
         let orders = watch::Sender::new(None);
         let modality = |spec: &DeviceSpec| {
