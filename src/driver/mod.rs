@@ -8,6 +8,7 @@
 //! Invariant: no bytes from a device make a driver panic.
 
 pub mod camera;
+pub mod lan;
 pub mod process;
 pub mod replay;
 pub mod serial;
@@ -61,6 +62,8 @@ pub enum Driver {
     Camera(Box<camera::Camera>),
     /// A serial line.
     Serial(Box<serial::Serial>),
+    /// A device on the network.
+    Lan(Box<lan::Lan>),
     /// A device that exists only in a scenario.
     Sim(Box<sim::Sim>),
     /// One topic of a recorded episode.
@@ -84,6 +87,9 @@ impl Driver {
             (NodeSpec::Camera(_), node) => Err(wrong_kind(spec, "camera", node)),
             (NodeSpec::Serial(_), node) => Err(wrong_kind(spec, "serial line", node)),
             (NodeSpec::Can(_), node) => Err(wrong_kind(spec, "CAN adapter", node)),
+            (NodeSpec::Lan(settings), node @ (DeviceNode::Net(_) | DeviceNode::Lan { .. })) => {
+                Ok(Self::Lan(Box::new(lan::Lan::open(spec, settings, node).await?)))
+            }
             (NodeSpec::Lan(_), node) => Err(wrong_kind(spec, "network device", node)),
             // The rig supervises programs itself: `process` only starts and ends them.
             (NodeSpec::Process(_), node) => Err(wrong_kind(spec, "program", node)),
@@ -107,6 +113,7 @@ impl Driver {
         match self {
             Self::Camera(driver) => driver.read().await,
             Self::Serial(driver) => driver.read().await,
+            Self::Lan(driver) => driver.read().await,
             Self::Sim(driver) => driver.read().await,
             Self::Replay(driver) => driver.read().await,
         }
@@ -119,7 +126,7 @@ impl Driver {
     pub fn command(&mut self, target: &[f64]) -> Result<(), DriverError> {
         match self {
             Self::Sim(driver) => driver.command(target),
-            Self::Camera(_) | Self::Serial(_) | Self::Replay(_) => {
+            Self::Camera(_) | Self::Serial(_) | Self::Lan(_) | Self::Replay(_) => {
                 Err(DriverError::Fatal("this version commands simulated actuators alone".to_owned()))
             }
         }
@@ -131,6 +138,7 @@ impl Driver {
         match self {
             Self::Camera(driver) => driver.description().to_owned(),
             Self::Serial(driver) => driver.description().to_owned(),
+            Self::Lan(driver) => driver.description().to_owned(),
             Self::Sim(driver) => driver.description(),
             Self::Replay(driver) => driver.description().to_owned(),
         }
@@ -143,6 +151,7 @@ impl Driver {
         match self {
             Self::Camera(driver) => driver.negotiated(),
             Self::Serial(driver) => driver.negotiated(),
+            Self::Lan(driver) => driver.negotiated(),
             Self::Sim(driver) => driver.negotiated(),
             Self::Replay(driver) => driver.negotiated(),
         }
@@ -155,7 +164,7 @@ fn wrong_kind(spec: &DeviceSpec, wished: &str, node: &DeviceNode) -> DriverError
         DeviceNode::Tty(_) => "a serial line",
         DeviceNode::Usb(_) => "a USB device",
         DeviceNode::Net(_) => "a network interface",
-        DeviceNode::Lan(_) => "on the network",
+        DeviceNode::Lan { .. } => "on the network",
         DeviceNode::Sim(_) => "simulated",
     };
     DriverError::Fatal(format!(

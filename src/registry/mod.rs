@@ -19,14 +19,15 @@ pub mod trust;
 pub mod units;
 mod words;
 
-pub use attachment::{Attachment, DeviceNode, LanIdentity, Unit, UsbIdentity};
+pub use attachment::{Attachment, DeviceNode, Heard, LanIdentity, Unit, UsbIdentity};
 pub(crate) use diagnostic::did_you_mean;
 pub use diagnostic::{Diagnostic, RegistryErrors};
 pub use identity::{Assigner, Assignment, Detached, Explanation};
 pub use limits::{Limits, VerdictSpec};
 pub use parse::{BUILTIN, Loaded};
 pub use spec::{
-    ActionSpec, CameraSpec, CanAdapter, CanProtocol, CanSpec, DeviceSpec, Framing, IdentitySpec, LanProtocol, LanSpec,
-    MAX_BORROWED, MAX_SUBSCRIBERS, Mount, NodeSpec, Opens, POOL_SPARE, Parse, PixelFormat, ProcessSpec, Registry,
+    ActionSpec, CameraSpec, CanAdapter, CanProtocol, CanSpec, DeviceSpec, Framing, IdentitySpec, LanFind, LanPicture, LanProtocol,
+    LanSpec, MAX_BORROWED, MAX_SUBSCRIBERS, Mount, NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream, PixelFormat, Probe,
+    ProcessSpec, Registry,
     RigSpec, SerialSpec, UsbSpec, WhenStale,
 };

@@ -17,7 +17,7 @@ use crate::modality::{Modality, ModalityId, ModalityKind};
 use crate::sample::SampleHeader;
 
 pub use can::{CanAdapter, CanProtocol, CanSpec};
-pub use lan::{LanProtocol, LanSpec};
+pub use lan::{LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, Probe};
 
 /// Samples that the pool of a topic holds beyond its depth: what 8 subscribers hold back, 4 each, the
 /// one being written, and one that is on its way out. The bus reserves them.
