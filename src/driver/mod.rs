@@ -9,6 +9,7 @@
 
 pub mod camera;
 pub mod can;
+pub mod lan;
 pub mod process;
 pub mod replay;
 pub mod serial;
@@ -68,6 +69,8 @@ pub enum Driver {
     Motors(Box<can::motors::Motors>),
     /// The frames of a CAN bus.
     Can(Box<can::raw::Raw>),
+    /// A device on the network.
+    Lan(Box<lan::Lan>),
     /// A device that exists only in a scenario.
     Sim(Box<sim::Sim>),
     /// One topic of a recorded episode.
@@ -97,6 +100,9 @@ impl Driver {
             (NodeSpec::Camera(_), node) => Err(wrong_kind(spec, "camera", node)),
             (NodeSpec::Serial(_), node) => Err(wrong_kind(spec, "serial line", node)),
             (NodeSpec::Can(_), node) => Err(wrong_kind(spec, "CAN adapter", node)),
+            (NodeSpec::Lan(settings), node @ (DeviceNode::Net(_) | DeviceNode::Lan { .. })) => {
+                Ok(Self::Lan(Box::new(lan::Lan::open(spec, settings, node).await?)))
+            }
             (NodeSpec::Lan(_), node) => Err(wrong_kind(spec, "network device", node)),
             // The rig supervises programs itself: `process` only starts and ends them.
             (NodeSpec::Process(_), node) => Err(wrong_kind(spec, "program", node)),
@@ -122,6 +128,7 @@ impl Driver {
             Self::Serial(driver) => driver.read().await,
             Self::Motors(driver) => driver.read().await,
             Self::Can(driver) => driver.read().await,
+            Self::Lan(driver) => driver.read().await,
             Self::Sim(driver) => driver.read().await,
             Self::Replay(driver) => driver.read().await,
         }
@@ -167,9 +174,7 @@ impl Driver {
     /// When the device cannot do it, for people; it is read on.
     pub fn record(&mut self, episode: Option<&Arc<Episode>>) -> Result<(), DriverError> {
         let _ = episode;
-        match self {
-            _ => Ok(()),
-        }
+        Ok(())
     }
 
     /// Ends in order what the device does by itself: the run ends, or the device was unplugged. Is given
@@ -189,6 +194,7 @@ impl Driver {
             Self::Serial(driver) => driver.description().to_owned(),
             Self::Motors(driver) => driver.description().to_owned(),
             Self::Can(driver) => driver.description().to_owned(),
+            Self::Lan(driver) => driver.description().to_owned(),
             Self::Sim(driver) => driver.description(),
             Self::Replay(driver) => driver.description().to_owned(),
         }
@@ -203,6 +209,7 @@ impl Driver {
             Self::Serial(driver) => driver.negotiated(),
             Self::Motors(driver) => driver.negotiated(),
             Self::Can(driver) => driver.negotiated(),
+            Self::Lan(driver) => driver.negotiated(),
             Self::Sim(driver) => driver.negotiated(),
             Self::Replay(driver) => driver.negotiated(),
         }
@@ -215,7 +222,7 @@ fn wrong_kind(spec: &DeviceSpec, wished: &str, node: &DeviceNode) -> DriverError
         DeviceNode::Tty(_) => "a serial line",
         DeviceNode::Usb(_) => "a USB device",
         DeviceNode::Net(_) => "a network interface",
-        DeviceNode::Lan(_) => "on the network",
+        DeviceNode::Lan { .. } => "on the network",
         DeviceNode::Sim(_) => "simulated",
     };
     DriverError::Fatal(format!(

@@ -19,7 +19,7 @@ pub mod trust;
 pub mod units;
 mod words;
 
-pub use attachment::{Attachment, DeviceNode, LanIdentity, Unit, UsbIdentity};
+pub use attachment::{Attachment, DeviceNode, Heard, LanIdentity, Unit, UsbIdentity};
 pub(crate) use diagnostic::did_you_mean;
 pub use diagnostic::{Diagnostic, RegistryErrors};
 pub use identity::{Assigner, Assignment, Detached, Explanation};
@@ -27,7 +27,8 @@ pub use limits::{Limits, VerdictSpec};
 pub use parse::{BUILTIN, Loaded};
 pub use spec::{
     ActionSpec, CAN_BATCH, CAN_RECORD, CAN_RESTART_MS, CameraSpec, CanAdapter, CanProtocol, CanSpec, DamiaoSpec,
-    DeviceSpec, Framing, Hook, Hooks, IdentitySpec, LanProtocol, LanSpec, MAX_BORROWED, MAX_MOTORS, MAX_SUBSCRIBERS,
-    MOTOR_CHANNELS, MotorKind, MotorMode, MotorSpec, Mount, NodeSpec, Opens, POOL_SPARE, Parse, PixelFormat,
-    ProcessSpec, Registry, RigSpec, SLCAN_BITRATES, SerialSpec, UsbSpec, WhenStale,
+    DeviceSpec, Framing, Hook, Hooks, IdentitySpec, LanFind, LanPicture, LanProtocol, LanSpec, MAX_BORROWED,
+    MAX_MOTORS, MAX_SUBSCRIBERS, MOTOR_CHANNELS, MotorKind, MotorMode, MotorSpec, Mount, NodeSpec, Opens, POOL_SPARE,
+    Parse, PhoneStream, PixelFormat, Probe, ProcessSpec, Registry, RigSpec, SLCAN_BITRATES, SerialSpec, UsbSpec,
+    WhenStale,
 };

@@ -23,7 +23,7 @@ use crate::sample::SampleHeader;
 pub use can::{
     CAN_BATCH, CAN_RECORD, CAN_RESTART_MS, CanAdapter, CanProtocol, CanSpec, MOTOR_CHANNELS, SLCAN_BITRATES,
 };
-pub use lan::{LanProtocol, LanSpec};
+pub use lan::{LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, Probe};
 pub use motors::{DamiaoSpec, MAX_MOTORS, MotorKind, MotorMode, MotorSpec};
 
 /// Samples that the pool of a topic holds beyond its depth: what 8 subscribers hold back, 4 each, the

@@ -92,7 +92,11 @@ impl Draft<'_> {
     /// The entry, with what `[verdict]` says for all; `None` only if a problem with it was reported.
     pub(super) fn finish(self, rig: &VerdictTable) -> Option<DeviceSpec> {
         let node = self.node?;
-        let fps = if let NodeSpec::Camera(camera) = &node { Some(f64::from(camera.fps)) } else { None };
+        let fps = match &node {
+            NodeSpec::Camera(camera) => Some(f64::from(camera.fps)),
+            NodeSpec::Lan(lan) => lan.rate(),
+            _ => None,
+        };
         Some(DeviceSpec {
             verdict: verdict::spec(node.modality_kind(), self.stall_after, fps, rig, &self.verdict),
             name: self.name,
