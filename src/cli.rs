@@ -10,9 +10,11 @@ use clap::{ArgAction, ArgMatches, Args, CommandFactory, FromArgMatches, Parser, 
 
 mod compare;
 mod policy;
+mod register;
 
 pub use compare::CompareArgs;
 pub use policy::{EvalArgs, PolicyArgs};
+pub use register::{RegisterArgs, UnregisterArgs};
 
 /// Records robot demonstrations from sensors that come and go
 #[derive(Debug, Parser)]
@@ -168,6 +170,11 @@ pub enum Command {
         #[command(flatten)]
         simulation: SimArgs,
     },
+    /// Adds an entry to the registry for a device that is plugged in
+    #[command(after_help = register::REGISTER)]
+    Register(Box<RegisterArgs>),
+    /// Takes an entry out of the registry; everything else in it stays as it is
+    Unregister(UnregisterArgs),
     /// Checks the registry and says everything that is wrong with it
     Check,
     /// Writes what follows from the registry: udev rules, descriptors, systemd unit
@@ -290,6 +297,7 @@ impl Cli {
         {
             let fix = match name {
                 "devices" => "write `rapid devices --sim`",
+                "register" => "write `rapid register --sim`",
                 "calibrate" => "write `rapid calibrate latency --sim`",
                 _ => "leave --sim out, or name a scenario file",
             };
@@ -309,7 +317,7 @@ fn stray(matches: &ArgMatches, command: &str) -> Option<String> {
     let known = run
         .get_arguments()
         .chain(policy.get_arguments())
-        .chain(simulation.get_arguments().filter(|_| !matches!(command, "devices" | "calibrate")));
+        .chain(simulation.get_arguments().filter(|_| !matches!(command, "devices" | "calibrate" | "register")));
     let typed = |id: &str| matches.value_source(id) == Some(ValueSource::CommandLine);
     known.map(|argument| argument.get_id().as_str()).find(|id| typed(id)).map(str::to_owned)
 }

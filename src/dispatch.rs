@@ -4,6 +4,7 @@
 
 mod failure;
 mod policy;
+mod register;
 
 use std::io::{self, IsTerminal, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -91,6 +92,8 @@ fn print(global: &Global, before: SimArgs, command: Command) -> Result<(), Failu
                 out,
             )
         }
+        Command::Register(args) => register::register(global, before, &args, format, out),
+        Command::Unregister(args) => register::unregister(global, &args, format, out),
         Command::Artifacts { install, to } => {
             let registry = load(&registry_path(global)?)?;
             if install {

@@ -12,6 +12,7 @@ pub mod inspect;
 pub mod mask;
 pub mod progress;
 pub mod recover;
+pub mod register;
 
 /// How a listing is written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

@@ -39,6 +39,8 @@ pub(super) enum Failure {
     #[error(transparent)]
     Artifacts(#[from] commands::artifacts::ArtifactsError),
     #[error(transparent)]
+    Register(#[from] commands::register::RegisterError),
+    #[error(transparent)]
     Mask(#[from] commands::mask::MaskError),
     #[error(transparent)]
     Calibrate(#[from] commands::calibrate::CalibrateError),
@@ -118,6 +120,7 @@ impl Failure {
                 2
             }
             Self::Calibrate(error) if error.is_bad_argument() => 2,
+            Self::Register(error) if error.is_bad_argument() => 2,
             Self::Recover(outcome) if outcome.is_bad_argument() => 2,
             Self::NoPolicy(_) | Self::App(AppError::Required(_)) => 3,
             _ => 1,

@@ -7,7 +7,9 @@
 pub mod artifacts;
 mod attachment;
 mod diagnostic;
+pub mod edit;
 mod identity;
+pub mod import;
 mod limits;
 mod parse;
 pub mod scenario;
@@ -24,7 +26,7 @@ pub(crate) use diagnostic::did_you_mean;
 pub use diagnostic::{Diagnostic, RegistryErrors};
 pub use identity::{Assigner, Assignment, Detached, Explanation};
 pub use limits::{Limits, VerdictSpec};
-pub use parse::{BUILTIN, Loaded};
+pub use parse::{BUILTIN, Loaded, like_a_name, name_problem, read_file};
 pub use spec::{
     ActionSpec, CameraSpec, DeviceSpec, Framing, IdentitySpec, MAX_BORROWED, MAX_SUBSCRIBERS, Mount, NodeSpec, Opens,
     POOL_SPARE, Parse, PixelFormat, ProcessSpec, Registry, RigSpec, SerialSpec, WhenStale,

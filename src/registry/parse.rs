@@ -28,7 +28,8 @@ use program::Programs;
 use verdict::Whose;
 
 pub(super) use device::is_port;
-pub(super) use file::read_file;
+pub use device::{like_a_name, name_problem};
+pub use file::read_file;
 
 /// The registry used when there is no file: the rig `rapid --sim` simulates.
 pub const BUILTIN: &str = include_str!("../../devices.toml");
