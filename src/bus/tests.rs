@@ -1,6 +1,6 @@
 use super::*;
 use crate::modality::ModalityId;
-use crate::registry::{DeviceSpec, IdentitySpec, NodeSpec, Parse, RigSpec, SerialSpec, WhenStale};
+use crate::registry::{DeviceSpec, IdentitySpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbSpec, WhenStale};
 use std::time::Duration;
 
 fn registry(depth: usize) -> Registry {
@@ -17,7 +17,7 @@ fn registry(depth: usize) -> Registry {
         devices: vec![DeviceSpec {
             name: "motor".into(),
             id,
-            identity: IdentitySpec { vid: 1, pid: 2, serial: None, port: None },
+            identity: IdentitySpec::Usb(UsbSpec { vid: 1, pid: 2, serial: None, port: None }),
             node: NodeSpec::Serial(SerialSpec {
                 baud: 115_200,
                 framing: crate::registry::Framing::Line,

@@ -83,6 +83,8 @@ impl Driver {
             (_, DeviceNode::Sim(device)) => Self::open_sim(spec, device).await,
             (NodeSpec::Camera(_), node) => Err(wrong_kind(spec, "camera", node)),
             (NodeSpec::Serial(_), node) => Err(wrong_kind(spec, "serial line", node)),
+            (NodeSpec::Can(_), node) => Err(wrong_kind(spec, "CAN adapter", node)),
+            (NodeSpec::Lan(_), node) => Err(wrong_kind(spec, "network device", node)),
             // The rig supervises programs itself: `process` only starts and ends them.
             (NodeSpec::Process(_), node) => Err(wrong_kind(spec, "program", node)),
         }
@@ -152,6 +154,8 @@ fn wrong_kind(spec: &DeviceSpec, wished: &str, node: &DeviceNode) -> DriverError
         DeviceNode::Video(_) => "a camera",
         DeviceNode::Tty(_) => "a serial line",
         DeviceNode::Usb(_) => "a USB device",
+        DeviceNode::Net(_) => "a network interface",
+        DeviceNode::Lan(_) => "on the network",
         DeviceNode::Sim(_) => "simulated",
     };
     DriverError::Fatal(format!(

@@ -165,9 +165,9 @@ impl Rig {
                 match self.assigner.attach(&attachment) {
                     Assignment::Entry(id) => self.attached(id, attachment),
                     Assignment::Waiting { reason } | Assignment::Unregistered { reason } => {
-                        let usb = &attachment.usb;
-                        let serial = usb.serial.as_deref().unwrap_or("no serial");
-                        let device = format!("{:04x}:{:04x} ({serial}) at {}", usb.vid, usb.pid, usb.port);
+                        let unit = &attachment.unit;
+                        let serial = unit.serial().unwrap_or("no serial");
+                        let device = format!("{} ({serial}) at {}", unit.model(), unit.place());
                         self.board.announce(What::Unregistered { device, reason });
                     }
                     Assignment::WrongNode { reason } => tracing::debug!(%reason, "node not used"),
@@ -186,7 +186,7 @@ impl Rig {
             device: modality.spec.name.clone(),
             bit: id,
             node: attachment.node.label(),
-            usb: attachment.usb.clone(),
+            unit: attachment.unit.clone(),
             driver: attachment.driver.as_deref().cloned(),
         };
         modality.attached = Stamp::now();

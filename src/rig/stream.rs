@@ -263,7 +263,7 @@ impl Stream {
             epoch: self.epoch,
             node: self.attachment.node.label(),
             attached: self.attached,
-            usb: self.attachment.usb.clone(),
+            unit: self.attachment.unit.clone(),
             negotiated,
             latency_ns: nanoseconds(self.spec.latency),
         }

@@ -224,8 +224,8 @@ fn environment(
         ("DEVICE_NAME", text(&spec.name)),
         ("DEVICE_NODE", text(&attachment.node.label())),
         // No such variable rather than one that holds what cannot be said in it.
-        ("DEVICE_SERIAL", attachment.usb.serial.as_deref().filter(|serial| !serial.contains('\0')).and_then(text)),
-        ("DEVICE_ADDR", text(&attachment.usb.port)),
+        ("DEVICE_SERIAL", attachment.unit.serial().filter(|serial| !serial.contains('\0')).and_then(text)),
+        ("DEVICE_ADDR", text(attachment.unit.place())),
         ("RAPID_TOPIC", text(ingress.topic())),
         ("RAPID_EPOCH", text(&epoch.0.to_string())),
         ("RAPID_BIT", text(&spec.id.to_string())),

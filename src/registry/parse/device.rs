@@ -5,19 +5,20 @@ use std::time::Duration;
 
 use super::program::Programs;
 use super::verdict::{VerdictTable, Whose};
-use super::{action, node, process, verdict};
+use super::{action, can, lan, node, process, verdict};
 use crate::modality::ModalityId;
 use crate::registry::diagnostic::did_you_mean;
 use crate::registry::section::{At, Problems, Section};
-use crate::registry::spec::{ActionSpec, DeviceSpec, IdentitySpec, Mount, NodeSpec, Opens, WhenStale};
+use crate::registry::spec::{
+    ActionSpec, CanAdapter, DeviceSpec, IdentitySpec, Mount, NodeSpec, Opens, UsbSpec, WhenStale,
+};
 
 /// Kinds of node this version has a driver for.
-pub(super) const BUILT_IN: [(&str, Kind); 2] = [("camera", Kind::Camera), ("serial", Kind::Serial)];
-/// Kinds of node that are designed but have no driver in this version.
-const PLANNED: [&str; 2] = ["can", "lan"];
-/// Keys that only planned kinds of node have.
-const PLANNED_KEYS: [&str; 4] = ["can", "lan", "on_attach", "on_detach"];
-const KEYS: [&str; 18] = [
+pub(super) const BUILT_IN: [(&str, Kind); 4] =
+    [("camera", Kind::Camera), ("serial", Kind::Serial), ("can", Kind::Can), ("lan", Kind::Lan)];
+/// Keys that are designed and not read by this version.
+const PLANNED_KEYS: [&str; 2] = ["on_attach", "on_detach"];
+const KEYS: [&str; 20] = [
     "vid",
     "pid",
     "serial",
@@ -33,6 +34,8 @@ const KEYS: [&str; 18] = [
     "when_stale",
     "latency",
     "camera",
+    "can",
+    "lan",
     "process",
     "verdict",
     "action",
@@ -52,6 +55,8 @@ const LONGEST_LATENCY: Duration = Duration::from_secs(1);
 pub(super) enum Kind {
     Camera,
     Serial,
+    Can,
+    Lan,
     Process,
 }
 
@@ -115,6 +120,8 @@ impl Draft<'_> {
             NodeSpec::Camera(_) => Opens::Video,
             NodeSpec::Serial(_) => Opens::Tty,
             NodeSpec::Process(process) => process.opens,
+            NodeSpec::Can(can) if can.adapter != CanAdapter::SocketCan => Opens::Tty,
+            NodeSpec::Can(_) | NodeSpec::Lan(_) => Opens::Net,
         })
     }
 
@@ -122,7 +129,7 @@ impl Draft<'_> {
     pub(super) fn program(&self) -> Option<&Path> {
         match self.node.as_ref()? {
             NodeSpec::Process(process) => Some(&process.program),
-            NodeSpec::Camera(_) | NodeSpec::Serial(_) => None,
+            NodeSpec::Camera(_) | NodeSpec::Serial(_) | NodeSpec::Can(_) | NodeSpec::Lan(_) => None,
         }
     }
 
@@ -141,11 +148,13 @@ pub(super) fn read<'a>(
     check_name(name, &section, problems);
     check_keys(&section, problems);
     let kind = kind(&section, problems);
-    let identity = identity(&section, problems);
+    let identity = identity(kind, &section, problems);
     let mut heartbeat = None;
     let settings = match kind {
         Some(Kind::Camera) => Some(NodeSpec::Camera(node::camera(&section, problems))),
         Some(Kind::Serial) => node::serial(&section, problems).map(NodeSpec::Serial),
+        Some(Kind::Can) => can::can(&section, problems).map(NodeSpec::Can),
+        Some(Kind::Lan) => lan::lan(&section, problems).map(NodeSpec::Lan),
         Some(Kind::Process) => section.text(problems, "node").and_then(|program| {
             let (process, silent) = process::process(&section, program.value, programs, problems)?;
             heartbeat = Some(silent);
@@ -233,7 +242,7 @@ fn check_keys(section: &Section<'_>, problems: &mut Problems<'_>) {
             continue;
         }
         if PLANNED_KEYS.contains(&key) {
-            let fix = "remove it; this version reads camera and serial devices, and through programs";
+            let fix = "remove it; programs are named with node";
             problems.report(at, &section.entry, format!("{key:?} is not supported by this version of rapid"), fix);
         } else {
             let fix = did_you_mean(key, &KEYS, "known keys here");
@@ -244,15 +253,14 @@ fn check_keys(section: &Section<'_>, problems: &mut Problems<'_>) {
 
 fn kind(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<Kind> {
     if !section.has("node") {
-        section.missing(problems, "node", "write node = \"camera\", \"serial\" or the name of a program");
+        section.missing(
+            problems,
+            "node",
+            "write node = \"camera\", \"serial\", \"can\", \"lan\" or the name of a program",
+        );
         return None;
     }
     let text = section.text(problems, "node")?.value;
-    if PLANNED.contains(&text) {
-        let fix = "built in are \"camera\" and \"serial\"; leave the entry out until then, or name a program";
-        section.report(problems, "node", format!("node {text:?} is not supported by this version of rapid"), fix);
-        return None;
-    }
     if text == "process" {
         let fix = "write node = the name of the program, for example node = \"tactile_publisher\"";
         section.report(problems, "node", "node \"process\" does not say which program".to_owned(), fix);
@@ -261,7 +269,12 @@ fn kind(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<Kind> {
     Some(BUILT_IN.iter().find(|(name, _)| *name == text).map_or(Kind::Process, |(_, kind)| *kind))
 }
 
-fn identity(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<IdentitySpec> {
+fn identity(kind: Option<Kind>, section: &Section<'_>, problems: &mut Problems<'_>) -> Option<IdentitySpec> {
+    // A device on the network has none; one behind a USB adapter of its own has that adapter's.
+    if kind == Some(Kind::Lan) && !["vid", "pid", "serial", "serial_number", "port"].iter().any(|key| section.has(key))
+    {
+        return Some(IdentitySpec::Lan {});
+    }
     for key in ["vid", "pid"] {
         if !section.has(key) {
             let fix = format!("write the four hexadecimal digits lsusb shows, for example {key} = \"046d\"");
@@ -280,7 +293,7 @@ fn identity(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<Identi
         legal
     });
     let port = port.map(|port| port.value.to_owned());
-    Some(IdentitySpec { vid: vid?, pid: pid?, serial, port })
+    Some(IdentitySpec::Usb(UsbSpec { vid: vid?, pid: pid?, serial, port }))
 }
 
 /// `serial = "..."`, or `serial_number = "..."` where `serial` is the table of the serial line: in

@@ -61,7 +61,7 @@ impl Programs<'_> {
         let known = super::device::BUILT_IN.iter().map(|(name, _)| *name).chain(near.iter().map(String::as_str));
         let fix = match nearest(name, known) {
             Some(name) => format!("did you mean {name:?}?"),
-            None => "built in are \"camera\" and \"serial\"; a program must lie beside this file or on PATH, or be \
+            None => "built in are camera, serial, can and lan; a program must lie beside this file or on PATH, or be \
                      written with its absolute path"
                 .to_owned(),
         };

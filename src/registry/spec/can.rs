@@ -1,0 +1,50 @@
+//! `[device.NAME.can]`: a CAN adapter and what is behind it.
+
+use crate::modality::ModalityKind;
+
+/// See the module's comment.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CanSpec {
+    /// How the adapter is spoken to, default SocketCAN.
+    pub adapter: CanAdapter,
+    /// Bits a second on the bus, `10_000..=1_000_000`, default 1,000,000.
+    pub bitrate: u32,
+    /// What is on the bus.
+    pub protocol: CanProtocol,
+}
+
+/// How a CAN adapter is spoken to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum CanAdapter {
+    /// The kernel has a driver for it, which makes it a network interface.
+    SocketCan,
+    /// A serial line that speaks slcan (Lawicel's protocol).
+    Slcan,
+    /// A serial line with the framing of Damiao's adapter.
+    Damiao,
+}
+
+/// What is on the bus.
+#[derive(Debug, Clone, PartialEq)]
+pub enum CanProtocol {
+    /// Frames, not looked into.
+    Raw,
+}
+
+impl CanSpec {
+    /// What its samples hold.
+    #[must_use]
+    pub const fn modality_kind(&self) -> ModalityKind {
+        match self.protocol {
+            CanProtocol::Raw => ModalityKind::Bytes,
+        }
+    }
+
+    /// Scalars: how many. Bytes: empty.
+    #[must_use]
+    pub fn shape(&self) -> Vec<u32> {
+        match self.protocol {
+            CanProtocol::Raw => Vec::new(),
+        }
+    }
+}
