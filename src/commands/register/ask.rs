@@ -14,9 +14,9 @@ pub struct Dialogue<'a> {
 }
 
 impl Dialogue<'_> {
-    /// Says a line.
+    /// Says a line, or several.
     pub(super) fn say(&mut self, line: &str) -> io::Result<()> {
-        for line in line.lines() {
+        for line in line.split('\n') {
             writeln!(self.out, "{}", text::plain(line))?;
         }
         self.out.flush()

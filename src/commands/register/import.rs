@@ -12,7 +12,7 @@ use super::wish::free_bit;
 use crate::driver::camera::query;
 use crate::registry::edit::{NewEntry, Setting};
 use crate::registry::import::{Foreign, devices, layout};
-use crate::registry::{Attachment, DeviceNode, RegistryErrors, like_a_name, name_problem, read_file};
+use crate::registry::{Attachment, DeviceNode, RegistryErrors, UsbIdentity, like_a_name, name_problem, read_file};
 use crate::text;
 
 /// Why nothing is imported.
@@ -70,10 +70,12 @@ impl Reader {
             return Err(format!("it is found by mDNS ({service}), for which the settings are to be written by hand"));
         }
         let is_it = |attachment: &&Attachment| {
-            let usb = &attachment.usb;
-            Some((usb.vid, usb.pid)) == device.usb && (device.serial.is_none() || usb.serial == device.serial)
+            let is_unit = |usb: &UsbIdentity| {
+                Some((usb.vid, usb.pid)) == device.usb && (device.serial.is_none() || usb.serial == device.serial)
+            };
+            attachment.unit.usb().is_some_and(is_unit)
         };
-        let read = attached.iter().filter(is_it).find_map(|attachment| Some((kind(&attachment.node)?, attachment)));
+        let read = attached.iter().filter(is_it).find_map(|attachment| Some((kind(attachment)?, attachment)));
         let settings = |attachment: &Attachment| {
             let camera = if let DeviceNode::Video(path) = &attachment.node { query(path).ok() } else { None };
             suggested(&attachment.node, camera.as_ref())

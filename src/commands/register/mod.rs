@@ -219,7 +219,7 @@ fn commit(
     let written: Vec<String> = entries.iter().map(edit::written).collect::<Result<_, _>>()?;
     let shown = written.join("\n");
     if let Some(talk) = talk.filter(|_| !manner.yes && !manner.dry_run) {
-        talk.say(&format!("\n{shown}\n"))?;
+        talk.say(&format!("\n{shown}"))?;
         if !talk.agrees(&format!("Add this to {}", target.path.display()))? {
             talk.say("Nothing was written.")?;
             return Ok(());

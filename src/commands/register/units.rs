@@ -1,6 +1,6 @@
 //! What is plugged in and no entry means, and what an entry for it would say.
 //!
-//! Pure, but for one look at sysfs that tells a hub from a device.
+//! Pure, but for looks at sysfs that tell a hub from a device and a CAN adapter from a network card.
 
 use crate::driver::camera::{CameraInfo, Rate, Rates, Size};
 use crate::registry::edit::Setting;
@@ -9,7 +9,7 @@ use crate::registry::{Assigner, Assignment, Attachment, DeviceNode, PixelFormat,
 
 /// A USB device and those of its nodes that no entry reads.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Unit {
+pub struct Candidate {
     /// What it says it is.
     pub usb: UsbIdentity,
     /// Its nodes, those with data before the USB device itself.
@@ -22,25 +22,28 @@ pub struct Unit {
 
 /// Units that could be registered, in the order of their ports; those that offer data first.
 #[must_use]
-pub fn unregistered(registry: Option<&Registry>, attached: &[Attachment]) -> Vec<Unit> {
+pub fn unregistered(registry: Option<&Registry>, attached: &[Attachment]) -> Vec<Candidate> {
     let mut assigner = registry.map(Assigner::new);
     let taken: Vec<bool> = attached
         .iter()
         .map(|node| assigner.as_mut().is_some_and(|assigner| matches!(assigner.attach(node), Assignment::Entry(_))))
         .collect();
-    let mut units: Vec<Unit> = Vec::new();
+    let mut units: Vec<Candidate> = Vec::new();
     for (at, node) in attached.iter().enumerate() {
-        let same = |other: &Attachment| same_unit(&other.usb, &node.usb);
+        // Only devices that an entry asks for are looked for on the network.
+        let Some(usb) = node.unit.usb() else { continue };
+        let same = |other: &Attachment| other.unit.usb().is_some_and(|other| same_unit(other, usb));
         // One entry reads one node of a kind: a second camera node of the same unit is no news.
-        let is_read = attached.iter().zip(&taken).any(|(other, taken)| {
-            *taken && same(other) && (is_usb(&node.node) || kind(&other.node) == kind(&node.node))
-        });
+        let is_read = attached
+            .iter()
+            .zip(&taken)
+            .any(|(other, taken)| *taken && same(other) && (is_usb(&node.node) || kind(other) == kind(node)));
         if is_read || taken.get(at) == Some(&true) || is_hub(node) {
             continue;
         }
-        match units.iter_mut().find(|unit| same_unit(&unit.usb, &node.usb)) {
+        match units.iter_mut().find(|unit| same_unit(&unit.usb, usb)) {
             Some(unit) => unit.nodes.push(node.clone()),
-            None => units.push(unit(node, registry, attached)),
+            None => units.push(candidate(node, usb, registry, attached)),
         }
     }
     for unit in &mut units {
@@ -50,18 +53,17 @@ pub fn unregistered(registry: Option<&Registry>, attached: &[Attachment]) -> Vec
     units
 }
 
-fn unit(node: &Attachment, registry: Option<&Registry>, attached: &[Attachment]) -> Unit {
-    let usb = &node.usb;
+fn candidate(node: &Attachment, usb: &UsbIdentity, registry: Option<&Registry>, attached: &[Attachment]) -> Candidate {
     let model = (usb.vid, usb.pid);
-    let others = || attached.iter().map(|other| &other.usb).filter(|other| !same_unit(other, usb));
+    let others = || attached.iter().filter_map(|other| other.unit.usb()).filter(|other| !same_unit(other, usb));
     let entries = registry.map(|registry| registry.devices.as_slice()).unwrap_or_default();
     let shared = others().any(|other| (other.vid, other.pid) == model && other.serial == usb.serial);
     let legal = |serial: &&String| !serial.is_empty() && !serial.chars().any(char::is_control);
-    Unit {
+    Candidate {
         usb: usb.clone(),
         nodes: vec![node.clone()],
         has_twin: others().any(|other| (other.vid, other.pid) == model)
-            || entries.iter().any(|entry| (entry.identity.vid, entry.identity.pid) == model),
+            || entries.iter().filter_map(|entry| entry.identity.usb()).any(|usb| (usb.vid, usb.pid) == model),
         own_serial: usb.serial.as_ref().filter(|_| !shared).filter(legal).cloned(),
     }
 }
@@ -82,11 +84,17 @@ fn is_hub(node: &Attachment) -> bool {
 
 /// The word for `node` in an entry that reads this node; `None` where only a program can.
 #[must_use]
-pub fn kind(node: &DeviceNode) -> Option<&'static str> {
-    match node {
+pub fn kind(attachment: &Attachment) -> Option<&'static str> {
+    /// `ARPHRD_CAN` of `linux/if_arp.h`.
+    const CAN: &str = "280";
+    match &attachment.node {
         DeviceNode::Video(_) => Some("camera"),
         DeviceNode::Tty(_) => Some("serial"),
-        DeviceNode::Usb(_) => None,
+        DeviceNode::Net(_) => {
+            let is_can = std::fs::read_to_string(attachment.syspath.join("type")).is_ok_and(|kind| kind.trim() == CAN);
+            Some(if is_can { "can" } else { "lan" })
+        }
+        DeviceNode::Usb(_) | DeviceNode::Lan(_) => None,
         DeviceNode::Sim(device) => match device.source {
             SimSource::Camera { .. } | SimSource::Task { part: TaskPart::Wrist | TaskPart::Tactile, .. } => {
                 Some("camera")
@@ -97,17 +105,17 @@ pub fn kind(node: &DeviceNode) -> Option<&'static str> {
     }
 }
 
-impl Unit {
+impl Candidate {
     /// The word for `node` that its nodes suggest.
     #[must_use]
     pub fn guess(&self) -> Option<&'static str> {
-        self.nodes.iter().find_map(|node| kind(&node.node))
+        self.nodes.iter().find_map(|node| kind(node))
     }
 
     /// The node that an entry of this kind would read.
     #[must_use]
     pub fn node(&self, word: &str) -> Option<&Attachment> {
-        self.nodes.iter().find(|node| kind(&node.node) == Some(word))
+        self.nodes.iter().find(|node| kind(node) == Some(word))
     }
 
     /// The key and value by which an entry means this unit and no other, where that can be said.

@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use serde::Serialize;
 
-use super::units::{Unit, suggested};
+use super::units::{Candidate, suggested};
 use super::{Dialogue, Format, RegisterError, sample};
 use crate::cli::RegisterArgs;
 use crate::driver::camera::query;
@@ -14,7 +14,7 @@ use crate::text;
 
 /// A unit that could be registered, as JSON.
 #[derive(Serialize)]
-struct Candidate<'a> {
+struct Listed<'a> {
     event: &'static str,
     #[serde(flatten)]
     usb: &'a UsbIdentity,
@@ -24,19 +24,19 @@ struct Candidate<'a> {
 
 /// The unit that is meant. `Some(None)`: none that is plugged in; `None`: there is nothing to do.
 pub(super) fn choose(
-    units: &[Unit],
+    units: &[Candidate],
     args: &RegisterArgs,
     talk: Option<&mut Dialogue<'_>>,
     format: Format,
     out: &mut dyn Write,
-) -> Result<Option<Option<Unit>>, RegisterError> {
-    let fits = |unit: &&Unit| {
+) -> Result<Option<Option<Candidate>>, RegisterError> {
+    let fits = |unit: &&Candidate| {
         args.vid.is_none_or(|vid| vid == unit.usb.vid)
             && args.pid.is_none_or(|pid| pid == unit.usb.pid)
             && args.serial.as_ref().is_none_or(|serial| Some(serial) == unit.usb.serial.as_ref())
             && args.port.as_ref().is_none_or(|port| *port == unit.usb.port)
     };
-    let fitting: Vec<&Unit> = units.iter().filter(fits).collect();
+    let fitting: Vec<&Candidate> = units.iter().filter(fits).collect();
     let says_which = args.vid.is_some() || args.pid.is_some() || args.serial.is_some() || args.port.is_some();
     match (fitting.as_slice(), talk) {
         ([unit], _) if says_which => Ok(Some(Some((*unit).clone()))),
@@ -54,8 +54,9 @@ pub(super) fn choose(
             for (at, unit) in units.iter().enumerate() {
                 talk.say(&format!("  {}  {}", at + 1, line(unit)))?;
             }
+            talk.say("")?;
             let most = units.len();
-            let which = talk.ask("\nWhich one", Some("1"), |answer| {
+            let which = talk.ask("Which one", Some("1"), |answer| {
                 let number = answer.parse::<usize>().ok().and_then(|number| number.checked_sub(1));
                 number.filter(|number| *number < most).ok_or_else(|| format!("a number from 1 to {most}"))
             })?;
@@ -67,7 +68,7 @@ pub(super) fn choose(
         (units, None) => {
             for unit in units {
                 let nodes = unit.nodes.iter().map(|node| node.node.label()).collect();
-                let candidate = Candidate { event: "unregistered", usb: &unit.usb, nodes, node: unit.guess() };
+                let candidate = Listed { event: "unregistered", usb: &unit.usb, nodes, node: unit.guess() };
                 match format {
                     Format::Text => writeln!(out, "not registered: {}", line(unit))?,
                     Format::Json => writeln!(out, "{}", text::json(&candidate).map_err(io::Error::from)?)?,
@@ -82,7 +83,7 @@ pub(super) fn choose(
 }
 
 /// A unit on a line.
-fn line(unit: &Unit) -> String {
+fn line(unit: &Candidate) -> String {
     let usb = &unit.usb;
     let nodes: Vec<String> = unit.nodes.iter().map(|node| node.node.label()).collect();
     let serial = usb.serial.as_ref().map_or("no serial".to_owned(), |serial| format!("serial {serial:?}"));
@@ -98,7 +99,7 @@ fn line(unit: &Unit) -> String {
     text::plain(&said).into_owned()
 }
 
-pub(super) fn comments(unit: Option<&Unit>) -> Vec<String> {
+pub(super) fn comments(unit: Option<&Candidate>) -> Vec<String> {
     let product =
         unit.and_then(|unit| unit.usb.product.as_deref()).map(|product| text::plain(product).trim().to_owned());
     product.filter(|product| !product.is_empty()).into_iter().collect()
@@ -106,7 +107,7 @@ pub(super) fn comments(unit: Option<&Unit>) -> Vec<String> {
 
 pub(super) fn name(
     registry: Option<&Registry>,
-    unit: Option<&Unit>,
+    unit: Option<&Candidate>,
     args: &RegisterArgs,
     talk: Option<&mut Dialogue<'_>>,
 ) -> Result<String, RegisterError> {
@@ -127,18 +128,18 @@ pub(super) fn name(
 }
 
 pub(super) fn node(
-    unit: Option<&Unit>,
+    unit: Option<&Candidate>,
     args: &RegisterArgs,
     talk: Option<&mut Dialogue<'_>>,
 ) -> Result<String, RegisterError> {
-    let guess = unit.and_then(Unit::guess);
+    let guess = unit.and_then(Candidate::guess);
     match (&args.node, talk, guess) {
         (Some(node), ..) => Ok(node.clone()),
         (None, Some(talk), guess) => {
-            let question = "Node (how it is read: camera, serial, or the name of a program)";
+            let question = "Node (how it is read: camera, serial, can, lan, or the name of a program)";
             talk.ask(question, guess, |answer| {
                 if answer.is_empty() {
-                    Err("camera, serial, or the name of a program".to_owned())
+                    Err("camera, serial, can, lan, or the name of a program".to_owned())
                 } else {
                     Ok(answer.to_owned())
                 }
@@ -151,7 +152,7 @@ pub(super) fn node(
 
 /// The keys that single the unit out.
 pub(super) fn identity(
-    unit: Option<&Unit>,
+    unit: Option<&Candidate>,
     args: &RegisterArgs,
     talk: Option<&mut Dialogue<'_>>,
 ) -> Result<Vec<(&'static str, String)>, RegisterError> {
@@ -194,7 +195,7 @@ pub(super) fn slot(args: &RegisterArgs, talk: Option<&mut Dialogue<'_>>) -> Resu
 }
 
 pub(super) async fn settings(
-    unit: Option<&Unit>,
+    unit: Option<&Candidate>,
     node: &str,
     args: &RegisterArgs,
     talk: Option<&mut Dialogue<'_>>,
