@@ -177,6 +177,15 @@ pub enum Command {
     Unregister(UnregisterArgs),
     /// Checks the registry and says everything that is wrong with it
     Check,
+    /// Looks for what on this machine stands in the way: bandwidth, permissions, rules, limits, disk
+    #[command(after_help = "Exit code: 0 if nothing is bad, otherwise 1.\n\nExamples:\n  rapid doctor\n  \
+        rapid doctor --out /data/episodes      that disk\n  \
+        rapid doctor --json | jq -r 'select(.level == \"bad\") | .fix'")]
+    Doctor {
+        /// Folder for episodes, whose disk is tried
+        #[arg(long, value_name = "DIR", default_value = "episodes", value_hint = ValueHint::DirPath)]
+        out: PathBuf,
+    },
     /// Writes what follows from the registry: udev rules, descriptors, systemd unit
     #[command(after_help = "Examples:\n  rapid artifacts                look at them first, in udev/\n  \
         sudo rapid artifacts --install")]

@@ -94,6 +94,11 @@ fn print(global: &Global, before: SimArgs, command: Command) -> Result<(), Failu
         }
         Command::Register(args) => register::register(global, before, &args, format, out),
         Command::Unregister(args) => register::unregister(global, &args, format, out),
+        Command::Doctor { out: episodes } => {
+            let registry = registry_path(global).and_then(|path| load(&path)).map_err(|failure| failure.to_string());
+            let registry = registry.as_ref().map_err(String::as_str);
+            if commands::doctor::doctor(registry, &episodes, format, out)? { Ok(()) } else { Err(Failure::Found) }
+        }
         Command::Artifacts { install, to } => {
             let registry = load(&registry_path(global)?)?;
             if install {

@@ -7,6 +7,7 @@ pub mod compare;
 pub mod completions;
 pub mod demonstrate;
 pub mod devices;
+pub mod doctor;
 pub mod eval;
 pub mod inspect;
 pub mod mask;

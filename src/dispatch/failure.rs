@@ -74,6 +74,9 @@ pub(super) enum Failure {
     /// What was wrong has been printed.
     #[error("")]
     Told,
+    /// What was looked for has been found, and printed.
+    #[error("")]
+    Found,
     #[error("output: {0}")]
     Output(#[from] io::Error),
     /// Whatever was done has been undone on the way here.
