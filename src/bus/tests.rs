@@ -32,6 +32,7 @@ fn registry(depth: usize) -> Registry {
             when_stale: WhenStale::Hold,
             latency: Duration::ZERO,
             action: None,
+            hooks: crate::registry::Hooks::default(),
             verdict: crate::registry::VerdictSpec::of(
                 crate::modality::ModalityKind::Image,
                 Duration::from_millis(500),

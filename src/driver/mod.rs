@@ -8,6 +8,7 @@
 //! Invariant: no bytes from a device make a driver panic.
 
 pub mod camera;
+pub mod can;
 pub mod process;
 pub mod replay;
 pub mod serial;
@@ -19,6 +20,7 @@ use crate::provenance::Negotiated;
 use crate::registry::scenario::{SimDevice, SimSource};
 use crate::registry::{DeviceNode, DeviceSpec, NodeSpec};
 use crate::sample::Encoding;
+use crate::status::Episode;
 use crate::time::Stamp;
 
 /// One sample as the device gave it, borrowed until the next read.
@@ -122,6 +124,28 @@ impl Driver {
             Self::Camera(_) | Self::Serial(_) | Self::Replay(_) => {
                 Err(DriverError::Fatal("this version commands simulated actuators alone".to_owned()))
             }
+        }
+    }
+
+    /// Tells a device that records by itself of the episode in progress, or with `None` that there is
+    /// none: when one begins or ends, and of one in progress when the device is opened. Returns at once:
+    /// what takes time is done by [`Self::read`] or a task of the driver's own.
+    ///
+    /// # Errors
+    /// When the device cannot do it, for people; it is read on.
+    pub fn record(&mut self, episode: Option<&Arc<Episode>>) -> Result<(), DriverError> {
+        let _ = episode;
+        match self {
+            Self::Camera(_) | Self::Serial(_) | Self::Sim(_) | Self::Replay(_) => Ok(()),
+        }
+    }
+
+    /// Ends in order what the device does by itself: the run ends, or the device was unplugged. Is given
+    /// up after a moment. A driver that is only dropped has been read to its end, or was given up.
+    #[expect(clippy::unused_async, reason = "devices on a network take time to be told")]
+    pub async fn close(self) {
+        match self {
+            Self::Camera(_) | Self::Serial(_) | Self::Sim(_) | Self::Replay(_) => {}
         }
     }
 

@@ -53,7 +53,7 @@ impl Attached {
     pub(super) fn take(&mut self, event: &Event) {
         match &event.what {
             What::Attach { device, unit, .. } => {
-                drop(self.serials.insert(device.clone(), unit.serial().map(str::to_owned)))
+                drop(self.serials.insert(device.clone(), unit.serial().map(str::to_owned)));
             }
             What::Detach { device, .. } => drop(self.serials.remove(device)),
             What::Opened { device, provenance, .. } => {
@@ -97,7 +97,7 @@ impl Units {
     pub(super) fn take(&mut self, event: &Event) {
         match &event.what {
             What::Attach { device, unit, .. } => {
-                drop(self.serials.insert(device.clone(), unit.serial().map(str::to_owned)))
+                drop(self.serials.insert(device.clone(), unit.serial().map(str::to_owned)));
             }
             What::Opened { device, provenance, .. } => {
                 self.end(device, event.stamp);

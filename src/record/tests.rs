@@ -103,6 +103,7 @@ fn device(bit: u8, name: &str, node: NodeSpec) -> DeviceSpec {
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
         action: None,
+        hooks: crate::registry::Hooks::default(),
         verdict,
     }
 }

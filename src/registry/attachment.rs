@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use serde::Serialize;
 
-use super::scenario::SimDevice;
+use super::scenario::{SimDevice, SimSource};
 use crate::provenance::KernelDriver;
 
 /// What a USB device says it is, and where it is plugged in.
@@ -154,6 +154,12 @@ impl Attachment {
 }
 
 impl DeviceNode {
+    /// Is it a topic of a recorded episode, which needs no program?
+    #[must_use]
+    pub fn is_recording(&self) -> bool {
+        matches!(self, Self::Sim(device) if matches!(device.source, SimSource::Replay { .. }))
+    }
+
     /// The node as shown to people.
     #[must_use]
     pub fn label(&self) -> String {

@@ -28,7 +28,8 @@ pub use identity::{Assigner, Assignment, Detached, Explanation};
 pub use limits::{Limits, VerdictSpec};
 pub use parse::{BUILTIN, Loaded, like_a_name, name_problem, read_file};
 pub use spec::{
-    ActionSpec, CameraSpec, CanAdapter, CanProtocol, CanSpec, DeviceSpec, Framing, IdentitySpec, LanProtocol, LanSpec,
-    MAX_BORROWED, MAX_SUBSCRIBERS, Mount, NodeSpec, Opens, POOL_SPARE, Parse, PixelFormat, ProcessSpec, Registry,
-    RigSpec, SerialSpec, UsbSpec, WhenStale,
+    ActionSpec, CameraSpec, CanAdapter, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, Framing, Hook, Hooks,
+    IdentitySpec, LanProtocol, LanSpec, MAX_BORROWED, MAX_SUBSCRIBERS, MOTOR_CHANNELS, MotorKind, MotorMode, MotorSpec,
+    Mount, NodeSpec, Opens, POOL_SPARE, Parse, PixelFormat, ProcessSpec, Registry, RigSpec, SerialSpec, UsbSpec,
+    WhenStale,
 };

@@ -11,6 +11,7 @@ mod budget;
 mod can;
 mod device;
 mod file;
+mod hooks;
 mod lan;
 mod node;
 mod process;
@@ -93,7 +94,7 @@ impl Registry {
         check_actuators(&drafts, &mut problems);
         let mut warnings = assign_bits(&mut drafts, &mut problems);
         warnings.extend(unused_ports(&drafts, &problems));
-        warnings.extend(drafts.iter().filter_map(|draft| program::distrusted(draft, &problems)));
+        warnings.extend(drafts.iter().flat_map(|draft| program::distrusted(draft, &problems)));
         warnings.extend(budget::fit(&mut drafts, rig.memory_budget, root.at_of("rig"), &mut problems));
         problems.check()?;
         let mut devices: Vec<_> = drafts.into_iter().filter_map(|draft| draft.finish(&verdict)).collect();

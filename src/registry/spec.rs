@@ -5,19 +5,24 @@
 //! ascending order of bit.
 
 mod can;
+mod hooks;
 mod lan;
+mod motors;
 
 use std::path::PathBuf;
 use std::time::Duration;
 
 use serde::Serialize;
 
+pub use hooks::{Hook, Hooks};
+
 use super::limits::VerdictSpec;
 use crate::modality::{Modality, ModalityId, ModalityKind};
 use crate::sample::SampleHeader;
 
-pub use can::{CanAdapter, CanProtocol, CanSpec};
+pub use can::{CanAdapter, CanProtocol, CanSpec, MOTOR_CHANNELS};
 pub use lan::{LanProtocol, LanSpec};
+pub use motors::{DamiaoSpec, MotorKind, MotorMode, MotorSpec};
 
 /// Samples that the pool of a topic holds beyond its depth: what 8 subscribers hold back, 4 each, the
 /// one being written, and one that is on its way out. The bus reserves them.
@@ -95,6 +100,8 @@ pub struct DeviceSpec {
     pub verdict: VerdictSpec,
     /// The device is an actuator, and takes these actions.
     pub action: Option<ActionSpec>,
+    /// What is run when something happens to it.
+    pub hooks: Hooks,
 }
 
 /// `[device.NAME.action]`: what an actuator may be told. All lists have one entry an axis, `1..=64` of

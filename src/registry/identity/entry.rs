@@ -45,9 +45,8 @@ impl Entry {
                 Opens::Net => (Kind::Net, true),
             },
             NodeSpec::Can(can) if can.adapter != CanAdapter::SocketCan => (Kind::Serial, false),
-            NodeSpec::Can(_) => (Kind::Net, false),
             NodeSpec::Lan(_) if device.identity.usb().is_none() => (Kind::Lan, false),
-            NodeSpec::Lan(_) => (Kind::Net, false),
+            NodeSpec::Can(_) | NodeSpec::Lan(_) => (Kind::Net, false),
         };
         Self { id: device.id, name: device.name.clone(), identity: device.identity.clone(), kind, is_process }
     }
