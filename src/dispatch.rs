@@ -118,6 +118,7 @@ fn print(global: &Global, before: SimArgs, command: Command) -> Result<(), Failu
             Outcome::BadConfiguration => Err(Failure::Told),
         },
         Command::Recover { paths } => recover(&paths, format),
+        Command::Ablation(args) => Ok(commands::ablation::ablation(&registry_or_builtin(global)?, &args, format, out)?),
         Command::Eval(args) => policy::eval(args, format),
         Command::Completions { shell } => Ok(commands::completions::completions(&mut Cli::command(), shell, out)?),
         Command::Replay { .. } => Ok(()),
@@ -267,6 +268,7 @@ fn run(global: &Global, args: &RunArgs, source: Source, policy: Option<PolicyArg
     if let Some(window) = args.window {
         registry.rig.sync_window = window;
     }
+    let modules = modules(&registry, args)?;
     if args.record {
         prepare(&args.out).map_err(Failure::Folder)?;
     }
@@ -282,12 +284,24 @@ fn run(global: &Global, args: &RunArgs, source: Source, policy: Option<PolicyArg
         registry,
         devices,
         screen,
-        episode: EpisodeRequest { out: args.out.clone(), task: args.task.clone(), tags: args.tag.clone(), duration },
+        episode: EpisodeRequest {
+            out: args.out.clone(),
+            task: args.task.clone(),
+            tags: args.tag.clone(),
+            modules,
+            duration,
+        },
         record: args.record,
         duration,
         instance: global.instance.clone(),
     };
     Ok(block_on(app::run(options))??)
+}
+
+/// The modules that were said to be mounted, if the registry knows them.
+fn modules(registry: &Registry, args: &RunArgs) -> Result<Vec<String>, Failure> {
+    let mounted = crate::registry::mounted(&registry.modules, &args.module)?;
+    Ok(mounted.into_iter().map(|module| module.name.clone()).collect())
 }
 
 /// The folder an episode is to be written to at once: better refused before the devices are started.

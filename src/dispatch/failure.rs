@@ -68,6 +68,10 @@ pub(super) enum Failure {
     Compare(#[from] CompareFailure),
     #[error(transparent)]
     Demonstrate(#[from] commands::demonstrate::DemonstrateError),
+    #[error(transparent)]
+    Module(#[from] crate::registry::ModuleError),
+    #[error(transparent)]
+    Ablation(#[from] commands::ablation::AblationError),
     /// What was typed makes no sense together.
     #[error("{0}")]
     Arguments(&'static str),
@@ -105,6 +109,7 @@ impl Failure {
             | Self::Folder(_)
             | Self::Inspect(InspectError::NotMcap(_))
             | Self::Arguments(_)
+            | Self::Module(_)
             | Self::Bundle(_)
             | Self::Eval(EvalError::Bundle(_))
             | Self::Compare(
@@ -123,6 +128,7 @@ impl Failure {
                 2
             }
             Self::Calibrate(error) if error.is_bad_argument() => 2,
+            Self::Ablation(error) if error.is_bad_argument() => 2,
             Self::Register(error) if error.is_bad_argument() => 2,
             Self::Recover(outcome) if outcome.is_bad_argument() => 2,
             Self::NoPolicy(_) | Self::App(AppError::Required(_)) => 3,

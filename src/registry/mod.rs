@@ -4,6 +4,7 @@
 //! attached device is which entry (`identity`), what a simulation plays (`scenario_file`) and the
 //! files udev and systemd read (`artifacts`).
 
+pub mod ablation;
 pub mod artifacts;
 mod attachment;
 mod diagnostic;
@@ -29,7 +30,7 @@ pub use limits::{Limits, VerdictSpec};
 pub use parse::{BUILTIN, Loaded, like_a_name, name_problem, read_file};
 pub use spec::{
     ActionSpec, CameraSpec, CanAdapter, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, Framing, Hook, Hooks,
-    IdentitySpec, LanProtocol, LanSpec, MAX_BORROWED, MAX_SUBSCRIBERS, MOTOR_CHANNELS, MotorKind, MotorMode, MotorSpec,
-    Mount, NodeSpec, Opens, POOL_SPARE, Parse, PixelFormat, ProcessSpec, Registry, RigSpec, SerialSpec, UsbSpec,
-    WhenStale,
+    IdentitySpec, LanProtocol, LanSpec, MAX_BORROWED, MAX_SUBSCRIBERS, MOTOR_CHANNELS, ModuleError, ModuleSpec,
+    MotorKind, MotorMode, MotorSpec, Mount, NodeSpec, Opens, POOL_SPARE, Parse, PixelFormat, ProcessSpec, Registry,
+    RigSpec, SerialSpec, UsbSpec, WhenStale, mounted,
 };

@@ -7,6 +7,7 @@
 mod can;
 mod hooks;
 mod lan;
+mod module;
 mod motors;
 
 use std::path::PathBuf;
@@ -22,6 +23,7 @@ use crate::sample::SampleHeader;
 
 pub use can::{CanAdapter, CanProtocol, CanSpec, MOTOR_CHANNELS};
 pub use lan::{LanProtocol, LanSpec};
+pub use module::{ModuleError, ModuleSpec, mounted};
 pub use motors::{DamiaoSpec, MotorKind, MotorMode, MotorSpec};
 
 /// Samples that the pool of a topic holds beyond its depth: what 8 subscribers hold back, 4 each, the
@@ -44,6 +46,8 @@ pub struct Registry {
     pub rig: RigSpec,
     /// One entry a modality, ascending by bit, at least one, at most 64.
     pub devices: Vec<DeviceSpec>,
+    /// What can be mounted, in the order of the file.
+    pub modules: Vec<ModuleSpec>,
     /// Where the text came from, for messages. `None` for the built-in registry.
     pub path: Option<PathBuf>,
     /// The text itself, recorded with every episode.

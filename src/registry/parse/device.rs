@@ -77,7 +77,7 @@ pub(super) struct Draft<'a> {
     pub(super) topic: String,
     pub(super) bit: Option<At<u8>>,
     pub(super) id: Option<ModalityId>,
-    mount: Option<Mount>,
+    pub(super) mount: Option<Mount>,
     stall_after: Duration,
     pub(super) max_bytes: u64,
     pub(super) depth: u64,
