@@ -90,8 +90,9 @@ impl Bus {
 /// Reads `ID#DATA`, as `cansend` does: three digits of an identifier, two of each byte.
 pub fn parse(text: &str) -> Option<Frame> {
     let (id, data) = text.split_once('#')?;
-    let bytes: Option<Vec<u8>> =
-        data.as_bytes().chunks(2).map(|pair| u8::from_str_radix(std::str::from_utf8(pair).ok()?, 16).ok()).collect();
+    let (pairs, odd) = data.as_bytes().as_chunks::<2>();
+    let byte = |pair: &[u8; 2]| u8::from_str_radix(std::str::from_utf8(pair).ok()?, 16).ok();
+    let bytes: Option<Vec<u8>> = if odd.is_empty() { pairs.iter().map(byte).collect() } else { None };
     let bytes = bytes?;
     Frame::new(u32::from_str_radix(id, 16).ok()?, id.len() > 3, false, bytes.len(), &bytes)
 }
