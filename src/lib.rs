@@ -100,6 +100,7 @@ pub mod calibration;
 pub mod cli;
 pub mod commands;
 pub mod compare;
+pub mod control;
 pub mod dispatch;
 pub mod driver;
 pub mod episode_format;

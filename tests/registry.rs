@@ -97,8 +97,8 @@ fn every_key_arrives() {
     let [tof, cam] = registry.devices.as_slice() else { panic!("two devices") };
     assert_eq!((cam.id.bit(), cam.topic.as_str(), cam.depth, cam.max_bytes), (63, "/a/b-c_d", 100, 1 << 20));
     assert_eq!((cam.latency.as_micros(), tof.latency.as_micros()), (36_500, 0));
-    assert_eq!(cam.identity.serial.as_deref(), Some("with \"quotes\" and spaces"));
-    assert_eq!(cam.identity.port.as_deref(), Some("1-2.3"));
+    assert_eq!(cam.identity.serial(), Some("with \"quotes\" and spaces"));
+    assert_eq!(cam.identity.usb().unwrap().port.as_deref(), Some("1-2.3"));
     let NodeSpec::Camera(camera) = &cam.node else { panic!("a camera") };
     assert_eq!((camera.width, camera.height, camera.fps), (1, 2, 1000));
     assert_eq!(camera.controls, [("gain".to_owned(), -3)]);

@@ -6,7 +6,7 @@ use std::path::Path;
 use serde::Serialize;
 
 use super::{Format, Outcome};
-use crate::registry::{DeviceSpec, Diagnostic, IdentitySpec, Loaded, Mount, Registry};
+use crate::registry::{DeviceSpec, Diagnostic, IdentitySpec, Loaded, Mount, Registry, UsbSpec};
 use crate::text;
 
 /// Reads the registry at `path` and writes its entries, or every problem, to `out`.
@@ -88,6 +88,15 @@ fn row(device: &DeviceSpec) -> Row<'_> {
     }
 }
 
+fn unit(usb: &UsbSpec) -> String {
+    let place = match (&usb.serial, &usb.port) {
+        (Some(serial), _) => format!(" serial {}", serial.escape_debug()),
+        (None, Some(port)) => format!(" port {port}"),
+        (None, None) => " any unit".to_owned(),
+    };
+    format!("{:04x}:{:04x}{place}", usb.vid, usb.pid)
+}
+
 fn line(out: &mut dyn Write, line: &Line<'_>) -> io::Result<()> {
     writeln!(out, "{}", text::json(line)?)
 }
@@ -97,12 +106,7 @@ fn table(loaded: &Loaded, out: &mut dyn Write) -> io::Result<()> {
     let mut rows = vec![header];
     for device in &loaded.registry.devices {
         let row = row(device);
-        let place = match (&row.identity.serial, &row.identity.port) {
-            (Some(serial), _) => format!(" serial {}", serial.escape_debug()),
-            (None, Some(port)) => format!(" port {port}"),
-            (None, None) => " any unit".to_owned(),
-        };
-        let identity = format!("{:04x}:{:04x}{place}", row.identity.vid, row.identity.pid);
+        let identity = row.identity.usb().map_or_else(|| "on the network".to_owned(), unit);
         let cells = [row.bit.to_string(), row.name.into(), row.node.into(), identity, row.topic.into(), row.format];
         rows.push(cells);
     }

@@ -8,6 +8,7 @@
 //! Invariant: no bytes from a device make a driver panic.
 
 pub mod camera;
+pub mod can;
 pub mod process;
 pub mod replay;
 pub mod serial;
@@ -19,6 +20,7 @@ use crate::provenance::Negotiated;
 use crate::registry::scenario::{SimDevice, SimSource};
 use crate::registry::{DeviceNode, DeviceSpec, NodeSpec};
 use crate::sample::Encoding;
+use crate::status::Episode;
 use crate::time::Stamp;
 
 /// One sample as the device gave it, borrowed until the next read.
@@ -83,6 +85,8 @@ impl Driver {
             (_, DeviceNode::Sim(device)) => Self::open_sim(spec, device).await,
             (NodeSpec::Camera(_), node) => Err(wrong_kind(spec, "camera", node)),
             (NodeSpec::Serial(_), node) => Err(wrong_kind(spec, "serial line", node)),
+            (NodeSpec::Can(_), node) => Err(wrong_kind(spec, "CAN adapter", node)),
+            (NodeSpec::Lan(_), node) => Err(wrong_kind(spec, "network device", node)),
             // The rig supervises programs itself: `process` only starts and ends them.
             (NodeSpec::Process(_), node) => Err(wrong_kind(spec, "program", node)),
         }
@@ -123,6 +127,28 @@ impl Driver {
         }
     }
 
+    /// Tells a device that records by itself of the episode in progress, or with `None` that there is
+    /// none: when one begins or ends, and of one in progress when the device is opened. Returns at once:
+    /// what takes time is done by [`Self::read`] or a task of the driver's own.
+    ///
+    /// # Errors
+    /// When the device cannot do it, for people; it is read on.
+    pub fn record(&mut self, episode: Option<&Arc<Episode>>) -> Result<(), DriverError> {
+        let _ = episode;
+        match self {
+            Self::Camera(_) | Self::Serial(_) | Self::Sim(_) | Self::Replay(_) => Ok(()),
+        }
+    }
+
+    /// Ends in order what the device does by itself: the run ends, or the device was unplugged. Is given
+    /// up after a moment. A driver that is only dropped has been read to its end, or was given up.
+    #[expect(clippy::unused_async, reason = "devices on a network take time to be told")]
+    pub async fn close(self) {
+        match self {
+            Self::Camera(_) | Self::Serial(_) | Self::Sim(_) | Self::Replay(_) => {}
+        }
+    }
+
     /// What was agreed with the device: format, rate, driver, for people.
     #[must_use]
     pub fn description(&self) -> String {
@@ -152,6 +178,8 @@ fn wrong_kind(spec: &DeviceSpec, wished: &str, node: &DeviceNode) -> DriverError
         DeviceNode::Video(_) => "a camera",
         DeviceNode::Tty(_) => "a serial line",
         DeviceNode::Usb(_) => "a USB device",
+        DeviceNode::Net(_) => "a network interface",
+        DeviceNode::Lan(_) => "on the network",
         DeviceNode::Sim(_) => "simulated",
     };
     DriverError::Fatal(format!(

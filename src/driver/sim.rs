@@ -261,6 +261,8 @@ pub(super) fn check(spec: &DeviceSpec, device: &SimDevice) -> Result<(), DriverE
             }
             (format!("{channels} numbers"), serial.channels.to_string())
         }
+        // What stands for them sends as much as it likes.
+        (SimSource::Camera { .. } | SimSource::Serial { .. }, NodeSpec::Can(_) | NodeSpec::Lan(_)) => return Ok(()),
         (SimSource::Camera { .. }, NodeSpec::Serial(_)) => (String::from("pictures"), String::from("a serial line")),
         (SimSource::Serial { .. }, NodeSpec::Camera(_)) => (String::from("numbers"), String::from("a camera")),
         (SimSource::Task { .. } | SimSource::Process | SimSource::Replay { .. }, _) | (_, NodeSpec::Process(_)) => {

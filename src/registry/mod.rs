@@ -19,13 +19,15 @@ pub mod trust;
 pub mod units;
 mod words;
 
-pub use attachment::{Attachment, DeviceNode, UsbIdentity};
+pub use attachment::{Attachment, DeviceNode, LanIdentity, Unit, UsbIdentity};
 pub(crate) use diagnostic::did_you_mean;
 pub use diagnostic::{Diagnostic, RegistryErrors};
 pub use identity::{Assigner, Assignment, Detached, Explanation};
 pub use limits::{Limits, VerdictSpec};
 pub use parse::{BUILTIN, Loaded};
 pub use spec::{
-    ActionSpec, CameraSpec, DeviceSpec, Framing, IdentitySpec, MAX_BORROWED, MAX_SUBSCRIBERS, Mount, NodeSpec, Opens,
-    POOL_SPARE, Parse, PixelFormat, ProcessSpec, Registry, RigSpec, SerialSpec, WhenStale,
+    ActionSpec, CameraSpec, CanAdapter, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, Framing, Hook, Hooks,
+    IdentitySpec, LanProtocol, LanSpec, MAX_BORROWED, MAX_SUBSCRIBERS, MOTOR_CHANNELS, MotorKind, MotorMode, MotorSpec,
+    Mount, NodeSpec, Opens, POOL_SPARE, Parse, PixelFormat, ProcessSpec, Registry, RigSpec, SerialSpec, UsbSpec,
+    WhenStale,
 };

@@ -8,8 +8,11 @@
 
 mod action;
 mod budget;
+mod can;
 mod device;
 mod file;
+mod hooks;
+mod lan;
 mod node;
 mod process;
 mod program;
@@ -20,7 +23,7 @@ use std::time::Duration;
 
 use super::diagnostic::{Diagnostic, RegistryErrors};
 use super::section::{At, Problems, Section, file_label, read};
-use super::spec::{Registry, RigSpec};
+use super::spec::{IdentitySpec, Registry, RigSpec};
 use super::trust::distrust;
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use device::Draft;
@@ -90,7 +93,7 @@ impl Registry {
         check_actuators(&drafts, &mut problems);
         let mut warnings = assign_bits(&mut drafts, &mut problems);
         warnings.extend(unused_ports(&drafts, &problems));
-        warnings.extend(drafts.iter().filter_map(|draft| program::distrusted(draft, &problems)));
+        warnings.extend(drafts.iter().flat_map(|draft| program::distrusted(draft, &problems)));
         warnings.extend(budget::fit(&mut drafts, rig.memory_budget, root.at_of("rig"), &mut problems));
         problems.check()?;
         let mut devices: Vec<_> = drafts.into_iter().filter_map(|draft| draft.finish(&verdict)).collect();
@@ -186,9 +189,9 @@ fn drafts<'a>(root: &Section<'a>, programs: Programs<'_>, problems: &mut Problem
 /// device may have one entry for its camera and one for its serial line.
 fn check_identities(drafts: &[Draft<'_>], problems: &mut Problems<'_>) {
     for (index, draft) in drafts.iter().enumerate() {
-        let Some(identity) = &draft.identity else { continue };
+        let Some(identity) = draft.identity.as_ref().and_then(IdentitySpec::usb) else { continue };
         let same_unit = |other: &&Draft<'_>| {
-            let Some(earlier) = &other.identity else { return false };
+            let Some(earlier) = other.identity.as_ref().and_then(IdentitySpec::usb) else { return false };
             let same_model = (earlier.vid, earlier.pid, other.opens()) == (identity.vid, identity.pid, draft.opens());
             let same_place = match (&identity.serial, &earlier.serial) {
                 (Some(serial), Some(earlier)) => serial == earlier,
@@ -212,7 +215,8 @@ fn check_identities(drafts: &[Draft<'_>], problems: &mut Problems<'_>) {
 
 fn unused_ports(drafts: &[Draft<'_>], problems: &Problems<'_>) -> Vec<Diagnostic> {
     let both = drafts.iter().filter(|draft| {
-        draft.identity.as_ref().is_some_and(|identity| identity.serial.is_some() && identity.port.is_some())
+        let usb = draft.identity.as_ref().and_then(IdentitySpec::usb);
+        usb.is_some_and(|usb| usb.serial.is_some() && usb.port.is_some())
     });
     let warn = |draft: &Draft<'_>| {
         let message = "port has no effect beside a serial number: the unit is recognised in every port".to_owned();

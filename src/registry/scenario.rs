@@ -11,7 +11,7 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::Duration;
 
-use super::attachment::UsbIdentity;
+use super::attachment::{LanIdentity, UsbIdentity};
 use crate::provenance::KernelDriver;
 use crate::time::Stamp;
 
@@ -33,6 +33,8 @@ pub struct ScenarioDevice {
     pub name: String,
     /// What it says it is when plugged.
     pub usb: UsbIdentity,
+    /// It is on the network and says this instead; only its port is of use then.
+    pub lan: Option<LanIdentity>,
     /// What it sends.
     pub source: SimSource,
     /// Plugged when the scenario begins.

@@ -44,7 +44,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Duration;
 
-use super::attachment::UsbIdentity;
+use super::attachment::{LanIdentity, UsbIdentity};
 use super::diagnostic::{RegistryErrors, did_you_mean};
 use super::parse::{is_port, read_file};
 use super::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, SimFaults, SimSource};
@@ -147,17 +147,24 @@ fn standing_for(spec: &DeviceSpec, name: &str) -> ScenarioDevice {
         // Raw lines have no channels; something must be sent all the same.
         NodeSpec::Serial(serial) => SimSource::Serial { channels: serial.channels.max(1), hz: SERIAL_HZ, seed },
         NodeSpec::Process(_) => SimSource::Process,
+        NodeSpec::Can(_) | NodeSpec::Lan(_) => SimSource::Serial { channels: 1, hz: SERIAL_HZ, seed },
     };
+    let wished = spec.identity.usb();
+    let lan = wished.is_none().then(|| LanIdentity {
+        entry: spec.name.clone(),
+        address: format!("sim:{name}"),
+        instance: None,
+    });
     let usb = UsbIdentity {
-        vid: spec.identity.vid,
-        pid: spec.identity.pid,
-        serial: Some(spec.identity.serial.clone().unwrap_or_else(|| format!("SIM-{name}"))),
-        port: spec.identity.port.clone().unwrap_or_default(),
+        vid: wished.map_or(0, |wished| wished.vid),
+        pid: wished.map_or(0, |wished| wished.pid),
+        serial: Some(spec.identity.serial().map_or_else(|| format!("SIM-{name}"), str::to_owned)),
+        port: wished.and_then(|wished| wished.port.clone()).unwrap_or_default(),
         product: Some(format!("simulated {}", spec.name)),
         manufacturer: Some("rapid".to_owned()),
         firmware: Some("1.00".to_owned()),
     };
-    ScenarioDevice { name: name.to_owned(), usb, source, plugged: true, faults: SimFaults::default() }
+    ScenarioDevice { name: name.to_owned(), usb, lan, source, plugged: true, faults: SimFaults::default() }
 }
 
 /// Ports of a bus no rig has, for devices whose port nothing says.

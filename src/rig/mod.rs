@@ -7,8 +7,11 @@
 //! Invariant: nothing here waits for a device; a stream that is to end is told so and forgotten.
 //! Invariant: the end of a stream, by value or by panic, is an event like any other.
 
+mod attendant;
+mod output;
 mod owner;
 pub mod presence;
+mod programs;
 pub mod slot;
 mod stream;
 mod worker;

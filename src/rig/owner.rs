@@ -6,15 +6,17 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use futures::StreamExt;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 use tokio::task::{Id, JoinError, JoinSet};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep, timeout};
 use tokio_util::sync::CancellationToken;
 
+use super::attendant::Post;
 use super::presence::{JsonDevice, Presence};
+use super::programs::Programs;
 use super::slot::{Effects, End, Input, Slot};
 use super::stream::{Numbers, Report, Reported, Stream};
-use super::worker::{Seat, Workers};
+use super::worker::Seat;
 use super::{RigCommand, RigError};
 use crate::bus::{Actions, Bus, TopicId, Writer};
 use crate::hotplug::{HotplugEvent, HotplugStream, Witness};
@@ -22,7 +24,7 @@ use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::registry::{Assigner, Assignment, Attachment, DeviceSpec, Registry};
 use crate::sample::Epoch;
-use crate::status::{Board, Level, SlotState, What};
+use crate::status::{Board, EpisodeWatch, Level, SlotState, What};
 use crate::time::Stamp;
 
 /// The JSON file is written this often, and at every change.
@@ -47,7 +49,9 @@ pub struct Rig {
     tasks: HashMap<Id, (ModalityId, Epoch)>,
     reports: mpsc::Sender<Reported>,
     /// The programs, if an entry needs one.
-    workers: Option<Workers>,
+    programs: Option<Programs>,
+    /// The episode in progress.
+    episode: EpisodeWatch,
 }
 
 /// A slot and what belongs to it.
@@ -63,7 +67,9 @@ struct Modality {
     stop: CancellationToken,
     /// Where its program works, if it has one.
     seat: Option<Seat>,
-    /// What it is told, if it is the actuator.
+    /// Where its hooks are run, if a program is run at all.
+    post: Option<Post>,
+    /// What it is told, if it is the actuator and no program reads it.
     actions: Option<Arc<Actions>>,
     /// What was agreed with the device, or why it does not run.
     detail: String,
@@ -73,18 +79,26 @@ impl Rig {
     /// A rig with every slot empty, which publishes through `presence`.
     #[must_use]
     pub fn new(registry: &Registry, bus: &Bus, presence: Presence, board: Arc<Board>) -> Self {
-        let workers = Workers::new(registry, bus, &board);
+        let programs = Programs::new(registry, &board);
+        let prefix = bus.membership().prefix();
         let modality = |spec: &DeviceSpec| {
             let writer = bus.writer(TopicId::Modality(spec.id))?;
+            let spec = Arc::new(spec.clone());
+            let seat = programs.as_ref().and_then(|programs| Seat::new(programs, &spec, bus));
+            let post = programs
+                .as_ref()
+                .map(|programs| Post::new(programs, &spec, prefix.clone(), seat.as_ref().map(Seat::turn)));
             Some(Modality {
-                spec: Arc::new(spec.clone()),
                 slot: Slot::new(registry.rig.cooldown),
                 writer,
                 numbers: Arc::default(),
                 attached: Stamp::default(),
                 stop: CancellationToken::new(),
-                actions: spec.action.as_ref().and_then(|_| bus.actions()),
-                seat: workers.as_ref().and_then(|workers| workers.seat(spec, bus)),
+                // A program that moves its device listens itself.
+                actions: spec.action.as_ref().filter(|_| seat.is_none()).and_then(|_| bus.actions()),
+                seat,
+                post,
+                spec,
                 detail: String::new(),
             })
         };
@@ -99,20 +113,8 @@ impl Rig {
             streams: JoinSet::new(),
             tasks: HashMap::new(),
             reports: mpsc::channel(1).0,
-            workers,
-        }
-    }
-
-    /// Cancelled, it kills the programs that are being ended.
-    #[must_use]
-    pub fn hurry(&self) -> CancellationToken {
-        self.workers.as_ref().map_or_else(CancellationToken::new, Workers::hurry)
-    }
-
-    /// After a run, waits for the programs of its devices, which it told to end.
-    pub async fn programs_ended(&self) {
-        if let Some(workers) = &self.workers {
-            workers.ended().await;
+            programs,
+            episode: watch::channel(None).1,
         }
     }
 
@@ -165,9 +167,9 @@ impl Rig {
                 match self.assigner.attach(&attachment) {
                     Assignment::Entry(id) => self.attached(id, attachment),
                     Assignment::Waiting { reason } | Assignment::Unregistered { reason } => {
-                        let usb = &attachment.usb;
-                        let serial = usb.serial.as_deref().unwrap_or("no serial");
-                        let device = format!("{:04x}:{:04x} ({serial}) at {}", usb.vid, usb.pid, usb.port);
+                        let unit = &attachment.unit;
+                        let serial = unit.serial().unwrap_or("no serial");
+                        let device = format!("{} ({serial}) at {}", unit.model(), unit.place());
                         self.board.announce(What::Unregistered { device, reason });
                     }
                     Assignment::WrongNode { reason } => tracing::debug!(%reason, "node not used"),
@@ -186,11 +188,12 @@ impl Rig {
             device: modality.spec.name.clone(),
             bit: id,
             node: attachment.node.label(),
-            usb: attachment.usb.clone(),
+            unit: attachment.unit.clone(),
             driver: attachment.driver.as_deref().cloned(),
         };
         modality.attached = Stamp::now();
         self.board.announce(what);
+        self.attend(id, &attachment);
         self.apply(id, Input::Attached(attachment));
     }
 
@@ -199,6 +202,7 @@ impl Rig {
         for id in detached.freed {
             self.tell_detach(id, witness.word());
             self.apply(id, Input::Detached);
+            self.dismiss(id);
         }
         for (id, attachment) in detached.assigned {
             self.attached(id, attachment);
@@ -315,7 +319,7 @@ impl Rig {
     }
 
     fn start(&mut self, id: ModalityId, epoch: Epoch, attachment: Attachment) {
-        let (board, reports) = (Arc::clone(&self.board), self.reports.clone());
+        let (board, reports, episode) = (Arc::clone(&self.board), self.reports.clone(), self.episode.clone());
         let Some(modality) = self.modality(id) else { return };
         modality.stop = CancellationToken::new();
         let stream = Stream {
@@ -330,6 +334,7 @@ impl Rig {
             stop: modality.stop.clone(),
             seat: modality.seat.clone(),
             actions: modality.actions.clone(),
+            episode,
         };
         let task = self.streams.spawn(stream.run());
         self.tasks.insert(task.id(), (id, epoch));
@@ -389,5 +394,6 @@ impl Rig {
     }
 }
 
+mod programs;
 #[cfg(test)]
 mod tests;

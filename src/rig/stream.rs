@@ -19,10 +19,9 @@ use crate::bus::{Actions, Writer};
 use crate::driver::{Driver, DriverError, Reading};
 use crate::fault;
 use crate::provenance::Negotiated;
-use crate::registry::scenario::SimSource;
-use crate::registry::{Attachment, DeviceNode, DeviceSpec, NodeSpec};
+use crate::registry::{Attachment, DeviceSpec, NodeSpec};
 use crate::sample::{Epoch, SampleHeader};
-use crate::status::{Board, Provenance};
+use crate::status::{Board, Episode, EpisodeWatch, Provenance};
 use crate::time::{Stamp, nanoseconds};
 
 /// A device that does not open within this time is tried again.
@@ -34,6 +33,8 @@ const SILENT_AFTER: Duration = Duration::from_secs(2);
 /// A camera always sends: one that has sent nothing for this long is opened again. Six of these and the
 /// delays between them fit into the minute in which five restarts are allowed.
 const CAMERA_LIMIT: Duration = Duration::from_secs(5);
+/// How long a device may take to be closed in order.
+const CLOSE_LIMIT: Duration = Duration::from_secs(2);
 /// How often the actuator is asked whether it was told something.
 const ACTIONS_EVERY: Duration = Duration::from_millis(2);
 
@@ -93,6 +94,8 @@ pub(super) struct Stream {
     pub(super) seat: Option<Seat>,
     /// What it is told, if it is the actuator.
     pub(super) actions: Option<Arc<Actions>>,
+    /// The episode in progress, of which devices are told that record by themselves.
+    pub(super) episode: EpisodeWatch,
 }
 
 /// Where the samples of a stream come from.
@@ -107,7 +110,7 @@ impl Source {
         let Stream { spec, attachment, epoch, seat, .. } = stream;
         match (&spec.node, seat) {
             // A recorded topic needs no program.
-            (NodeSpec::Process(process), Some(seat)) if !is_recording(&attachment.node) => {
+            (NodeSpec::Process(process), Some(seat)) if !attachment.node.is_recording() => {
                 Ok(Self::Worker(Box::new(Worker::open(seat, spec, process, attachment, *epoch).await?)))
             }
             _ => Ok(Self::Driver(Driver::open(spec, &attachment.node).await?)),
@@ -135,6 +138,22 @@ impl Source {
         }
     }
 
+    /// What a program wants to know of episodes its hooks are told.
+    fn record(&mut self, episode: Option<&Arc<Episode>>) -> Result<(), DriverError> {
+        match self {
+            Self::Driver(driver) => driver.record(episode),
+            Self::Worker(_) => Ok(()),
+        }
+    }
+
+    /// The stream was told to stop.
+    async fn close(self) {
+        match self {
+            Self::Driver(driver) => drop(timeout(CLOSE_LIMIT, driver.close()).await),
+            Self::Worker(worker) => drop(worker),
+        }
+    }
+
     fn negotiated(&self) -> Negotiated {
         match self {
             Self::Driver(driver) => driver.negotiated(),
@@ -152,30 +171,31 @@ impl Source {
     }
 }
 
-fn is_recording(node: &DeviceNode) -> bool {
-    matches!(node, DeviceNode::Sim(device) if matches!(device.source, SimSource::Replay { .. }))
-}
-
 impl Stream {
     /// Reads the device until it ends or the stream is told to stop. The reason is for people.
     pub(super) async fn run(self) -> (End, String) {
-        let stop = self.stop.clone();
         let stopped = || (End::Gone, "stopped".to_owned());
-        tokio::select! {
+        let opened = tokio::select! {
             biased;
-            () = stop.cancelled() => stopped(),
-            end = self.read() => end,
-        }
-    }
-
-    async fn read(self) -> (End, String) {
-        let opened = timeout(OPEN_LIMIT, Source::open(&self)).await;
+            () = self.stop.cancelled() => return stopped(),
+            opened = timeout(OPEN_LIMIT, Source::open(&self)) => opened,
+        };
         let mut source = match opened {
             Ok(Ok(source)) => source,
             Ok(Err(error)) => return end(&error),
             Err(_) => return (End::Retry, format!("did not open within {} s", OPEN_LIMIT.as_secs())),
         };
-        self.report(Report::Opened(source.description(), Box::new(self.provenance(&source)))).await;
+        tokio::select! {
+            biased;
+            () = self.stop.cancelled() => {}
+            end = self.read(&mut source) => return end,
+        }
+        source.close().await;
+        stopped()
+    }
+
+    async fn read(&self, source: &mut Source) -> (End, String) {
+        self.report(Report::Opened(source.description(), Box::new(self.provenance(source)))).await;
         let patience = source.patience(self.spec.stall_after);
         let mut pulse = Pulse::Silent;
         let mut refused = false;
@@ -188,6 +208,12 @@ impl Stream {
         let mut action = [0.0; MAX_ACTION];
         // What was said before it was there was not meant for now.
         let _ = self.actions.as_ref().and_then(|actions| actions.newest(&mut action));
+        let mut episode = self.episode.clone();
+        if episode.borrow_and_update().is_some() {
+            episode.mark_changed();
+        }
+        let news = changed(episode.clone());
+        tokio::pin!(news);
         // The timer is looked at when it fires, not set anew at every sample.
         let mut newest = Instant::now();
         loop {
@@ -210,6 +236,8 @@ impl Stream {
                         pulse = Pulse::Beating;
                         self.report(report).await;
                     }
+                    // A device that always has something to read never lets us get to `news`.
+                    self.tell(source, &mut episode).await;
                 }
                 _ = told.tick(), if self.actions.is_some() => {
                     let newest = self.actions.as_ref().and_then(|actions| actions.newest(&mut action));
@@ -220,6 +248,10 @@ impl Stream {
                         refused = true;
                         self.report(Report::Refused(format!("it does not move: {error}"))).await;
                     }
+                }
+                () = &mut news => {
+                    self.tell(source, &mut episode).await;
+                    news.set(changed(episode.clone()));
                 }
                 reason = &mut silent, if pulse == Pulse::Silent => return (End::Retry, reason),
                 () = &mut stall => {
@@ -241,6 +273,18 @@ impl Stream {
         }
     }
 
+    /// Tells the device what is new of the episode in progress, if anything is.
+    async fn tell(&self, source: &mut Source, episode: &mut EpisodeWatch) {
+        if !episode.has_changed().unwrap_or(false) {
+            return;
+        }
+        let now = episode.borrow_and_update().clone();
+        if let Err(error) = source.record(now.as_ref()) {
+            let verb = if now.is_some() { "start" } else { "stop" };
+            self.report(Report::Refused(format!("it does not {verb} recording: {error}"))).await;
+        }
+    }
+
     /// Says that the device sends nothing; ends, with the reason, when it is to be opened again.
     async fn silence(&self) -> String {
         let opened = Instant::now();
@@ -248,7 +292,7 @@ impl Stream {
         let Some(at) = opened.checked_add(say) else { return std::future::pending().await };
         sleep_until(at).await;
         self.report(Report::Silent(say)).await;
-        if !matches!(self.spec.node, NodeSpec::Camera(_)) || is_recording(&self.attachment.node) {
+        if !matches!(self.spec.node, NodeSpec::Camera(_)) || self.attachment.node.is_recording() {
             return std::future::pending().await;
         }
         let limit = CAMERA_LIMIT.max(2 * say);
@@ -263,7 +307,7 @@ impl Stream {
             epoch: self.epoch,
             node: self.attachment.node.label(),
             attached: self.attached,
-            usb: self.attachment.usb.clone(),
+            unit: self.attachment.unit.clone(),
             negotiated,
             latency_ns: nanoseconds(self.spec.latency),
         }
@@ -310,6 +354,14 @@ enum Pulse {
     Silent,
     Beating,
     Stalled,
+}
+
+/// Returns when there is news of an episode.
+async fn changed(mut episode: EpisodeWatch) {
+    if episode.changed().await.is_err() {
+        // Nobody records any more.
+        std::future::pending::<()>().await;
+    }
 }
 
 fn end(error: &DriverError) -> (End, String) {

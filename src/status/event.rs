@@ -8,7 +8,7 @@ use serde::Serialize;
 use super::{Chunk, Grade, Level, SlotState, Verdict};
 use crate::modality::ModalityId;
 use crate::provenance::{KernelDriver, Negotiated};
-use crate::registry::UsbIdentity;
+use crate::registry::Unit;
 use crate::sample::Epoch;
 use crate::text;
 use crate::time::Stamp;
@@ -37,7 +37,7 @@ pub enum What {
         node: String,
         /// The unit.
         #[serde(flatten)]
-        usb: UsbIdentity,
+        unit: Unit,
         /// The kernel's driver of it.
         driver: Option<KernelDriver>,
     },
@@ -201,7 +201,7 @@ pub struct Provenance {
     pub attached: Stamp,
     /// The unit.
     #[serde(flatten)]
-    pub usb: UsbIdentity,
+    pub unit: Unit,
     /// What was agreed with it. The driver is hot-plug's where the open node names none.
     #[serde(flatten)]
     pub negotiated: Negotiated,
@@ -221,9 +221,9 @@ impl What {
     #[must_use]
     pub fn sentence(&self) -> Option<(Level, String)> {
         Some(match self {
-            Self::Attach { device, node, usb, .. } => {
-                let serial = usb.serial.as_deref().map(|serial| format!(", serial {serial}")).unwrap_or_default();
-                (Level::Info, format!("{device} attached ({node} at port {}{serial})", usb.port))
+            Self::Attach { device, node, unit, .. } => {
+                let serial = unit.serial().map(|serial| format!(", serial {serial}")).unwrap_or_default();
+                (Level::Info, format!("{device} attached ({node} at {}{serial})", unit.location()))
             }
             // The slot's state changes with it and names the witness, or what was agreed.
             Self::Detach { .. } | Self::Opened { .. } => return None,

@@ -8,7 +8,7 @@
 use std::fmt::Write as _;
 
 use super::HEADER;
-use crate::registry::spec::{DeviceSpec, NodeSpec, Opens, Registry};
+use crate::registry::spec::{CanAdapter, DeviceSpec, NodeSpec, Opens, Registry, UsbSpec};
 
 /// The rules of a whole registry.
 pub(super) fn rules(registry: &Registry) -> String {
@@ -19,11 +19,11 @@ pub(super) fn rules(registry: &Registry) -> String {
          # read before this file.\n"
     );
     for device in &registry.devices {
-        let usb = &device.identity;
+        let Some(usb) = device.identity.usb() else { continue };
         // Writing to a String cannot fail.
         let _ = writeln!(text, "\n# {}: {:04x}:{:04x}", device.name, usb.vid, usb.pid);
         let _ = match identify(registry, device) {
-            Ok(identity) => writeln!(text, "{}", rule(device, &identity)),
+            Ok(identity) => writeln!(text, "{}", rule(device, usb, &identity)),
             Err(reason) => writeln!(text, "# No stable name: {reason}."),
         };
     }
@@ -32,7 +32,10 @@ pub(super) fn rules(registry: &Registry) -> String {
 
 /// The matches that single out an entry's unit among all others, or why there are none.
 pub(super) fn identify(registry: &Registry, device: &DeviceSpec) -> Result<String, String> {
-    let usb = &device.identity;
+    let Some(usb) = device.identity.usb() else { return Err("it is no USB device".to_owned()) };
+    if opens(device) == Opens::Net {
+        return Err("a network interface has no path".to_owned());
+    }
     if let Some(serial) = &usb.serial {
         return match quoted_match(serial) {
             Some(serial) => Ok(format!(", {}{{serial}}==\"{serial}\"", keys(device).0)),
@@ -46,7 +49,8 @@ pub(super) fn identify(registry: &Registry, device: &DeviceSpec) -> Result<Strin
         return Ok(format!(", {}==\"{port}\"", keys(device).1));
     }
     let same_model = |other: &&DeviceSpec| {
-        (other.identity.vid, other.identity.pid) == (usb.vid, usb.pid) && subsystem(other) == subsystem(device)
+        let is_model = other.identity.usb().is_some_and(|other| (other.vid, other.pid) == (usb.vid, usb.pid));
+        is_model && subsystem(other) == subsystem(device)
     };
     if registry.devices.iter().filter(same_model).count() == 1 {
         return Ok(String::new());
@@ -54,20 +58,20 @@ pub(super) fn identify(registry: &Registry, device: &DeviceSpec) -> Result<Strin
     Err("several entries are of this model and this one has neither serial number nor port".to_owned())
 }
 
-fn rule(device: &DeviceSpec, identity: &str) -> String {
+fn rule(device: &DeviceSpec, usb: &UsbSpec, identity: &str) -> String {
     // A camera has several nodes; index 0 is the one that captures pictures.
     let (index, group) = match opens(device) {
         Opens::Video => (", ATTR{index}==\"0\"", "video"),
         Opens::Tty => ("", "dialout"),
-        Opens::Usb => (", ENV{DEVTYPE}==\"usb_device\"", "plugdev"),
+        Opens::Usb | Opens::Net => (", ENV{DEVTYPE}==\"usb_device\"", "plugdev"),
     };
     let attr = keys(device).0;
     format!(
         "SUBSYSTEM==\"{}\"{index}, {attr}{{idVendor}}==\"{:04x}\", {attr}{{idProduct}}==\"{:04x}\"{identity}, \
          SYMLINK+=\"rapid/{}\", GROUP=\"{group}\", MODE=\"0660\", TAG+=\"uaccess\", RUN{{builtin}}+=\"uaccess\"",
         subsystem(device),
-        device.identity.vid,
-        device.identity.pid,
+        usb.vid,
+        usb.pid,
         device.name,
     )
 }
@@ -77,6 +81,7 @@ const fn subsystem(device: &DeviceSpec) -> &'static str {
         Opens::Video => "video4linux",
         Opens::Tty => "tty",
         Opens::Usb => "usb",
+        Opens::Net => "net",
     }
 }
 
@@ -86,6 +91,11 @@ pub(super) const fn opens(device: &DeviceSpec) -> Opens {
         NodeSpec::Camera(_) => Opens::Video,
         NodeSpec::Serial(_) => Opens::Tty,
         NodeSpec::Process(process) => process.opens,
+        NodeSpec::Can(can) => match can.adapter {
+            CanAdapter::SocketCan => Opens::Net,
+            CanAdapter::Slcan | CanAdapter::Damiao => Opens::Tty,
+        },
+        NodeSpec::Lan(_) => Opens::Net,
     }
 }
 
@@ -94,7 +104,7 @@ pub(super) const fn opens(device: &DeviceSpec) -> Opens {
 const fn keys(device: &DeviceSpec) -> (&'static str, &'static str) {
     match opens(device) {
         Opens::Usb => ("ATTR", "KERNEL"),
-        Opens::Video | Opens::Tty => ("ATTRS", "KERNELS"),
+        Opens::Video | Opens::Tty | Opens::Net => ("ATTRS", "KERNELS"),
     }
 }
 

@@ -5,6 +5,7 @@ use proptest::prelude::*;
 use yaml_rust2::{Yaml, YamlLoader};
 
 use super::*;
+use crate::registry::IdentitySpec;
 
 fn text_of(all: &[Artifact], path: &str) -> String {
     all.iter().find(|artifact| artifact.path == Path::new(path)).unwrap().contents.clone()
@@ -16,7 +17,8 @@ fn rule_lines(rules: &str) -> Vec<&str> {
 
 fn with_serial(serial: &str) -> Registry {
     let mut registry = Registry::builtin();
-    registry.devices[0].identity.serial = Some(serial.to_owned());
+    let IdentitySpec::Usb(usb) = &mut registry.devices[0].identity else { panic!("a USB device") };
+    usb.serial = Some(serial.to_owned());
     registry
 }
 

@@ -3,21 +3,24 @@
 use std::path::Path;
 use std::time::Duration;
 
-use super::program::Programs;
+use toml::de::DeValue;
+
+use super::program::{For, Programs};
 use super::verdict::{VerdictTable, Whose};
-use super::{action, node, process, verdict};
+use super::{action, can, hooks, lan, node, process, verdict};
 use crate::modality::ModalityId;
 use crate::registry::diagnostic::did_you_mean;
 use crate::registry::section::{At, Problems, Section};
-use crate::registry::spec::{ActionSpec, DeviceSpec, IdentitySpec, Mount, NodeSpec, Opens, WhenStale};
+use crate::registry::spec::{
+    ActionSpec, CanAdapter, DeviceSpec, Hook, Hooks, IdentitySpec, Mount, NodeSpec, Opens, UsbSpec, WhenStale,
+};
 
 /// Kinds of node this version has a driver for.
-pub(super) const BUILT_IN: [(&str, Kind); 2] = [("camera", Kind::Camera), ("serial", Kind::Serial)];
-/// Kinds of node that are designed but have no driver in this version.
-const PLANNED: [&str; 2] = ["can", "lan"];
-/// Keys that only planned kinds of node have.
-const PLANNED_KEYS: [&str; 4] = ["can", "lan", "on_attach", "on_detach"];
-const KEYS: [&str; 18] = [
+pub(super) const BUILT_IN: [(&str, Kind); 4] =
+    [("camera", Kind::Camera), ("serial", Kind::Serial), ("can", Kind::Can), ("lan", Kind::Lan)];
+/// Says that `on_attach` is the program that reads the device.
+const PROCESS: &str = "process";
+const KEYS: [&str; 24] = [
     "vid",
     "pid",
     "serial",
@@ -33,9 +36,15 @@ const KEYS: [&str; 18] = [
     "when_stale",
     "latency",
     "camera",
+    "can",
+    "lan",
     "process",
     "verdict",
     "action",
+    "on_attach",
+    "on_detach",
+    "on_record_start",
+    "on_record_stop",
 ];
 
 /// The mask is 64 bits wide.
@@ -49,6 +58,8 @@ const LONGEST_LATENCY: Duration = Duration::from_secs(1);
 pub(super) enum Kind {
     Camera,
     Serial,
+    Can,
+    Lan,
     Process,
 }
 
@@ -73,6 +84,7 @@ pub(super) struct Draft<'a> {
     latency: Duration,
     verdict: VerdictTable,
     pub(super) action: Option<ActionSpec>,
+    hooks: Hooks,
 }
 
 impl Draft<'_> {
@@ -94,6 +106,7 @@ impl Draft<'_> {
             when_stale: self.when_stale,
             latency: self.latency,
             action: self.action,
+            hooks: self.hooks,
         })
     }
 
@@ -112,15 +125,19 @@ impl Draft<'_> {
             NodeSpec::Camera(_) => Opens::Video,
             NodeSpec::Serial(_) => Opens::Tty,
             NodeSpec::Process(process) => process.opens,
+            NodeSpec::Can(can) if can.adapter != CanAdapter::SocketCan => Opens::Tty,
+            NodeSpec::Can(_) | NodeSpec::Lan(_) => Opens::Net,
         })
     }
 
-    /// The program that reads it, if one does.
-    pub(super) fn program(&self) -> Option<&Path> {
-        match self.node.as_ref()? {
-            NodeSpec::Process(process) => Some(&process.program),
-            NodeSpec::Camera(_) | NodeSpec::Serial(_) => None,
-        }
+    /// The programs that are run for it, each with the key that names it.
+    pub(super) fn programs(&self) -> impl Iterator<Item = (&'static str, &Path)> {
+        let key = if attach_is_node(&self.section) { "on_attach" } else { "node" };
+        let node = self.node.as_ref().and_then(|node| match node {
+            NodeSpec::Process(process) => Some((key, process.program.as_path())),
+            NodeSpec::Camera(_) | NodeSpec::Serial(_) | NodeSpec::Can(_) | NodeSpec::Lan(_) => None,
+        });
+        node.into_iter().chain(self.hooks.all().map(|(key, hook)| (key, hook.program.as_path())))
     }
 
     pub(super) fn is_camera(&self) -> bool {
@@ -138,16 +155,19 @@ pub(super) fn read<'a>(
     check_name(name, &section, problems);
     check_keys(&section, problems);
     let kind = kind(&section, problems);
-    let identity = identity(&section, problems);
+    let identity = identity(kind, &section, problems);
     let mut heartbeat = None;
     let settings = match kind {
         Some(Kind::Camera) => Some(NodeSpec::Camera(node::camera(&section, problems))),
         Some(Kind::Serial) => node::serial(&section, problems).map(NodeSpec::Serial),
-        Some(Kind::Process) => section.text(problems, "node").and_then(|program| {
-            let (process, silent) = process::process(&section, program.value, programs, problems)?;
-            heartbeat = Some(silent);
-            Some(NodeSpec::Process(process))
-        }),
+        Some(Kind::Can) => can::can(&section, problems).map(NodeSpec::Can),
+        Some(Kind::Lan) => lan::lan(&section, problems).map(NodeSpec::Lan),
+        Some(Kind::Process) => {
+            process::process(&section, program(&section, programs, problems), problems).map(|(process, silent)| {
+                heartbeat = Some(silent);
+                NodeSpec::Process(process)
+            })
+        }
         None => None,
     };
     if kind.is_some_and(|kind| kind != Kind::Process) && section.has("process") {
@@ -183,6 +203,7 @@ pub(super) fn read<'a>(
         latency,
         verdict: verdict::read(&section, Whose::Device, problems),
         action: action::action(&section, problems),
+        hooks: hooks::hooks(&section, attach_is_node(&section), programs, problems),
         node: settings,
         section,
     }
@@ -208,36 +229,53 @@ fn check_keys(section: &Section<'_>, problems: &mut Problems<'_>) {
         if KEYS.contains(&key) {
             continue;
         }
-        if PLANNED_KEYS.contains(&key) {
-            let fix = "remove it; this version reads camera and serial devices, and through programs";
-            problems.report(at, &section.entry, format!("{key:?} is not supported by this version of rapid"), fix);
-        } else {
-            let fix = did_you_mean(key, &KEYS, "known keys here");
-            problems.report(at, &section.entry, format!("unknown key {key:?}"), fix);
-        }
+        let fix = did_you_mean(key, &KEYS, "known keys here");
+        problems.report(at, &section.entry, format!("unknown key {key:?}"), fix);
     }
 }
 
 fn kind(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<Kind> {
     if !section.has("node") {
-        section.missing(problems, "node", "write node = \"camera\", \"serial\" or the name of a program");
+        section.missing(
+            problems,
+            "node",
+            "write node = \"camera\", \"serial\", \"can\", \"lan\" or the name of a program",
+        );
         return None;
     }
     let text = section.text(problems, "node")?.value;
-    if PLANNED.contains(&text) {
-        let fix = "built in are \"camera\" and \"serial\"; leave the entry out until then, or name a program";
-        section.report(problems, "node", format!("node {text:?} is not supported by this version of rapid"), fix);
-        return None;
-    }
-    if text == "process" {
-        let fix = "write node = the name of the program, for example node = \"tactile_publisher\"";
+    if text == PROCESS && !section.has("on_attach") {
+        let fix = "write node = the name of the program, for example node = \"tactile_publisher\", or add on_attach = \
+                   [\"tactile_publisher\", \"argument\"]";
         section.report(problems, "node", "node \"process\" does not say which program".to_owned(), fix);
         return None;
     }
     Some(BUILT_IN.iter().find(|(name, _)| *name == text).map_or(Kind::Process, |(_, kind)| *kind))
 }
 
-fn identity(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<IdentitySpec> {
+/// Is `on_attach` the program that reads the device?
+fn attach_is_node(section: &Section<'_>) -> bool {
+    let is_process = |key: &str, value: &DeValue<'_>| key == "node" && value.as_str() == Some(PROCESS);
+    section.has("on_attach") && section.fields().iter().any(|(_, key, value)| is_process(key, value.get_ref()))
+}
+
+/// The program that reads the device: what `node` names, or with `node = "process"` what `on_attach` does.
+fn program(section: &Section<'_>, programs: Programs<'_>, problems: &mut Problems<'_>) -> Option<Hook> {
+    if attach_is_node(section) {
+        return hooks::hook(section, "on_attach", programs, problems);
+    }
+    let name = section.text(problems, "node")?;
+    let found = programs.find(For::Node, name.value);
+    let program = found.map_err(|(message, fix)| section.report(problems, "node", message, fix)).ok()?;
+    Some(Hook { program, args: Vec::new() })
+}
+
+fn identity(kind: Option<Kind>, section: &Section<'_>, problems: &mut Problems<'_>) -> Option<IdentitySpec> {
+    // A device on the network has none; one behind a USB adapter of its own has that adapter's.
+    if kind == Some(Kind::Lan) && !["vid", "pid", "serial", "serial_number", "port"].iter().any(|key| section.has(key))
+    {
+        return Some(IdentitySpec::Lan {});
+    }
     for key in ["vid", "pid"] {
         if !section.has(key) {
             let fix = format!("write the four hexadecimal digits lsusb shows, for example {key} = \"046d\"");
@@ -256,7 +294,7 @@ fn identity(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<Identi
         legal
     });
     let port = port.map(|port| port.value.to_owned());
-    Some(IdentitySpec { vid: vid?, pid: pid?, serial, port })
+    Some(IdentitySpec::Usb(UsbSpec { vid: vid?, pid: pid?, serial, port }))
 }
 
 /// `serial = "..."`, or `serial_number = "..."` where `serial` is the table of the serial line: in

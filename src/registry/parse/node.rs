@@ -128,6 +128,7 @@ pub(super) fn max_bytes(section: &Section<'_>, node: Option<&NodeSpec>, problems
             // Numbers travel as 64-bit floats.
             _ => (8 * serial.channels as u64, 8 * serial.channels as u64),
         },
+        Some(NodeSpec::Can(_) | NodeSpec::Lan(_)) => (64 << 10, 1),
         Some(NodeSpec::Process(process)) => match (process.kind, process.shape.as_slice()) {
             (ModalityKind::Image, [height, width]) => {
                 ((2 * u64::from(*width) * u64::from(*height)).max(SMALLEST_JPEG), 1024)

@@ -10,7 +10,7 @@ use super::*;
 use crate::hotplug::HotplugError;
 use crate::registry::scenario::{SimDevice, SimSource};
 use crate::registry::{
-    DeviceNode, Framing, IdentitySpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbIdentity, WhenStale,
+    DeviceNode, Framing, IdentitySpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbIdentity, UsbSpec, WhenStale,
 };
 use crate::rig::presence::{Claim, read_mask};
 use crate::status::Event;
@@ -25,7 +25,7 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
     let device = |(bit, name): (u8, &str)| DeviceSpec {
         name: name.into(),
         id: ModalityId::new(bit).expect("below 64"),
-        identity: IdentitySpec { vid: 1, pid: 2, serial: None, port: None },
+        identity: IdentitySpec::Usb(UsbSpec { vid: 1, pid: 2, serial: None, port: None }),
         node: NodeSpec::Serial(serial.clone()),
         topic: format!("/rapid/serial/{name}"),
         mount: None,
@@ -35,6 +35,7 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
         action: None,
+        hooks: crate::registry::Hooks::default(),
         verdict: crate::registry::VerdictSpec::of(
             crate::modality::ModalityKind::Image,
             Duration::from_millis(500),
@@ -91,7 +92,12 @@ impl Bench {
                 self.units.insert(port, Arc::clone(&unit));
                 let usb = UsbIdentity { vid: 1, pid: 2, serial: None, port: (*port).into(), ..UsbIdentity::default() };
                 let syspath = PathBuf::from("/test").join(port);
-                self.tell(HotplugEvent::Added(Attachment { syspath, node: DeviceNode::Sim(unit), usb, driver: None }));
+                self.tell(HotplugEvent::Added(Attachment {
+                    syspath,
+                    node: DeviceNode::Sim(unit),
+                    unit: usb.into(),
+                    driver: None,
+                }));
             }
             Pull(port) => self.units[port].unplug(),
             Removed(port, witness) => {
@@ -130,7 +136,7 @@ impl Bench {
 
 fn word(what: &What) -> Option<String> {
     match what {
-        What::Attach { device, usb, .. } => Some(format!("{device} at {}", usb.port)),
+        What::Attach { device, unit, .. } => Some(format!("{device} at {}", unit.place())),
         What::Detach { device, witness, .. } => Some(format!("{device} gone {witness}")),
         What::State { device, state, .. } => Some(format!("{device} {}", state.word())),
         What::Unregistered { .. } => Some("unused".into()),

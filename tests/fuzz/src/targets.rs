@@ -19,7 +19,7 @@ use rapid::registry::scenario::Scenario;
 use rapid::registry::units::{parse_duration, parse_size, show_duration, show_size};
 use rapid::registry::{
     Assigner, Assignment, Attachment, DeviceNode, DeviceSpec, Framing, NodeSpec, Opens, Parse, ProcessSpec, Registry,
-    RegistryErrors, SerialSpec, UsbIdentity,
+    RegistryErrors, SerialSpec, Unit, UsbIdentity,
 };
 use rapid::text as shown;
 use yaml_rust2::{Yaml, YamlLoader};
@@ -208,7 +208,7 @@ pub fn strings(bytes: &[u8]) {
         syspath: PathBuf::from("/sys/devices/1-1/1-1:1.0/video4linux/video0"),
         node: DeviceNode::Video(PathBuf::from("/dev/video0")),
         driver: None,
-        usb: UsbIdentity {
+        unit: Unit::Usb(UsbIdentity {
             firmware: None,
             manufacturer: None,
             vid: 1,
@@ -216,7 +216,7 @@ pub fn strings(bytes: &[u8]) {
             serial: Some(serial.to_owned()),
             port: "1-1".to_owned(),
             product: Some(serial.to_owned()),
-        },
+        }),
     };
     let registry = match Registry::parse(&text, None) {
         Ok(loaded) => loaded.registry,
@@ -342,7 +342,7 @@ fn check_rules(registry: &Registry, text: &str) {
         let keys: BTreeSet<_> = rule.iter().map(|token| &token.key).collect();
         assert_eq!(keys.len(), rule.len(), "a key twice in {rule:?}");
         assert_eq!(value("RUN{builtin}"), Some("uaccess"));
-        let serial = device.identity.serial.as_deref();
+        let serial = device.identity.serial();
         assert_eq!(value(serial_key).is_some(), serial.is_some());
         if let (Some(pattern), Some(serial)) = (value(serial_key), serial) {
             assert!(rules::matches(pattern, serial), "{pattern:?} does not match {serial:?}");
@@ -370,7 +370,7 @@ fn check_descriptor(registry: &Registry, path: &Path, text: &str) {
     };
     assert_eq!(keys(document), "module slot sensors bring_up identity path topic bit ");
     assert_eq!(keys(&document["identity"]), "vid pid serial port ");
-    assert_eq!(document["identity"]["serial"].as_str(), device.identity.serial.as_deref());
+    assert_eq!(document["identity"]["serial"].as_str(), device.identity.serial());
     assert_eq!(document["topic"].as_str(), Some(device.topic.as_str()));
     assert_eq!(document["module"].as_str(), Some(device.name.as_str()));
 }
