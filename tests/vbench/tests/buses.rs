@@ -32,10 +32,9 @@ slcan=/dev/serial/by-id/usb-Bench_Virtual_slcan_CAN2-if00
 damiao=/dev/serial/by-id/usb-Bench_Virtual_damiao_CAN3-if00
 wait_for 30 test -e /sys/class/net/can0 -a -e $slcan -a -e $damiao || fail 'no interface or no line'
 udevadm settle
-can_up() { ip link set can0 up type can bitrate 1000000 || fail 'can0 does not come up'; }
 can() { "${usbemu[@]}" --can can0 "$@"; }
 state() { ip -details link show can0 | sed -n 's/.* state \([A-Z-]*\) .*restart-ms.*/\1/p; s/.*can state \([A-Z-]*\) .*/\1/p' | head -n 1; }
-can_up
+can_up can0
 udevadm info --query=property --path=/sys/class/net/can0 >$out/can0
 # A zero, a parameter, enable, go to 1 rad, there it is, disable, another motor, nobody.
 can 005#7fff7ff0000007ff 7ff#0500331600000000 005#fffffffffffffffc 005#8a3c7ff0520007ff >$out/answers
@@ -73,7 +72,7 @@ wait_for 10 said $out/emu.jsonl motor_timeout || fail 'the motor did not give up
 emu plug 0
 wait_for 30 test -e /sys/class/net/can0 || fail 'can0 did not come back'
 udevadm settle
-can_up
+can_up can0
 can 7ff#0500cc0000000000 >$out/after
 
 stty -F $slcan raw -echo
@@ -120,7 +119,7 @@ exit 0
     assert_eq!(outcome.file("states"), "BUS-OFF\nERROR-ACTIVE\n");
 
     let flood = json(&outcome, "flood.json");
-    assert_eq!((&flood["frames"], &flood["lost"]), (&500.into(), &0.into()));
+    assert_eq!((&flood["came"], &flood["lost"]), (&500.into(), &0.into()));
     println!("500 frames/s: {flood}; as fast as it goes: {}", json(&outcome, "full.json"));
 
     // The motor outlived its adapter's cable by its own time-out, and remembers why.
@@ -147,9 +146,9 @@ fn a_camera_and_a_lidar_answer_behind_a_network_adapter() {
 net=enx00005e005300
 lan_up() {
   wait_for 60 test -e /sys/class/net/$net || { ip link; fail 'no interface'; }
-  udevadm settle
-  ip addr add 172.23.145.50/24 dev $net && ip link set $net up || fail 'the interface does not come up'
+  wait_for 10 eval 'ip -4 addr show up dev $net | grep -q 172.23.145.50/24' || { ip addr; fail 'no address'; }
 }
+lan_rule 172.23.145.50/24
 get() {
   exec 6<>/dev/tcp/172.23.145.51/8080 || return 1
   printf 'GET %s HTTP/1.1\r\nHost: camera\r\n\r\n' "$1" >&6
@@ -206,7 +205,7 @@ exit 0
 
     let lidar = json(&outcome, "lidar.json");
     println!("lidar: {lidar}");
-    assert_eq!((&lidar["packets"], &lidar["lost"]), (&600.into(), &0.into()));
+    assert_eq!((&lidar["came"], &lidar["lost"]), (&600.into(), &0.into()));
 
     let asked: Vec<&str> = outcome.emu.iter().filter_map(|line| line["target"].as_str()).collect();
     let starts = asked.iter().filter(|target| target.ends_with("shutter/start")).count();

@@ -11,6 +11,7 @@ use rustix::net::addr::{SocketAddrArg, SocketAddrLen, SocketAddrOpaque};
 use rustix::net::{AddressFamily, Protocol, RecvFlags, SendFlags, SocketType, bind, recv, send, socket};
 use serde_json::{Value, json};
 
+use super::tally::Tally;
 use crate::clock;
 use crate::emu::can::Frame;
 use crate::emu::can::bus::FLOOD_ID;
@@ -142,27 +143,18 @@ pub fn stream(name: &str, frame: &str, period: Duration) -> io::Result<Value> {
     }
 }
 
-/// Reads so many generated frames; how many numbers were missing among them, and how long it took.
-pub fn count(name: &str, wanted: u64) -> io::Result<Value> {
+/// Reads so many generated frames and counts them.
+pub fn count(name: &str, wanted: usize) -> io::Result<Value> {
     let bus = Bus::open(name)?;
-    let (mut frames, mut lost, mut next) = (0_u64, 0_u64, None);
-    let mut begun_ns = 0;
-    while frames < wanted {
+    let mut tally = Tally::default();
+    while tally.len() < wanted {
         let Some(frame) = bus.receive(PATIENCE)? else { break };
-        if frame.id != u32::from(FLOOD_ID) {
-            continue;
+        if frame.id == u32::from(FLOOD_ID) {
+            let [a, b, c, d, ..] = frame.padded();
+            tally.add(u32::from_le_bytes([a, b, c, d]));
         }
-        let [a, b, c, d, ..] = frame.padded();
-        let number = u32::from_le_bytes([a, b, c, d]);
-        match next {
-            None => begun_ns = clock::mono_ns(),
-            Some(next) => lost += u64::from(number.wrapping_sub(next)),
-        }
-        next = Some(number.wrapping_add(1));
-        frames += 1;
     }
-    let seconds = clock::mono_ns().saturating_sub(begun_ns) as f64 / 1e9;
-    Ok(json!({"frames": frames, "lost": lost, "seconds": seconds}))
+    Ok(tally.summary())
 }
 
 #[cfg(test)]

@@ -7,5 +7,6 @@ pub mod beat;
 pub mod can;
 pub mod lan;
 pub mod mask;
+pub mod tally;
 pub mod uevent;
 pub mod v4l;

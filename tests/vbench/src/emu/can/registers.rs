@@ -15,7 +15,8 @@ pub const VEL: u32 = 3;
 const TIMEOUT_UNIT: Duration = Duration::from_micros(50);
 
 /// What a type of motor has stored when it leaves the factory: name, PMAX (rad), VMAX (rad/s), TMAX (Nm).
-const TYPES: [(&str, f32, f32, f32); 12] = [
+const TYPES: [(&str, f32, f32, f32); 13] = [
+    ("DM3507", 12.5, 30.0, 10.0),
     ("DM4310", 12.5, 30.0, 10.0),
     ("DM4310_48V", 12.5, 50.0, 10.0),
     ("DM4340", 12.5, 8.0, 28.0),

@@ -87,6 +87,13 @@ impl Gopro {
                 Some(number) => Reply::json(200, &json!({"folder": FOLDER, "file": file(number)})),
                 None => refused(404, "nothing was captured"),
             },
+            "/gopro/media/info" => {
+                let wanted = request.query("path").and_then(|path| path.strip_prefix(FOLDER)?.strip_prefix('/'));
+                match self.finished(now_ns).find(|number| Some(file(*number).as_str()) == wanted) {
+                    Some(_) => Reply::json(200, &json!({"ct": "0", "cre": "0", "s": self.clip_bytes.to_string()})),
+                    None => refused(404, "no such clip"),
+                }
+            }
             "/gopro/media/list" => {
                 let all = self.finished(now_ns).map(|number| {
                     let seconds = (self.clips[number as usize - 1] / 1_000_000_000).to_string();
@@ -121,10 +128,10 @@ impl Gopro {
         })
     }
 
-    /// Status numbers as in Open GoPro: 8 busy, 10 encoding, 70 battery in per cent.
+    /// Status numbers as in Open GoPro: 8 busy, 10 encoding, 35 seconds and 54 KB that are left, 70 battery in per cent.
     fn state(&self, now_ns: u64) -> Value {
         let busy = self.encoding || self.finished(now_ns).count() != self.clips.len();
-        json!({"status": {"8": u8::from(busy), "10": u8::from(self.encoding), "70": 87}, "settings": {}})
+        json!({"status": {"8": u8::from(busy), "10": u8::from(self.encoding), "35": 7_200, "54": 62_000_000, "70": 87}, "settings": {}})
     }
 }
 
@@ -172,14 +179,17 @@ mod tests {
         assert_eq!(ask(&mut gopro, "/gopro/camera/state", 10).1["status"]["10"], 1);
         ask(&mut gopro, "/gopro/camera/shutter/stop", 1_000);
         ask(&mut gopro, "/gopro/camera/shutter/stop", 1_001);
-        assert_eq!(ask(&mut gopro, "/gopro/camera/state", 1_100).1["status"], json!({"8": 1, "10": 0, "70": 87}));
+        let (_, state) = ask(&mut gopro, "/gopro/camera/state", 1_100);
+        assert_eq!((&state["status"]["8"], &state["status"]["10"]), (&json!(1), &json!(0)));
         assert_eq!(ask(&mut gopro, "/gopro/media/last_captured", 1_699).0, 404, "not finished");
         let last = json!({"folder": "100GOPRO", "file": "GX010001.MP4"});
         assert_eq!(ask(&mut gopro, "/gopro/media/last_captured", 1_700), (200, last));
+        assert_eq!(ask(&mut gopro, "/gopro/media/info?path=100GOPRO/GX010001.MP4", 1_700).1["s"], "2000000");
+        assert_eq!(ask(&mut gopro, "/gopro/media/info?path=100GOPRO/GX010002.MP4", 1_700).0, 404);
         let (_, list) = ask(&mut gopro, "/gopro/media/list", 1_700);
         assert_eq!(list["media"][0]["fs"], json!([{"n": "GX010001.MP4", "cre": "1", "mod": "1", "s": "2000000"}]));
         let told: Vec<Told> = gopro.told().collect();
-        assert_eq!(told.len(), 12);
+        assert_eq!(told.len(), 14);
         assert_eq!(told[0].fields, json!({"target": "/gopro/camera/control/wired_usb?p=1", "status": 200}));
     }
 
