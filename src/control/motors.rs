@@ -287,9 +287,6 @@ impl MotorBus {
         let passed = self.stepped.map_or(self.cycle, |last| now.since(last)).min(self.cycle * LATE_CYCLES);
         self.stepped = Some(now);
         self.listen(now);
-        if let Some(fault) = (0..self.motors.len()).find_map(|index| self.judge(index)) {
-            self.fail(fault, now);
-        }
         self.advance(now, passed);
         for (motor, command) in self.motors.iter_mut().zip(&self.commands) {
             let is_silent = motor.unanswered(now) >= self.silent_after;
