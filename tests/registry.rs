@@ -10,8 +10,8 @@ use proptest::prelude::*;
 use rapid::modality::ModalityKind;
 use rapid::registry::scenario::Scenario;
 use rapid::registry::{
-    BUILTIN, CanAdapter, CanProtocol, Framing, Loaded, MotorKind, MotorMode, NodeSpec, Opens, POOL_SPARE, Parse,
-    Registry, VerdictSpec,
+    BUILTIN, CanAdapter, CanProtocol, DeviceSpec, Framing, Hook, Loaded, MotorKind, MotorMode, NodeSpec, Opens,
+    POOL_SPARE, Parse, Registry, VerdictSpec,
 };
 
 fn files(folder: &str) -> Vec<PathBuf> {
@@ -91,6 +91,27 @@ fn a_program_and_its_settings_arrive() {
     assert_eq!((leds.max_bytes, leds.depth, leds.modality().shape), (64 << 10, 60, vec![]));
     assert_eq!(digit.modality().shape, [240, 320]);
     assert_eq!((digit.max_bytes, digit.depth), (320 * 240 * 2, 60));
+}
+
+#[test]
+fn hooks_arrive_and_one_of_them_may_be_the_node() {
+    let Loaded { registry, warnings } = valid("hooks");
+    assert_eq!(warnings, []);
+    let [cam, imu] = registry.devices.as_slice() else { panic!("two devices") };
+    let said = |device: &DeviceSpec| -> Vec<(&str, String)> {
+        let text = |hook: &Hook| format!("{} {:?}", hook.program.display(), hook.args);
+        device.hooks.all().map(|(key, hook)| (key, text(hook))).collect()
+    };
+    let of_cam = [
+        ("on_attach", r#"/bin/sh ["-c", "exit"]"#.to_owned()),
+        ("on_detach", "/bin/sh []".to_owned()),
+        ("on_record_start", r#"/bin/sh ["", "a b"]"#.to_owned()),
+        ("on_record_stop", r#"/bin/sh ["$HOME; no shell reads this"]"#.to_owned()),
+    ];
+    assert_eq!(said(cam), of_cam);
+    assert_eq!(said(imu), [("on_detach", "/bin/sh []".to_owned())]);
+    let NodeSpec::Process(process) = &imu.node else { panic!("a program") };
+    assert_eq!((process.program.to_str(), process.args.join(" ")), (Some("/bin/sh"), "-c exit".to_owned()));
 }
 
 #[test]

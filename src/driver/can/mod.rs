@@ -8,6 +8,7 @@
 pub mod damiao_serial;
 mod line;
 pub mod link;
+pub mod motors;
 pub mod netlink;
 pub mod raw;
 pub mod slcan;

@@ -48,6 +48,9 @@ const KEYS: [&str; 24] = [
     "on_record_stop",
 ];
 
+/// In bytes.
+const LONGEST_NAME: usize = 64;
+
 /// The mask is 64 bits wide.
 const HIGHEST_BIT: i64 = 63;
 
@@ -75,7 +78,7 @@ pub(super) struct Draft<'a> {
     pub(super) topic: String,
     pub(super) bit: Option<At<u8>>,
     pub(super) id: Option<ModalityId>,
-    mount: Option<Mount>,
+    pub(super) mount: Option<Mount>,
     stall_after: Duration,
     pub(super) max_bytes: u64,
     pub(super) depth: u64,
@@ -92,7 +95,11 @@ impl Draft<'_> {
     /// The entry, with what `[verdict]` says for all; `None` only if a problem with it was reported.
     pub(super) fn finish(self, rig: &VerdictTable) -> Option<DeviceSpec> {
         let node = self.node?;
-        let fps = if let NodeSpec::Camera(camera) = &node { Some(f64::from(camera.fps)) } else { None };
+        let fps = match &node {
+            NodeSpec::Camera(camera) => Some(f64::from(camera.fps)),
+            NodeSpec::Lan(lan) => lan.rate(),
+            _ => None,
+        };
         Some(DeviceSpec {
             verdict: verdict::spec(node.modality_kind(), self.stall_after, fps, rig, &self.verdict),
             name: self.name,
@@ -219,18 +226,39 @@ pub(super) fn read<'a>(
 }
 
 fn check_name(name: &str, section: &Section<'_>, problems: &mut Problems<'_>) {
-    let legal = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
-    let begins = name.starts_with(|c: char| c.is_ascii_lowercase());
-    if begins && name.len() <= 64 && name.chars().all(legal) {
-        return;
+    if let Some((message, fix)) = name_problem(name) {
+        problems.report(section.at, &section.entry, message, fix);
     }
-    let better: String = name.to_lowercase().chars().map(|c| if legal(c) { c } else { '_' }).take(64).collect();
-    let fix = if better.starts_with(|c: char| c.is_ascii_lowercase()) {
-        format!("use lower-case letters, digits and `_`, at most 64, for example [device.{better}]")
-    } else {
-        "begin with a lower-case letter; then lower-case letters, digits and `_`, at most 64".to_owned()
+}
+
+/// Why `name` cannot be a modality's name, and what to do about it; `None` if it can.
+#[must_use]
+pub fn name_problem(name: &str) -> Option<(String, String)> {
+    let begins = name.starts_with(|c: char| c.is_ascii_lowercase());
+    if begins && name.len() <= LONGEST_NAME && name.chars().all(in_a_name) {
+        return None;
+    }
+    let fix = match like_a_name(name) {
+        Some(better) => {
+            format!("use lower-case letters, digits and `_`, at most {LONGEST_NAME}, for example [device.{better}]")
+        }
+        None => {
+            format!("begin with a lower-case letter; then lower-case letters, digits and `_`, at most {LONGEST_NAME}")
+        }
     };
-    problems.report(section.at, &section.entry, format!("{name:?} cannot be a modality's name"), fix);
+    Some((format!("{name:?} cannot be a modality's name"), fix))
+}
+
+/// The name that is nearest to any text, if one is near.
+#[must_use]
+pub fn like_a_name(text: &str) -> Option<String> {
+    let better: String =
+        text.to_lowercase().chars().map(|c| if in_a_name(c) { c } else { '_' }).take(LONGEST_NAME).collect();
+    better.starts_with(|c: char| c.is_ascii_lowercase()).then_some(better)
+}
+
+const fn in_a_name(c: char) -> bool {
+    c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_'
 }
 
 fn check_keys(section: &Section<'_>, problems: &mut Problems<'_>) {

@@ -5,11 +5,13 @@
 
 use std::time::Duration;
 
+/// Motors of one bus, at the most: an action has an axis each, a sample 6 numbers each.
+pub const MAX_MOTORS: usize = 10;
+
 /// `protocol = "damiao"`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DamiaoSpec {
-    /// One motor an axis, in the order of samples and actions, `1..=10` of them (a sample has 6 numbers
-    /// a motor, an action at most 64). No two are [`Self::indistinct`].
+    /// One motor an axis, in the order of samples and actions, `1..=`[`MAX_MOTORS`] of them. No two are [`Self::indistinct`].
     pub motors: Vec<MotorSpec>,
     /// Commands a second to each motor, `10..=1000`, default 200.
     pub hz: u32,
