@@ -133,10 +133,11 @@ impl Driver {
     /// # Errors
     /// When the device cannot do it, for people; it is read on.
     pub fn record(&mut self, episode: Option<&Arc<Episode>>) -> Result<(), DriverError> {
-        let _ = episode;
         match self {
-            Self::Camera(_) | Self::Serial(_) | Self::Sim(_) | Self::Replay(_) => Ok(()),
+            Self::Sim(driver) => driver.record(episode.is_some()),
+            Self::Camera(_) | Self::Serial(_) | Self::Replay(_) => {}
         }
+        Ok(())
     }
 
     /// Ends in order what the device does by itself: the run ends, or the device was unplugged. Is given
@@ -144,7 +145,8 @@ impl Driver {
     #[expect(clippy::unused_async, reason = "devices on a network take time to be told")]
     pub async fn close(self) {
         match self {
-            Self::Camera(_) | Self::Serial(_) | Self::Sim(_) | Self::Replay(_) => {}
+            Self::Sim(mut driver) => driver.record(false),
+            Self::Camera(_) | Self::Serial(_) | Self::Replay(_) => {}
         }
     }
 

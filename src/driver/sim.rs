@@ -47,6 +47,8 @@ pub struct Sim {
     /// The sample in `payload` is to be sent once more, with this stamp.
     again: Option<Stamp>,
     controls: BTreeMap<String, i64>,
+    /// It was told to record.
+    records: bool,
 }
 
 #[derive(Debug)]
@@ -87,7 +89,7 @@ impl Sim {
         let grid = Grid { begun: device.begun, rate: u64::from(rate.max(1)) };
         let next = grid.first_after(stamp_of(Instant::now()));
         let (payload, controls) = (Vec::with_capacity(capacity), BTreeMap::new());
-        Ok(Self { device, content, grid, next, backlog, payload, owed: 0, again: None, controls })
+        Ok(Self { device, content, grid, next, backlog, payload, owed: 0, again: None, controls, records: false })
     }
 
     /// With the controls that `spec` sets: a simulated camera has those and no others.
@@ -113,6 +115,14 @@ impl Sim {
             _ => return Err(DriverError::Fatal(format!("{} is no actuator", self.device.name))),
         }
         Ok(())
+    }
+
+    /// Tells the device to record, or to end that.
+    pub(super) fn record(&mut self, record: bool) {
+        if self.records != record {
+            self.records = record;
+            self.device.record(record);
+        }
     }
 
     /// The next sample.

@@ -23,6 +23,22 @@ pub(crate) fn until(what: &str, mut holds: impl FnMut() -> bool) {
     }
 }
 
+/// The Python of `make setup`.
+pub(crate) fn python() -> PathBuf {
+    let python = std::env::var_os("RAPID_PYTHON").map_or_else(
+        || {
+            let cache = std::env::var_os("XDG_CACHE_HOME").map_or_else(
+                || PathBuf::from(std::env::var_os("HOME").expect("a home directory")).join(".cache"),
+                PathBuf::from,
+            );
+            cache.join("rapid/venv/bin/python")
+        },
+        PathBuf::from,
+    );
+    assert!(python.exists(), "no Python environment at {}: run `make setup`", python.display());
+    python
+}
+
 /// A folder and an instance name of a test's own.
 pub(crate) struct Place {
     pub(crate) folder: tempfile::TempDir,
