@@ -97,6 +97,8 @@ impl Place {
             .env_remove("RAPID_LOG")
             .env("HOME", self.folder.path())
             .env_remove("XDG_CONFIG_HOME")
+            .env_remove("XDG_STATE_HOME")
+            .env_remove("STATE_DIRECTORY")
             .args(["--instance", &self.instance])
             .args(arguments)
             .stdin(Stdio::null())
@@ -117,6 +119,12 @@ impl Place {
         let mut running = Running { child: Some(child), log };
         running.wait_for(word);
         running
+    }
+
+    /// What the programs of a device printed, over all runs in this place.
+    pub(crate) fn logbook(&self, device: &str) -> String {
+        let folder = self.path(".local/state/rapid/logs").join(&self.instance);
+        std::fs::read_to_string(folder.join(format!("{device}.log"))).unwrap_or_default()
     }
 
     /// Files in `folder` of this place, by name.
