@@ -26,6 +26,7 @@ use crate::bus::{Bus, BusError, TopicId};
 use crate::fault;
 use crate::headless::style::ColourChoice;
 use crate::headless::{self, HeadlessOptions};
+use crate::hotplug::lan::LanMonitor;
 use crate::hotplug::script::Script;
 use crate::hotplug::udev::UdevMonitor;
 use crate::hotplug::{HotplugError, HotplugStream};
@@ -180,7 +181,10 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     let recorder = Recorder::spawn(bus.inbox()?, RecorderConfig::new(Arc::clone(&registry), Arc::clone(&board)))?;
     // Before the screen: what fails until here is said on an ordinary terminal.
     let hotplug: HotplugStream = match options.devices {
-        Devices::Machine => Box::pin(UdevMonitor::open()?),
+        Devices::Machine => match LanMonitor::open(&registry) {
+            Some(lan) => Box::pin(futures::stream::select(UdevMonitor::open()?, lan)),
+            None => Box::pin(UdevMonitor::open()?),
+        },
         Devices::Simulated(scenario) => Box::pin(Script::new(scenario)),
     };
     let screen_stop = CancellationToken::new();

@@ -39,6 +39,7 @@ fn registry(depth: usize) -> Registry {
                 Some(30.0),
             ),
         }],
+        modules: Vec::new(),
         path: None,
         text: String::new(),
     }

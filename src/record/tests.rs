@@ -135,6 +135,7 @@ pub(super) fn registry() -> Registry {
             device(NEVER, "never", camera(PixelFormat::Yuyv)),
             device(RAW, "raw", camera(PixelFormat::Grey)),
         ],
+        modules: Vec::new(),
         path: None,
         text: "[rig]\nname = \"bench\"\n".to_owned(),
     }
@@ -172,6 +173,7 @@ impl Bench {
             out: self.folder.path().join("out"),
             task: "place block".to_owned(),
             tags: vec![("finger".to_owned(), "soft".to_owned())],
+            modules: Vec::new(),
             duration,
         }
     }

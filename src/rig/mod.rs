@@ -19,6 +19,7 @@ mod worker;
 
 pub use owner::Rig;
 
+use crate::action::Order;
 use crate::hotplug::HotplugError;
 use crate::modality::ModalityId;
 use presence::PresenceError;
@@ -39,4 +40,6 @@ pub enum RigError {
 pub enum RigCommand {
     /// Start a failed device again.
     Restart(ModalityId),
+    /// Let the actuator move, or stop it.
+    Order(Order),
 }

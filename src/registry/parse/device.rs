@@ -7,12 +7,13 @@ use toml::de::DeValue;
 
 use super::program::{For, Programs};
 use super::verdict::{VerdictTable, Whose};
-use super::{action, can, hooks, lan, node, process, verdict};
+use super::{action, can, hooks, lan, motors, node, process, verdict};
 use crate::modality::ModalityId;
 use crate::registry::diagnostic::did_you_mean;
 use crate::registry::section::{At, Problems, Section};
 use crate::registry::spec::{
-    ActionSpec, CanAdapter, DeviceSpec, Hook, Hooks, IdentitySpec, Mount, NodeSpec, Opens, UsbSpec, WhenStale,
+    ActionSpec, CanAdapter, CanProtocol, CanSpec, DeviceSpec, Hook, Hooks, IdentitySpec, Mount, NodeSpec, Opens,
+    UsbSpec, WhenStale,
 };
 
 /// Kinds of node this version has a driver for.
@@ -47,6 +48,9 @@ const KEYS: [&str; 24] = [
     "on_record_stop",
 ];
 
+/// In bytes.
+const LONGEST_NAME: usize = 64;
+
 /// The mask is 64 bits wide.
 const HIGHEST_BIT: i64 = 63;
 
@@ -74,7 +78,7 @@ pub(super) struct Draft<'a> {
     pub(super) topic: String,
     pub(super) bit: Option<At<u8>>,
     pub(super) id: Option<ModalityId>,
-    mount: Option<Mount>,
+    pub(super) mount: Option<Mount>,
     stall_after: Duration,
     pub(super) max_bytes: u64,
     pub(super) depth: u64,
@@ -91,7 +95,11 @@ impl Draft<'_> {
     /// The entry, with what `[verdict]` says for all; `None` only if a problem with it was reported.
     pub(super) fn finish(self, rig: &VerdictTable) -> Option<DeviceSpec> {
         let node = self.node?;
-        let fps = if let NodeSpec::Camera(camera) = &node { Some(f64::from(camera.fps)) } else { None };
+        let fps = match &node {
+            NodeSpec::Camera(camera) => Some(f64::from(camera.fps)),
+            NodeSpec::Lan(lan) => lan.rate(),
+            _ => None,
+        };
         Some(DeviceSpec {
             verdict: verdict::spec(node.modality_kind(), self.stall_after, fps, rig, &self.verdict),
             name: self.name,
@@ -174,6 +182,10 @@ pub(super) fn read<'a>(
         let message = format!("a built-in node has no table [{}]", section.child("process"));
         section.report(problems, "process", message, "remove the table, or write node = the name of a program");
     }
+    if kind.is_some_and(|kind| kind != Kind::Can) && section.has("can") {
+        let message = format!("only a CAN adapter has a table [{}]", section.child("can"));
+        section.report(problems, "can", message, "remove the table, or write node = \"can\"");
+    }
     let topic = topic(&section, problems).unwrap_or_else(|| default_topic(kind, name));
     let bit = section
         .integer(problems, "bit", 0..=HIGHEST_BIT)
@@ -186,6 +198,10 @@ pub(super) fn read<'a>(
         .unwrap_or_else(|| node::default_stall(settings.as_ref()));
     let latency = section.duration(problems, "latency", Duration::ZERO..=LONGEST_LATENCY).unwrap_or_default();
     let max_bytes = node::max_bytes(&section, settings.as_ref(), problems);
+    let mut action = action::action(&section, problems);
+    if let Some(NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(damiao), .. })) = &settings {
+        action = motors::axes(damiao, action, &section, problems);
+    }
     let written = section.integer(problems, "depth", 2..=4096).and_then(|depth| u64::try_from(depth.value).ok());
     Draft {
         name: name.to_owned(),
@@ -202,7 +218,7 @@ pub(super) fn read<'a>(
         when_stale,
         latency,
         verdict: verdict::read(&section, Whose::Device, problems),
-        action: action::action(&section, problems),
+        action,
         hooks: hooks::hooks(&section, attach_is_node(&section), programs, problems),
         node: settings,
         section,
@@ -210,18 +226,39 @@ pub(super) fn read<'a>(
 }
 
 fn check_name(name: &str, section: &Section<'_>, problems: &mut Problems<'_>) {
-    let legal = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
-    let begins = name.starts_with(|c: char| c.is_ascii_lowercase());
-    if begins && name.len() <= 64 && name.chars().all(legal) {
-        return;
+    if let Some((message, fix)) = name_problem(name) {
+        problems.report(section.at, &section.entry, message, fix);
     }
-    let better: String = name.to_lowercase().chars().map(|c| if legal(c) { c } else { '_' }).take(64).collect();
-    let fix = if better.starts_with(|c: char| c.is_ascii_lowercase()) {
-        format!("use lower-case letters, digits and `_`, at most 64, for example [device.{better}]")
-    } else {
-        "begin with a lower-case letter; then lower-case letters, digits and `_`, at most 64".to_owned()
+}
+
+/// Why `name` cannot be a modality's name, and what to do about it; `None` if it can.
+#[must_use]
+pub fn name_problem(name: &str) -> Option<(String, String)> {
+    let begins = name.starts_with(|c: char| c.is_ascii_lowercase());
+    if begins && name.len() <= LONGEST_NAME && name.chars().all(in_a_name) {
+        return None;
+    }
+    let fix = match like_a_name(name) {
+        Some(better) => {
+            format!("use lower-case letters, digits and `_`, at most {LONGEST_NAME}, for example [device.{better}]")
+        }
+        None => {
+            format!("begin with a lower-case letter; then lower-case letters, digits and `_`, at most {LONGEST_NAME}")
+        }
     };
-    problems.report(section.at, &section.entry, format!("{name:?} cannot be a modality's name"), fix);
+    Some((format!("{name:?} cannot be a modality's name"), fix))
+}
+
+/// The name that is nearest to any text, if one is near.
+#[must_use]
+pub fn like_a_name(text: &str) -> Option<String> {
+    let better: String =
+        text.to_lowercase().chars().map(|c| if in_a_name(c) { c } else { '_' }).take(LONGEST_NAME).collect();
+    better.starts_with(|c: char| c.is_ascii_lowercase()).then_some(better)
+}
+
+const fn in_a_name(c: char) -> bool {
+    c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_'
 }
 
 fn check_keys(section: &Section<'_>, problems: &mut Problems<'_>) {

@@ -52,6 +52,7 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
             disk_reserve: None,
         },
         devices: [(0, "a"), (1, "b")].into_iter().map(device).collect(),
+        modules: Vec::new(),
         path: None,
         text: String::new(),
     }
