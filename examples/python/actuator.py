@@ -15,7 +15,8 @@
     min = [0.0]
     max = [0.4]
 
-`rapid` checks no action for a program: limits, a time-out and a stop when the program ends are its own.
+`rapid` stands between no program and its device: limits, a time-out, whether it is armed, and a stop when it ends are
+the program's own.
 """
 
 import time
