@@ -50,6 +50,8 @@ pub struct Sim {
     /// Of simulated motors: where each was last told to go, once they were told.
     motors: Vec<f64>,
     moved: bool,
+    /// It was told to record.
+    records: bool,
 }
 
 #[derive(Debug)]
@@ -102,6 +104,7 @@ impl Sim {
             controls,
             motors: Vec::new(),
             moved: false,
+            records: false,
         })
     }
 
@@ -137,6 +140,14 @@ impl Sim {
             _ => return Err(DriverError::Fatal(format!("{} is no actuator", self.device.name))),
         }
         Ok(())
+    }
+
+    /// Tells the device to record, or to end that.
+    pub(super) fn record(&mut self, record: bool) {
+        if self.records != record {
+            self.records = record;
+            self.device.record(record);
+        }
     }
 
     /// The next sample.
