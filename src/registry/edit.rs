@@ -170,10 +170,10 @@ pub fn remove(text: &str, name: &str) -> Result<String, EditError> {
     Ok(new)
 }
 
-/// Does `text` hold any entry?
+/// Does `text` name no device yet? False of a text that is no TOML.
 #[must_use]
-pub fn has_entries(text: &str) -> bool {
-    Document::parse(text).is_ok_and(|document| document.as_table().contains_key("device"))
+pub fn has_no_entries(text: &str) -> bool {
+    Document::parse(text).is_ok_and(|document| !document.as_table().contains_key("device"))
 }
 
 /// A table under a header of its own.

@@ -165,6 +165,7 @@ pub(crate) fn board(names: &[&str]) -> Board {
             disk_reserve: None,
         },
         devices: names.iter().enumerate().map(device).collect(),
+        modules: Vec::new(),
         path: None,
         text: String::new(),
     })

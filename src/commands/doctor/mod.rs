@@ -181,3 +181,6 @@ fn write_rate(folder: &Path) -> io::Result<f64> {
     file.sync_data()?;
     Ok(written as f64 / begun.elapsed().as_secs_f64().max(1e-6))
 }
+
+#[cfg(test)]
+mod tests;

@@ -265,3 +265,6 @@ struct Registered<'a> {
     entry: &'a str,
     dry_run: bool,
 }
+
+#[cfg(test)]
+mod tests;
