@@ -5,11 +5,13 @@
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use serde::Serialize;
 
 use super::scenario::{SimDevice, SimSource};
 use crate::provenance::KernelDriver;
+use crate::time::Stamp;
 
 /// What a USB device says it is, and where it is plugged in.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Default, Serialize)]
@@ -113,6 +115,30 @@ impl From<UsbIdentity> for Unit {
     }
 }
 
+/// When a device on the network was last heard of by its driver, for whoever keeps its lease.
+#[derive(Debug, Clone, Default)]
+pub struct Heard(Arc<AtomicU64>);
+
+impl Heard {
+    /// It was heard of, now.
+    pub fn now(&self) {
+        self.0.store(Stamp::now().0, Ordering::Relaxed);
+    }
+
+    /// When that was; the beginning of time if it never was.
+    #[must_use]
+    pub fn at(&self) -> Stamp {
+        Stamp(self.0.load(Ordering::Relaxed))
+    }
+}
+
+impl PartialEq for Heard {
+    /// Two nodes are the same whenever they were heard of.
+    fn eq(&self, _: &Self) -> bool {
+        true
+    }
+}
+
 /// A node that can be opened.
 #[derive(Debug, Clone, PartialEq)]
 pub enum DeviceNode {
@@ -125,8 +151,13 @@ pub enum DeviceNode {
     /// A network interface by its name, for example `can0`: a CAN adapter, or a network adapter with a device
     /// behind it.
     Net(String),
-    /// A device on the network, by what it is to be reached at.
-    Lan(SocketAddr),
+    /// A device on the network.
+    Lan {
+        /// Where it is to be reached.
+        address: SocketAddr,
+        /// When its driver heard of it.
+        heard: Heard,
+    },
     /// A simulated device.
     Sim(Arc<SimDevice>),
 }
@@ -166,7 +197,7 @@ impl DeviceNode {
         match self {
             Self::Video(path) | Self::Tty(path) | Self::Usb(path) => path.display().to_string(),
             Self::Net(interface) => interface.clone(),
-            Self::Lan(address) => address.to_string(),
+            Self::Lan { address, .. } => address.to_string(),
             Self::Sim(device) => format!("sim:{}", device.name),
         }
     }

@@ -22,15 +22,16 @@ pub mod trust;
 pub mod units;
 mod words;
 
-pub use attachment::{Attachment, DeviceNode, LanIdentity, Unit, UsbIdentity};
+pub use attachment::{Attachment, DeviceNode, Heard, LanIdentity, Unit, UsbIdentity};
 pub(crate) use diagnostic::did_you_mean;
 pub use diagnostic::{Diagnostic, RegistryErrors};
 pub use identity::{Assigner, Assignment, Detached, Explanation};
 pub use limits::{Limits, VerdictSpec};
 pub use parse::{BUILTIN, Loaded, like_a_name, name_problem, read_file};
 pub use spec::{
-    ActionSpec, CameraSpec, CanAdapter, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, Framing, Hook, Hooks,
-    IdentitySpec, LanProtocol, LanSpec, MAX_BORROWED, MAX_SUBSCRIBERS, MOTOR_CHANNELS, ModuleError, ModuleSpec,
-    MotorKind, MotorMode, MotorSpec, Mount, NodeSpec, Opens, POOL_SPARE, Parse, PixelFormat, ProcessSpec, Registry,
-    RigSpec, SerialSpec, UsbSpec, WhenStale, mounted,
+    ActionSpec, CAN_BATCH, CAN_RECORD, CAN_RESTART_MS, CameraSpec, CanAdapter, CanProtocol, CanSpec, DamiaoSpec,
+    DeviceSpec, Framing, Hook, Hooks, IdentitySpec, LanFind, LanPicture, LanProtocol, LanSpec, MAX_BORROWED,
+    MAX_MOTORS, MAX_SUBSCRIBERS, MOTOR_CHANNELS, ModuleError, ModuleSpec, MotorKind, MotorMode, MotorSpec, Mount,
+    NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream, PixelFormat, Probe, ProcessSpec, Registry, RigSpec,
+    SLCAN_BITRATES, SerialSpec, UsbSpec, WhenStale, mounted,
 };

@@ -14,6 +14,7 @@ mod file;
 mod hooks;
 mod lan;
 mod module;
+mod motors;
 mod node;
 mod process;
 mod program;
@@ -254,7 +255,8 @@ fn check_actuators(drafts: &[Draft<'_>], problems: &mut Problems<'_>) {
     let Some(first) = actuators.next() else { return };
     for draft in actuators {
         let message = format!("[{}] is an actuator already, and a rig has one", first.section.entry);
-        draft.section.report(problems, "action", message, "remove one of the two action tables");
+        let fix = "remove one of the two action tables; the motors of a CAN bus have one without being asked";
+        draft.section.report(problems, "action", message, fix);
     }
 }
 

@@ -49,7 +49,7 @@ use super::diagnostic::{RegistryErrors, did_you_mean};
 use super::parse::{is_port, read_file};
 use super::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, SimFaults, SimSource};
 use super::section::{Problems, Section, file_label, read};
-use super::spec::{DeviceSpec, NodeSpec, Registry};
+use super::spec::{DeviceSpec, LanPicture, NodeSpec, Registry};
 
 const DEVICE_KEYS: [&str; 14] = [
     "name",
@@ -147,7 +147,15 @@ fn standing_for(spec: &DeviceSpec, name: &str) -> ScenarioDevice {
         // Raw lines have no channels; something must be sent all the same.
         NodeSpec::Serial(serial) => SimSource::Serial { channels: serial.channels.max(1), hz: SERIAL_HZ, seed },
         NodeSpec::Process(_) => SimSource::Process,
-        NodeSpec::Can(_) | NodeSpec::Lan(_) => SimSource::Serial { channels: 1, hz: SERIAL_HZ, seed },
+        NodeSpec::Can(can) => SimSource::Serial { channels: can.channels().max(1), hz: SERIAL_HZ, seed },
+        NodeSpec::Lan(lan) => match (lan.picture(), lan.shape().as_slice()) {
+            (Some(LanPicture { width, height, fps }), [_, _]) => {
+                SimSource::Camera { width, height, fps, seed, bytes: 0 }
+            }
+            (_, [channels]) => SimSource::Serial { channels: *channels as usize, hz: SERIAL_HZ, seed },
+            // What sends bytes has no numbers; something must be sent all the same.
+            _ => SimSource::Serial { channels: 1, hz: SERIAL_HZ, seed },
+        },
     };
     let wished = spec.identity.usb();
     let lan = wished.is_none().then(|| LanIdentity {

@@ -21,10 +21,12 @@ use super::limits::VerdictSpec;
 use crate::modality::{Modality, ModalityId, ModalityKind};
 use crate::sample::SampleHeader;
 
-pub use can::{CanAdapter, CanProtocol, CanSpec, MOTOR_CHANNELS};
-pub use lan::{LanProtocol, LanSpec};
+pub use can::{
+    CAN_BATCH, CAN_RECORD, CAN_RESTART_MS, CanAdapter, CanProtocol, CanSpec, MOTOR_CHANNELS, SLCAN_BITRATES,
+};
+pub use lan::{LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, Probe};
 pub use module::{ModuleError, ModuleSpec, mounted};
-pub use motors::{DamiaoSpec, MotorKind, MotorMode, MotorSpec};
+pub use motors::{DamiaoSpec, MAX_MOTORS, MotorKind, MotorMode, MotorSpec};
 
 /// Samples that the pool of a topic holds beyond its depth: what 8 subscribers hold back, 4 each, the
 /// one being written, and one that is on its way out. The bus reserves them.

@@ -22,7 +22,7 @@ use super::programs::{Environment, MARGIN, Programs, environment};
 use super::worker::{TERM_LIMIT, describe};
 use crate::driver::process::Launch;
 use crate::registry::{Attachment, DeviceSpec, Hook};
-use crate::status::{Episode, EpisodeWatch, Level, What};
+use crate::status::{Episode, EpisodeWatch, Level};
 
 /// A hook that has not ended by then is killed.
 pub(super) const HOOK_LIMIT: Duration = Duration::from_secs(10);
@@ -141,16 +141,13 @@ impl Attendant {
     /// Runs a hook to its end. What goes wrong is said and changes nothing else.
     async fn run(&self, key: &str, hook: Option<&Hook>, episode: Option<&Episode>) {
         let Some(hook) = hook else { return };
-        let (name, board) = (&self.spec.name, &self.programs.board);
-        let told = match self.run_hook(key, hook, episode).await {
-            Ok(()) => return,
-            Err(reason) => format!("{name}: {key}: {reason}"),
-        };
-        board.announce(What::Log { level: Level::Error, text: told });
+        if let Err(reason) = self.run_hook(key, hook, episode).await {
+            Output::new(&self.spec.name, Some(key), &self.programs).note(Level::Error, &reason);
+        }
     }
 
     async fn run_hook(&self, key: &str, hook: &Hook, episode: Option<&Episode>) -> Result<(), String> {
-        let Programs { spawner, board, hurry, .. } = &self.programs;
+        let Programs { spawner, hurry, .. } = &self.programs;
         if hurry.is_cancelled() {
             return Err("not run, as the run was interrupted twice".to_owned());
         }
@@ -163,7 +160,7 @@ impl Attendant {
         let launch = Launch { program: hook.program.clone(), args: hook.args.clone(), env };
         let mut child = spawner.spawn(launch).await.map_err(|error| error.to_string())?;
         tracing::debug!(device = %self.spec.name, hook = key, process = child.id(), "started");
-        let mut output = Output::new(&format!("{}: {key}", self.spec.name), board);
+        let mut output = Output::new(&self.spec.name, Some(key), &self.programs);
         let ended = tokio::select! {
             biased;
             () = child.ended() => Ok(()),

@@ -8,6 +8,7 @@
 //! Invariant: the end of a stream, by value or by panic, is an event like any other.
 
 mod attendant;
+mod logbook;
 mod output;
 mod owner;
 pub mod presence;
@@ -18,6 +19,7 @@ mod worker;
 
 pub use owner::Rig;
 
+use crate::action::Order;
 use crate::hotplug::HotplugError;
 use crate::modality::ModalityId;
 use presence::PresenceError;
@@ -38,4 +40,6 @@ pub enum RigError {
 pub enum RigCommand {
     /// Start a failed device again.
     Restart(ModalityId),
+    /// Let the actuator move, or stop it.
+    Order(Order),
 }

@@ -15,16 +15,17 @@ use super::attendant::Post;
 use super::presence::{JsonDevice, Presence};
 use super::programs::Programs;
 use super::slot::{Effects, End, Input, Slot};
-use super::stream::{Numbers, Report, Reported, Stream};
+use super::stream::{Controls, Numbers, Reported, Stream};
 use super::worker::Seat;
 use super::{RigCommand, RigError};
-use crate::bus::{Actions, Bus, TopicId, Writer};
+use crate::action::Order;
+use crate::bus::{Bus, TopicId, Writer};
 use crate::hotplug::{HotplugEvent, HotplugStream, Witness};
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::registry::{Assigner, Assignment, Attachment, DeviceSpec, Registry};
 use crate::sample::Epoch;
-use crate::status::{Board, EpisodeWatch, Level, SlotState, What};
+use crate::status::{Board, EpisodeWatch, SlotState, What};
 use crate::time::Stamp;
 
 /// The JSON file is written this often, and at every change.
@@ -52,6 +53,8 @@ pub struct Rig {
     programs: Option<Programs>,
     /// The episode in progress.
     episode: EpisodeWatch,
+    /// To the actuator.
+    orders: watch::Sender<Option<Order>>,
 }
 
 /// A slot and what belongs to it.
@@ -70,7 +73,7 @@ struct Modality {
     /// Where its hooks are run, if a program is run at all.
     post: Option<Post>,
     /// What it is told, if it is the actuator and no program reads it.
-    actions: Option<Arc<Actions>>,
+    controls: Option<Controls>,
     /// What was agreed with the device, or why it does not run.
     detail: String,
 }
@@ -79,8 +82,9 @@ impl Rig {
     /// A rig with every slot empty, which publishes through `presence`.
     #[must_use]
     pub fn new(registry: &Registry, bus: &Bus, presence: Presence, board: Arc<Board>) -> Self {
-        let programs = Programs::new(registry, &board);
+        let programs = Programs::new(registry, bus, &board);
         let prefix = bus.membership().prefix();
+        let orders = watch::Sender::new(None);
         let modality = |spec: &DeviceSpec| {
             let writer = bus.writer(TopicId::Modality(spec.id))?;
             let spec = Arc::new(spec.clone());
@@ -95,7 +99,10 @@ impl Rig {
                 attached: Stamp::default(),
                 stop: CancellationToken::new(),
                 // A program that moves its device listens itself.
-                actions: spec.action.as_ref().filter(|_| seat.is_none()).and_then(|_| bus.actions()),
+                controls: spec.action.as_ref().filter(|_| seat.is_none()).and_then(|_| {
+                    let orders = orders.subscribe();
+                    Some(Controls::new(bus.actions()?, orders, false))
+                }),
                 seat,
                 post,
                 spec,
@@ -115,6 +122,7 @@ impl Rig {
             reports: mpsc::channel(1).0,
             programs,
             episode: watch::channel(None).1,
+            orders,
         }
     }
 
@@ -146,7 +154,11 @@ impl Rig {
                     None => break Ok(()),
                 },
                 Some((id, epoch, report)) = reported.recv() => self.report(id, epoch, report),
-                Some(RigCommand::Restart(id)) = commands.recv() => self.apply(id, Input::Restart),
+                Some(command) = commands.recv() => match command {
+                    RigCommand::Restart(id) => self.apply(id, Input::Restart),
+                    // Without an actuator nobody listens.
+                    RigCommand::Order(order) => drop(self.orders.send(Some(order))),
+                },
                 () = sleep(deadline.since(Stamp::now())) => self.deadlines_passed(),
                 _ = json.tick() => self.json_is_stale = true,
             }
@@ -237,32 +249,6 @@ impl Rig {
         self.apply(id, Input::Ended(epoch, end));
     }
 
-    fn report(&mut self, id: ModalityId, epoch: Epoch, report: Report) {
-        // A report may arrive after the end of its stream, whose reason must stay.
-        let Some(modality) = self.modality(id).filter(|modality| modality.slot.is_current(epoch)) else { return };
-        match report {
-            Report::Opened(description, provenance) => {
-                modality.detail = description;
-                let device = modality.spec.name.clone();
-                self.show(id);
-                self.board.announce(What::Opened { device, bit: id, provenance });
-            }
-            Report::Silent(limit) => {
-                modality.detail = format!("{}; it has sent nothing for {} s", modality.detail, limit.as_secs());
-                let text = format!("{}: open, but it has sent nothing for {} s", modality.spec.name, limit.as_secs());
-                self.show(id);
-                self.board.announce(What::Log { level: Level::Warn, text });
-            }
-            Report::Started => self.apply(id, Input::Started(epoch)),
-            Report::Stalled => self.apply(id, Input::Stalled(epoch)),
-            Report::Resumed => self.apply(id, Input::Resumed(epoch)),
-            Report::Refused(reason) => {
-                let text = format!("{}: {reason}", modality.spec.name);
-                self.board.announce(What::Log { level: Level::Error, text });
-            }
-        }
-    }
-
     fn deadlines_passed(&mut self) {
         let now = Stamp::now();
         let due = |modality: &&Modality| modality.slot.deadline().is_some_and(|deadline| deadline <= now);
@@ -333,7 +319,7 @@ impl Rig {
             reports,
             stop: modality.stop.clone(),
             seat: modality.seat.clone(),
-            actions: modality.actions.clone(),
+            controls: modality.controls.clone(),
             episode,
         };
         let task = self.streams.spawn(stream.run());
@@ -344,13 +330,6 @@ impl Rig {
         let board = Arc::clone(&self.board);
         let Some(modality) = self.modality(id) else { return };
         board.set_slot(id, modality.slot.state(), modality.slot.epoch(), &modality.detail);
-    }
-
-    fn announce_state(&mut self, id: ModalityId) {
-        let (mask, count, board) = (self.mask, self.modalities.len(), Arc::clone(&self.board));
-        let Some(modality) = self.modality(id) else { return };
-        let (device, detail, state) = (modality.spec.name.clone(), modality.detail.clone(), modality.slot.state());
-        board.announce(What::State { device, bit: id, state, mask: mask.hex(count), detail });
     }
 
     fn write_json(&self) {
@@ -395,5 +374,6 @@ impl Rig {
 }
 
 mod programs;
+mod report;
 #[cfg(test)]
 mod tests;

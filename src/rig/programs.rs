@@ -9,7 +9,9 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use super::attendant::HOOK_LIMIT;
+use super::logbook::Logbook;
 use super::worker::TERM_LIMIT;
+use crate::bus::Bus;
 use crate::driver::process::Spawner;
 use crate::registry::{Attachment, DeviceSpec, NodeSpec, Registry};
 use crate::status::Board;
@@ -22,6 +24,7 @@ pub(super) const MARGIN: Duration = Duration::from_secs(2);
 pub(super) struct Programs {
     pub(super) spawner: Spawner,
     pub(super) board: Arc<Board>,
+    pub(super) logbook: Logbook,
     /// One task a child, and one an attended device.
     pub(super) tasks: TaskTracker,
     /// The run ends: what is not begun yet is not begun any more.
@@ -32,11 +35,12 @@ pub(super) struct Programs {
 
 impl Programs {
     /// `None` where no entry needs a program.
-    pub(super) fn new(registry: &Registry, board: &Arc<Board>) -> Option<Self> {
+    pub(super) fn new(registry: &Registry, bus: &Bus, board: &Arc<Board>) -> Option<Self> {
         let mut devices = registry.devices.iter();
         devices.any(|device| matches!(device.node, NodeSpec::Process(_)) || !device.hooks.is_empty()).then(|| Self {
             spawner: Spawner::start(),
             board: Arc::clone(board),
+            logbook: Logbook::start(bus.instance(), board),
             tasks: TaskTracker::new(),
             closing: CancellationToken::new(),
             hurry: CancellationToken::new(),
@@ -53,6 +57,7 @@ impl Programs {
         if timeout(limit, self.tasks.wait()).await.is_err() {
             tracing::warn!(programs = self.tasks.len(), "did not end even when killed and are abandoned");
         }
+        self.logbook.flush().await;
     }
 }
 

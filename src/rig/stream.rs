@@ -4,6 +4,9 @@
 //! own; what publishing costs is said in `bus`.
 //! Invariant: a stream that was told to stop publishes no more.
 
+mod controls;
+mod source;
+
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
@@ -13,15 +16,14 @@ use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until, timeout};
 use tokio_util::sync::CancellationToken;
 
 use super::slot::End;
-use super::worker::{MOST_SILENT_BEATS, Seat, Worker};
-use crate::action::MAX_ACTION;
-use crate::bus::{Actions, Writer};
-use crate::driver::{Driver, DriverError, Reading};
+use super::worker::Seat;
+use crate::action::ActuatorNotice;
+use crate::bus::Writer;
+use crate::driver::{DriverError, Reading};
 use crate::fault;
-use crate::provenance::Negotiated;
 use crate::registry::{Attachment, DeviceSpec, NodeSpec};
 use crate::sample::{Epoch, SampleHeader};
-use crate::status::{Board, Episode, EpisodeWatch, Provenance};
+use crate::status::{Board, EpisodeWatch, Provenance};
 use crate::time::{Stamp, nanoseconds};
 
 /// A device that does not open within this time is tried again.
@@ -38,6 +40,9 @@ const CLOSE_LIMIT: Duration = Duration::from_secs(2);
 /// How often the actuator is asked whether it was told something.
 const ACTIONS_EVERY: Duration = Duration::from_millis(2);
 
+pub(super) use controls::Controls;
+use source::Source;
+
 /// What a stream tells the rig while it runs.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Report {
@@ -53,6 +58,8 @@ pub(super) enum Report {
     Resumed,
     /// Samples or actions are lost, and why; told once an epoch.
     Refused(String),
+    /// What an actuator has to tell.
+    Actuator(ActuatorNotice),
 }
 
 /// A report with its sender.
@@ -93,82 +100,9 @@ pub(super) struct Stream {
     /// Where the program of the entry works, if it has one.
     pub(super) seat: Option<Seat>,
     /// What it is told, if it is the actuator.
-    pub(super) actions: Option<Arc<Actions>>,
+    pub(super) controls: Option<Controls>,
     /// The episode in progress, of which devices are told that record by themselves.
     pub(super) episode: EpisodeWatch,
-}
-
-/// Where the samples of a stream come from.
-#[derive(Debug)]
-enum Source {
-    Driver(Driver),
-    Worker(Box<Worker>),
-}
-
-impl Source {
-    async fn open(stream: &Stream) -> Result<Self, DriverError> {
-        let Stream { spec, attachment, epoch, seat, .. } = stream;
-        match (&spec.node, seat) {
-            // A recorded topic needs no program.
-            (NodeSpec::Process(process), Some(seat)) if !attachment.node.is_recording() => {
-                Ok(Self::Worker(Box::new(Worker::open(seat, spec, process, attachment, *epoch).await?)))
-            }
-            _ => Ok(Self::Driver(Driver::open(spec, &attachment.node).await?)),
-        }
-    }
-
-    async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
-        match self {
-            Self::Driver(driver) => driver.read().await,
-            Self::Worker(worker) => worker.read().await,
-        }
-    }
-
-    fn description(&self) -> String {
-        match self {
-            Self::Driver(driver) => driver.description(),
-            Self::Worker(worker) => worker.description(),
-        }
-    }
-
-    fn command(&mut self, target: &[f64]) -> Result<(), DriverError> {
-        match self {
-            Self::Driver(driver) => driver.command(target),
-            Self::Worker(_) => Err(DriverError::Fatal("a program of the rig takes no actions".to_owned())),
-        }
-    }
-
-    /// What a program wants to know of episodes its hooks are told.
-    fn record(&mut self, episode: Option<&Arc<Episode>>) -> Result<(), DriverError> {
-        match self {
-            Self::Driver(driver) => driver.record(episode),
-            Self::Worker(_) => Ok(()),
-        }
-    }
-
-    /// The stream was told to stop.
-    async fn close(self) {
-        match self {
-            Self::Driver(driver) => drop(timeout(CLOSE_LIMIT, driver.close()).await),
-            Self::Worker(worker) => drop(worker),
-        }
-    }
-
-    fn negotiated(&self) -> Negotiated {
-        match self {
-            Self::Driver(driver) => driver.negotiated(),
-            // What a program agrees with its device, only the program knows.
-            Self::Worker(worker) => Negotiated { card: Some(worker.description()), ..Negotiated::default() },
-        }
-    }
-
-    /// A source that is silent for this long is opened anew.
-    fn patience(&self, stall_after: Duration) -> Option<Duration> {
-        match self {
-            Self::Driver(_) => None,
-            Self::Worker(_) => Some(stall_after * MOST_SILENT_BEATS),
-        }
-    }
 }
 
 impl Stream {
@@ -205,9 +139,12 @@ impl Stream {
         tokio::pin!(silent);
         let mut told = interval(ACTIONS_EVERY);
         told.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let mut action = [0.0; MAX_ACTION];
-        // What was said before it was there was not meant for now.
-        let _ = self.actions.as_ref().and_then(|actions| actions.newest(&mut action));
+        let mut controls = self.controls.clone();
+        if let Some(controls) = &mut controls
+            && let Err(error) = controls.begin(source)
+        {
+            return end(&error);
+        }
         let mut episode = self.episode.clone();
         if episode.borrow_and_update().is_some() {
             episode.mark_changed();
@@ -239,14 +176,16 @@ impl Stream {
                     // A device that always has something to read never lets us get to `news`.
                     self.tell(source, &mut episode).await;
                 }
-                _ = told.tick(), if self.actions.is_some() => {
-                    let newest = self.actions.as_ref().and_then(|actions| actions.newest(&mut action));
-                    if let Some(target) = newest
-                        && let Err(error) = source.command(target)
+                _ = told.tick(), if controls.is_some() => {
+                    if let Some(controls) = &mut controls
+                        && let Err(error) = controls.pass_on(source)
                         && !refused
                     {
                         refused = true;
                         self.report(Report::Refused(format!("it does not move: {error}"))).await;
+                    }
+                    while let Some(notice) = source.take_notice() {
+                        self.report(Report::Actuator(notice)).await;
                     }
                 }
                 () = &mut news => {

@@ -23,6 +23,9 @@ const POSITION_VELOCITY: u16 = 0x100;
 /// Added to a motor's id in velocity mode.
 const VELOCITY: u16 = 0x200;
 
+/// Of a quantum; far more than a 64-bit float is wrong by, and far less than a motor can tell.
+const HAIR: f64 = 1e-6;
+
 /// A value of a command is infinite or not a number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 #[error("a command to a motor holds a value that is not a finite number")]
@@ -294,7 +297,8 @@ fn count(value: f64, low: f64, high: f64, bits: u32) -> Result<u16, NotFinite> {
         return Err(NotFinite);
     }
     let quanta = f64::from((1_u32 << bits) - 1);
-    let counted = (value.clamp(low, high) - low) / (high - low) * quanta;
+    // A position that was read is sent as the count it was read from, though rounding took a hair off it.
+    let counted = (value.clamp(low, high) - low) / (high - low) * quanta + HAIR;
     // In `0..=quanta`, cut off as the public drivers do.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     Ok(counted as u16)

@@ -224,6 +224,16 @@ impl Link {
         }
     }
 
+    /// After a bus-off it returns to the bus by itself.
+    #[must_use]
+    pub const fn restarts(&self) -> bool {
+        match self {
+            Self::Socket(socket) => socket.restarts(),
+            // What these adapters do then, they do not tell.
+            Self::Slcan(_) | Self::Damiao(_) => true,
+        }
+    }
+
     /// What was opened, for people.
     #[must_use]
     pub fn description(&self) -> &str {
@@ -353,4 +363,4 @@ pub const fn is_overflow(frame: &CanFrame) -> bool {
 }
 
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;

@@ -9,9 +9,7 @@ use socketcan::CanInterface;
 use socketcan::nl::{CanState, InterfaceDetails};
 
 use super::link::LinkError;
-
-/// A controller that left the bus returns after this many ms.
-pub const RESTART_MS: u32 = 100;
+use crate::registry::CAN_RESTART_MS;
 
 /// A CAN interface as it is.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -54,13 +52,24 @@ pub(super) fn index(name: &str) -> Option<u32> {
     Some(CanInterface::open(name).ok()?.details().ok()?.index)
 }
 
-/// Sees to it that the interface `name` is up with `bitrate`; its index.
-pub(super) fn bring_up(name: &str, bitrate: u32) -> Result<u32, LinkError> {
+/// An interface that is up.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Ready {
+    /// By which it is told from a later one of the same name.
+    pub(super) index: u32,
+    /// It returns from bus-off by itself.
+    pub(super) restarts: bool,
+}
+
+/// Sees to it that the interface `name` is up with `bitrate`.
+pub(super) fn bring_up(name: &str, bitrate: u32) -> Result<Ready, LinkError> {
     let interface = CanInterface::open(name).map_err(|error| refusal(name, &error))?;
     let details = interface.details().map_err(|error| refusal(name, &error))?;
     let state = read(&details);
     match need(&state, bitrate) {
-        Need::Nothing => return Ok(details.index),
+        Need::Nothing => {
+            return Ok(Ready { index: details.index, restarts: state.restart_ms.is_some_and(|ms| ms > 0) });
+        }
         Need::Up => {}
         Need::Anew => {
             tracing::warn!(interface = name, ?state.bitrate, wished = bitrate, "the interface is set up anew");
@@ -69,11 +78,12 @@ pub(super) fn bring_up(name: &str, bitrate: u32) -> Result<u32, LinkError> {
     }
     interface.set_bitrate(bitrate, None).map_err(|error| not_set(name, bitrate, &state, &error))?;
     // Not every driver can.
-    if let Err(error) = interface.set_restart_ms(RESTART_MS) {
+    let restart = interface.set_restart_ms(CAN_RESTART_MS);
+    if let Err(error) = &restart {
         tracing::info!(interface = name, %error, "the interface does not return from bus-off by itself");
     }
     interface.bring_up().map_err(|error| not_set(name, bitrate, &state, &error))?;
-    Ok(details.index)
+    Ok(Ready { index: details.index, restarts: restart.is_ok() })
 }
 
 fn need(state: &Interface, bitrate: u32) -> Need {
@@ -109,7 +119,7 @@ fn read(details: &InterfaceDetails) -> Interface {
 /// The commands that do by hand what was not permitted.
 fn by_hand(name: &str, bitrate: u32, up: bool) -> String {
     let down = if up { format!("sudo ip link set {name} down && ") } else { String::new() };
-    format!("{down}sudo ip link set {name} up type can bitrate {bitrate} restart-ms {RESTART_MS}")
+    format!("{down}sudo ip link set {name} up type can bitrate {bitrate} restart-ms {CAN_RESTART_MS}")
 }
 
 fn not_set(name: &str, bitrate: u32, state: &Interface, error: &socketcan::Error) -> LinkError {

@@ -10,9 +10,8 @@
 //! Invariant: no bytes make the decoder panic, and it holds at most [`LONGEST`] of them.
 
 use crate::control::can::CanFrame;
+use crate::registry::SLCAN_BITRATES;
 
-/// Bit rates by the digit after `S`, bits a second.
-pub const BITRATES: [u32; 9] = [10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000];
 /// The longest line: `T`, 8 digits of identifier, the length, 16 digits of data, 4 of a time stamp, and CR.
 pub const LONGEST: usize = 31;
 
@@ -24,7 +23,7 @@ const BEL: u8 = 0x07;
 pub enum Command {
     /// Leave the bus.
     Close,
-    /// Bit rate by its digit, an index into [`BITRATES`].
+    /// Bit rate by its digit, an index into [`SLCAN_BITRATES`].
     Bitrate(u8),
     /// Time stamps after each frame, or none.
     Timestamps(bool),
@@ -36,7 +35,7 @@ impl Command {
     /// The command that sets `bitrate`; `None` if slcan has no name for it.
     #[must_use]
     pub fn bitrate(bitrate: u32) -> Option<Self> {
-        let digit = BITRATES.iter().position(|known| *known == bitrate)?;
+        let digit = SLCAN_BITRATES.iter().position(|known| *known == bitrate)?;
         u8::try_from(digit).ok().map(Self::Bitrate)
     }
 

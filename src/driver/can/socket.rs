@@ -11,7 +11,7 @@ use std::time::Duration;
 use socketcan::{CanSocket, Socket as _, SocketOptions as _};
 
 use super::link::{Arrival, LinkError, is_overflow};
-use super::netlink;
+use super::netlink::{self, Ready};
 use crate::control::can::CanFrame;
 use crate::time::{Stamp, WallClock};
 
@@ -27,6 +27,7 @@ pub struct Socket {
     socket: CanSocket,
     name: String,
     index: u32,
+    restarts: bool,
     /// The kernel's count of frames that found the queue full.
     dropped: u32,
     lost: u64,
@@ -35,13 +36,14 @@ pub struct Socket {
 
 impl Socket {
     pub(super) fn open(name: &str, bitrate: u32) -> Result<Self, LinkError> {
-        let index = netlink::bring_up(name, bitrate)?;
-        let socket = listen(index).map_err(|error| open_error(name, &error))?;
-        Ok(Self::of(socket, name, index, format!("{name} at {bitrate} bit/s")))
+        let ready = netlink::bring_up(name, bitrate)?;
+        let socket = listen(ready.index).map_err(|error| open_error(name, &error))?;
+        Ok(Self::of(socket, name, ready, format!("{name} at {bitrate} bit/s")))
     }
 
-    fn of(socket: CanSocket, name: &str, index: u32, description: String) -> Self {
-        Self { socket, name: name.to_owned(), index, dropped: 0, lost: 0, description }
+    fn of(socket: CanSocket, name: &str, ready: Ready, description: String) -> Self {
+        let Ready { index, restarts } = ready;
+        Self { socket, name: name.to_owned(), index, restarts, dropped: 0, lost: 0, description }
     }
 
     pub(super) fn send(&mut self, frame: &CanFrame) -> Result<(), LinkError> {
@@ -96,6 +98,10 @@ impl Socket {
 
     pub(super) fn take_lost(&mut self) -> u64 {
         std::mem::take(&mut self.lost)
+    }
+
+    pub(super) const fn restarts(&self) -> bool {
+        self.restarts
     }
 
     pub(super) fn description(&self) -> &str {
@@ -237,4 +243,4 @@ fn from_raw(raw: &libc::can_frame) -> CanFrame {
 }
 
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;

@@ -63,7 +63,7 @@ impl Entry {
             DeviceNode::Tty(_) => self.kind == Kind::Serial,
             DeviceNode::Usb(_) => self.kind == Kind::Usb,
             DeviceNode::Net(_) => self.kind == Kind::Net,
-            DeviceNode::Lan(_) => self.kind == Kind::Lan,
+            DeviceNode::Lan { .. } => self.kind == Kind::Lan,
             DeviceNode::Sim(device) => match device.source {
                 // What stands for a device that has neither a picture's node nor a line sends as if it had.
                 SimSource::Camera { .. } | SimSource::Serial { .. } if matches!(self.kind, Kind::Net | Kind::Lan) => {

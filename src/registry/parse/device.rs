@@ -7,12 +7,13 @@ use toml::de::DeValue;
 
 use super::program::{For, Programs};
 use super::verdict::{VerdictTable, Whose};
-use super::{action, can, hooks, lan, node, process, verdict};
+use super::{action, can, hooks, lan, motors, node, process, verdict};
 use crate::modality::ModalityId;
 use crate::registry::diagnostic::did_you_mean;
 use crate::registry::section::{At, Problems, Section};
 use crate::registry::spec::{
-    ActionSpec, CanAdapter, DeviceSpec, Hook, Hooks, IdentitySpec, Mount, NodeSpec, Opens, UsbSpec, WhenStale,
+    ActionSpec, CanAdapter, CanProtocol, CanSpec, DeviceSpec, Hook, Hooks, IdentitySpec, Mount, NodeSpec, Opens,
+    UsbSpec, WhenStale,
 };
 
 /// Kinds of node this version has a driver for.
@@ -94,7 +95,11 @@ impl Draft<'_> {
     /// The entry, with what `[verdict]` says for all; `None` only if a problem with it was reported.
     pub(super) fn finish(self, rig: &VerdictTable) -> Option<DeviceSpec> {
         let node = self.node?;
-        let fps = if let NodeSpec::Camera(camera) = &node { Some(f64::from(camera.fps)) } else { None };
+        let fps = match &node {
+            NodeSpec::Camera(camera) => Some(f64::from(camera.fps)),
+            NodeSpec::Lan(lan) => lan.rate(),
+            _ => None,
+        };
         Some(DeviceSpec {
             verdict: verdict::spec(node.modality_kind(), self.stall_after, fps, rig, &self.verdict),
             name: self.name,
@@ -177,6 +182,10 @@ pub(super) fn read<'a>(
         let message = format!("a built-in node has no table [{}]", section.child("process"));
         section.report(problems, "process", message, "remove the table, or write node = the name of a program");
     }
+    if kind.is_some_and(|kind| kind != Kind::Can) && section.has("can") {
+        let message = format!("only a CAN adapter has a table [{}]", section.child("can"));
+        section.report(problems, "can", message, "remove the table, or write node = \"can\"");
+    }
     let topic = topic(&section, problems).unwrap_or_else(|| default_topic(kind, name));
     let bit = section
         .integer(problems, "bit", 0..=HIGHEST_BIT)
@@ -189,6 +198,10 @@ pub(super) fn read<'a>(
         .unwrap_or_else(|| node::default_stall(settings.as_ref()));
     let latency = section.duration(problems, "latency", Duration::ZERO..=LONGEST_LATENCY).unwrap_or_default();
     let max_bytes = node::max_bytes(&section, settings.as_ref(), problems);
+    let mut action = action::action(&section, problems);
+    if let Some(NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(damiao), .. })) = &settings {
+        action = motors::axes(damiao, action, &section, problems);
+    }
     let written = section.integer(problems, "depth", 2..=4096).and_then(|depth| u64::try_from(depth.value).ok());
     Draft {
         name: name.to_owned(),
@@ -205,7 +218,7 @@ pub(super) fn read<'a>(
         when_stale,
         latency,
         verdict: verdict::read(&section, Whose::Device, problems),
-        action: action::action(&section, problems),
+        action,
         hooks: hooks::hooks(&section, attach_is_node(&section), programs, problems),
         node: settings,
         section,

@@ -7,6 +7,15 @@ use crate::modality::ModalityKind;
 /// transistors and of its winding °C, and its error code.
 pub const MOTOR_CHANNELS: usize = 6;
 
+/// Bytes that stand for one frame in a sample of [`CanProtocol::Raw`].
+pub const CAN_RECORD: usize = 24;
+/// Frames in such a sample, at most.
+pub const CAN_BATCH: usize = 128;
+/// A controller that left the bus after too many errors is made to return after this many ms.
+pub const CAN_RESTART_MS: u32 = 100;
+/// Bit rates that slcan has a name for, `S0` to `S8`.
+pub const SLCAN_BITRATES: [u32; 9] = [10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000];
+
 /// See the module's comment.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CanSpec {

@@ -15,6 +15,15 @@ impl Rig {
         self
     }
 
+    /// Arms the actuator as soon as it is there, once.
+    #[must_use]
+    pub fn arming(mut self, arm: bool) -> Self {
+        for controls in self.modalities.iter_mut().filter_map(|modality| modality.controls.as_mut()) {
+            controls.arm = arm;
+        }
+        self
+    }
+
     /// Cancelled, it kills the programs that are being ended.
     #[must_use]
     pub fn hurry(&self) -> CancellationToken {

@@ -16,7 +16,7 @@ use super::super::programs::Programs;
 use crate::bus::Membership;
 use crate::driver::DriverError;
 use crate::driver::process::{Child, Launch};
-use crate::status::{Level, What};
+use crate::status::Level;
 
 /// How long a child has to end after SIGTERM.
 pub(in crate::rig) const TERM_LIMIT: Duration = Duration::from_secs(5);
@@ -60,7 +60,8 @@ impl Keeper {
         let id = child.id();
         // Where the stream has been told to stop meanwhile, nobody listens, here and below.
         let _ = started.send(Ok(id));
-        let mut output = Output::new(&name, &programs.board);
+        programs.logbook.write(&name, &format!("started as process {id}"));
+        let mut output = Output::new(&name, None, &programs);
         let end = tokio::select! {
             biased;
             end = until_end(&child, &stop, &programs.hurry) => end,
@@ -72,9 +73,9 @@ impl Keeper {
             Err(error) => format!("its process {id} cannot be reaped: {error}"),
         };
         if end == End::Killed {
-            let text = format!("{name}: process {id} did not end on SIGTERM and was killed");
-            programs.board.announce(What::Log { level: Level::Warn, text });
+            output.note(Level::Warn, &format!("process {id} did not end on SIGTERM and was killed"));
         }
+        programs.logbook.write(&name, &reason);
         tracing::debug!(device = %name, process = id, "{reason}");
         let _ = ended.send(reason);
         // What the child published last goes with its memory.

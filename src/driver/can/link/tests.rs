@@ -45,7 +45,7 @@ fn slcan_link() -> (Link, File) {
     (link, line)
 }
 
-fn damiao_link() -> (Link, File) {
+pub(in crate::driver::can) fn damiao_link() -> (Link, File) {
     let (line, path) = terminal();
     (Link::open_damiao(&path).unwrap(), line)
 }
@@ -54,7 +54,7 @@ fn soon() -> Stamp {
     Stamp::now().after(Duration::from_secs(10))
 }
 
-fn received(frame: &CanFrame) -> Vec<u8> {
+pub(in crate::driver::can) fn received(frame: &CanFrame) -> Vec<u8> {
     [&[0xaa, 0x11, frame.len][..], &frame.id.to_le_bytes(), &frame.data, &[0x55]].concat()
 }
 

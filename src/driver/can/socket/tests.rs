@@ -7,16 +7,16 @@ use std::os::fd::OwnedFd;
 use super::*;
 use crate::driver::can::link::Link;
 
-fn bus() -> (Link, UdpSocket) {
+pub(in crate::driver::can) fn bus() -> (Link, UdpSocket) {
     let (ours, theirs) = (UdpSocket::bind("127.0.0.1:0").unwrap(), UdpSocket::bind("127.0.0.1:0").unwrap());
     ours.connect(theirs.local_addr().unwrap()).unwrap();
     theirs.connect(ours.local_addr().unwrap()).unwrap();
     let socket = CanSocket::from(OwnedFd::from(ours));
     set_up(&socket).unwrap();
-    (Link::Socket(Socket::of(socket, "stand-in", 0, String::new())), theirs)
+    (Link::Socket(Socket::of(socket, "stand-in", netlink::Ready { index: 0, restarts: false }, String::new())), theirs)
 }
 
-fn bytes(frame: &CanFrame) -> [u8; 16] {
+pub(in crate::driver::can) fn bytes(frame: &CanFrame) -> [u8; 16] {
     let mut bytes = [0; 16];
     bytes[..4].copy_from_slice(&can_id(frame).to_ne_bytes());
     bytes[4] = frame.len;
