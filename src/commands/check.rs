@@ -109,7 +109,7 @@ fn module_line(module: &ModuleSpec) -> String {
     let mut line = format!("module {} in slot {}", module.name, module.mount);
     for (what, words) in [("sensors", &module.devices), ("tags", &tags)] {
         if !words.is_empty() {
-            line.push_str(&format!(", {what} {}", words.join(" ")));
+            line += &[", ", what, " ", &words.join(" ")].concat();
         }
     }
     text::plain(&line).into_owned()

@@ -110,7 +110,7 @@ fn tree_line(device: &UsbDevice, entries: &[&str]) -> String {
         line.push_str("  hub");
     }
     for entry in entries {
-        line.push_str(&format!("  [device.{entry}]"));
+        line += &["  [device.", entry, "]"].concat();
     }
     if let Some(product) = &device.product {
         line.push_str("  ");

@@ -195,7 +195,8 @@ fn devices_of_rapid_driver_become_entries_or_comments() {
         "[[device]]\nname = \"Force-L\"\nvid = \"1209\"\npid = \"0002\"\nserial = \"F1\"\n\
          on_attach = \"python3 force.py; \\u001b[2J\\nrm -rf /\"\n\n\
          [[device]]\nname = \"unknown\"\nvid = \"1\"\npid = \"2\"\n\n\
-         [[device]]\nname = \"phone\"\nbackend = \"mdns\"\nservice_type = \"_iphonevio._tcp\"\n",
+         [[device]]\nname = \"phone\"\nbackend = \"mdns\"\nservice_type = \"_iphonevio._tcp\"\n\n\
+         [[device]]\nname = \"radio\"\nbackend = \"mdns\"\nservice_type = \"_radio._tcp\"\n",
     )
     .unwrap();
     std::fs::write(&layout, "device_order = [\"a\", \"b\", \"c\", \"phone\", \"Force-L\", \"unknown\"]\n").unwrap();
@@ -210,12 +211,13 @@ fn devices_of_rapid_driver_become_entries_or_comments() {
         "# Not in use: how it is read is not known",
         "# [device.unknown]\n# vid = \"0001\"\n",
         "# bit = 5\n",
-        "# Not in use: it is found by mDNS (_iphonevio._tcp)",
+        "# Not in use: it is found by mDNS (_radio._tcp), and what it speaks is not known",
+        "[device.phone.lan]\nprotocol = \"iphone\"\nmdns = \"_iphonevio._tcp\"\n",
     ] {
         assert!(added.contains(expected), "{expected:?} in {added}");
     }
     let registry = bench.target().registry.unwrap();
-    assert_eq!(registry.devices.len(), 4);
+    assert_eq!(registry.devices.len(), 5);
     assert_eq!(registry.named("force_l").map(|device| device.id.bit()), Some(4));
     // Told how they are read, the others come in as well; the first is an entry by now.
     let again = bench.register(&format!("--import {} --node camera", foreign.display()), &[], None).1.unwrap_err();
