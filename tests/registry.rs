@@ -77,6 +77,22 @@ fn defaults_are_those_of_the_documentation() {
 }
 
 #[test]
+fn modules_arrive_and_are_mounted_by_name() {
+    let modules = valid("modules").registry.modules;
+    let [get, soft, pinch] = modules.as_slice() else { panic!("three modules") };
+    assert_eq!((get.mount.to_string().as_str(), get.devices.as_slice()), ("tip", &["tactile_tip".to_owned()][..]));
+    assert_eq!(soft.tags[1], ("material".to_owned(), "tpu".to_owned()));
+    assert_eq!((pinch.devices.len(), pinch.tags.len()), (0, 0));
+    let mounted = |names: &[&str]| {
+        let names: Vec<String> = names.iter().map(|name| (*name).to_owned()).collect();
+        rapid::registry::mounted(&modules, &names).map(|found| found.len()).map_err(|error| error.to_string())
+    };
+    assert_eq!(mounted(&["soft_tip", "pinch", "pinch"]), Ok(2));
+    assert!(mounted(&["soft_tpi"]).unwrap_err().contains("did you mean \"soft_tip\"?"));
+    assert!(mounted(&["soft_tip", "get"]).unwrap_err().contains("both sit in the slot tip"));
+}
+
+#[test]
 fn a_program_and_its_settings_arrive() {
     let Loaded { registry, warnings } = valid("process");
     assert_eq!(warnings, []);

@@ -10,6 +10,9 @@ use super::usb::UsbDevice;
 use crate::registry::{DeviceSpec, NodeSpec, Opens, Registry};
 use crate::text;
 
+/// A camera that runs slower than this, Mbit/s, is in the wrong port or on a bad cable.
+const SLOWEST: f64 = 480.0;
+
 /// How bad it is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "lowercase")]
@@ -118,21 +121,19 @@ fn buses(facts: &Facts, plugged: &[(&DeviceSpec, &UsbDevice)]) -> Vec<Finding> {
     let mut found = Vec::new();
     let roots = facts.usb.iter().filter(|device| device.is_root());
     for root in roots {
-        let wishes: Vec<(Wish, &UsbDevice)> = plugged
+        // What runs slower has a finding of its own, and takes next to nothing behind its hub.
+        let of_the_bus = |device: &UsbDevice| device.bus == root.bus && device.mbit >= SLOWEST;
+        let wishes: Vec<Wish> = plugged
             .iter()
-            .filter(|(_, device)| device.bus == root.bus)
-            .filter_map(|(entry, device)| {
+            .filter(|(_, device)| of_the_bus(device))
+            .filter_map(|(entry, _)| {
                 let NodeSpec::Camera(camera) = &entry.node else { return None };
-                let wish = Wish { name: entry.name.clone(), camera: camera.clone(), max_bytes: entry.max_bytes };
-                Some((wish, *device))
+                Some(Wish { name: entry.name.clone(), camera: camera.clone(), max_bytes: entry.max_bytes })
             })
             .collect();
-        if wishes.is_empty() {
-            continue;
+        if !wishes.is_empty() {
+            found.push(bus(root.bus, root.mbit, &wishes));
         }
-        let slow = wishes.iter().map(|(_, device)| device.mbit).fold(root.mbit, f64::min);
-        let wishes: Vec<Wish> = wishes.into_iter().map(|(wish, _)| wish).collect();
-        found.push(bus(root.bus, slow, &wishes));
     }
     found
 }
@@ -159,7 +160,7 @@ fn bus(bus: u32, mbit: f64, wishes: &[Wish]) -> Finding {
 /// Cameras that run slower than cameras do.
 fn speeds(plugged: &[(&DeviceSpec, &UsbDevice)]) -> Vec<Finding> {
     let slow =
-        plugged.iter().filter(|(entry, device)| matches!(entry.node, NodeSpec::Camera(_)) && device.mbit < 480.0);
+        plugged.iter().filter(|(entry, device)| matches!(entry.node, NodeSpec::Camera(_)) && device.mbit < SLOWEST);
     let say = |(entry, device): &(&DeviceSpec, &UsbDevice)| {
         let what = format!("[device.{}] runs at {} Mbit/s, too slow for pictures", entry.name, device.mbit);
         Finding::bad("speed", what, format!("another cable, port or hub: it is at port {}", device.port))

@@ -110,7 +110,7 @@ fn tree_line(device: &UsbDevice, entries: &[&str]) -> String {
         line.push_str("  hub");
     }
     for entry in entries {
-        line.push_str(&format!("  [device.{entry}]"));
+        line += &["  [device.", entry, "]"].concat();
     }
     if let Some(product) = &device.product {
         line.push_str("  ");
@@ -181,3 +181,6 @@ fn write_rate(folder: &Path) -> io::Result<f64> {
     file.sync_data()?;
     Ok(written as f64 / begun.elapsed().as_secs_f64().max(1e-6))
 }
+
+#[cfg(test)]
+mod tests;
