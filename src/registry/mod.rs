@@ -26,8 +26,7 @@ pub use identity::{Assigner, Assignment, Detached, Explanation};
 pub use limits::{Limits, VerdictSpec};
 pub use parse::{BUILTIN, Loaded};
 pub use spec::{
-    ActionSpec, CameraSpec, CanAdapter, CanProtocol, CanSpec, DeviceSpec, Framing, IdentitySpec, LanFind, LanPicture, LanProtocol,
-    LanSpec, MAX_BORROWED, MAX_SUBSCRIBERS, Mount, NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream, PixelFormat, Probe,
-    ProcessSpec, Registry,
-    RigSpec, SerialSpec, UsbSpec, WhenStale,
+    ActionSpec, CameraSpec, CanAdapter, CanProtocol, CanSpec, DeviceSpec, Framing, IdentitySpec, LanFind, LanPicture,
+    LanProtocol, LanSpec, MAX_BORROWED, MAX_SUBSCRIBERS, Mount, NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream,
+    PixelFormat, Probe, ProcessSpec, Registry, RigSpec, SerialSpec, UsbSpec, WhenStale,
 };

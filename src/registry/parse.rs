@@ -90,6 +90,7 @@ impl Registry {
         check_identities(&drafts, &mut problems);
         check_topics(&drafts, &mut problems);
         check_actuators(&drafts, &mut problems);
+        lan::check_ports(&drafts, &mut problems);
         let mut warnings = assign_bits(&mut drafts, &mut problems);
         warnings.extend(unused_ports(&drafts, &problems));
         warnings.extend(drafts.iter().filter_map(|draft| program::distrusted(draft, &problems)));

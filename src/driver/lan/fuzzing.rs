@@ -5,7 +5,11 @@ use super::multipart::{self, Multipart, boundary};
 use super::{gopro, jpeg};
 
 /// Bodies of a multipart stream that comes in these pieces, and how many were given up.
-pub fn multipart<'p>(content_type: &str, largest: usize, pieces: impl IntoIterator<Item = &'p [u8]>) -> (Vec<Vec<u8>>, u64) {
+pub fn multipart<'p>(
+    content_type: &str,
+    largest: usize,
+    pieces: impl IntoIterator<Item = &'p [u8]>,
+) -> (Vec<Vec<u8>>, u64) {
     let (mut parts, mut malformed) = (Vec::new(), 0);
     let Some(mut parser) = boundary(content_type).and_then(|boundary| Multipart::new(boundary, largest)) else {
         return (parts, malformed);

@@ -210,12 +210,20 @@ impl Camera {
         sleep(CLIP_IS_LISTED_AFTER).await;
         match self.note(episode).await {
             Ok(clip) => {
-                tracing::info!(device = self.name, clip = clip.file, folder = clip.folder, size = clip.size, "recorded");
+                tracing::info!(
+                    device = self.name,
+                    clip = clip.file,
+                    folder = clip.folder,
+                    size = clip.size,
+                    "recorded"
+                );
                 if self.download {
                     self.pending.push_back(clip);
                 }
             }
-            Err(reason) => tracing::error!(device = self.name, %reason, "which clip belongs to the episode is not known"),
+            Err(reason) => {
+                tracing::error!(device = self.name, %reason, "which clip belongs to the episode is not known")
+            }
         }
         self.fetch();
     }

@@ -106,7 +106,9 @@ impl Reply {
                         return Ok(Some(bytes));
                     }
                 }
-                Some(Err(error)) => return Err(self.server.place.lost(format_args!("the stream broke: {}", causes(&error)))),
+                Some(Err(error)) => {
+                    return Err(self.server.place.lost(format_args!("the stream broke: {}", causes(&error))));
+                }
                 None => return Ok(None),
             }
         }

@@ -145,7 +145,11 @@ impl Phone {
                 Cut::Frame(frame) => return Some((frame, connection.arrived)),
                 Cut::Session => {
                     let text = String::from_utf8_lossy(connection.packets.payload());
-                    tracing::info!(device = self.name, session = crate::text::plain(&text).as_ref(), "a phone connected");
+                    tracing::info!(
+                        device = self.name,
+                        session = crate::text::plain(&text).as_ref(),
+                        "a phone connected"
+                    );
                 }
                 Cut::Malformed => self.lost += 1,
             }

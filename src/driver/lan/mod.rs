@@ -139,10 +139,9 @@ fn describe(lan: &LanSpec, at: &str) -> (String, Option<Format>) {
         Some(Format::Pictures { fourcc: "MJPG".to_owned(), width, height, fps: None })
     };
     match &lan.protocol {
-        LanProtocol::Mjpeg { path, picture, .. } => (
-            format!("camera at {at}, MJPG {}x{} from {path}", picture.width, picture.height),
-            pictures(*picture),
-        ),
+        LanProtocol::Mjpeg { path, picture, .. } => {
+            (format!("camera at {at}, MJPG {}x{} from {path}", picture.width, picture.height), pictures(*picture))
+        }
         LanProtocol::Udp { port } => (format!("packets from {at} to port {port}"), None),
         LanProtocol::Gopro { .. } => (format!("GoPro at {at}"), None),
         LanProtocol::Iphone { port, picture, .. } => {

@@ -118,7 +118,10 @@ impl Place {
     /// The address of ours on the interface for which `wanted` is true.
     pub(super) fn own_address(&self, wanted: impl Fn(Ipv4Addr) -> bool) -> Option<Ipv4Addr> {
         let interface = self.interface.as_deref()?;
-        addresses().into_iter().find(|(name, address)| name == interface && wanted(*address)).map(|(_, address)| address)
+        addresses()
+            .into_iter()
+            .find(|(name, address)| name == interface && wanted(*address))
+            .map(|(_, address)| address)
     }
 
     fn socket(&self, family: IpAddr) -> io::Result<TcpSocket> {
@@ -189,9 +192,8 @@ fn addresses() -> Vec<(String, Ipv4Addr)> {
             continue;
         }
         // SAFETY: of this family it is a `sockaddr_in`, which may lie unaligned; the name ends in a zero.
-        let (address, name) = unsafe {
-            (entry.ifa_addr.cast::<libc::sockaddr_in>().read_unaligned(), CStr::from_ptr(entry.ifa_name))
-        };
+        let (address, name) =
+            unsafe { (entry.ifa_addr.cast::<libc::sockaddr_in>().read_unaligned(), CStr::from_ptr(entry.ifa_name)) };
         let address = Ipv4Addr::from(u32::from_be(address.sin_addr.s_addr));
         found.push((name.to_string_lossy().into_owned(), address));
     }

@@ -234,7 +234,9 @@ fn address(from: &libc::sockaddr_storage) -> Option<IpAddr> {
     // SAFETY: of either family the storage holds that type, and is large enough and aligned for both.
     unsafe {
         match i32::from((*from).ss_family) {
-            libc::AF_INET => Some(Ipv4Addr::from(u32::from_be((*from.cast::<libc::sockaddr_in>()).sin_addr.s_addr)).into()),
+            libc::AF_INET => {
+                Some(Ipv4Addr::from(u32::from_be((*from.cast::<libc::sockaddr_in>()).sin_addr.s_addr)).into())
+            }
             libc::AF_INET6 => Some(Ipv6Addr::from((*from.cast::<libc::sockaddr_in6>()).sin6_addr.s6_addr).into()),
             _ => None,
         }

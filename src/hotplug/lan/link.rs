@@ -58,7 +58,8 @@ fn route_v6(table: &str, address: Ipv6Addr) -> Option<&str> {
     let fitting = table.lines().filter_map(|line| {
         let fields: Vec<&str> = line.split_whitespace().collect();
         let [destination, length, .., name] = fields.as_slice() else { return None };
-        let (destination, length) = (u128::from_str_radix(destination, 16).ok()?, u32::from_str_radix(length, 16).ok()?);
+        let (destination, length) =
+            (u128::from_str_radix(destination, 16).ok()?, u32::from_str_radix(length, 16).ok()?);
         let mask = u128::MAX.checked_shl(128_u32.checked_sub(length)?).unwrap_or(0);
         // The table ends in a route to nowhere, on `lo`.
         (u128::from(address) & mask == destination && *name != "lo").then_some((length, *name))

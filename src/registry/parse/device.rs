@@ -10,7 +10,7 @@ use crate::modality::ModalityId;
 use crate::registry::diagnostic::did_you_mean;
 use crate::registry::section::{At, Problems, Section};
 use crate::registry::spec::{
-    ActionSpec, CanAdapter, DeviceSpec, IdentitySpec, Mount, NodeSpec, Opens, UsbSpec, WhenStale,
+    ActionSpec, CanAdapter, DeviceSpec, IdentitySpec, LanSpec, Mount, NodeSpec, Opens, UsbSpec, WhenStale,
 };
 
 /// Kinds of node this version has a driver for.
@@ -131,6 +131,14 @@ impl Draft<'_> {
         match self.node.as_ref()? {
             NodeSpec::Process(process) => Some(&process.program),
             NodeSpec::Camera(_) | NodeSpec::Serial(_) | NodeSpec::Can(_) | NodeSpec::Lan(_) => None,
+        }
+    }
+
+    /// Its settings, if it is on the network.
+    pub(super) fn lan(&self) -> Option<&LanSpec> {
+        match self.node.as_ref()? {
+            NodeSpec::Lan(lan) => Some(lan),
+            _ => None,
         }
     }
 

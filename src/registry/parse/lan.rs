@@ -3,12 +3,25 @@
 use std::net::IpAddr;
 use std::time::Duration;
 
+use super::device::Draft;
 use crate::registry::section::{Problems, Section};
 use crate::registry::spec::{LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, Probe};
 
 const KEYS: [&str; 14] = [
-    "protocol", "mdns", "instance", "host", "port", "probe", "probe_port", "lease", "path", "width", "height", "fps",
-    "download", "stream",
+    "protocol",
+    "mdns",
+    "instance",
+    "host",
+    "port",
+    "probe",
+    "probe_port",
+    "lease",
+    "path",
+    "width",
+    "height",
+    "fps",
+    "download",
+    "stream",
 ];
 /// Keys of the table that only some protocols have.
 const OWN: [(Word, &[&str]); 4] = [
@@ -52,7 +65,8 @@ pub(super) fn lan(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<
         section.report(problems, key, message, format!("write its settings into [{}]", section.child("lan")));
     }
     if !section.is_table("lan") {
-        let fix = format!("write [{}] with protocol = \"mjpeg\", \"udp\", \"gopro\" or \"iphone\"", section.child("lan"));
+        let fix =
+            format!("write [{}] with protocol = \"mjpeg\", \"udp\", \"gopro\" or \"iphone\"", section.child("lan"));
         section.missing(problems, "the table of the network device", &fix);
         return None;
     }
@@ -63,9 +77,8 @@ pub(super) fn lan(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<
     }
     let word = table.choice(problems, "protocol", &Word::WORDS);
     let port = port(&table, "port", problems);
-    let lease = table
-        .duration(problems, "lease", Duration::from_millis(500)..=Duration::from_mins(1))
-        .unwrap_or(DEFAULT_LEASE);
+    let lease =
+        table.duration(problems, "lease", Duration::from_millis(500)..=Duration::from_mins(1)).unwrap_or(DEFAULT_LEASE);
     let word = word?;
     for key in OPTIONAL.into_iter().filter(|key| table.has(key) && !word.own().contains(key)) {
         let message = format!("protocol {:?} has no {key}", word.name());
@@ -129,6 +142,23 @@ fn picture(table: &Section<'_>, default: LanPicture, problems: &mut Problems<'_>
     }
 }
 
+/// Two entries cannot have one port of this computer, unless each has it on an adapter of its own.
+pub(super) fn check_ports(drafts: &[Draft<'_>], problems: &mut Problems<'_>) {
+    for (index, draft) in drafts.iter().enumerate() {
+        let Some((port, own)) = draft.lan().and_then(|lan| Some((lan.own_port()?, lan))) else { continue };
+        let same = |earlier: &&Draft<'_>| {
+            earlier.lan().is_some_and(|other| {
+                other.own_port() == Some(port) && !(own.find.is_adapter() && other.find.is_adapter())
+            })
+        };
+        let Some(earlier) = drafts.iter().take(index).find(same) else { continue };
+        let (_, number) = port;
+        let message = format!("port {number} of this computer is already that of [{}]", earlier.section.entry);
+        let fix = "write another port here, and set the device to send to it";
+        draft.section.report(problems, "lan", message, fix);
+    }
+}
+
 /// Exactly one way: the USB identity of the entry, `mdns`, or `host`.
 fn find(
     section: &Section<'_>,
@@ -176,7 +206,8 @@ fn find(
         }
         (false, false, true) => fixed(table, host, word, port, problems),
         (false, false, false) => {
-            let fix = "write vid and pid of its USB network adapter, or mdns = \"_service._tcp\", or host = its address";
+            let fix =
+                "write vid and pid of its USB network adapter, or mdns = \"_service._tcp\", or host = its address";
             table.missing(problems, "a way to find the device", fix);
             None
         }
@@ -225,7 +256,8 @@ fn fixed(
 
 fn host(table: &Section<'_>, problems: &mut Problems<'_>) -> Option<IpAddr> {
     let host = table.text(problems, "host")?;
-    let address = host.value.parse().ok().filter(|address: &IpAddr| !address.is_unspecified() && !address.is_multicast());
+    let address =
+        host.value.parse().ok().filter(|address: &IpAddr| !address.is_unspecified() && !address.is_multicast());
     if address.is_none() {
         let fix = "write its address, for example host = \"192.168.1.7\"; give the device a fixed one in your router";
         table.report(problems, "host", format!("{:?} is not the address of a device", host.value), fix);
@@ -244,7 +276,8 @@ fn service(table: &Section<'_>, problems: &mut Problems<'_>) -> Option<String> {
             && matches!(transport, "_tcp" | "_udp")
     });
     if !legal {
-        let fix = "write it as the device announces it, for example mdns = \"_iphonevio._tcp\"; `avahi-browse -a` lists all";
+        let fix =
+            "write it as the device announces it, for example mdns = \"_iphonevio._tcp\"; `avahi-browse -a` lists all";
         table.report(problems, "mdns", format!("{service:?} is not a service"), fix);
     }
     legal.then(|| bare.to_owned())

@@ -89,7 +89,8 @@ impl Packets {
         {
             if self.header_filled < HEADER {
                 let count = rest.len().min(HEADER - self.header_filled);
-                let (from, to) = (rest.get(..count), self.header.get_mut(self.header_filled..self.header_filled + count));
+                let (from, to) =
+                    (rest.get(..count), self.header.get_mut(self.header_filled..self.header_filled + count));
                 if let (Some(from), Some(to)) = (from, to) {
                     to.copy_from_slice(from);
                 }

@@ -55,7 +55,11 @@ fn the_liberties_of_cameras() {
 fn what_is_wrong_costs_its_own_part() {
     // Announces more than is permitted.
     check(b"--frame\r\nContent-Length: 65\r\n\r\nabc\r\n--frame\r\nContent-Length: 1\r\n\r\na", &[b"a"], 1);
-    check(b"--frame\r\nContent-Length: 99999999999999999999999\r\n\r\nabc\r\n--frame\r\n\r\na\r\n--frame\r\n", &[b"abc", b"a"], 0);
+    check(
+        b"--frame\r\nContent-Length: 99999999999999999999999\r\n\r\nabc\r\n--frame\r\n\r\na\r\n--frame\r\n",
+        &[b"abc", b"a"],
+        0,
+    );
     // Sends more than is permitted.
     let mut stream = b"--frame\r\n\r\n".to_vec();
     stream.extend([b'x'; 300]);

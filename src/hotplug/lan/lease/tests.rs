@@ -32,7 +32,11 @@ fn a_lease_is_renewed_expires_and_begins_again() {
         ("over at its end, once", &[Heard(1), Look(4), Look(9)], &["came", "went"]),
         ("an older answer does not shorten it", &[Heard(5), Heard(2), Look(7)], &["came"]),
         ("a goodbye ends it at once", &[Heard(1), End(2), Look(9)], &["came", "went"]),
-        ("an answer from before the goodbye says nothing", &[Heard(1), End(4), Heard(3), Heard(5)], &["came", "went", "came"]),
+        (
+            "an answer from before the goodbye says nothing",
+            &[Heard(1), End(4), Heard(3), Heard(5)],
+            &["came", "went", "came"],
+        ),
         ("and again", &[Heard(1), Look(9), Heard(10), Look(13)], &["came", "went", "came", "went"]),
     ];
     for (name, steps, expected) in table {
