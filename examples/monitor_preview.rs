@@ -83,6 +83,7 @@ fn registry(count: u8) -> Registry {
             ),
             latency: Duration::ZERO,
             action: None,
+            hooks: rapid::registry::Hooks::default(),
         })
     };
     Registry {

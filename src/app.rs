@@ -193,7 +193,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
 
     let rig_stop = CancellationToken::new();
     let (rig_commands, rig_asked) = mpsc::channel(16);
-    let mut rig = Rig::new(&registry, &bus, presence, Arc::clone(&board));
+    let mut rig = Rig::new(&registry, &bus, presence, Arc::clone(&board)).following(recorder.episode());
     let rig_ended = CancellationToken::new();
     let hurry = rig.hurry();
     let rig = tokio::spawn({

@@ -4,6 +4,7 @@
 
 mod failure;
 mod policy;
+mod register;
 
 use std::io::{self, IsTerminal, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -91,6 +92,13 @@ fn print(global: &Global, before: SimArgs, command: Command) -> Result<(), Failu
                 out,
             )
         }
+        Command::Register(args) => register::register(global, before, &args, format, out),
+        Command::Unregister(args) => register::unregister(global, &args, format, out),
+        Command::Doctor { out: episodes } => {
+            let registry = registry_path(global).and_then(|path| load(&path)).map_err(|failure| failure.to_string());
+            let registry = registry.as_ref().map_err(String::as_str);
+            if commands::doctor::doctor(registry, &episodes, format, out)? { Ok(()) } else { Err(Failure::Found) }
+        }
         Command::Artifacts { install, to } => {
             let registry = load(&registry_path(global)?)?;
             if install {
@@ -110,6 +118,7 @@ fn print(global: &Global, before: SimArgs, command: Command) -> Result<(), Failu
             Outcome::BadConfiguration => Err(Failure::Told),
         },
         Command::Recover { paths } => recover(&paths, format),
+        Command::Ablation(args) => Ok(commands::ablation::ablation(&registry_or_builtin(global)?, &args, format, out)?),
         Command::Eval(args) => policy::eval(args, format),
         Command::Completions { shell } => Ok(commands::completions::completions(&mut Cli::command(), shell, out)?),
         Command::Replay { .. } => Ok(()),
@@ -259,6 +268,7 @@ fn run(global: &Global, args: &RunArgs, source: Source, policy: Option<PolicyArg
     if let Some(window) = args.window {
         registry.rig.sync_window = window;
     }
+    let modules = modules(&registry, args)?;
     if args.record {
         prepare(&args.out).map_err(Failure::Folder)?;
     }
@@ -274,12 +284,24 @@ fn run(global: &Global, args: &RunArgs, source: Source, policy: Option<PolicyArg
         registry,
         devices,
         screen,
-        episode: EpisodeRequest { out: args.out.clone(), task: args.task.clone(), tags: args.tag.clone(), duration },
+        episode: EpisodeRequest {
+            out: args.out.clone(),
+            task: args.task.clone(),
+            tags: args.tag.clone(),
+            modules,
+            duration,
+        },
         record: args.record,
         duration,
         instance: global.instance.clone(),
     };
     Ok(block_on(app::run(options))??)
+}
+
+/// The modules that were said to be mounted, if the registry knows them.
+fn modules(registry: &Registry, args: &RunArgs) -> Result<Vec<String>, Failure> {
+    let mounted = crate::registry::mounted(&registry.modules, &args.module)?;
+    Ok(mounted.into_iter().map(|module| module.name.clone()).collect())
 }
 
 /// The folder an episode is to be written to at once: better refused before the devices are started.

@@ -17,7 +17,8 @@ use rapid::driver::{Driver, DriverError, sim};
 use rapid::modality::ModalityId;
 use rapid::registry::scenario::{SimDevice, SimSource};
 use rapid::registry::{
-    CameraSpec, DeviceNode, DeviceSpec, Framing, IdentitySpec, NodeSpec, Parse, PixelFormat, SerialSpec, WhenStale,
+    CameraSpec, DeviceNode, DeviceSpec, Framing, IdentitySpec, NodeSpec, Parse, PixelFormat, SerialSpec, UsbSpec,
+    WhenStale,
 };
 use rapid::sample::Encoding;
 use rapid::time::Stamp;
@@ -62,7 +63,7 @@ fn spec(node: NodeSpec) -> DeviceSpec {
     DeviceSpec {
         name: "device".into(),
         id: ModalityId::new(0).unwrap(),
-        identity: IdentitySpec { vid: 1, pid: 2, serial: None, port: None },
+        identity: IdentitySpec::Usb(UsbSpec { vid: 1, pid: 2, serial: None, port: None }),
         node,
         topic: "/rapid/device".into(),
         mount: None,
@@ -72,6 +73,7 @@ fn spec(node: NodeSpec) -> DeviceSpec {
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
         action: None,
+        hooks: rapid::registry::Hooks::default(),
         verdict: rapid::registry::VerdictSpec::of(
             rapid::modality::ModalityKind::Image,
             Duration::from_millis(500),

@@ -9,7 +9,10 @@ use std::path::{Path, PathBuf};
 use proptest::prelude::*;
 use rapid::modality::ModalityKind;
 use rapid::registry::scenario::Scenario;
-use rapid::registry::{BUILTIN, Framing, Loaded, NodeSpec, Opens, POOL_SPARE, Parse, Registry, VerdictSpec};
+use rapid::registry::{
+    BUILTIN, CanAdapter, CanProtocol, DeviceSpec, Framing, Hook, Loaded, MotorKind, MotorMode, NodeSpec, Opens,
+    POOL_SPARE, Parse, Registry, VerdictSpec,
+};
 
 fn files(folder: &str) -> Vec<PathBuf> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/registry").join(folder);
@@ -91,6 +94,27 @@ fn a_program_and_its_settings_arrive() {
 }
 
 #[test]
+fn hooks_arrive_and_one_of_them_may_be_the_node() {
+    let Loaded { registry, warnings } = valid("hooks");
+    assert_eq!(warnings, []);
+    let [cam, imu] = registry.devices.as_slice() else { panic!("two devices") };
+    let said = |device: &DeviceSpec| -> Vec<(&str, String)> {
+        let text = |hook: &Hook| format!("{} {:?}", hook.program.display(), hook.args);
+        device.hooks.all().map(|(key, hook)| (key, text(hook))).collect()
+    };
+    let of_cam = [
+        ("on_attach", r#"/bin/sh ["-c", "exit"]"#.to_owned()),
+        ("on_detach", "/bin/sh []".to_owned()),
+        ("on_record_start", r#"/bin/sh ["", "a b"]"#.to_owned()),
+        ("on_record_stop", r#"/bin/sh ["$HOME; no shell reads this"]"#.to_owned()),
+    ];
+    assert_eq!(said(cam), of_cam);
+    assert_eq!(said(imu), [("on_detach", "/bin/sh []".to_owned())]);
+    let NodeSpec::Process(process) = &imu.node else { panic!("a program") };
+    assert_eq!((process.program.to_str(), process.args.join(" ")), (Some("/bin/sh"), "-c exit".to_owned()));
+}
+
+#[test]
 fn every_key_arrives() {
     let Loaded { registry, warnings } = valid("every_key");
     assert_eq!(warnings[0].message, "port has no effect beside a serial number: the unit is recognised in every port");
@@ -106,6 +130,43 @@ fn every_key_arrives() {
     assert_eq!((serial.baud, serial.framing, serial.parse, serial.channels), (9600, Framing::Cobs, Parse::Raw, 0));
     assert_eq!((tof.max_bytes, tof.depth), (4096, 2048));
     assert_eq!(registry.rig.sync_window.as_micros(), 12_500);
+}
+
+#[test]
+fn a_bus_and_its_motors_arrive() {
+    let Loaded { registry, warnings } = valid("can");
+    assert_eq!(warnings, []);
+    let [bus, line, hand] = registry.devices.as_slice() else { panic!("three devices") };
+    let [raw, slcan, motors] = [bus, line, hand].map(|device| {
+        let NodeSpec::Can(can) = &device.node else { panic!("a CAN adapter") };
+        can
+    });
+    assert_eq!((raw.adapter, raw.bitrate, &raw.protocol), (CanAdapter::SocketCan, 1_000_000, &CanProtocol::Raw));
+    assert_eq!((slcan.adapter, slcan.bitrate, &slcan.protocol), (CanAdapter::Slcan, 250_000, &CanProtocol::Raw));
+    assert_eq!((bus.modality().kind, bus.modality().shape, bus.max_bytes), (ModalityKind::Bytes, vec![], 128 * 24));
+    assert_eq!((bus.topic.as_str(), bus.action.as_ref()), ("/rapid/can/bus", None));
+
+    assert_eq!((hand.modality().kind, hand.modality().shape, hand.max_bytes), (ModalityKind::Scalars, vec![18], 144));
+    let CanProtocol::Damiao(damiao) = &motors.protocol else { panic!("motors") };
+    let ms = std::time::Duration::from_millis;
+    assert_eq!((damiao.hz, damiao.deadman), (500, Some(ms(80))));
+    assert_eq!((damiao.disable_after, damiao.timeout, damiao.silent_after), (ms(2000), ms(200), ms(20)));
+    let [gripper, roll, wheel] = damiao.motors.as_slice() else { panic!("three motors") };
+    assert_eq!((gripper.slave, gripper.master, gripper.kind), (5, 0x15, MotorKind::Dmh3510));
+    assert_eq!((gripper.mode, gripper.position), (MotorMode::Mit { kp: 0.8, kd: 0.05 }, [-1.5, 0.25]));
+    // What is not written is a tenth of the motor's torque, and slow.
+    assert_eq!((gripper.velocity, gripper.torque, gripper.slew), (2.0, 0.1, 2.0));
+    assert_eq!((gripper.max_mos, gripper.max_rotor), (80.0, 80.0));
+    assert_eq!((roll.slave, roll.master, roll.mode), (6, 0, MotorMode::PositionVelocity));
+    assert_eq!((roll.velocity, roll.torque, roll.slew), (10.0, 5.0, 4.0));
+    assert_eq!((roll.max_mos, roll.max_rotor), (70.0, 90.0));
+    assert_eq!((wheel.master, wheel.mode, wheel.slew), (0x7fe, MotorMode::Velocity, 20.0));
+    let axes = hand.action.as_ref().unwrap();
+    assert_eq!(
+        (axes.names.join(" "), axes.units.join(" ")),
+        ("gripper wrist.roll wheel".into(), "rad rad rad/s".into())
+    );
+    assert_eq!((axes.min.as_slice(), axes.max.as_slice()), (&[-1.5, -3.0, -2.0][..], &[0.25, 3.0, 2.0][..]));
 }
 
 #[test]

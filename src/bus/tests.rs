@@ -32,12 +32,14 @@ fn registry(depth: usize) -> Registry {
             when_stale: WhenStale::Hold,
             latency: Duration::ZERO,
             action: None,
+            hooks: crate::registry::Hooks::default(),
             verdict: crate::registry::VerdictSpec::of(
                 crate::modality::ModalityKind::Image,
                 Duration::from_millis(500),
                 Some(30.0),
             ),
         }],
+        modules: Vec::new(),
         path: None,
         text: String::new(),
     }

@@ -261,9 +261,17 @@ pub(super) fn check(spec: &DeviceSpec, device: &SimDevice) -> Result<(), DriverE
             }
             (format!("{channels} numbers"), serial.channels.to_string())
         }
-        // What stands for them sends as much as it likes.
-        (SimSource::Camera { .. } | SimSource::Serial { .. }, NodeSpec::Can(_) | NodeSpec::Lan(_)) => return Ok(()),
+        (SimSource::Serial { channels, .. }, NodeSpec::Can(can)) => {
+            // Frames have no channels; something is sent all the same.
+            if can.channels() == 0 || *channels == can.channels() {
+                return Ok(());
+            }
+            (format!("{channels} numbers"), can.channels().to_string())
+        }
+        // What stands for it sends as much as it likes.
+        (SimSource::Camera { .. } | SimSource::Serial { .. }, NodeSpec::Lan(_)) => return Ok(()),
         (SimSource::Camera { .. }, NodeSpec::Serial(_)) => (String::from("pictures"), String::from("a serial line")),
+        (SimSource::Camera { .. }, NodeSpec::Can(_)) => (String::from("pictures"), String::from("a CAN adapter")),
         (SimSource::Serial { .. }, NodeSpec::Camera(_)) => (String::from("numbers"), String::from("a camera")),
         (SimSource::Task { .. } | SimSource::Process | SimSource::Replay { .. }, _) | (_, NodeSpec::Process(_)) => {
             return Ok(());

@@ -130,6 +130,10 @@ impl Columns {
                 (&"policy".to_owned(), None, word, rest)
             }
             What::Recovered { text, .. } => (&"episode".to_owned(), None, palette.warn(&pad("repaired")), text.clone()),
+            What::Actuator { device, bit, arming, is_problem, text } => {
+                let word = pad(arming.word());
+                (device, Some(bit), if *is_problem { palette.warn(&word) } else { word }, text.clone())
+            }
             What::Log { level, text } => {
                 let word = palette.level(*level, &pad(level.word()));
                 (&"log".to_owned(), None, word, text.clone())

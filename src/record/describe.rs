@@ -22,7 +22,8 @@ pub(super) fn describe(what: &What) -> String {
         What::Recording { file } => format!("recording {}", file.display()),
         What::Episode { file, .. } => format!("finished {}", file.display()),
         What::Recovered { text, .. } | What::Log { text, .. } => text.clone(),
-        What::DiskLow { .. }
+        What::Actuator { .. }
+        | What::DiskLow { .. }
         | What::ClockStep { .. }
         | What::Policy { .. }
         | What::Chunk(_)

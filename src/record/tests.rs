@@ -103,6 +103,7 @@ fn device(bit: u8, name: &str, node: NodeSpec) -> DeviceSpec {
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
         action: None,
+        hooks: crate::registry::Hooks::default(),
         verdict,
     }
 }
@@ -134,6 +135,7 @@ pub(super) fn registry() -> Registry {
             device(NEVER, "never", camera(PixelFormat::Yuyv)),
             device(RAW, "raw", camera(PixelFormat::Grey)),
         ],
+        modules: Vec::new(),
         path: None,
         text: "[rig]\nname = \"bench\"\n".to_owned(),
     }
@@ -171,6 +173,7 @@ impl Bench {
             out: self.folder.path().join("out"),
             task: "place block".to_owned(),
             tags: vec![("finger".to_owned(), "soft".to_owned())],
+            modules: Vec::new(),
             duration,
         }
     }

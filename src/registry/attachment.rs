@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use serde::Serialize;
 
-use super::scenario::SimDevice;
+use super::scenario::{SimDevice, SimSource};
 use crate::provenance::KernelDriver;
 use crate::time::Stamp;
 
@@ -185,6 +185,12 @@ impl Attachment {
 }
 
 impl DeviceNode {
+    /// Is it a topic of a recorded episode, which needs no program?
+    #[must_use]
+    pub fn is_recording(&self) -> bool {
+        matches!(self, Self::Sim(device) if matches!(device.source, SimSource::Replay { .. }))
+    }
+
     /// The node as shown to people.
     #[must_use]
     pub fn label(&self) -> String {

@@ -11,7 +11,10 @@ mod budget;
 mod can;
 mod device;
 mod file;
+mod hooks;
 mod lan;
+mod module;
+mod motors;
 mod node;
 mod process;
 mod program;
@@ -30,7 +33,8 @@ use program::Programs;
 use verdict::Whose;
 
 pub(super) use device::is_port;
-pub(super) use file::read_file;
+pub use device::{like_a_name, name_problem};
+pub use file::read_file;
 
 /// The registry used when there is no file: the rig `rapid --sim` simulates.
 pub const BUILTIN: &str = include_str!("../../devices.toml");
@@ -79,7 +83,7 @@ impl Registry {
         let document = read(text, &mut problems);
         problems.check()?;
         let root = Section::new(document.get_ref(), 0, String::new());
-        root.allow(&mut problems, &["rig", "verdict", "device"]);
+        root.allow(&mut problems, &["rig", "verdict", "device", "module"]);
         let rig = rig(&root, &mut problems);
         let verdict = verdict::read(&root, Whose::Rig, &mut problems);
         let programs = path.map_or(Programs::Nowhere, Programs::Beside);
@@ -93,12 +97,13 @@ impl Registry {
         lan::check_ports(&drafts, &mut problems);
         let mut warnings = assign_bits(&mut drafts, &mut problems);
         warnings.extend(unused_ports(&drafts, &problems));
-        warnings.extend(drafts.iter().filter_map(|draft| program::distrusted(draft, &problems)));
+        warnings.extend(drafts.iter().flat_map(|draft| program::distrusted(draft, &problems)));
         warnings.extend(budget::fit(&mut drafts, rig.memory_budget, root.at_of("rig"), &mut problems));
+        let modules = module::modules(&root, &drafts, &mut problems);
         problems.check()?;
         let mut devices: Vec<_> = drafts.into_iter().filter_map(|draft| draft.finish(&verdict)).collect();
         devices.sort_by_key(|device| device.id);
-        let registry = Self { rig, devices, path: path.map(Path::to_path_buf), text: text.to_owned() };
+        let registry = Self { rig, devices, modules, path: path.map(Path::to_path_buf), text: text.to_owned() };
         Ok(Loaded { registry, warnings })
     }
 
@@ -251,7 +256,8 @@ fn check_actuators(drafts: &[Draft<'_>], problems: &mut Problems<'_>) {
     let Some(first) = actuators.next() else { return };
     for draft in actuators {
         let message = format!("[{}] is an actuator already, and a rig has one", first.section.entry);
-        draft.section.report(problems, "action", message, "remove one of the two action tables");
+        let fix = "remove one of the two action tables; the motors of a CAN bus have one without being asked";
+        draft.section.report(problems, "action", message, fix);
     }
 }
 

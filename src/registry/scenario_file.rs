@@ -147,6 +147,7 @@ fn standing_for(spec: &DeviceSpec, name: &str) -> ScenarioDevice {
         // Raw lines have no channels; something must be sent all the same.
         NodeSpec::Serial(serial) => SimSource::Serial { channels: serial.channels.max(1), hz: SERIAL_HZ, seed },
         NodeSpec::Process(_) => SimSource::Process,
+        NodeSpec::Can(can) => SimSource::Serial { channels: can.channels().max(1), hz: SERIAL_HZ, seed },
         NodeSpec::Lan(lan) => match (lan.picture(), lan.shape().as_slice()) {
             (Some(LanPicture { width, height, fps }), [_, _]) => {
                 SimSource::Camera { width, height, fps, seed, bytes: 0 }
@@ -155,7 +156,6 @@ fn standing_for(spec: &DeviceSpec, name: &str) -> ScenarioDevice {
             // What sends bytes has no numbers; something must be sent all the same.
             _ => SimSource::Serial { channels: 1, hz: SERIAL_HZ, seed },
         },
-        NodeSpec::Can(_) => SimSource::Serial { channels: 1, hz: SERIAL_HZ, seed },
     };
     let wished = spec.identity.usb();
     let lan = wished.is_none().then(|| LanIdentity {

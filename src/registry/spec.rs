@@ -5,19 +5,28 @@
 //! ascending order of bit.
 
 mod can;
+mod hooks;
 mod lan;
+mod module;
+mod motors;
 
 use std::path::PathBuf;
 use std::time::Duration;
 
 use serde::Serialize;
 
+pub use hooks::{Hook, Hooks};
+
 use super::limits::VerdictSpec;
 use crate::modality::{Modality, ModalityId, ModalityKind};
 use crate::sample::SampleHeader;
 
-pub use can::{CanAdapter, CanProtocol, CanSpec};
+pub use can::{
+    CAN_BATCH, CAN_RECORD, CAN_RESTART_MS, CanAdapter, CanProtocol, CanSpec, MOTOR_CHANNELS, SLCAN_BITRATES,
+};
 pub use lan::{LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, Probe};
+pub use module::{ModuleError, ModuleSpec, mounted};
+pub use motors::{DamiaoSpec, MAX_MOTORS, MotorKind, MotorMode, MotorSpec};
 
 /// Samples that the pool of a topic holds beyond its depth: what 8 subscribers hold back, 4 each, the
 /// one being written, and one that is on its way out. The bus reserves them.
@@ -39,6 +48,8 @@ pub struct Registry {
     pub rig: RigSpec,
     /// One entry a modality, ascending by bit, at least one, at most 64.
     pub devices: Vec<DeviceSpec>,
+    /// What can be mounted, in the order of the file.
+    pub modules: Vec<ModuleSpec>,
     /// Where the text came from, for messages. `None` for the built-in registry.
     pub path: Option<PathBuf>,
     /// The text itself, recorded with every episode.
@@ -95,6 +106,8 @@ pub struct DeviceSpec {
     pub verdict: VerdictSpec,
     /// The device is an actuator, and takes these actions.
     pub action: Option<ActionSpec>,
+    /// What is run when something happens to it.
+    pub hooks: Hooks,
 }
 
 /// `[device.NAME.action]`: what an actuator may be told. All lists have one entry an axis, `1..=64` of

@@ -6,6 +6,7 @@ use std::time::Duration;
 use serde::Serialize;
 
 use super::{Chunk, Grade, Level, SlotState, Verdict};
+use crate::action::Arming;
 use crate::modality::ModalityId;
 use crate::provenance::{KernelDriver, Negotiated};
 use crate::registry::Unit;
@@ -181,6 +182,19 @@ pub enum What {
         /// Of a hundred one was slower.
         latency_p99_ms: f64,
     },
+    /// An actuator was armed or disarmed, or disabled itself.
+    Actuator {
+        /// Modality.
+        device: String,
+        /// Its bit.
+        bit: ModalityId,
+        /// May it move now?
+        arming: Arming,
+        /// Somebody should look after it.
+        is_problem: bool,
+        /// What happened, for people.
+        text: String,
+    },
     /// A line of the log that has no event of its own.
     Log {
         /// Severity.
@@ -301,6 +315,9 @@ impl What {
             }
             // Something was lost before this run began.
             Self::Recovered { text, .. } => (Level::Warn, text.clone()),
+            Self::Actuator { device, is_problem, text, .. } => {
+                (if *is_problem { Level::Warn } else { Level::Info }, format!("{device}: {text}"))
+            }
             Self::Log { level, text } => (*level, text.clone()),
         })
     }

@@ -148,6 +148,7 @@ pub(crate) fn board(names: &[&str]) -> Board {
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
         action: None,
+        hooks: crate::registry::Hooks::default(),
         verdict: crate::registry::VerdictSpec::of(
             crate::modality::ModalityKind::Image,
             Duration::from_millis(500),

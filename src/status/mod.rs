@@ -5,6 +5,7 @@
 //! Invariant: a screen holds no handle into a stage.
 
 pub mod board;
+mod episode;
 mod event;
 #[cfg(test)]
 pub(crate) mod literal;
@@ -24,6 +25,7 @@ use crate::text;
 use crate::time::Stamp;
 
 pub use board::{Board, EpisodeEnd};
+pub use episode::{Episode, EpisodeWatch};
 pub use event::{Event, Provenance, What};
 pub use policy::{Chunk, ObservedSamples, PolicyStatus};
 pub use verdict::{Grade, Verdict};

@@ -4,11 +4,19 @@
 //! `[`, alternatives are separated by `|`, and `\"` stands for a quote (systemd,
 //! `src/udev/udev-rules.c`: `rule_line_add_token`, `udev_rule_parse_value`). Match values undergo
 //! no `%` or `$` substitution; assigned values do, but those are only names we have validated.
+//!
+//! A network interface has no node and no name of ours. That of a CAN adapter is brought up with the bit
+//! rate of its entry at each plug, which only root may do. `RUN` starts the program itself, no shell, with
+//! words split at spaces; the one word that comes from outside is `$name`, the name that the interface has
+//! after udev's rules, which the kernel takes without spaces and `/` and which no device chooses.
 
 use std::fmt::Write as _;
 
 use super::HEADER;
-use crate::registry::spec::{CanAdapter, DeviceSpec, NodeSpec, Opens, Registry, UsbSpec};
+use crate::registry::spec::{CAN_RESTART_MS, CanAdapter, DeviceSpec, NodeSpec, Opens, Registry, UsbSpec};
+
+/// What linux/if_arp.h calls a CAN interface (`ARPHRD_CAN`).
+const ARPHRD_CAN: u32 = 280;
 
 /// The rules of a whole registry.
 pub(super) fn rules(registry: &Registry) -> String {
@@ -22,20 +30,32 @@ pub(super) fn rules(registry: &Registry) -> String {
         let Some(usb) = device.identity.usb() else { continue };
         // Writing to a String cannot fail.
         let _ = writeln!(text, "\n# {}: {:04x}:{:04x}", device.name, usb.vid, usb.pid);
-        let _ = match identify(registry, device) {
-            Ok(identity) => writeln!(text, "{}", rule(device, usb, &identity)),
-            Err(reason) => writeln!(text, "# No stable name: {reason}."),
+        let bitrate = if let NodeSpec::Can(can) = &device.node { Some(can.bitrate) } else { None };
+        let _ = match (opens(device), bitrate) {
+            (Opens::Net, Some(bitrate)) => match single_out(registry, device, usb) {
+                Ok(identity) => writeln!(text, "{}", bring_up(usb, &identity, bitrate)),
+                Err(reason) => writeln!(text, "# Not brought up: {reason}."),
+            },
+            _ => match identify(registry, device) {
+                Ok(identity) => writeln!(text, "{}", rule(device, usb, &identity)),
+                Err(reason) => writeln!(text, "# No stable name: {reason}."),
+            },
         };
     }
     text
 }
 
-/// The matches that single out an entry's unit among all others, or why there are none.
+/// The matches that single out the node of an entry's unit, or why there are none.
 pub(super) fn identify(registry: &Registry, device: &DeviceSpec) -> Result<String, String> {
     let Some(usb) = device.identity.usb() else { return Err("it is no USB device".to_owned()) };
     if opens(device) == Opens::Net {
         return Err("a network interface has no path".to_owned());
     }
+    single_out(registry, device, usb)
+}
+
+/// The matches that single out an entry's unit among all others, or why there are none.
+fn single_out(registry: &Registry, device: &DeviceSpec, usb: &UsbSpec) -> Result<String, String> {
     if let Some(serial) = &usb.serial {
         return match quoted_match(serial) {
             Some(serial) => Ok(format!(", {}{{serial}}==\"{serial}\"", keys(device).0)),
@@ -73,6 +93,16 @@ fn rule(device: &DeviceSpec, usb: &UsbSpec, identity: &str) -> String {
         usb.vid,
         usb.pid,
         device.name,
+    )
+}
+
+/// Brings up the CAN interface of a unit when it is plugged in.
+fn bring_up(usb: &UsbSpec, identity: &str, bitrate: u32) -> String {
+    format!(
+        "ACTION==\"add\", SUBSYSTEM==\"net\", ATTR{{type}}==\"{ARPHRD_CAN}\", ATTRS{{idVendor}}==\"{:04x}\", \
+         ATTRS{{idProduct}}==\"{:04x}\"{identity}, RUN+=\"/usr/sbin/ip link set dev $name up type can bitrate {bitrate} \
+         restart-ms {CAN_RESTART_MS}\"",
+        usb.vid, usb.pid,
     )
 }
 

@@ -3,22 +3,25 @@
 use std::path::Path;
 use std::time::Duration;
 
-use super::program::Programs;
+use toml::de::DeValue;
+
+use super::program::{For, Programs};
 use super::verdict::{VerdictTable, Whose};
-use super::{action, can, lan, node, process, verdict};
+use super::{action, can, hooks, lan, motors, node, process, verdict};
 use crate::modality::ModalityId;
 use crate::registry::diagnostic::did_you_mean;
 use crate::registry::section::{At, Problems, Section};
 use crate::registry::spec::{
-    ActionSpec, CanAdapter, DeviceSpec, IdentitySpec, LanSpec, Mount, NodeSpec, Opens, UsbSpec, WhenStale,
+    ActionSpec, CanAdapter, CanProtocol, CanSpec, DeviceSpec, Hook, Hooks, IdentitySpec, LanSpec, Mount, NodeSpec,
+    Opens, UsbSpec, WhenStale,
 };
 
 /// Kinds of node this version has a driver for.
 pub(super) const BUILT_IN: [(&str, Kind); 4] =
     [("camera", Kind::Camera), ("serial", Kind::Serial), ("can", Kind::Can), ("lan", Kind::Lan)];
-/// Keys that are designed and not read by this version.
-const PLANNED_KEYS: [&str; 2] = ["on_attach", "on_detach"];
-const KEYS: [&str; 20] = [
+/// Says that `on_attach` is the program that reads the device.
+const PROCESS: &str = "process";
+const KEYS: [&str; 24] = [
     "vid",
     "pid",
     "serial",
@@ -39,7 +42,14 @@ const KEYS: [&str; 20] = [
     "process",
     "verdict",
     "action",
+    "on_attach",
+    "on_detach",
+    "on_record_start",
+    "on_record_stop",
 ];
+
+/// In bytes.
+const LONGEST_NAME: usize = 64;
 
 /// The mask is 64 bits wide.
 const HIGHEST_BIT: i64 = 63;
@@ -68,7 +78,7 @@ pub(super) struct Draft<'a> {
     pub(super) topic: String,
     pub(super) bit: Option<At<u8>>,
     pub(super) id: Option<ModalityId>,
-    mount: Option<Mount>,
+    pub(super) mount: Option<Mount>,
     stall_after: Duration,
     pub(super) max_bytes: u64,
     pub(super) depth: u64,
@@ -78,6 +88,7 @@ pub(super) struct Draft<'a> {
     latency: Duration,
     verdict: VerdictTable,
     pub(super) action: Option<ActionSpec>,
+    hooks: Hooks,
 }
 
 impl Draft<'_> {
@@ -103,6 +114,7 @@ impl Draft<'_> {
             when_stale: self.when_stale,
             latency: self.latency,
             action: self.action,
+            hooks: self.hooks,
         })
     }
 
@@ -126,12 +138,14 @@ impl Draft<'_> {
         })
     }
 
-    /// The program that reads it, if one does.
-    pub(super) fn program(&self) -> Option<&Path> {
-        match self.node.as_ref()? {
-            NodeSpec::Process(process) => Some(&process.program),
+    /// The programs that are run for it, each with the key that names it.
+    pub(super) fn programs(&self) -> impl Iterator<Item = (&'static str, &Path)> {
+        let key = if attach_is_node(&self.section) { "on_attach" } else { "node" };
+        let node = self.node.as_ref().and_then(|node| match node {
+            NodeSpec::Process(process) => Some((key, process.program.as_path())),
             NodeSpec::Camera(_) | NodeSpec::Serial(_) | NodeSpec::Can(_) | NodeSpec::Lan(_) => None,
-        }
+        });
+        node.into_iter().chain(self.hooks.all().map(|(key, hook)| (key, hook.program.as_path())))
     }
 
     /// Its settings, if it is on the network.
@@ -164,16 +178,21 @@ pub(super) fn read<'a>(
         Some(Kind::Serial) => node::serial(&section, problems).map(NodeSpec::Serial),
         Some(Kind::Can) => can::can(&section, problems).map(NodeSpec::Can),
         Some(Kind::Lan) => lan::lan(&section, problems).map(NodeSpec::Lan),
-        Some(Kind::Process) => section.text(problems, "node").and_then(|program| {
-            let (process, silent) = process::process(&section, program.value, programs, problems)?;
-            heartbeat = Some(silent);
-            Some(NodeSpec::Process(process))
-        }),
+        Some(Kind::Process) => {
+            process::process(&section, program(&section, programs, problems), problems).map(|(process, silent)| {
+                heartbeat = Some(silent);
+                NodeSpec::Process(process)
+            })
+        }
         None => None,
     };
     if kind.is_some_and(|kind| kind != Kind::Process) && section.has("process") {
         let message = format!("a built-in node has no table [{}]", section.child("process"));
         section.report(problems, "process", message, "remove the table, or write node = the name of a program");
+    }
+    if kind.is_some_and(|kind| kind != Kind::Can) && section.has("can") {
+        let message = format!("only a CAN adapter has a table [{}]", section.child("can"));
+        section.report(problems, "can", message, "remove the table, or write node = \"can\"");
     }
     let topic = topic(&section, problems).unwrap_or_else(|| default_topic(kind, name));
     let bit = section
@@ -187,6 +206,10 @@ pub(super) fn read<'a>(
         .unwrap_or_else(|| node::default_stall(settings.as_ref()));
     let latency = section.duration(problems, "latency", Duration::ZERO..=LONGEST_LATENCY).unwrap_or_default();
     let max_bytes = node::max_bytes(&section, settings.as_ref(), problems);
+    let mut action = action::action(&section, problems);
+    if let Some(NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(damiao), .. })) = &settings {
+        action = motors::axes(damiao, action, &section, problems);
+    }
     let written = section.integer(problems, "depth", 2..=4096).and_then(|depth| u64::try_from(depth.value).ok());
     Draft {
         name: name.to_owned(),
@@ -203,25 +226,47 @@ pub(super) fn read<'a>(
         when_stale,
         latency,
         verdict: verdict::read(&section, Whose::Device, problems),
-        action: action::action(&section, problems),
+        action,
+        hooks: hooks::hooks(&section, attach_is_node(&section), programs, problems),
         node: settings,
         section,
     }
 }
 
 fn check_name(name: &str, section: &Section<'_>, problems: &mut Problems<'_>) {
-    let legal = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
-    let begins = name.starts_with(|c: char| c.is_ascii_lowercase());
-    if begins && name.len() <= 64 && name.chars().all(legal) {
-        return;
+    if let Some((message, fix)) = name_problem(name) {
+        problems.report(section.at, &section.entry, message, fix);
     }
-    let better: String = name.to_lowercase().chars().map(|c| if legal(c) { c } else { '_' }).take(64).collect();
-    let fix = if better.starts_with(|c: char| c.is_ascii_lowercase()) {
-        format!("use lower-case letters, digits and `_`, at most 64, for example [device.{better}]")
-    } else {
-        "begin with a lower-case letter; then lower-case letters, digits and `_`, at most 64".to_owned()
+}
+
+/// Why `name` cannot be a modality's name, and what to do about it; `None` if it can.
+#[must_use]
+pub fn name_problem(name: &str) -> Option<(String, String)> {
+    let begins = name.starts_with(|c: char| c.is_ascii_lowercase());
+    if begins && name.len() <= LONGEST_NAME && name.chars().all(in_a_name) {
+        return None;
+    }
+    let fix = match like_a_name(name) {
+        Some(better) => {
+            format!("use lower-case letters, digits and `_`, at most {LONGEST_NAME}, for example [device.{better}]")
+        }
+        None => {
+            format!("begin with a lower-case letter; then lower-case letters, digits and `_`, at most {LONGEST_NAME}")
+        }
     };
-    problems.report(section.at, &section.entry, format!("{name:?} cannot be a modality's name"), fix);
+    Some((format!("{name:?} cannot be a modality's name"), fix))
+}
+
+/// The name that is nearest to any text, if one is near.
+#[must_use]
+pub fn like_a_name(text: &str) -> Option<String> {
+    let better: String =
+        text.to_lowercase().chars().map(|c| if in_a_name(c) { c } else { '_' }).take(LONGEST_NAME).collect();
+    better.starts_with(|c: char| c.is_ascii_lowercase()).then_some(better)
+}
+
+const fn in_a_name(c: char) -> bool {
+    c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_'
 }
 
 fn check_keys(section: &Section<'_>, problems: &mut Problems<'_>) {
@@ -229,13 +274,8 @@ fn check_keys(section: &Section<'_>, problems: &mut Problems<'_>) {
         if KEYS.contains(&key) {
             continue;
         }
-        if PLANNED_KEYS.contains(&key) {
-            let fix = "remove it; programs are named with node";
-            problems.report(at, &section.entry, format!("{key:?} is not supported by this version of rapid"), fix);
-        } else {
-            let fix = did_you_mean(key, &KEYS, "known keys here");
-            problems.report(at, &section.entry, format!("unknown key {key:?}"), fix);
-        }
+        let fix = did_you_mean(key, &KEYS, "known keys here");
+        problems.report(at, &section.entry, format!("unknown key {key:?}"), fix);
     }
 }
 
@@ -249,12 +289,30 @@ fn kind(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<Kind> {
         return None;
     }
     let text = section.text(problems, "node")?.value;
-    if text == "process" {
-        let fix = "write node = the name of the program, for example node = \"tactile_publisher\"";
+    if text == PROCESS && !section.has("on_attach") {
+        let fix = "write node = the name of the program, for example node = \"tactile_publisher\", or add on_attach = \
+                   [\"tactile_publisher\", \"argument\"]";
         section.report(problems, "node", "node \"process\" does not say which program".to_owned(), fix);
         return None;
     }
     Some(BUILT_IN.iter().find(|(name, _)| *name == text).map_or(Kind::Process, |(_, kind)| *kind))
+}
+
+/// Is `on_attach` the program that reads the device?
+fn attach_is_node(section: &Section<'_>) -> bool {
+    let is_process = |key: &str, value: &DeValue<'_>| key == "node" && value.as_str() == Some(PROCESS);
+    section.has("on_attach") && section.fields().iter().any(|(_, key, value)| is_process(key, value.get_ref()))
+}
+
+/// The program that reads the device: what `node` names, or with `node = "process"` what `on_attach` does.
+fn program(section: &Section<'_>, programs: Programs<'_>, problems: &mut Problems<'_>) -> Option<Hook> {
+    if attach_is_node(section) {
+        return hooks::hook(section, "on_attach", programs, problems);
+    }
+    let name = section.text(problems, "node")?;
+    let found = programs.find(For::Node, name.value);
+    let program = found.map_err(|(message, fix)| section.report(problems, "node", message, fix)).ok()?;
+    Some(Hook { program, args: Vec::new() })
 }
 
 fn identity(kind: Option<Kind>, section: &Section<'_>, problems: &mut Problems<'_>) -> Option<IdentitySpec> {

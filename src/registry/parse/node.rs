@@ -6,7 +6,7 @@ use std::time::Duration;
 use crate::modality::ModalityKind;
 use crate::registry::diagnostic::nearest;
 use crate::registry::section::{Problems, Section};
-use crate::registry::spec::{CameraSpec, Framing, NodeSpec, Parse, PixelFormat, SerialSpec};
+use crate::registry::spec::{CAN_BATCH, CAN_RECORD, CameraSpec, Framing, NodeSpec, Parse, PixelFormat, SerialSpec};
 
 pub(super) fn camera(section: &Section<'_>, problems: &mut Problems<'_>) -> CameraSpec {
     if section.is_table("serial") {
@@ -129,7 +129,10 @@ pub(super) fn max_bytes(section: &Section<'_>, node: Option<&NodeSpec>, problems
             // Numbers travel as 64-bit floats.
             _ => (8 * serial.channels as u64, 8 * serial.channels as u64),
         },
-        Some(NodeSpec::Can(_)) => (64 << 10, 1),
+        Some(NodeSpec::Can(can)) => match can.channels() {
+            0 => ((CAN_BATCH * CAN_RECORD) as u64, (CAN_BATCH * CAN_RECORD) as u64),
+            channels => (8 * channels as u64, 8 * channels as u64),
+        },
         Some(NodeSpec::Lan(lan)) => lan.max_bytes(),
         Some(NodeSpec::Process(process)) => match (process.kind, process.shape.as_slice()) {
             (ModalityKind::Image, [height, width]) => {

@@ -35,6 +35,7 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
         action: None,
+        hooks: crate::registry::Hooks::default(),
         verdict: crate::registry::VerdictSpec::of(
             crate::modality::ModalityKind::Image,
             Duration::from_millis(500),
@@ -51,6 +52,7 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
             disk_reserve: None,
         },
         devices: [(0, "a"), (1, "b")].into_iter().map(device).collect(),
+        modules: Vec::new(),
         path: None,
         text: String::new(),
     }

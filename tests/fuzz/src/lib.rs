@@ -29,6 +29,8 @@ pub const TARGETS: &[Target] = &[
     Target { name: "scenario", run: targets::scenario, seeds: seeds::scenarios },
     Target { name: "units", run: targets::units, seeds: seeds::units },
     Target { name: "serial", run: targets::serial, seeds: seeds::serial },
+    Target { name: "slcan", run: targets::slcan, seeds: seeds::slcan },
+    Target { name: "damiao_serial", run: targets::damiao_serial, seeds: seeds::damiao_serial },
     Target { name: "message", run: targets::message, seeds: seeds::messages },
     Target { name: "inspect", run: targets::inspect, seeds: seeds::episodes },
     Target { name: "recover", run: targets::recover, seeds: seeds::episodes },

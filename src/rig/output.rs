@@ -1,4 +1,4 @@
-//! What a child prints, as lines of the log.
+//! What a child prints, as lines of the log and of its device's file.
 //!
 //! Invariant: the lines of a child are bounded in length and in rate; what is left out is counted and
 //! said. A child that prints faster than that is held up by its pipe, as at a slow terminal, and
@@ -10,6 +10,8 @@ use std::time::Duration;
 use tokio::net::unix::pipe::Receiver;
 use tokio::time::sleep;
 
+use super::logbook::Logbook;
+use super::programs::Programs;
 use crate::status::{Board, Level, What};
 use crate::text;
 use crate::time::Stamp;
@@ -30,8 +32,11 @@ const CHUNK: usize = 16 << 10;
 /// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Output {
-    name: String,
+    device: String,
+    /// Which of the device's programs it is, as `hook: `; empty for the one that reads it.
+    whose: String,
     board: Arc<Board>,
+    logbook: Logbook,
     /// Standard output and standard error.
     lines: [Lines; 2],
     limit: Limit,
@@ -40,11 +45,14 @@ pub(super) struct Output {
 }
 
 impl Output {
-    pub(super) fn new(name: &str, board: &Arc<Board>) -> Self {
+    /// `hook` is the key of the hook that is run, if one is.
+    pub(super) fn new(device: &str, hook: Option<&str>, programs: &Programs) -> Self {
         let now = Stamp::now();
         Self {
-            name: name.to_owned(),
-            board: Arc::clone(board),
+            device: device.to_owned(),
+            whose: hook.map_or_else(String::new, |hook| format!("{hook}: ")),
+            board: Arc::clone(&programs.board),
+            logbook: programs.logbook.clone(),
             lines: [Lines::default(), Lines::default()],
             limit: Limit::new(now),
             left_out: 0,
@@ -107,17 +115,23 @@ impl Output {
             self.left_out += 1;
             return;
         }
-        let text = format!("{}: {line}", self.name);
-        self.board.announce(What::Log { level: Level::Info, text });
+        self.note(Level::Info, line);
     }
 
     fn tell(&mut self) {
         self.told = Stamp::now();
         let left_out = std::mem::take(&mut self.left_out);
         if left_out > 0 {
-            let text = format!("{}: prints too much: {left_out} lines are left out", self.name);
-            self.board.announce(What::Log { level: Level::Warn, text });
+            self.note(Level::Warn, &format!("prints too much: {left_out} lines are left out"));
         }
+    }
+
+    /// Adds a line to the log and to the device's file.
+    pub(super) fn note(&self, level: Level, line: &str) {
+        let line = format!("{}{line}", self.whose);
+        self.logbook.write(&self.device, &line);
+        let text = format!("{}: {line}", self.device);
+        self.board.announce(What::Log { level, text });
     }
 }
 

@@ -1,0 +1,8 @@
+//! Damiao's motors: their frames, their parameters, and what their maker says of each kind.
+//!
+//! Firmware whose enable frame is sent to `((mode - 1) << 2) + id` instead of the motor's own id is not
+//! supported.
+
+pub mod codec;
+pub mod model;
+pub mod parameter;

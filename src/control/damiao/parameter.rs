@@ -1,0 +1,219 @@
+//! A motor's parameters: reading, writing and keeping them, over the id 0x7ff.
+//!
+//! A reply comes with the id that feedback has, and looks like feedback of a motor that stands at the
+//! very beginning of its range and turns backwards at more than a third of its speed range, at one of
+//! two positions of 65,536. Whoever asks for parameters lets such a frame be a reply: taking it for
+//! feedback would invent a position, taking feedback for it loses one of hundreds a second.
+
+use std::fmt;
+
+use crate::control::can::CanFrame;
+
+use super::codec;
+
+/// The id that all motors listen to.
+const BROADCAST: u16 = 0x7ff;
+const READ: u8 = 0x33;
+const WRITE: u8 = 0x55;
+const SAVE: u8 = 0xaa;
+const REFRESH: u8 = 0xcc;
+/// One unit of [`Parameter::Timeout`], µs.
+pub const TIMEOUT_UNIT_US: u32 = 50;
+
+/// A parameter, by its number (RID).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Parameter {
+    /// The id the motor answers with.
+    MasterId = 7,
+    /// The id it listens to.
+    SlaveId = 8,
+    /// Without a frame for this long an enabled motor stops and latches
+    /// [`codec::MotorStatus::CommunicationLost`]; in [`TIMEOUT_UNIT_US`], 0 for never.
+    Timeout = 9,
+    /// See [`ControlMode`].
+    ControlMode = 10,
+    /// Version of its firmware.
+    SoftwareVersion = 14,
+    /// Serial number.
+    SerialNumber = 15,
+    /// Range of position, rad.
+    PMax = 21,
+    /// Range of velocity, rad/s.
+    VMax = 22,
+    /// Range of torque, Nm.
+    TMax = 23,
+}
+
+/// All that are read here.
+const ALL: [Parameter; 9] = [
+    Parameter::MasterId,
+    Parameter::SlaveId,
+    Parameter::Timeout,
+    Parameter::ControlMode,
+    Parameter::SoftwareVersion,
+    Parameter::SerialNumber,
+    Parameter::PMax,
+    Parameter::VMax,
+    Parameter::TMax,
+];
+
+impl Parameter {
+    /// Its number.
+    #[must_use]
+    pub const fn rid(self) -> u8 {
+        self as u8
+    }
+
+    /// The parameter of this number, if it is one of these.
+    #[must_use]
+    pub fn from_rid(rid: u8) -> Option<Self> {
+        ALL.into_iter().find(|parameter| parameter.rid() == rid)
+    }
+
+    /// Is it a 32-bit float? The others are unsigned whole numbers of 32 bits.
+    #[must_use]
+    pub const fn is_float(self) -> bool {
+        matches!(self, Self::PMax | Self::VMax | Self::TMax)
+    }
+}
+
+impl fmt::Display for Parameter {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::MasterId => "MST_ID",
+            Self::SlaveId => "ESC_ID",
+            Self::Timeout => "TIMEOUT",
+            Self::ControlMode => "CTRL_MODE",
+            Self::SoftwareVersion => "sw_ver",
+            Self::SerialNumber => "SN",
+            Self::PMax => "PMAX",
+            Self::VMax => "VMAX",
+            Self::TMax => "TMAX",
+        })
+    }
+}
+
+/// Values of [`Parameter::ControlMode`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u32)]
+pub enum ControlMode {
+    /// Impedance.
+    Mit = 1,
+    /// Position, with a highest velocity.
+    PositionVelocity = 2,
+    /// Velocity.
+    Velocity = 3,
+}
+
+/// The value of a parameter.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Value {
+    /// A whole number.
+    Whole(u32),
+    /// A float, of any bits.
+    Float(f32),
+}
+
+impl Value {
+    /// As it is in a frame.
+    #[must_use]
+    pub const fn to_le_bytes(self) -> [u8; 4] {
+        match self {
+            Self::Whole(value) => value.to_le_bytes(),
+            Self::Float(value) => value.to_le_bytes(),
+        }
+    }
+
+    /// As a number.
+    #[must_use]
+    pub fn number(self) -> f64 {
+        match self {
+            Self::Whole(value) => f64::from(value),
+            Self::Float(value) => f64::from(value),
+        }
+    }
+}
+
+impl fmt::Display for Value {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Whole(value) => value.fmt(f),
+            Self::Float(value) => value.fmt(f),
+        }
+    }
+}
+
+/// Asks a motor for a parameter.
+#[must_use]
+pub const fn read(slave: u16, parameter: Parameter) -> CanFrame {
+    request(slave, READ, parameter.rid(), [0; 4])
+}
+
+/// Sets a parameter until the motor loses its power. A motor writes while it is disabled.
+#[must_use]
+pub const fn write(slave: u16, parameter: Parameter, value: Value) -> CanFrame {
+    request(slave, WRITE, parameter.rid(), value.to_le_bytes())
+}
+
+/// Makes all parameters outlast a loss of power. The motor is to be disabled.
+#[must_use]
+pub const fn save(slave: u16) -> CanFrame {
+    request(slave, SAVE, 1, [0; 4])
+}
+
+/// Asks a motor for its feedback, and for nothing else.
+#[must_use]
+pub const fn refresh(slave: u16) -> CanFrame {
+    request(slave, REFRESH, 0, [0; 4])
+}
+
+const fn request(slave: u16, verb: u8, rid: u8, value: [u8; 4]) -> CanFrame {
+    let [low, high] = slave.to_le_bytes();
+    let [a, b, c, d] = value;
+    CanFrame::standard(BROADCAST, [low, high, verb, rid, a, b, c, d])
+}
+
+/// A motor's answer: what a parameter is, after it was read or written.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Reply {
+    /// The motor.
+    pub slave: u16,
+    /// It was written, and not read.
+    pub written: bool,
+    /// Which one.
+    pub parameter: Parameter,
+    /// Its value.
+    pub value: Value,
+}
+
+impl Reply {
+    /// Reads a frame that a motor sent; `None` if it is no reply about a parameter that is known here.
+    #[must_use]
+    pub fn decode(frame: &CanFrame) -> Option<Self> {
+        let [low, high, verb @ (READ | WRITE), rid, value @ ..] = codec::data_of(frame)? else { return None };
+        let parameter = Parameter::from_rid(rid)?;
+        let slave = u16::from_le_bytes([low, high]);
+        (slave <= BROADCAST).then_some(Self {
+            slave,
+            written: verb == WRITE,
+            parameter,
+            value: if parameter.is_float() {
+                Value::Float(f32::from_le_bytes(value))
+            } else {
+                Value::Whole(u32::from_le_bytes(value))
+            },
+        })
+    }
+
+    /// As a motor would send it from `master`. For simulated motors.
+    #[must_use]
+    pub const fn encode(&self, master: u16) -> CanFrame {
+        let verb = if self.written { WRITE } else { READ };
+        let request = request(self.slave, verb, self.parameter.rid(), self.value.to_le_bytes());
+        CanFrame::standard(master, request.data)
+    }
+}
+
+#[cfg(test)]
+mod tests;

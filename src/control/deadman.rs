@@ -1,0 +1,77 @@
+//! The deadman: no action, no motion.
+//!
+//! Without a fresh action for two periods of actions, or as long as is configured, motors hold; after
+//! holding for a while longer they are to be disabled. An action that comes while they hold moves them
+//! again.
+//!
+//! Invariant: after being armed, and without an action, it says `Hold` and then `Disable`, never
+//! `Follow`.
+
+use std::time::Duration;
+
+use crate::time::Stamp;
+
+/// Periods of actions that may pass without one.
+const PERIODS: u32 = 2;
+
+/// See the module's comment.
+#[derive(Debug, Clone, Copy)]
+pub struct Deadman {
+    hold_after: Option<Duration>,
+    disable_after: Duration,
+    /// Of the newest action, if any came since arming.
+    fresh: Option<Stamp>,
+    armed: Stamp,
+}
+
+/// What to do.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Verdict {
+    /// Go on.
+    Follow,
+    /// Stay where the last command was.
+    Hold,
+    /// Turn the motors off.
+    Disable,
+}
+
+impl Deadman {
+    /// `hold_after` of `None` is two periods.
+    #[must_use]
+    pub const fn new(hold_after: Option<Duration>, disable_after: Duration) -> Self {
+        Self { hold_after, disable_after, fresh: None, armed: Stamp(0) }
+    }
+
+    /// The motors were armed at `now`, and there is no action yet.
+    pub const fn arm(&mut self, now: Stamp) {
+        self.fresh = None;
+        self.armed = now;
+    }
+
+    /// There is an action that was fresh at this moment.
+    pub fn feed(&mut self, fresh: Stamp) {
+        self.fresh = self.fresh.max(Some(fresh));
+    }
+
+    /// How old an action may be, with so long between actions.
+    #[must_use]
+    pub fn patience(&self, period: Duration) -> Duration {
+        self.hold_after.unwrap_or(period * PERIODS)
+    }
+
+    /// What to do at `now`, with so long between actions.
+    #[must_use]
+    pub fn look(&self, now: Stamp, period: Duration) -> Verdict {
+        let holds_from = self.fresh.map_or(self.armed, |fresh| fresh.after(self.patience(period)));
+        if self.fresh.is_some() && now < holds_from {
+            Verdict::Follow
+        } else if now < holds_from.after(self.disable_after) {
+            Verdict::Hold
+        } else {
+            Verdict::Disable
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,40 @@
+use super::*;
+
+const MS: u64 = 1_000_000;
+
+fn at(ms: u64) -> Stamp {
+    Stamp(ms * MS)
+}
+
+#[test]
+fn actions_that_stop_are_held_and_then_disabled() {
+    let period = Duration::from_millis(100);
+    for (configured, hold_ms) in [(None, 200), (Some(Duration::from_millis(50)), 50)] {
+        let mut deadman = Deadman::new(configured, Duration::from_secs(1));
+        deadman.arm(at(0));
+        deadman.feed(at(500));
+        // One that is older than what is known changes nothing.
+        deadman.feed(at(400));
+        for (ms, verdict) in [
+            (500, Verdict::Follow),
+            (500 + hold_ms - 1, Verdict::Follow),
+            (500 + hold_ms, Verdict::Hold),
+            (500 + hold_ms + 999, Verdict::Hold),
+            (500 + hold_ms + 1000, Verdict::Disable),
+        ] {
+            assert_eq!(deadman.look(at(ms), period), verdict, "{configured:?} {ms}");
+        }
+        deadman.feed(at(9000));
+        assert_eq!(deadman.look(at(9000), period), Verdict::Follow);
+    }
+}
+
+#[test]
+fn an_armed_motor_without_an_action_holds_and_is_disabled() {
+    let mut deadman = Deadman::new(None, Duration::from_secs(1));
+    deadman.feed(at(9));
+    deadman.arm(at(10));
+    for (ms, verdict) in [(10, Verdict::Hold), (1009, Verdict::Hold), (1010, Verdict::Disable)] {
+        assert_eq!(deadman.look(at(ms), Duration::from_millis(100)), verdict);
+    }
+}

@@ -1,0 +1,302 @@
+//! All motors of one CAN bus, as one state machine: when they may move, where to, and what stops them.
+//!
+//! | state     | motors                         | leaves for                                       |
+//! |-----------|--------------------------------|--------------------------------------------------|
+//! | Probing   | disabled, parameters are read  | Disarmed, when all have answered                 |
+//! | Disarmed  | disabled, positions stream     | Arming, when asked                               |
+//! | Arming    | read, cleared, enabled         | Holding, when all are enabled; Faulted after 1 s |
+//! | Following | go where actions say           | Holding, without a fresh action                  |
+//! | Holding   | stay                           | Following; Disabling, after a while              |
+//! | Disabling | told to turn off               | Disarmed, when all have said so                  |
+//! | Faulted   | told to turn off, until they do | Arming, when asked                              |
+//! | Stopped   | nothing is sent                |                                                  |
+//!
+//! A cycle is: [`MotorBus::feed`] every frame that came, [`MotorBus::target`] the newest action,
+//! [`MotorBus::step`], and send what that gives. Who polls motors knows their positions without
+//! enabling them: that is what happens in all states but the last.
+//!
+//! Every arm reads the parameters anew: a motor that lost its power has forgotten its mode and its time
+//! limit, by which it stops on its own when this program was killed.
+//!
+//! Invariant: no command before an arm was asked for, nor after a fault, a disarm or a stop until one is
+//! asked for again.
+//! Invariant: one motor that is silent, faulty or hot disables all: an arm must not go on without its
+//! elbow.
+//! Invariant: the first command is where the joint is. From there a commanded position changes by the
+//! slew limit at most, and lies within the limits, or between them and where the joint is. In MIT mode
+//! it is besides so near to the joint that the stiffness asks for no more than the torque limit; this
+//! alone may move it faster, and only towards the joint.
+//! Invariant: an action is followed only if its tick is after the arm, after those of all before it, and
+//! no older than the deadman allows.
+//! Invariant: a sample holds an answer of every motor, each newer than those of the sample before.
+
+mod due;
+mod motor;
+mod notice;
+
+use std::time::Duration;
+
+use motor::Motor;
+use notice::Notices;
+pub use notice::{BusState, Fault, Notice, Part, Reason, Refusal, Words};
+
+use super::can::CanFrame;
+use super::damiao::codec::{self, Order};
+use super::damiao::parameter::Reply;
+use super::deadman::Deadman;
+use super::interpolate::Interpolator;
+use super::limits::Limits;
+use crate::registry::DamiaoSpec;
+use crate::time::Stamp;
+
+/// Numbers a motor has in a sample: position rad, velocity rad/s, torque Nm, temperature of the
+/// transistors °C, of the winding °C, and the code of its status.
+pub const SAMPLE_VALUES: usize = 6;
+/// A motor may leave the frames of this many cycles unanswered, however short the configured time.
+const SILENT_CYCLES: u32 = 3;
+/// A step that comes later than this many cycles moves no farther than after so many.
+const LATE_CYCLES: u32 = 2;
+/// Actions may be this far in the future: clocks are one, ticks are rounded.
+const EARLY: Duration = Duration::from_millis(100);
+
+/// See the module's comment.
+#[derive(Debug)]
+pub struct MotorBus {
+    motors: Vec<Motor>,
+    names: Vec<String>,
+    limits: Vec<Limits>,
+    commands: Vec<f64>,
+    targets: Vec<f64>,
+    line: Interpolator,
+    deadman: Deadman,
+    state: BusState,
+    /// When the state began.
+    since: Stamp,
+    reason: Reason,
+    cycle: Duration,
+    silent_after: Duration,
+    stepped: Option<Stamp>,
+    armed: Stamp,
+    refusing: Option<Refusal>,
+    notices: Notices,
+    counts: Counts,
+}
+
+/// What has happened so far.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Counts {
+    /// Frames that no motor of the entry sends.
+    pub strangers: u64,
+    /// Actions that were followed.
+    pub actions: u64,
+    /// Actions that were refused.
+    pub refused: u64,
+    /// Values of actions beyond their limits.
+    pub clamped: u64,
+    /// Times that all motors were disabled by a fault.
+    pub faults: u64,
+    /// Notices that nobody took in time.
+    pub lost_notices: u64,
+}
+
+impl MotorBus {
+    /// All motors of an entry, of which nothing is known yet.
+    #[must_use]
+    pub fn new(spec: &DamiaoSpec, now: Stamp) -> Self {
+        let cycle = Duration::from_secs(1) / spec.hz.max(1);
+        let axes = spec.motors.len();
+        let motors = spec.motors.iter().enumerate();
+        Self {
+            motors: motors.map(|(index, motor)| Motor::new(index, motor, spec.timeout)).collect(),
+            names: spec.motors.iter().map(|motor| motor.name.clone()).collect(),
+            limits: spec.motors.iter().map(motor::limits).collect(),
+            commands: vec![0.0; axes],
+            targets: vec![0.0; axes],
+            line: Interpolator::new(axes),
+            deadman: Deadman::new(spec.deadman, spec.disable_after),
+            state: BusState::Probing,
+            since: now,
+            reason: Reason::Asked,
+            cycle,
+            silent_after: spec.silent_after.max(cycle * SILENT_CYCLES),
+            stepped: None,
+            armed: now,
+            refusing: None,
+            notices: Notices::new(),
+            counts: Counts::default(),
+        }
+    }
+
+    /// Where the bus stands.
+    #[must_use]
+    pub const fn state(&self) -> BusState {
+        self.state
+    }
+
+    /// Are all motors enabled?
+    #[must_use]
+    pub const fn is_armed(&self) -> bool {
+        matches!(self.state, BusState::Following | BusState::Holding)
+    }
+
+    /// Names of the motors, for [`Notice::words`].
+    #[must_use]
+    pub fn names(&self) -> &[String] {
+        &self.names
+    }
+
+    /// The command to each motor as of the last step, rad or rad/s. Means nothing unless armed.
+    #[must_use]
+    pub fn commands(&self) -> &[f64] {
+        &self.commands
+    }
+
+    /// What has happened so far.
+    #[must_use]
+    pub fn counts(&self) -> Counts {
+        let clamped = self.limits.iter().map(Limits::clamped).sum();
+        Counts { clamped, lost_notices: self.notices.lost(), ..self.counts }
+    }
+
+    /// The oldest notice that was not taken yet.
+    pub fn take_notice(&mut self) -> Option<Notice> {
+        self.notices.take()
+    }
+
+    /// A frame came from the bus.
+    pub fn feed(&mut self, frame: &CanFrame, now: Stamp) {
+        if self.state == BusState::Stopped || codec::data_of(frame).is_none() {
+            return;
+        }
+        let reply = Reply::decode(frame);
+        let Some(index) = self.motors.iter().position(|motor| motor.sent(frame, reply.as_ref())) else {
+            self.counts.strangers += 1;
+            return;
+        };
+        let Some(motor) = self.motors.get_mut(index) else { return };
+        let taken = if let Some(reply) = reply {
+            motor.take_reply(&reply, &mut self.notices)
+        } else {
+            motor.take_feedback(frame, now, &mut self.notices);
+            Ok(())
+        };
+        // At once: what a motor says next must not cover it up.
+        if let Some(fault) = taken.err().or_else(|| self.judge(index)) {
+            self.fail(fault, now);
+        }
+    }
+
+    /// An action: a number for each motor, and its tick. Says whether it is followed.
+    pub fn target(&mut self, target: &[f64], tick: Stamp, now: Stamp) -> bool {
+        let refusal = self.refuse(target, tick, now);
+        if let Some(refusal) = refusal {
+            self.counts.refused += 1;
+            if self.refusing != Some(refusal) {
+                self.notices.tell(Notice::Refused(refusal));
+            }
+        }
+        self.refusing = refusal;
+        let is_newer = self.line.tick().is_none_or(|last| tick > last);
+        if refusal.is_some() || !self.is_armed() || tick < self.armed || !is_newer {
+            return false;
+        }
+        for (motor, target) in target.iter().enumerate() {
+            let Some(clamped) = self.limits.get_mut(motor).and_then(|limits| limits.clamp(*target)) else { continue };
+            if clamped.is_news {
+                self.notices.tell(Notice::Clamped { motor, target: *target, used: clamped.value });
+            }
+            if let Some(slot) = self.targets.get_mut(motor) {
+                *slot = clamped.value;
+            }
+        }
+        self.line.head_for(&self.targets, tick, &self.commands, now);
+        self.deadman.feed(tick.min(now));
+        self.counts.actions += 1;
+        if self.state == BusState::Holding {
+            self.enter(BusState::Following, now);
+            self.notices.tell(Notice::Following);
+        }
+        true
+    }
+
+    fn refuse(&self, target: &[f64], tick: Stamp, now: Stamp) -> Option<Refusal> {
+        if target.len() != self.motors.len() {
+            Some(Refusal::Length)
+        } else if !target.iter().all(|value| value.is_finite()) {
+            Some(Refusal::NotFinite)
+        } else if tick > now.after(EARLY) {
+            Some(Refusal::Early)
+        } else if now.since(tick) >= self.deadman.patience(self.line.period()) {
+            Some(Refusal::Old)
+        } else {
+            None
+        }
+    }
+
+    /// Enables all motors, after reading their parameters and clearing their faults. A notice says
+    /// whether that went well. Changes nothing where they are enabled, or are being enabled.
+    pub fn arm(&mut self, now: Stamp) {
+        if matches!(self.state, BusState::Probing | BusState::Disarmed | BusState::Faulted(_) | BusState::Disabling) {
+            self.turn_off();
+            self.enter(BusState::Arming, now);
+            self.notices.tell(Notice::Arming);
+        }
+    }
+
+    /// Disables all motors.
+    pub fn disarm(&mut self, now: Stamp) {
+        if self.is_armed() || self.state == BusState::Arming {
+            self.disable(Reason::Asked, now);
+        }
+    }
+
+    /// The frames that disable every motor, for any way out. Nothing is sent after them.
+    pub fn stop_frames(&mut self) -> impl Iterator<Item = CanFrame> + '_ {
+        self.state = BusState::Stopped;
+        self.motors.iter().map(|motor| Order::Disable.frame(motor.spec.slave))
+    }
+
+    /// Fills `out` with [`SAMPLE_VALUES`] numbers a motor, if every motor has answered since the last
+    /// sample, and returns when the first of them did. `None` too where `out` has another length.
+    pub fn sample(&mut self, out: &mut [f64]) -> Option<Stamp> {
+        if out.len() != self.motors.len() * SAMPLE_VALUES || !self.motors.iter().all(|motor| motor.is_new) {
+            return None;
+        }
+        let captured = self.motors.iter().map(|motor| motor.seen).min()?;
+        for (values, motor) in out.chunks_exact_mut(SAMPLE_VALUES).zip(&mut self.motors) {
+            let feedback = motor.feedback?;
+            motor.is_new = false;
+            values.copy_from_slice(&[
+                feedback.q,
+                feedback.dq,
+                feedback.tau,
+                f64::from(feedback.mos),
+                f64::from(feedback.rotor),
+                f64::from(feedback.status.code()),
+            ]);
+        }
+        Some(captured)
+    }
+
+    /// One cycle: what is due is decided, and the frames of the cycle go to `send`, at most two a motor.
+    /// All frames that came are to be fed before.
+    pub fn step(&mut self, now: Stamp, mut send: impl FnMut(CanFrame)) {
+        if self.state == BusState::Stopped {
+            return;
+        }
+        let passed = self.stepped.map_or(self.cycle, |last| now.since(last)).min(self.cycle * LATE_CYCLES);
+        self.stepped = Some(now);
+        self.listen(now);
+        if let Some(fault) = (0..self.motors.len()).find_map(|index| self.judge(index)) {
+            self.fail(fault, now);
+        }
+        self.advance(now, passed);
+        for (motor, command) in self.motors.iter_mut().zip(&self.commands) {
+            let is_silent = motor.unanswered(now) >= self.silent_after;
+            motor.step(*command, now, is_silent, &mut send);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

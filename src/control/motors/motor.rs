@@ -1,0 +1,354 @@
+//! One motor: what is being asked of it, and what it answered.
+//!
+//! | phase    | sent each cycle                        | until                                   |
+//! |----------|----------------------------------------|-----------------------------------------|
+//! | Off      | disable, then refresh                  | it said that it is not enabled          |
+//! | Asked    | read or write of a parameter, refresh  | all parameters are as they are to be    |
+//! | Probed   | refresh                                | the bus is armed                        |
+//! | Clearing | clear error, refresh                   | it reports no fault                     |
+//! | Enabling | enable, then a command to stay         | it said that it is enabled              |
+//! | On       | a command                              | the bus is disarmed                     |
+//!
+//! Invariant: a command is sent in `Enabling` and `On` alone.
+//! Invariant: who is found enabled without having been armed is disabled.
+
+use std::time::Duration;
+
+use super::notice::{Fault, Notice, Notices, Part};
+use crate::control::can::CanFrame;
+use crate::control::damiao::codec::{self, Feedback, Mit, MotorStatus, Order, Ranges};
+use crate::control::damiao::model;
+use crate::control::damiao::parameter::{self, ControlMode, Parameter, Reply, TIMEOUT_UNIT_US, Value};
+use crate::control::limits::Limits;
+use crate::registry::{MotorMode, MotorSpec};
+use crate::time::Stamp;
+
+/// What is read, in this order.
+const PROBE: [Parameter; 5] =
+    [Parameter::ControlMode, Parameter::PMax, Parameter::VMax, Parameter::TMax, Parameter::Timeout];
+/// A motor is warm this many °C below its limit...
+const WARM: f64 = 10.0;
+/// ...until it is this much cooler.
+const COOLER: f64 = 5.0;
+
+/// See the module's comment.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Phase {
+    /// To be disabled; `told` once a frame was sent.
+    Off {
+        told: bool,
+    },
+    /// Asked for `PROBE[at]`, or told to set it, from what it was.
+    Asked {
+        at: usize,
+        setting: Option<Value>,
+    },
+    Probed,
+    Clearing,
+    Enabling,
+    On,
+}
+
+/// The limits of a motor's axis.
+pub(super) fn limits(spec: &MotorSpec) -> Limits {
+    match spec.mode {
+        MotorMode::Velocity => Limits::new(-spec.velocity, spec.velocity, spec.slew),
+        MotorMode::Mit { .. } | MotorMode::PositionVelocity => {
+            let [low, high] = spec.position;
+            Limits::new(low, high, spec.slew.min(spec.velocity))
+        }
+    }
+}
+
+/// See the module's comment.
+#[derive(Debug)]
+pub(super) struct Motor {
+    pub(super) spec: MotorSpec,
+    pub(super) phase: Phase,
+    /// What it counts in; `None` until it was asked.
+    pub(super) ranges: Option<Ranges>,
+    /// Its newest feedback, once its ranges are known.
+    pub(super) feedback: Option<Feedback>,
+    /// When that came.
+    pub(super) seen: Stamp,
+    /// It came after the last sample.
+    pub(super) is_new: bool,
+    /// What it said of itself since it was last told to turn off.
+    pub(super) status: Option<MotorStatus>,
+    /// The first frame since its last answer.
+    asked: Option<Stamp>,
+    index: usize,
+    timeout: u32,
+    read: [f64; 3],
+    warm: [bool; 2],
+    differs: bool,
+    /// That it does not answer was told.
+    pub(super) missed: bool,
+}
+
+impl Motor {
+    pub(super) fn new(index: usize, spec: &MotorSpec, timeout: Duration) -> Self {
+        let units = timeout.as_micros().div_ceil(u128::from(TIMEOUT_UNIT_US)).max(1);
+        Self {
+            spec: spec.clone(),
+            phase: Phase::Off { told: false },
+            ranges: None,
+            feedback: None,
+            seen: Stamp(0),
+            is_new: false,
+            status: None,
+            asked: None,
+            index,
+            timeout: u32::try_from(units).unwrap_or(u32::MAX),
+            read: [0.0; 3],
+            warm: [false; 2],
+            differs: false,
+            missed: false,
+        }
+    }
+
+    /// Is this frame one of its answers?
+    pub(super) fn sent(&self, frame: &CanFrame, reply: Option<&Reply>) -> bool {
+        let id = u16::from(frame.data[0] & 0xf);
+        let slave_fits = reply.map_or(self.spec.slave & 0xf == id, |reply| reply.slave == self.spec.slave);
+        frame.id == u32::from(self.spec.master) && slave_fits
+    }
+
+    /// Turns it off, from the next frame on.
+    pub(super) const fn turn_off(&mut self) {
+        self.phase = Phase::Off { told: false };
+        self.status = None;
+    }
+
+    /// It was told to turn off, and said since that it is not enabled.
+    pub(super) fn is_off(&self) -> bool {
+        match self.phase {
+            Phase::Off { told } => told && self.status.is_some_and(|status| status != MotorStatus::Enabled),
+            Phase::Asked { .. } | Phase::Probed => true,
+            Phase::Clearing | Phase::Enabling | Phase::On => false,
+        }
+    }
+
+    /// Reads its parameters, from the first.
+    pub(super) const fn probe(&mut self) {
+        self.phase = Phase::Asked { at: 0, setting: None };
+    }
+
+    /// The parameter it is asked for.
+    pub(super) fn asked_for(&self) -> Option<Parameter> {
+        let Phase::Asked { at, .. } = self.phase else { return None };
+        PROBE.get(at).copied()
+    }
+
+    /// It has had a frame for this long without answering.
+    pub(super) fn unanswered(&self, now: Stamp) -> Duration {
+        self.asked.map_or(Duration::ZERO, |asked| now.since(asked))
+    }
+
+    /// Takes its answer about a parameter, if it is the one that was asked for.
+    pub(super) fn take_reply(&mut self, reply: &Reply, notices: &mut Notices) -> Result<(), Fault> {
+        self.asked = None;
+        let Phase::Asked { at, setting } = self.phase else { return Ok(()) };
+        // What comes late, to an earlier question or to one that was repeated, answers nothing.
+        if PROBE.get(at) != Some(&reply.parameter) || reply.written != setting.is_some() {
+            return Ok(());
+        }
+        let motor = self.index;
+        let unusable = Fault::Unusable { motor, parameter: reply.parameter, value: reply.value };
+        match self.wanted(reply.parameter) {
+            Some(wanted) if reply.value == wanted => {
+                if let Some(was) = setting {
+                    notices.tell(Notice::ParameterSet { motor, parameter: reply.parameter, was, is: wanted });
+                }
+            }
+            Some(_) if setting.is_none() => {
+                self.phase = Phase::Asked { at, setting: Some(reply.value) };
+                return Ok(());
+            }
+            Some(_) => return Err(unusable),
+            // A range: PROBE[1..=3].
+            None => {
+                let value = reply.value.number();
+                let [p, v, t] = &mut self.read;
+                let slot = match reply.parameter {
+                    Parameter::PMax => p,
+                    Parameter::VMax => v,
+                    _ => t,
+                };
+                *slot = value;
+                Ranges::new(value, value, value).ok_or(unusable)?;
+            }
+        }
+        self.phase = if at + 1 < PROBE.len() { Phase::Asked { at: at + 1, setting: None } } else { Phase::Probed };
+        if self.phase == Phase::Probed {
+            self.take_ranges(notices);
+        }
+        Ok(())
+    }
+
+    fn take_ranges(&mut self, notices: &mut Notices) {
+        let [p, v, t] = self.read;
+        let ranges = Ranges::new(p, v, t);
+        if self.ranges != ranges {
+            // Counted in other ranges, it says something else.
+            self.feedback = None;
+            self.is_new = false;
+        }
+        self.ranges = ranges;
+        let Some(read) = ranges else { return };
+        let differs = !model::is_shipped(self.spec.kind, &read);
+        if differs && !self.differs {
+            notices.tell(Notice::RangesDiffer { motor: self.index, read, shipped: model::shipped(self.spec.kind) });
+        }
+        self.differs = differs;
+    }
+
+    /// What a parameter is to be, if that is for us to say.
+    fn wanted(&self, parameter: Parameter) -> Option<Value> {
+        match parameter {
+            Parameter::ControlMode => Some(Value::Whole(match self.spec.mode {
+                MotorMode::Mit { .. } => ControlMode::Mit,
+                MotorMode::PositionVelocity => ControlMode::PositionVelocity,
+                MotorMode::Velocity => ControlMode::Velocity,
+            } as u32)),
+            Parameter::Timeout => Some(Value::Whole(self.timeout)),
+            _ => None,
+        }
+    }
+
+    /// Takes its feedback.
+    pub(super) fn take_feedback(&mut self, frame: &CanFrame, now: Stamp, notices: &mut Notices) {
+        // Before its ranges are known, what it says of itself counts alone.
+        let Some(feedback) = self.ranges.or(Ranges::new(1.0, 1.0, 1.0)).and_then(|r| Feedback::decode(frame, &r))
+        else {
+            return;
+        };
+        self.asked = None;
+        self.status = Some(feedback.status);
+        if self.ranges.is_some() {
+            self.feedback = Some(feedback);
+            self.seen = now;
+            self.is_new = true;
+        }
+        for (at, (part, celsius, limit)) in self.temperatures(&feedback).into_iter().enumerate() {
+            let Some(warm) = self.warm.get_mut(at) else { continue };
+            if celsius >= limit - WARM && !*warm {
+                *warm = true;
+                notices.tell(Notice::Warm { motor: self.index, part, celsius, limit });
+            } else if celsius < limit - WARM - COOLER {
+                *warm = false;
+            }
+        }
+    }
+
+    fn temperatures(&self, feedback: &Feedback) -> [(Part, f64, f64); 2] {
+        [
+            (Part::Mos, f64::from(feedback.mos), self.spec.max_mos),
+            (Part::Rotor, f64::from(feedback.rotor), self.spec.max_rotor),
+        ]
+    }
+
+    /// What is wrong with a motor that is to be enabled, or disabled, by what it says of itself.
+    pub(super) fn status_fault(&self) -> Option<Fault> {
+        let motor = self.index;
+        match self.status? {
+            MotorStatus::Disabled if self.phase == Phase::On => Some(Fault::Dropped { motor }),
+            MotorStatus::Enabled | MotorStatus::Disabled => None,
+            status => Some(Fault::Latched { motor, status }),
+        }
+    }
+
+    /// Is it hotter than it may be?
+    pub(super) fn heat_fault(&self) -> Option<Fault> {
+        let motor = self.index;
+        let hot = |(part, celsius, limit)| (celsius >= limit).then_some(Fault::Hot { motor, part, celsius, limit });
+        self.temperatures(self.feedback.as_ref()?).into_iter().find_map(hot)
+    }
+
+    /// Goes on to be enabled, once its parameters are read: faults are cleared before. Until it is, its
+    /// command is where it is.
+    pub(super) fn enable(&mut self, command: &mut f64, limits: &mut Limits) {
+        let (Some(ranges), Some(feedback), Some(status)) = (self.ranges, self.feedback, self.status) else { return };
+        if self.phase == Phase::Probed {
+            self.phase = Phase::Clearing;
+            let [low, high] = self.spec.position;
+            if self.spec.mode != MotorMode::Velocity {
+                // Positions beyond what it counts in can be neither sent nor seen.
+                limits.set_range(low.max(-ranges.position()), high.min(ranges.position()));
+            }
+        }
+        if self.phase == Phase::Clearing && status == MotorStatus::Disabled {
+            self.phase = Phase::Enabling;
+        }
+        if self.phase == Phase::Enabling {
+            *command = if self.spec.mode == MotorMode::Velocity { 0.0 } else { feedback.q };
+            if status == MotorStatus::Enabled {
+                self.phase = Phase::On;
+            }
+        }
+    }
+
+    /// Why it is not enabled by now, if it is not.
+    pub(super) fn arm_fault(&self) -> Option<Fault> {
+        let motor = self.index;
+        match (self.phase, self.status) {
+            // Who is probed waits for the others, which come to their own.
+            (Phase::On | Phase::Probed, _) => None,
+            (Phase::Off { .. }, Some(MotorStatus::Enabled)) => Some(Fault::NotDisabled { motor }),
+            (Phase::Off { .. }, _) => Some(Fault::Silent { motor }),
+            (Phase::Asked { .. }, _) => Some(Fault::Unread { motor, parameter: self.asked_for()? }),
+            (Phase::Clearing, Some(status)) if status != MotorStatus::Disabled => {
+                Some(Fault::Latched { motor, status })
+            }
+            (Phase::Clearing | Phase::Enabling, _) => Some(Fault::NotEnabled { motor }),
+        }
+    }
+
+    /// Sends the frames of this cycle. `command` is the position or the velocity of now.
+    pub(super) fn step(&mut self, command: f64, now: Stamp, is_silent: bool, send: &mut impl FnMut(CanFrame)) {
+        let slave = self.spec.slave;
+        if self.phase == Phase::Probed && self.status == Some(MotorStatus::Enabled) {
+            self.turn_off();
+        }
+        match self.phase {
+            Phase::Off { .. } if self.is_off() && !is_silent => send(parameter::refresh(slave)),
+            Phase::Off { .. } => {
+                send(Order::Disable.frame(slave));
+                self.phase = Phase::Off { told: true };
+            }
+            Phase::Asked { at, setting } => {
+                let parameter = PROBE.get(at).copied().unwrap_or(Parameter::ControlMode);
+                send(match self.wanted(parameter).filter(|_| setting.is_some()) {
+                    Some(value) => parameter::write(slave, parameter, value),
+                    None => parameter::read(slave, parameter),
+                });
+                send(parameter::refresh(slave));
+            }
+            Phase::Probed => send(parameter::refresh(slave)),
+            Phase::Clearing => {
+                send(Order::ClearError.frame(slave));
+                send(parameter::refresh(slave));
+            }
+            Phase::Enabling => {
+                send(Order::Enable.frame(slave));
+                self.command(command, send);
+            }
+            Phase::On => self.command(command, send),
+        }
+        self.asked.get_or_insert(now);
+    }
+
+    fn command(&self, command: f64, send: &mut impl FnMut(CanFrame)) {
+        let slave = self.spec.slave;
+        let Some(ranges) = &self.ranges else { return };
+        let frame = match self.spec.mode {
+            MotorMode::Mit { kp, kd } => codec::mit(slave, &Mit { kp, kd, q: command, dq: 0.0, tau: 0.0 }, ranges),
+            MotorMode::PositionVelocity => codec::position_velocity(slave, command, self.spec.velocity),
+            MotorMode::Velocity => codec::velocity(slave, command),
+        };
+        // Commands are finite: targets are, and so is what a motor says.
+        if let Ok(frame) = frame {
+            send(frame);
+        }
+    }
+}

@@ -1,0 +1,202 @@
+//! Arming, and what ends it.
+
+use super::*;
+use crate::control::damiao::codec::Order;
+
+#[test]
+fn an_arm_starts_where_the_joints_are() {
+    let mut world = World::ready();
+    (world.sims[0].q, world.sims[1].q) = (1.5, -0.75);
+    world.arm();
+    world.run_until(BusState::Holding);
+    assert!(world.sims.iter().all(Sim::is_on));
+    world.run(20);
+    assert!((world.sims[0].q - 1.5).abs() < 1e-3 && (world.sims[1].q + 0.75).abs() < 1e-3);
+    assert_eq!((world.told(Notice::Arming), world.told(Notice::Armed)), (1, 1));
+    // Once more is nothing new.
+    world.arm();
+    world.cycle();
+    assert_eq!((world.bus.state(), world.told(Notice::Arming)), (BusState::Holding, 1));
+}
+
+#[test]
+fn an_arm_at_the_start_is_an_arm() {
+    let mut world = World::new(spec(vec![motor(1, 0x11, MIT)]));
+    world.arm();
+    world.run_until(BusState::Holding);
+}
+
+#[test]
+fn an_arm_clears_a_fault_and_fails_while_it_lasts() {
+    let mut world = World::ready();
+    world.sims[1].status = MotorStatus::CommunicationLost;
+    let fault = Fault::Latched { motor: 1, status: MotorStatus::CommunicationLost };
+    assert_eq!(world.run_to_fault(), fault);
+    world.run(500);
+    assert_eq!(world.bus.state(), BusState::Faulted(fault), "nothing brings it back but an arm");
+    world.arm();
+    world.run_until(BusState::Holding);
+    world.disarm();
+    world.run_until(BusState::Disarmed);
+
+    world.sims[1].status = MotorStatus::UnderVoltage;
+    world.sims[1].broken = Some(MotorStatus::UnderVoltage);
+    let fault = world.run_to_fault();
+    for _ in 0..2 {
+        world.arm();
+        world.cycle();
+        assert_eq!(world.bus.state(), BusState::Arming);
+        assert_eq!(world.run_to_fault(), fault);
+        assert!(!world.sims[0].is_on());
+    }
+    world.sims[1].broken = None;
+    world.arm();
+    world.run_until(BusState::Holding);
+}
+
+#[test]
+fn a_silent_motor_disables_all_and_an_arm_fails_until_it_answers() {
+    let mut world = World::armed();
+    world.sims[1].silent = true;
+    assert_eq!(world.run_to_fault(), Fault::Silent { motor: 1 });
+    world.run(2);
+    assert!(!world.sims[0].is_on() && !world.moved());
+    world.arm();
+    assert_eq!(world.run_to_fault(), Fault::Silent { motor: 1 });
+    // It is told to turn off all the while: it may hear without being heard.
+    world.cycle();
+    assert!(world.sent.contains(&Order::Disable.frame(2)));
+    world.sims[1].silent = false;
+    world.run(5);
+    assert!(!world.sims[1].is_on());
+    assert_eq!(world.bus.state(), BusState::Faulted(Fault::Silent { motor: 1 }));
+    world.arm();
+    world.run_until(BusState::Holding);
+}
+
+#[test]
+fn a_few_lost_answers_are_no_silence() {
+    let mut world = World::armed();
+    for _ in 0..15 {
+        world.sims[1].silent = true;
+        world.run(9);
+        world.sims[1].silent = false;
+        world.run(1);
+    }
+    assert_eq!(world.bus.state(), BusState::Holding);
+}
+
+#[test]
+fn a_motor_that_lost_its_power_for_a_moment_is_set_up_again() {
+    let mut world = World::armed();
+    world.sims[0].status = MotorStatus::Disabled;
+    (world.sims[0].mode, world.sims[0].timeout) = (2, 0);
+    assert_eq!(world.run_to_fault(), Fault::Dropped { motor: 0 });
+    world.run(3);
+    assert!(!world.sims[1].is_on());
+    world.arm();
+    world.run_until(BusState::Holding);
+    assert_eq!((world.sims[0].mode, world.sims[0].timeout), (1, 8000));
+}
+
+#[test]
+fn every_fault_of_a_motor_that_moves_disables_all() {
+    for code in (2..16).chain([0]) {
+        let mut world = World::armed();
+        world.target(&[1.0, 1.0]);
+        world.run(3);
+        let status = MotorStatus::from_code(code);
+        world.sims[0].status = status;
+        world.cycle();
+        world.cycle();
+        let fault = world.run_to_fault();
+        let expected = if code == 0 { Fault::Dropped { motor: 0 } } else { Fault::Latched { motor: 0, status } };
+        assert_eq!(fault, expected);
+        world.run(2);
+        assert!(!world.sims[1].is_on());
+    }
+}
+
+#[test]
+fn a_motor_that_gets_hot_is_told_of_and_then_disables_all() {
+    let mut world = World::armed();
+    let warm = |celsius| Notice::Warm { motor: 0, part: Part::Mos, celsius, limit: 80.0 };
+    for (mos, told) in [(69, 0), (70, 1), (68, 1), (75, 1), (64, 1), (71, 2), (79, 2)] {
+        world.sims[0].mos = mos;
+        world.run(3);
+        assert_eq!(world.notices.iter().filter(|notice| matches!(notice, Notice::Warm { .. })).count(), told, "{mos}");
+    }
+    assert_eq!((world.told(warm(70.0)), world.told(warm(71.0))), (1, 1));
+    world.sims[0].rotor = 100;
+    assert_eq!(world.run_to_fault(), Fault::Hot { motor: 0, part: Part::Rotor, celsius: 100.0, limit: 100.0 });
+    world.run(2);
+    assert!(!world.sims.iter().any(Sim::is_on));
+    world.arm();
+    world.run(3);
+    assert!(matches!(world.bus.state(), BusState::Faulted(Fault::Hot { .. })));
+    world.sims[0].rotor = 90;
+    world.run(3);
+    world.arm();
+    world.run_until(BusState::Holding);
+}
+
+#[test]
+fn a_motor_that_does_not_do_as_it_is_told_is_a_fault() {
+    let mut world = World::ready();
+    world.sims[1].deaf = Some(Order::Enable);
+    world.arm();
+    assert_eq!(world.run_to_fault(), Fault::NotEnabled { motor: 1 });
+    world.sims[1].deaf = None;
+    world.arm();
+    world.run_until(BusState::Holding);
+    world.sims[1].deaf = Some(Order::Disable);
+    world.disarm();
+    assert_eq!(world.run_to_fault(), Fault::NotDisabled { motor: 1 });
+    world.arm();
+    assert_eq!(world.run_to_fault(), Fault::NotDisabled { motor: 1 });
+    world.cycle();
+    assert!(world.sent.contains(&Order::Disable.frame(2)));
+}
+
+#[test]
+fn a_disarm_ends_an_arm_at_any_moment() {
+    for cycles in 0..30 {
+        let mut world = World::ready();
+        world.arm();
+        world.run(cycles);
+        world.disarm();
+        world.run_until(BusState::Disarmed);
+        world.run(5);
+        assert!(!world.sims.iter().any(Sim::is_on), "{cycles}");
+        assert_eq!(world.told(Notice::Disabled(Reason::Asked)), 1);
+        world.arm();
+        world.run_until(BusState::Holding);
+    }
+}
+
+#[test]
+fn an_arm_while_motors_are_disabled_waits_for_that() {
+    let mut world = World::armed();
+    world.disarm();
+    world.arm();
+    world.run_until(BusState::Holding);
+    assert_eq!(world.told(Notice::Armed), 2);
+}
+
+#[test]
+fn nothing_is_sent_after_a_stop() {
+    for cycles in 0..25 {
+        let mut world = World::ready();
+        world.arm();
+        world.run(cycles);
+        assert_eq!(world.stop(), [Order::Disable.frame(1), Order::Disable.frame(2)]);
+        assert_eq!(world.bus.state(), BusState::Stopped);
+        world.arm();
+        world.target(&[0.0, 0.0]);
+        world.disarm();
+        world.run(20);
+        assert_eq!(world.sent, []);
+        // The frames may be had as often as they are wanted.
+        assert_eq!(world.stop().len(), 2);
+    }
+}

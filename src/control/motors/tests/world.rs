@@ -1,0 +1,407 @@
+//! Simulated motors, a bus between them and the machine, and a judge who sees every frame.
+
+use std::collections::VecDeque;
+
+use super::*;
+use crate::control::damiao::codec::{Feedback, MotorStatus, Ranges};
+use crate::control::damiao::parameter::{Parameter, Value};
+use crate::registry::{MotorKind, MotorSpec};
+
+pub(super) const CYCLE: Duration = Duration::from_millis(5);
+
+/// A motor as the public drivers know it.
+#[derive(Debug, Clone)]
+pub(super) struct Sim {
+    pub(super) slave: u16,
+    pub(super) master: u16,
+    pub(super) ranges: [f64; 3],
+    pub(super) q: f64,
+    pub(super) status: MotorStatus,
+    /// A fault that comes back as soon as it is cleared.
+    pub(super) broken: Option<MotorStatus>,
+    pub(super) mode: u32,
+    pub(super) timeout: u32,
+    pub(super) mos: u8,
+    pub(super) rotor: u8,
+    /// It has no power.
+    pub(super) silent: bool,
+    /// It does not move.
+    pub(super) stuck: bool,
+    /// It takes no orders to turn on, or off.
+    pub(super) deaf: Option<Order>,
+    /// It keeps its control mode, whatever is written.
+    pub(super) stubborn: bool,
+    /// The last command that it took: its id, and its first number.
+    pub(super) command: Option<(u32, f64)>,
+}
+
+impl Sim {
+    pub(super) fn new(slave: u16, master: u16) -> Self {
+        Self {
+            slave,
+            master,
+            ranges: [12.5, 30.0, 10.0],
+            q: 0.25,
+            status: MotorStatus::Disabled,
+            broken: None,
+            mode: 1,
+            timeout: 0,
+            mos: 30,
+            rotor: 31,
+            silent: false,
+            stuck: false,
+            deaf: None,
+            stubborn: false,
+            command: None,
+        }
+    }
+
+    pub(super) fn is_on(&self) -> bool {
+        self.status == MotorStatus::Enabled
+    }
+
+    pub(super) fn answer(&mut self, frame: &CanFrame) -> Option<CanFrame> {
+        if self.silent {
+            return None;
+        }
+        let slave = u32::from(self.slave);
+        if frame.id == 0x7ff {
+            let [low, high, verb, rid, value @ ..] = frame.data;
+            if u16::from_le_bytes([low, high]) != self.slave {
+                return None;
+            }
+            return if verb == 0xcc { self.feedback() } else { self.parameter(verb, rid, value) };
+        }
+        if frame.id == slave && frame.data.starts_with(&[0xff; 7]) {
+            let order = match frame.data[7] {
+                0xfc => Order::Enable,
+                0xfd => Order::Disable,
+                0xfe => Order::SetZero,
+                _ => Order::ClearError,
+            };
+            if self.deaf != Some(order) {
+                match order {
+                    Order::Enable if self.status == MotorStatus::Disabled => self.status = MotorStatus::Enabled,
+                    Order::Disable if self.is_on() => self.status = MotorStatus::Disabled,
+                    Order::ClearError if self.status.is_fault() => {
+                        self.status = self.broken.unwrap_or(MotorStatus::Disabled);
+                    }
+                    _ => {}
+                }
+            }
+            return self.feedback();
+        }
+        if ![slave, slave + 0x100, slave + 0x200].contains(&frame.id) {
+            return None;
+        }
+        let number = command_of(frame, self.slave, self.ranges);
+        if self.is_on() {
+            self.command = Some((frame.id, number));
+            match frame.id - slave {
+                0x200 if !self.stuck => self.q += number * CYCLE.as_secs_f64(),
+                0 | 0x100 if !self.stuck => self.q = number,
+                _ => {}
+            }
+        }
+        self.feedback()
+    }
+
+    fn parameter(&mut self, verb: u8, rid: u8, value: [u8; 4]) -> Option<CanFrame> {
+        let parameter = Parameter::from_rid(rid)?;
+        let written = verb == 0x55;
+        if written {
+            let whole = u32::from_le_bytes(value);
+            match parameter {
+                Parameter::ControlMode if !self.stubborn => self.mode = whole,
+                Parameter::Timeout => self.timeout = whole,
+                _ => {}
+            }
+        }
+        let [p, v, t] = self.ranges;
+        #[allow(clippy::cast_possible_truncation)]
+        let value = match parameter {
+            Parameter::ControlMode => Value::Whole(self.mode),
+            Parameter::Timeout => Value::Whole(self.timeout),
+            Parameter::PMax => Value::Float(p as f32),
+            Parameter::VMax => Value::Float(v as f32),
+            Parameter::TMax => Value::Float(t as f32),
+            _ => Value::Whole(0),
+        };
+        Some(Reply { slave: self.slave, written, parameter, value }.encode(self.master))
+    }
+
+    pub(super) fn feedback(&self) -> Option<CanFrame> {
+        let [p, v, t] = self.ranges;
+        let id = self.slave.to_le_bytes()[0] & 0xf;
+        let (mos, rotor) = (self.mos, self.rotor);
+        let feedback = Feedback { id, status: self.status, q: self.q, dq: 0.0, tau: 0.0, mos, rotor };
+        feedback.encode(self.master, &Ranges::new(p, v, t)?)
+    }
+}
+
+/// The first number of a command: position or velocity.
+fn command_of(frame: &CanFrame, slave: u16, [range, ..]: [f64; 3]) -> f64 {
+    let [a, b, c, d, ..] = frame.data;
+    if frame.id == u32::from(slave) {
+        f64::from(u16::from_be_bytes([a, b])) / 65_535.0 * 2.0 * range - range
+    } else {
+        f64::from(f32::from_le_bytes([a, b, c, d]))
+    }
+}
+
+pub(super) fn motor(slave: u16, master: u16, mode: MotorMode) -> MotorSpec {
+    MotorSpec {
+        name: format!("joint_{slave}"),
+        slave,
+        master,
+        kind: MotorKind::Dm4310,
+        mode,
+        position: [-2.0, 2.0],
+        velocity: 20.0,
+        torque: 1000.0,
+        slew: 5.0,
+        max_mos: 80.0,
+        max_rotor: 100.0,
+    }
+}
+
+pub(super) const MIT: MotorMode = MotorMode::Mit { kp: 10.0, kd: 1.0 };
+
+pub(super) fn spec(motors: Vec<MotorSpec>) -> DamiaoSpec {
+    DamiaoSpec {
+        motors,
+        hz: 200,
+        deadman: None,
+        disable_after: Duration::from_secs(1),
+        timeout: Duration::from_millis(400),
+        silent_after: Duration::from_millis(50),
+    }
+}
+
+/// The machine, its motors, and the time.
+pub(super) struct World {
+    pub(super) bus: MotorBus,
+    pub(super) sims: Vec<Sim>,
+    pub(super) spec: DamiaoSpec,
+    pub(super) now: Stamp,
+    pub(super) notices: Vec<Notice>,
+    /// Cycles that an answer is on its way.
+    pub(super) latency: usize,
+    /// The frames of the last cycle.
+    pub(super) sent: Vec<CanFrame>,
+    answers: VecDeque<Vec<CanFrame>>,
+    judge: Judge,
+}
+
+/// What must never happen, from the frames and from what was asked for alone.
+#[derive(Debug, Default)]
+struct Judge {
+    /// An arm was asked for, and nothing has ended it since.
+    may_move: bool,
+    stopped: bool,
+    axes: Vec<Axis>,
+}
+
+#[derive(Debug, Clone, Default)]
+struct Axis {
+    /// What the machine was told last.
+    reported: Option<f64>,
+    /// It was told that the motor is enabled.
+    is_on: bool,
+    /// The last command to a motor that is on, and when.
+    command: Option<(f64, Stamp)>,
+    unanswered: Option<Stamp>,
+}
+
+impl World {
+    pub(super) fn new(spec: DamiaoSpec) -> Self {
+        let now = Stamp(1_000_000_000_000);
+        let axes = spec.motors.len();
+        Self {
+            bus: MotorBus::new(&spec, now),
+            sims: spec.motors.iter().map(|motor| Sim::new(motor.slave, motor.master)).collect(),
+            spec,
+            now,
+            notices: Vec::new(),
+            latency: 0,
+            sent: Vec::new(),
+            answers: VecDeque::new(),
+            judge: Judge { axes: vec![Axis::default(); axes], ..Judge::default() },
+        }
+    }
+
+    /// Two motors in MIT mode that have answered.
+    pub(super) fn ready() -> Self {
+        let mut world = Self::new(spec(vec![motor(1, 0x11, MIT), motor(2, 0x12, MIT)]));
+        world.run_until(BusState::Disarmed);
+        world
+    }
+
+    /// Two motors in MIT mode that are armed.
+    pub(super) fn armed() -> Self {
+        let mut world = Self::ready();
+        world.arm();
+        world.run_until(BusState::Holding);
+        world
+    }
+
+    pub(super) fn arm(&mut self) {
+        self.bus.arm(self.now);
+        self.judge.may_move = true;
+    }
+
+    pub(super) fn disarm(&mut self) {
+        self.bus.disarm(self.now);
+        self.judge.may_move = false;
+    }
+
+    pub(super) fn stop(&mut self) -> Vec<CanFrame> {
+        self.judge.stopped = true;
+        self.bus.stop_frames().collect()
+    }
+
+    pub(super) fn target(&mut self, target: &[f64]) -> bool {
+        self.bus.target(target, self.now, self.now)
+    }
+
+    /// A frame reaches the machine.
+    pub(super) fn feed(&mut self, frame: &CanFrame) {
+        self.bus.feed(frame, self.now);
+        if Reply::decode(frame).is_some() {
+            return;
+        }
+        for ((axis, sim), motor) in self.judge.axes.iter_mut().zip(&self.sims).zip(&self.spec.motors) {
+            let id = u16::from(frame.data[0] & 0xf);
+            if frame.id != u32::from(sim.master) || id != sim.slave & 0xf {
+                continue;
+            }
+            let [p, v, t] = sim.ranges;
+            let said = Feedback::decode(frame, &Ranges::new(p, v, t).unwrap()).unwrap();
+            axis.unanswered = None;
+            // Once armed, and once it was on, whatever is not on ends it all.
+            let was_on = axis.is_on;
+            axis.is_on = said.status == MotorStatus::Enabled;
+            let too_hot = f64::from(said.mos) >= motor.max_mos || f64::from(said.rotor) >= motor.max_rotor;
+            self.judge.may_move &= !(was_on && (!axis.is_on || too_hot));
+            axis.reported = Some(said.q);
+        }
+    }
+
+    pub(super) fn cycle(&mut self) {
+        self.now = self.now.after(CYCLE);
+        if self.answers.len() > self.latency {
+            for frame in self.answers.pop_front().unwrap_or_default() {
+                self.feed(&frame);
+            }
+        }
+        let mut sent = Vec::new();
+        self.bus.step(self.now, |frame| sent.push(frame));
+        assert!(sent.len() <= 2 * self.sims.len());
+        let mut answers = Vec::new();
+        for frame in &sent {
+            self.look(frame);
+            answers.extend(self.sims.iter_mut().filter_map(|sim| sim.answer(frame)));
+        }
+        self.answers.push_back(answers);
+        self.sent = sent;
+        while let Some(notice) = self.bus.take_notice() {
+            assert!(!notice.words(self.bus.names()).to_string().is_empty());
+            self.notices.push(notice);
+        }
+    }
+
+    /// Judges a frame.
+    fn look(&mut self, frame: &CanFrame) {
+        assert!(!self.judge.stopped, "{frame:x?} after a stop");
+        let silent_after = self.spec.silent_after.max(CYCLE * 3) + CYCLE * 2;
+        for ((axis, sim), motor) in self.judge.axes.iter_mut().zip(&self.sims).zip(&self.spec.motors) {
+            let slave = u32::from(sim.slave);
+            let is_order = frame.id == slave && frame.data.starts_with(&[0xff; 7]);
+            let is_mine = frame.id == 0x7ff && u16::from_le_bytes([frame.data[0], frame.data[1]]) == sim.slave;
+            if frame.id == slave || frame.id == slave + 0x100 || frame.id == slave + 0x200 || is_mine {
+                axis.unanswered.get_or_insert(self.now);
+            }
+            let unanswered = axis.unanswered.map_or(Duration::ZERO, |since| self.now.since(since));
+            if is_order && frame.data[7] == 0xfd {
+                // Told to turn off: what it says until then is of the past.
+                *axis = Axis { is_on: false, command: None, ..axis.clone() };
+            }
+            if is_order && frame.data[7] == 0xfc {
+                axis.command = None;
+                assert!(self.judge.may_move, "a motor was enabled without an arm");
+            }
+            if is_order || ![slave, slave + 0x100, slave + 0x200].contains(&frame.id) {
+                continue;
+            }
+            assert!(self.judge.may_move, "{frame:x?} while nothing may move");
+            assert!(unanswered < silent_after, "a command to a motor that is silent for {unanswered:?}");
+            let command = command_of(frame, sim.slave, sim.ranges);
+            let measured = axis.reported.expect("a command before any answer");
+            let quantum = 25.0 / 65_535.0;
+            if frame.id == slave + 0x200 {
+                assert!(command.abs() <= motor.velocity + 1e-6);
+                let beyond =
+                    measured > motor.position[1] && command > 0.0 || measured < motor.position[0] && command < 0.0;
+                assert!(!beyond, "{command} rad/s at {measured}");
+                continue;
+            }
+            if !axis.is_on {
+                assert!((command - measured).abs() <= quantum, "first command {command} at {measured}");
+                continue;
+            }
+            let [low, high] = motor.position;
+            let range = low.min(measured) - quantum..=high.max(measured) + quantum;
+            let reach = match motor.mode {
+                MotorMode::Mit { kp, .. } => motor.torque / kp,
+                _ => f64::INFINITY,
+            };
+            assert!((command - measured).abs() <= reach + quantum, "{command} too far from {measured}");
+            if let Some((before, at)) = axis.command {
+                let step = motor.slew * self.now.since(at).min(CYCLE * 2).as_secs_f64() + 2.0 * quantum;
+                let pulled = (command - measured).abs() >= reach - 2.0 * quantum;
+                assert!((command - before).abs() <= step || pulled, "from {before} to {command}");
+                // Whoever starts beyond the limits may stay there and come back, no more.
+                let back = command.abs() <= before.abs() + quantum;
+                assert!(range.contains(&command) || back, "{command} is beyond the limits, at {measured}");
+            }
+            axis.command = Some((command, self.now));
+        }
+    }
+
+    pub(super) fn run(&mut self, cycles: usize) {
+        for _ in 0..cycles {
+            self.cycle();
+        }
+    }
+
+    pub(super) fn run_until(&mut self, state: BusState) {
+        for _ in 0..1000 {
+            if self.bus.state() == state {
+                return;
+            }
+            self.cycle();
+        }
+        panic!("{:?} and not {state:?} after 5 s; {:?}", self.bus.state(), self.notices);
+    }
+
+    pub(super) fn run_to_fault(&mut self) -> Fault {
+        for _ in 0..1000 {
+            if let BusState::Faulted(fault) = self.bus.state() {
+                assert!(self.notices.contains(&Notice::Fault(fault)));
+                return fault;
+            }
+            self.cycle();
+        }
+        panic!("{:?} and no fault after 5 s", self.bus.state());
+    }
+
+    /// Was anything but orders to turn off and requests sent in the last cycle?
+    pub(super) fn moved(&self) -> bool {
+        let harmless = |frame: &CanFrame| frame.id == 0x7ff || frame.data == [255, 255, 255, 255, 255, 255, 255, 0xfd];
+        !self.sent.iter().all(harmless)
+    }
+
+    pub(super) fn told(&self, notice: Notice) -> usize {
+        self.notices.iter().filter(|told| **told == notice).count()
+    }
+}

@@ -1,0 +1,221 @@
+//! Motors of a CAN bus that speak Damiao's protocol, as `[device.NAME.can]` tells of them.
+//!
+//! Invariant: which ranges a motor counts in is read from the motor. [`MotorKind`] says what the maker
+//! ships, to compare it with.
+
+use std::time::Duration;
+
+/// Motors of one bus, at the most: an action has an axis each, a sample 6 numbers each.
+pub const MAX_MOTORS: usize = 10;
+
+/// `protocol = "damiao"`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DamiaoSpec {
+    /// One motor an axis, in the order of samples and actions, `1..=`[`MAX_MOTORS`] of them. No two are [`Self::indistinct`].
+    pub motors: Vec<MotorSpec>,
+    /// Commands a second to each motor, `10..=1000`, default 200.
+    pub hz: u32,
+    /// Without an action for this long the motors hold; `None` is twice the time between actions.
+    pub deadman: Option<Duration>,
+    /// Holding for this long they are disabled.
+    pub disable_after: Duration,
+    /// The motors' own limit: without a frame for this long they stop by themselves. Above 0.
+    pub timeout: Duration,
+    /// A motor that leaves frames unanswered for this long is silent, default 50 ms.
+    pub silent_after: Duration,
+}
+
+/// One motor.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MotorSpec {
+    /// What it is called, in messages and as the name of its axis.
+    pub name: String,
+    /// CAN id it listens to (Damiao: `CAN_ID` or `ESC_ID`), `1..=0xff`.
+    pub slave: u16,
+    /// CAN id it answers with (Damiao: `MST_ID` or Master ID), `0..=0x7ff`.
+    pub master: u16,
+    /// Which motor it is.
+    pub kind: MotorKind,
+    /// How it is driven.
+    pub mode: MotorMode,
+    /// Lowest and highest position, rad; finite, the lowest first.
+    pub position: [f64; 2],
+    /// Highest speed, rad/s; above 0.
+    pub velocity: f64,
+    /// Highest torque, Nm; above 0. Bounds what the position error asks for in [`MotorMode::Mit`]; the
+    /// other modes have no torque in their frames.
+    pub torque: f64,
+    /// Highest change of the command: rad/s of a commanded position, rad/s² of a commanded velocity;
+    /// above 0.
+    pub slew: f64,
+    /// Highest temperature of its transistors, °C.
+    pub max_mos: f64,
+    /// Highest temperature of its winding, °C.
+    pub max_rotor: f64,
+}
+
+/// How a motor is driven, and what its axis of an action means.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum MotorMode {
+    /// Impedance: torque = `kp` (position error) - `kd` velocity. The action is a position, rad.
+    Mit {
+        /// Nm/rad, `0..=500`.
+        kp: f64,
+        /// Nm s/rad, `0..=5`.
+        kd: f64,
+    },
+    /// The motor's own position loop, at most at the motor's [`MotorSpec::velocity`]. The action is a
+    /// position, rad.
+    PositionVelocity,
+    /// The motor's own velocity loop. The action is a velocity, rad/s.
+    Velocity,
+}
+
+/// Damiao's motors, by name: programs number them differently.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[allow(missing_docs)]
+pub enum MotorKind {
+    Dm3507,
+    Dm4310,
+    Dm4310V48,
+    Dm4340,
+    Dm4340V48,
+    Dm6006,
+    Dm8006,
+    Dm8009,
+    Dm10010,
+    Dm10010L,
+    Dmg6220,
+    Dmh3510,
+    Dmh6215,
+}
+
+impl MotorKind {
+    /// All of them.
+    pub const ALL: [Self; 13] = [
+        Self::Dm3507,
+        Self::Dm4310,
+        Self::Dm4310V48,
+        Self::Dm4340,
+        Self::Dm4340V48,
+        Self::Dm6006,
+        Self::Dm8006,
+        Self::Dm8009,
+        Self::Dm10010,
+        Self::Dm10010L,
+        Self::Dmg6220,
+        Self::Dmh3510,
+        Self::Dmh6215,
+    ];
+
+    /// As it is written in `devices.toml`.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Dm3507 => "DM3507",
+            Self::Dm4310 => "DM4310",
+            Self::Dm4310V48 => "DM4310_48V",
+            Self::Dm4340 => "DM4340",
+            Self::Dm4340V48 => "DM4340_48V",
+            Self::Dm6006 => "DM6006",
+            Self::Dm8006 => "DM8006",
+            Self::Dm8009 => "DM8009",
+            Self::Dm10010 => "DM10010",
+            Self::Dm10010L => "DM10010L",
+            Self::Dmg6220 => "DMG6220",
+            Self::Dmh3510 => "DMH3510",
+            Self::Dmh6215 => "DMH6215",
+        }
+    }
+
+    /// PMAX in rad, VMAX in rad/s and TMAX in Nm as the motor leaves the factory. Source: the tables of the
+    /// public drivers `DM_CAN.py` and of `LeRobot`.
+    #[must_use]
+    pub const fn shipped(self) -> [f64; 3] {
+        match self {
+            Self::Dm3507 | Self::Dm4310 => [12.5, 30.0, 10.0],
+            Self::Dm4310V48 => [12.5, 50.0, 10.0],
+            Self::Dm4340 => [12.5, 8.0, 28.0],
+            Self::Dm4340V48 => [12.5, 10.0, 28.0],
+            Self::Dm6006 => [12.5, 45.0, 20.0],
+            Self::Dm8006 => [12.5, 45.0, 40.0],
+            Self::Dm8009 => [12.5, 45.0, 54.0],
+            Self::Dm10010L => [12.5, 25.0, 200.0],
+            Self::Dm10010 => [12.5, 20.0, 200.0],
+            Self::Dmh3510 => [12.5, 280.0, 1.0],
+            Self::Dmh6215 | Self::Dmg6220 => [12.5, 45.0, 10.0],
+        }
+    }
+
+    /// The motor of this name.
+    #[must_use]
+    pub fn named(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|kind| kind.name() == name)
+    }
+}
+
+impl DamiaoSpec {
+    /// The first two motors, by position, that cannot be told apart on the bus: one listens to what the
+    /// other does, or they answer with one id and the same low four bits of their own.
+    #[must_use]
+    pub fn indistinct(&self) -> Option<(usize, usize)> {
+        let alike = |a: &MotorSpec, b: &MotorSpec| {
+            a.slave == b.slave || (a.master == b.master && a.slave & 0xf == b.slave & 0xf)
+        };
+        self.motors.iter().enumerate().find_map(|(at, motor)| {
+            let earlier = self.motors.iter().take(at).position(|other| alike(other, motor))?;
+            Some((earlier, at))
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn motors(ids: &[(u16, u16)]) -> DamiaoSpec {
+        let motor = |(slave, master)| MotorSpec {
+            name: format!("m{slave}"),
+            slave,
+            master,
+            kind: MotorKind::Dm4310,
+            mode: MotorMode::Velocity,
+            position: [-1.0, 1.0],
+            velocity: 1.0,
+            torque: 1.0,
+            slew: 1.0,
+            max_mos: 80.0,
+            max_rotor: 80.0,
+        };
+        let second = Duration::from_secs(1);
+        DamiaoSpec {
+            motors: ids.iter().copied().map(motor).collect(),
+            hz: 200,
+            deadman: None,
+            disable_after: second,
+            timeout: second,
+            silent_after: second,
+        }
+    }
+
+    #[test]
+    fn motors_that_answer_alike_are_found() {
+        for (ids, pair) in [
+            (&[(1, 0x11), (2, 0x12), (3, 0x13)][..], None),
+            (&[(1, 0), (2, 0), (3, 0)], None),
+            (&[(1, 0x11), (0x11, 0x21)], None),
+            (&[(1, 0x11), (2, 0x12), (1, 0x13)], Some((0, 2))),
+            (&[(1, 0), (2, 0), (0x12, 0)], Some((1, 2))),
+        ] {
+            assert_eq!(motors(ids).indistinct(), pair, "{ids:x?}");
+        }
+    }
+
+    #[test]
+    fn names_are_unique_and_found() {
+        for kind in MotorKind::ALL {
+            assert_eq!(MotorKind::named(kind.name()), Some(kind));
+        }
+        assert_eq!(MotorKind::named("DM1"), None);
+    }
+}
