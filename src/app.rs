@@ -81,6 +81,8 @@ pub struct Options {
     pub policy: Option<PolicyOptions>,
     /// Begin an episode at the start.
     pub record: bool,
+    /// Arm the actuator as soon as it is there, once.
+    pub arm: bool,
     /// How long to record, or to run when nothing is recorded.
     pub duration: Option<Duration>,
     /// Keeps this rig apart from another on the machine.
@@ -193,7 +195,8 @@ pub async fn run(options: Options) -> Result<(), AppError> {
 
     let rig_stop = CancellationToken::new();
     let (rig_commands, rig_asked) = mpsc::channel(16);
-    let mut rig = Rig::new(&registry, &bus, presence, Arc::clone(&board)).following(recorder.episode());
+    let mut rig =
+        Rig::new(&registry, &bus, presence, Arc::clone(&board)).following(recorder.episode()).arming(options.arm);
     let rig_ended = CancellationToken::new();
     let hurry = rig.hurry();
     let rig = tokio::spawn({

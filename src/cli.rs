@@ -142,6 +142,9 @@ pub struct RunArgs {
     /// Demonstrations to record, each of another trial
     #[arg(long, value_name = "COUNT", default_value_t = 1, requires = "expert")]
     pub episodes: usize,
+    /// Let the actuator move as soon as it is there; without this `rapid arm` or a key of the monitor does
+    #[arg(long)]
+    pub arm: bool,
     /// Half width of an observation's window [default: as the registry says]
     #[arg(long, value_name = "TIME", value_parser = window)]
     pub window: Option<Duration>,
@@ -200,6 +203,12 @@ pub enum Command {
         #[arg(long)]
         watch: bool,
     },
+    /// Lets the actuator of a running rapid move: motors are enabled, and follow actions
+    #[command(after_help = "An actuator that was unplugged, failed or was disarmed needs this again.\n\nExamples:\n  \
+        rapid arm\n  rapid arm --instance left")]
+    Arm,
+    /// Stops the actuator of a running rapid: its motors are disabled
+    Disarm,
     /// Tells what an episode holds: verdict, rates, gaps, lateness, presence over time
     #[command(after_help = "Of one file a report; of a folder or of several files one line each, GOOD, SUSPECT or \
         BAD.\n\nExamples:\n  rapid inspect episodes/20260101_place-block_001.mcap\n  rapid inspect episodes\n  \

@@ -1,6 +1,7 @@
 //! Subcommands that need no rig: each writes to a given stream and says how it ended.
 
 pub mod ablation;
+pub mod arm;
 pub mod artifacts;
 pub mod calibrate;
 pub mod check;

@@ -41,6 +41,8 @@ pub(super) enum Failure {
     #[error(transparent)]
     Register(#[from] commands::register::RegisterError),
     #[error(transparent)]
+    Order(#[from] commands::arm::OrderError),
+    #[error(transparent)]
     Mask(#[from] commands::mask::MaskError),
     #[error(transparent)]
     Calibrate(#[from] commands::calibrate::CalibrateError),
@@ -131,7 +133,7 @@ impl Failure {
             Self::Ablation(error) if error.is_bad_argument() => 2,
             Self::Register(error) if error.is_bad_argument() => 2,
             Self::Recover(outcome) if outcome.is_bad_argument() => 2,
-            Self::NoPolicy(_) | Self::App(AppError::Required(_)) => 3,
+            Self::NoPolicy(_) | Self::App(AppError::Required(_)) | Self::Order(commands::arm::OrderError::Nobody) => 3,
             _ => 1,
         }
     }

@@ -18,6 +18,7 @@ use std::time::Duration;
 
 use serde::Serialize;
 
+use crate::action::Order;
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::sample::Epoch;
@@ -180,6 +181,8 @@ pub enum Command {
     ToggleRecording,
     /// Start a failed device again.
     Restart(ModalityId),
+    /// Let the actuator move, or stop it.
+    Order(Order),
     /// End the program.
     Quit,
 }

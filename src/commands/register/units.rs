@@ -94,7 +94,7 @@ pub fn kind(attachment: &Attachment) -> Option<&'static str> {
             let is_can = std::fs::read_to_string(attachment.syspath.join("type")).is_ok_and(|kind| kind.trim() == CAN);
             Some(if is_can { "can" } else { "lan" })
         }
-        DeviceNode::Usb(_) | DeviceNode::Lan(_) => None,
+        DeviceNode::Usb(_) | DeviceNode::Lan { .. } => None,
         DeviceNode::Sim(device) => match device.source {
             SimSource::Camera { .. } | SimSource::Task { part: TaskPart::Wrist | TaskPart::Tactile, .. } => {
                 Some("camera")
