@@ -5,14 +5,15 @@
 
 mod support;
 
-use std::collections::BTreeMap;
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream, UdpSocket};
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::process::{Child, Command, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use mdns_sd::{ServiceDaemon, ServiceEvent, ServiceInfo};
 use rapid::driver::sim;
 use rapid::registry::scenario::SimSource;
 use rustix::process::Signal;
@@ -44,7 +45,10 @@ struct Server {
 
 impl Server {
     fn start(port: u16, answer: impl Fn(TcpStream) + Send + Sync + 'static) -> Self {
-        let address = SocketAddr::from(([127, 0, 0, 1], port));
+        Self::start_at(([127, 0, 0, 1], port).into(), answer)
+    }
+
+    fn start_at(address: SocketAddr, answer: impl Fn(TcpStream) + Send + Sync + 'static) -> Self {
         let mut listener = None;
         // The port of a server that was just killed may still be in use for a moment.
         until("the port", || {
@@ -86,7 +90,7 @@ impl Drop for Server {
 }
 
 /// The path of a request, which is read to its end; `None` of a connection without one.
-fn request(stream: &mut TcpStream) -> Option<(String, BTreeMap<String, String>)> {
+fn request(stream: &mut TcpStream) -> Option<String> {
     let mut text = Vec::new();
     while !text.ends_with(b"\r\n\r\n") {
         let mut byte = [0];
@@ -94,10 +98,7 @@ fn request(stream: &mut TcpStream) -> Option<(String, BTreeMap<String, String>)>
         text.push(byte[0]);
     }
     let text = String::from_utf8(text).expect("ASCII");
-    let mut lines = text.lines();
-    let path = lines.next()?.split(' ').nth(1)?.to_owned();
-    let headers = lines.filter_map(|line| line.split_once(": ")).map(|(k, v)| (k.to_lowercase(), v.to_owned()));
-    Some((path, headers.collect()))
+    Some(text.lines().next()?.split(' ').nth(1)?.to_owned())
 }
 
 /// A camera that sends pictures 50 times a second, the boundary as most of them write it.
@@ -300,22 +301,16 @@ fn a_phone_connects_and_sends_pictures_with_poses() {
 struct Gopro {
     asked: Mutex<Vec<String>>,
     recording: AtomicBool,
-    /// Of how many downloads each ends early.
-    breaks: AtomicU32,
 }
 
 impl Gopro {
-    const CLIP: usize = 3 << 20;
-
-    fn clip() -> Vec<u8> {
-        (0..Self::CLIP).map(|index| u8::try_from(index % 251).expect("below 256")).collect()
-    }
+    const CLIP: u64 = 3 << 20;
 
     fn answer(&self, mut stream: TcpStream) {
-        let Some((path, headers)) = request(&mut stream) else { return };
+        let Some(path) = request(&mut stream) else { return };
         self.asked.lock().expect("no panic").push(path.clone());
         let recording = || self.recording.load(Ordering::Relaxed);
-        let mut body = match path.split('?').next().unwrap_or_default() {
+        let body = match path.split('?').next().unwrap_or_default() {
             "/gopro/camera/info" => br#"{"model_name":"HERO11 Black","firmware_version":"H22.01"}"#.to_vec(),
             "/gopro/camera/state" => {
                 format!(r#"{{"status":{{"8":0,"10":{},"70":90}}}}"#, u8::from(recording())).into_bytes()
@@ -330,37 +325,36 @@ impl Gopro {
             }
             "/gopro/media/last_captured" => br#"{"folder":"100GOPRO","file":"GX010001.MP4"}"#.to_vec(),
             "/gopro/media/info" => format!(r#"{{"s":"{}"}}"#, Self::CLIP).into_bytes(),
-            "/videos/DCIM/100GOPRO/GX010001.MP4" => Self::clip(),
             _ => b"{}".to_vec(),
         };
-        let range =
-            headers.get("range").and_then(|range| range.strip_prefix("bytes=")?.strip_suffix('-')?.parse().ok());
-        let status = if range.is_some() { "206 Partial Content" } else { "200 OK" };
-        body.drain(..range.unwrap_or(0));
-        let head = format!("HTTP/1.1 {status}\r\nContent-Length: {}\r\n\r\n", body.len());
-        let is_clip = path.starts_with("/videos");
-        if is_clip && self.breaks.load(Ordering::Relaxed) > 0 {
-            self.breaks.fetch_sub(1, Ordering::Relaxed);
-            body.truncate(body.len() / 2);
-        }
+        let head = format!("HTTP/1.1 200 OK\r\nContent-Length: {}\r\n\r\n", body.len());
         let _ = stream.write_all(head.as_bytes()).and_then(|()| stream.write_all(&body));
     }
 }
 
-#[test]
-fn a_gopro_is_there_while_it_answers() {
-    let (place, [port]) = (Place::new(), free_ports());
-    let entry = format!(
+/// An entry of a GoPro that is at this port.
+fn gopro_entry(port: u16, more: &str) -> String {
+    format!(
         "{RIG}[device.gopro]\nnode = \"lan\"\nbit = 0\n[device.gopro.lan]\nprotocol = \"gopro\"\nhost = \"127.0.0.1\"\n\
-         port = {port}\n"
-    );
-    place.write("devices.toml", &entry);
-    let running = place.start(&RUN, "begin");
+         port = {port}\n{more}\n"
+    )
+}
+
+fn gopro_at(port: u16) -> (Arc<Gopro>, Server) {
     let gopro = Arc::new(Gopro::default());
     let server = Server::start(port, {
         let gopro = Arc::clone(&gopro);
         move |stream| gopro.answer(stream)
     });
+    (gopro, server)
+}
+
+#[test]
+fn a_gopro_is_there_while_it_answers() {
+    let (place, [port]) = (Place::new(), free_ports());
+    place.write("devices.toml", &gopro_entry(port, ""));
+    let running = place.start(&RUN, "begin");
+    let (gopro, server) = gopro_at(port);
     wait_for(&running, "gopro", "streaming", 1);
     drop(server);
     wait_for(&running, "gopro", "by lease", 1);
@@ -370,6 +364,27 @@ fn a_gopro_is_there_while_it_answers() {
         assert!(asked.iter().any(|path| path == request), "{asked:?}");
     }
     assert!(asked.iter().any(|path| path.starts_with("/gopro/camera/set_date_time?date=20")), "{asked:?}");
+    assert!(!asked.iter().any(|path| path.contains("shutter")), "nothing was recorded: {asked:?}");
+}
+
+#[test]
+fn a_gopro_records_with_the_episode_and_its_clip_is_noted_beside_it() {
+    let (place, [port]) = (Place::new(), free_ports());
+    place.write("devices.toml", &gopro_entry(port, ""));
+    let (gopro, _server) = gopro_at(port);
+    let running = place.start(&[&RUN[..], &["--record", "--out", "out"]].concat(), "begin");
+    wait_for(&running, "gopro", "streaming", 1);
+    until("the shutter", || gopro.recording.load(Ordering::Relaxed));
+    let told = stop(running);
+    assert!(!gopro.recording.load(Ordering::Relaxed), "the camera records on");
+    let files = place.files("out");
+    let episode = files.iter().find(|name| name.ends_with(".mcap")).expect("an episode");
+    let stem = episode.trim_end_matches(".mcap");
+    let note = std::fs::read_to_string(place.path("out").join(format!("{stem}.gopro.clip.json")));
+    let note: Value =
+        serde_json::from_str(&note.unwrap_or_else(|_| panic!("no note in {files:?}: {told:#?}"))).expect("JSON");
+    assert_eq!((note["folder"].as_str(), note["file"].as_str()), (Some("100GOPRO"), Some("GX010001.MP4")));
+    assert_eq!(note["size"].as_u64(), Some(Gopro::CLIP));
 }
 
 /// What a hostile server does with a connection.
@@ -488,4 +503,95 @@ fn entries_on_the_network_are_simulated_like_any_other() {
     for device in ["cam_lan", "lidar", "lidar_asked", "gopro", "cam_behind_adapter", "phone", "phone_pose"] {
         assert_eq!(life_of(&told, device), ["opening", "streaming"], "{device}");
     }
+}
+
+/// Announces a service until it is told to say goodbye or is killed: a process of its own, so that it can
+/// be.
+struct Responder(Child);
+
+impl Responder {
+    fn start(service: &str, port: u16) -> Self {
+        let child = Command::new(std::env::current_exe().expect("this test"))
+            .args(["--exact", "announce_a_service", "--ignored", "--nocapture"])
+            .env("ANNOUNCE", format!("{service} {port}"))
+            .stdin(Stdio::piped())
+            .stdout(Stdio::null())
+            .spawn();
+        Self(child.expect("runs"))
+    }
+
+    fn say_goodbye(mut self) {
+        drop(self.0.stdin.take());
+        let _ = self.0.wait();
+    }
+}
+
+impl Drop for Responder {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+#[test]
+#[ignore = "a part of the test below, in a process of its own"]
+fn announce_a_service() {
+    let Ok(what) = std::env::var("ANNOUNCE") else { return };
+    let (service, port) = what.split_once(' ').expect("service and port");
+    let daemon = ServiceDaemon::new().expect("mDNS");
+    let port = port.parse().expect("a port");
+    let info = ServiceInfo::new(&format!("{service}.local."), "cam one", "rapid-test.local.", "", port, None);
+    let info = info.expect("a service").enable_addr_auto();
+    let name = info.get_fullname().to_owned();
+    daemon.register(info).expect("announced");
+    let _ = std::io::stdin().read_to_end(&mut Vec::new());
+    let done = daemon.unregister(&name).expect("unannounced");
+    let _ = done.recv_timeout(Duration::from_secs(5));
+}
+
+/// Does multicast reach from one process of this machine to another?
+fn can_be_heard(service: &str) -> bool {
+    let daemon = ServiceDaemon::new().expect("mDNS");
+    let events = daemon.browse(&format!("{service}.local.")).expect("browsing");
+    let begun = Instant::now();
+    let mut heard = false;
+    while !heard && begun.elapsed() < Duration::from_secs(15) {
+        let event = events.recv_timeout(Duration::from_millis(100));
+        heard = matches!(event, Ok(ServiceEvent::ServiceResolved(_)));
+    }
+    let _ = daemon.shutdown();
+    heard
+}
+
+#[test]
+fn a_device_that_announces_itself_comes_and_goes_by_goodbye_and_by_lease() {
+    let (place, [port]) = (Place::new(), free_ports());
+    let service = format!("_rt{}._tcp", std::process::id());
+    let entry = camera_entry("cam", 0, port).replace("host = \"127.0.0.1\"", &format!("mdns = {service:?}"));
+    // The port is the announced one.
+    place.write("devices.toml", &format!("{RIG}{}", entry.replace(&format!("port = {port}\n"), "")));
+    let anywhere = SocketAddr::from(([0; 4], port));
+    let server = Server::start_at(anywhere, camera);
+    let responder = Responder::start(&service, port);
+    if !can_be_heard(&service) {
+        eprintln!("multicast does not work on this machine: nothing is found by mDNS, and nothing is tested");
+        return;
+    }
+    let running = place.start(&RUN, "begin");
+    wait_for(&running, "cam", "streaming", 1);
+    // A goodbye counts although pictures arrive.
+    responder.say_goodbye();
+    wait_for(&running, "cam", "by goodbye", 1);
+    let responder = Responder::start(&service, port);
+    wait_for(&running, "cam", "streaming", 2);
+    // Nobody says anything: the cable is pulled.
+    drop(responder);
+    drop(server);
+    wait_for(&running, "cam", "by lease", 1);
+    let told = stop(running);
+    let life = life_of(&told, "cam");
+    let gone: Vec<_> = life.iter().filter(|word| word.starts_with("by ")).collect();
+    assert_eq!(gone, ["by goodbye", "by lease"], "{life:?}");
+    let attached = told.iter().find(|event| event["event"] == "attach").expect("attached");
+    assert_eq!(attached["instance"], "cam one");
 }

@@ -167,5 +167,6 @@ pub(crate) fn board(names: &[&str]) -> Board {
         devices: names.iter().enumerate().map(device).collect(),
         path: None,
         text: String::new(),
+        modules: Vec::new(),
     })
 }

@@ -181,7 +181,12 @@ impl LanSpec {
         match (self.modality_kind(), self.picture()) {
             (ModalityKind::Image, Some(picture)) => {
                 let pixels = u64::from(picture.width) * u64::from(picture.height);
-                ((2 * pixels).max(SMALLEST_JPEG), 1024)
+                let most = match &self.protocol {
+                    // It compresses to some fifth of a byte a pixel (quality 0.7), and its pictures are large.
+                    LanProtocol::Iphone { .. } => pixels / 2,
+                    _ => 2 * pixels,
+                };
+                (most.max(SMALLEST_JPEG), 4096)
             }
             (ModalityKind::Scalars, _) => (8 * u64::from(POSE), 8 * u64::from(POSE)),
             // What an Ethernet frame carries is under 1500.
