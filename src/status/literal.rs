@@ -168,5 +168,6 @@ pub(crate) fn board(names: &[&str]) -> Board {
         modules: Vec::new(),
         path: None,
         text: String::new(),
+        modules: Vec::new(),
     })
 }

@@ -5,6 +5,7 @@
 mod bandwidth;
 mod facts;
 mod judge;
+mod machine;
 mod usb;
 
 use std::io::{self, Write};
