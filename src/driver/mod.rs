@@ -173,7 +173,9 @@ impl Driver {
     /// # Errors
     /// When the device cannot do it, for people; it is read on.
     pub fn record(&mut self, episode: Option<&Arc<Episode>>) -> Result<(), DriverError> {
-        let _ = episode;
+        if let Self::Sim(driver) = self {
+            driver.record(episode.is_some());
+        }
         Ok(())
     }
 
@@ -182,6 +184,7 @@ impl Driver {
     pub async fn close(self) {
         match self {
             Self::Motors(driver) => driver.close().await,
+            Self::Sim(mut driver) => driver.record(false),
             _ => {}
         }
     }

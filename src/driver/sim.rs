@@ -21,7 +21,7 @@ use self::pictures::{PICTURES, Pictures, Scene, encode, fill, write_picture};
 use super::{DriverError, Reading, unblock};
 use crate::provenance::{Format, Negotiated};
 use crate::registry::scenario::{self, SimDevice, SimSource, TaskPart};
-use crate::registry::{DeviceSpec, NodeSpec};
+use crate::registry::{DeviceSpec, MOTOR_CHANNELS, NodeSpec};
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
 use crate::time::{Stamp, nanoseconds};
 
@@ -47,6 +47,11 @@ pub struct Sim {
     /// The sample in `payload` is to be sent once more, with this stamp.
     again: Option<Stamp>,
     controls: BTreeMap<String, i64>,
+    /// Of simulated motors: where each was last told to go, once they were told.
+    motors: Vec<f64>,
+    moved: bool,
+    /// It was told to record.
+    records: bool,
 }
 
 #[derive(Debug)]
@@ -87,14 +92,31 @@ impl Sim {
         let grid = Grid { begun: device.begun, rate: u64::from(rate.max(1)) };
         let next = grid.first_after(stamp_of(Instant::now()));
         let (payload, controls) = (Vec::with_capacity(capacity), BTreeMap::new());
-        Ok(Self { device, content, grid, next, backlog, payload, owed: 0, again: None, controls })
+        Ok(Self {
+            device,
+            content,
+            grid,
+            next,
+            backlog,
+            payload,
+            owed: 0,
+            again: None,
+            controls,
+            motors: Vec::new(),
+            moved: false,
+            records: false,
+        })
     }
 
-    /// With the controls that `spec` sets: a simulated camera has those and no others.
+    /// With the controls that `spec` sets: a simulated camera has those and no others. With its motors,
+    /// which are where they are told to be.
     #[must_use]
     pub(super) fn with_controls(mut self, spec: &NodeSpec) -> Self {
         if let NodeSpec::Camera(camera) = spec {
             self.controls = camera.controls.iter().cloned().collect();
+        }
+        if let NodeSpec::Can(can) = spec {
+            self.motors = vec![0.0; can.channels() / MOTOR_CHANNELS];
         }
         self
     }
@@ -104,6 +126,11 @@ impl Sim {
     /// # Errors
     /// When the device is no actuator, or takes another count of numbers.
     pub(super) fn command(&mut self, target: &[f64]) -> Result<(), DriverError> {
+        if !self.motors.is_empty() && self.motors.len() == target.len() {
+            self.motors.copy_from_slice(target);
+            self.moved = true;
+            return Ok(());
+        }
         match (&self.content, target.try_into()) {
             (Content::Task { part: TaskPart::Arm, trial }, Ok(target)) => trial.trial().command(target),
             (Content::Task { part: TaskPart::Arm, .. }, Err(_)) => {
@@ -113,6 +140,14 @@ impl Sim {
             _ => return Err(DriverError::Fatal(format!("{} is no actuator", self.device.name))),
         }
         Ok(())
+    }
+
+    /// Tells the device to record, or to end that.
+    pub(super) fn record(&mut self, record: bool) {
+        if self.records != record {
+            self.records = record;
+            self.device.record(record);
+        }
     }
 
     /// The next sample.
@@ -146,7 +181,12 @@ impl Sim {
                     let lit = pictures.shows_light() && self.device.light.was_lit(captured.before(faults.latency));
                     pictures.write(sequence, lit, &mut self.payload);
                 }
-                Content::Values { channels, seed } => write_values(*channels, *seed, sequence, &mut self.payload),
+                Content::Values { channels, seed } => {
+                    write_values(*channels, *seed, sequence, &mut self.payload);
+                    if self.moved {
+                        write_positions(&self.motors, &mut self.payload);
+                    }
+                }
                 Content::Task { part, trial } => {
                     let mut trial = trial.trial();
                     trial.advance_to(u32::try_from(point).unwrap_or(u32::MAX));
@@ -312,6 +352,15 @@ fn write_values(channels: usize, seed: u64, sequence: u32, payload: &mut Vec<u8>
             (TAU * (f64::from(sequence % 100_000) / 100.0 + phase)).sin()
         };
         payload.extend_from_slice(&value.to_le_bytes());
+    }
+}
+
+/// Puts the positions of motors in front of what else a sample says of each.
+fn write_positions(positions: &[f64], payload: &mut [u8]) {
+    for (motor, position) in payload.chunks_exact_mut(8 * MOTOR_CHANNELS).zip(positions) {
+        if let Some((place, _)) = motor.split_first_chunk_mut() {
+            *place = position.to_le_bytes();
+        }
     }
 }
 

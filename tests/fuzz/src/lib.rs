@@ -7,6 +7,7 @@
 //!
 //! Invariant: a target depends on its input alone, so that an input that broke it breaks it again.
 
+pub mod motors;
 pub mod mutate;
 pub mod policy;
 pub mod rules;
@@ -41,6 +42,7 @@ pub const TARGETS: &[Target] = &[
     Target { name: "text", run: targets::text, seeds: seeds::strings },
     Target { name: "bundle", run: policy::bundle, seeds: policy::bundles },
     Target { name: "picture", run: policy::picture, seeds: policy::pictures },
+    Target { name: "motors", run: motors::motors, seeds: motors::sessions },
 ];
 
 /// The target of this name.
