@@ -66,15 +66,20 @@ fn episodes_count_for_the_configuration_they_say_they_are_of() {
     assert_eq!(tags["finger"], "soft");
     let configuration: Value = serde_json::from_str(episode.said("rapid", "configuration")).expect("JSON");
     assert_eq!(configuration["modules"], serde_json::json!(["soft_tip"]));
-    let present: Vec<&str> =
-        configuration["present"].as_array().expect("names").iter().filter_map(Value::as_str).collect();
+    assert_eq!(configuration["present"], serde_json::json!(["cam_wrist"]));
     let any = ["--count", "any"];
-    // Whether the camera ran at that very moment is the episode's to say; so is what it counts for.
-    assert!(present.is_empty() || present == ["cam_wrist"], "{present:?}");
-    assert_eq!(counts(&ablation(&place, &any)), [u64::from(!present.is_empty()), 0, 0, 0]);
+    assert_eq!(counts(&ablation(&place, &any)), [1, 0, 0, 0]);
+    // The module whose sensor is there is mounted without being said to.
+    let tactile = record(&place, "both.toml", &[]);
+    let episode = Episode::read(&place.path("episodes").join(&tactile));
+    let tags: Value = serde_json::from_str(episode.said("rapid", "tags")).expect("JSON");
+    assert_eq!(tags["finger"], "tactile");
+    let said = ablation(&place, &any);
+    assert_eq!(counts(&said), [1, 0, 0, 1]);
+    assert_eq!(said.last().expect("a line")["modalities"], "vision+tactile");
 
     let other = record(&place, "vision.toml", &["--tag", "finger=hard"]);
-    assert_ne!(soft, other);
+    assert!(soft != other && tactile != other);
     let said = ablation(&place, &any);
     let left_out = said.iter().find(|line| line["event"] == "not_counted").expect("a line");
     assert_eq!(left_out["episodes"]["of no finger of the plan"], 1);

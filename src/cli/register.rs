@@ -7,7 +7,7 @@ use clap::{Args, ValueHint};
 use super::SimArgs;
 
 pub(super) const REGISTER: &str = "\
-On a terminal it asks for what is not given. Without --serial and --port an entry means the unit that is
+On a terminal it asks for what is not given. Without --serial and --port an entry means the unit that is \
 plugged in by its serial number, or by its port if it has none of its own and is not the only one.
 
 Examples:

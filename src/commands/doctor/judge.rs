@@ -9,7 +9,6 @@ use super::facts::{Facts, Node};
 use super::machine;
 use super::usb::UsbDevice;
 use crate::registry::{DeviceSpec, NodeSpec, Opens, Registry};
-use crate::text;
 
 /// A camera that runs slower than this, Mbit/s, is in the wrong port or on a bad cable.
 const SLOWEST: f64 = 480.0;
@@ -64,9 +63,9 @@ pub(super) fn judge(facts: &Facts, registry: Option<&Registry>, rules: Option<&s
     found.extend(speeds(&plugged));
     found.extend(serials(&facts.usb, entries));
     found.extend(nodes(facts, entries, &plugged));
-    found.extend(udev(facts, rules));
+    found.extend(machine::udev(facts, rules));
     found.extend(suspending(&plugged));
-    found.extend(can(facts, entries, &plugged));
+    found.extend(machine::can(facts, entries, &plugged));
     found.extend(machine::limits(facts, registry));
     found.extend(machine::disk(facts, registry));
     found
@@ -113,7 +112,8 @@ const fn subsystem(entry: &DeviceSpec) -> Option<(&'static str, &'static str)> {
     }
 }
 
-pub(super) fn mb(bytes: f64) -> String {
+/// A rate, for people.
+pub(super) fn megabytes(bytes: f64) -> String {
     format!("{:.1} MB/s", bytes / 1e6)
 }
 
@@ -144,7 +144,7 @@ fn bus(bus: u32, mbit: f64, wishes: &[Wish]) -> Finding {
     let estimated = wishes.iter().any(Wish::is_estimated);
     let most = if estimated { "at most (estimated: the largest pictures that MJPG may give) " } else { "" };
     let (taken, budget) = (bandwidth::taken(wishes, mbit), bandwidth::budget(mbit));
-    let what = format!("bus {bus} carries {names}: {most}{} of {}", mb(taken), mb(budget));
+    let what = format!("bus {bus} carries {names}: {most}{} of {}", megabytes(taken), megabytes(budget));
     let lower = bandwidth::fitting(wishes, mbit);
     let fix = match &lower {
         Some(lower) if lower.is_empty() => return Finding::ok("bandwidth", what),
@@ -269,27 +269,6 @@ fn nodes(facts: &Facts, entries: &[DeviceSpec], plugged: &[(&DeviceSpec, &UsbDev
     found
 }
 
-fn udev(facts: &Facts, rules: Option<&str>) -> Vec<Finding> {
-    const INSTALL: &str = "sudo rapid artifacts --install";
-    let mut found = Vec::new();
-    if !facts.udev_runs {
-        let what = "no udev daemon runs: plugged devices are not seen";
-        found.push(Finding::bad("udev", what, "sudo systemctl start systemd-udevd"));
-    }
-    match (&facts.rules, rules) {
-        (_, None) => {}
-        (None, Some(_)) => {
-            let what = "the udev rules are not installed: no stable names /dev/rapid/NAME";
-            found.push(Finding::warn("udev", what, INSTALL));
-        }
-        (Some(installed), Some(rules)) if installed != rules => {
-            found.push(Finding::warn("udev", "the installed udev rules are not those of this registry", INSTALL));
-        }
-        (Some(_), Some(_)) => found.push(Finding::ok("udev", "the udev rules are those of this registry")),
-    }
-    found
-}
-
 fn suspending(plugged: &[(&DeviceSpec, &UsbDevice)]) -> Vec<Finding> {
     let mut seen = Vec::new();
     let mut found = Vec::new();
@@ -302,38 +281,6 @@ fn suspending(plugged: &[(&DeviceSpec, &UsbDevice)]) -> Vec<Finding> {
             format!("[device.{}] may be suspended by the kernel while nobody reads it, and wakes late", entry.name);
         let fix = format!("echo on | sudo tee /sys/bus/usb/devices/{}/power/control", device.port);
         found.push(Finding::warn("suspend", what, fix));
-    }
-    found
-}
-
-/// CAN interfaces: up, and with a queue that takes a burst.
-fn can(facts: &Facts, entries: &[DeviceSpec], plugged: &[(&DeviceSpec, &UsbDevice)]) -> Vec<Finding> {
-    /// A burst of commands to a whole arm; the kernel's default of 10 loses some of it (ENOBUFS).
-    const LEAST_QUEUE: u64 = 64;
-    let mut found = Vec::new();
-    for interface in &facts.can {
-        let entry =
-            plugged.iter().find(|(_, device)| Some(&device.port) == interface.port.as_ref()).map(|(entry, _)| entry);
-        let bitrate =
-            entry.and_then(|entry| if let NodeSpec::Can(can) = &entry.node { Some(can.bitrate) } else { None });
-        let name = &interface.name;
-        if entry.is_none() && !entries.is_empty() {
-            continue;
-        }
-        if interface.state == "down" {
-            let fix = format!("sudo ip link set {name} up type can bitrate {}", bitrate.unwrap_or(1_000_000));
-            found.push(Finding::warn(
-                "can",
-                format!("{name} is down; rapid brings it up only if it is permitted to"),
-                fix,
-            ));
-        } else {
-            found.push(Finding::ok("can", format!("{name} is up")));
-        }
-        if let Some(queue) = interface.queue.filter(|queue| *queue < LEAST_QUEUE) {
-            let what = format!("{name} queues {queue} frames at most: a burst of commands does not fit");
-            found.push(Finding::warn("can", what, format!("sudo ip link set {name} txqueuelen 256")));
-        }
     }
     found
 }

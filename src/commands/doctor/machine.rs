@@ -1,10 +1,78 @@
-//! What is wrong with the machine itself: its limits, its memory, its disk.
+//! What is judged of the machine itself: udev, limits, clock, memory, disk, buses of their own.
+//!
+//! Pure.
 
 use super::bandwidth::Wish;
 use super::facts::Facts;
-use super::judge::{Finding, mb};
+use super::judge::{Finding, megabytes};
+use super::usb::UsbDevice;
 use crate::registry::{DeviceSpec, NodeSpec, Opens, Registry};
 use crate::text;
+
+pub(super) fn udev(facts: &Facts, rules: Option<&str>) -> Vec<Finding> {
+    const INSTALL: &str = "sudo rapid artifacts --install";
+    let mut found = Vec::new();
+    if !facts.udev_runs {
+        let what = "no udev daemon runs: plugged devices are not seen";
+        found.push(Finding::bad("udev", what, "sudo systemctl start systemd-udevd"));
+    }
+    match (&facts.rules, rules) {
+        (_, None) => {}
+        (None, Some(_)) => {
+            let what = "the udev rules are not installed: no stable names /dev/rapid/NAME";
+            found.push(Finding::warn("udev", what, INSTALL));
+        }
+        (Some(installed), Some(rules)) if installed != rules => {
+            found.push(Finding::warn("udev", "the installed udev rules are not those of this registry", INSTALL));
+        }
+        (Some(_), Some(_)) => found.push(Finding::ok("udev", "the udev rules are those of this registry")),
+    }
+    found
+}
+
+/// CAN interfaces: up, and with a queue that takes a burst.
+pub(super) fn can(facts: &Facts, entries: &[DeviceSpec], plugged: &[(&DeviceSpec, &UsbDevice)]) -> Vec<Finding> {
+    /// A burst of commands to a whole arm; the kernel's default of 10 loses some of it (ENOBUFS).
+    const LEAST_QUEUE: u64 = 64;
+    let mut found = Vec::new();
+    for interface in &facts.can {
+        let entry =
+            plugged.iter().find(|(_, device)| Some(&device.port) == interface.port.as_ref()).map(|(entry, _)| entry);
+        let bitrate =
+            entry.and_then(|entry| if let NodeSpec::Can(can) = &entry.node { Some(can.bitrate) } else { None });
+        let name = &interface.name;
+        if entry.is_none() && !entries.is_empty() {
+            continue;
+        }
+        if interface.bus_off {
+            let what = format!("{name} has left the bus after too many errors");
+            let fix = format!("check wiring, termination and bit rate; then sudo ip link set {name} type can restart");
+            found.push(Finding::bad("can", what, fix));
+        } else if interface.state == "down" {
+            let fix = format!("sudo ip link set {name} up type can bitrate {}", bitrate.unwrap_or(1_000_000));
+            found.push(Finding::warn(
+                "can",
+                format!("{name} is down; rapid brings it up only if it is permitted to"),
+                fix,
+            ));
+        } else if let (Some(own), Some(wished)) = (interface.bitrate, bitrate)
+            && own != wished
+        {
+            let what = format!("{name} runs at {own} bit/s, and its entry says {wished}");
+            let fix = format!(
+                "sudo ip link set {name} down && sudo ip link set {name} up type can bitrate {wished}; or correct the entry"
+            );
+            found.push(Finding::bad("can", what, fix));
+        } else {
+            found.push(Finding::ok("can", format!("{name} is up")));
+        }
+        if let Some(queue) = interface.queue.filter(|queue| *queue < LEAST_QUEUE) {
+            let what = format!("{name} queues {queue} frames at most: a burst of commands does not fit");
+            found.push(Finding::warn("can", what, format!("sudo ip link set {name} txqueuelen 256")));
+        }
+    }
+    found
+}
 
 pub(super) fn limits(facts: &Facts, registry: Option<&Registry>) -> Vec<Finding> {
     /// libusb programs with cameras need more than the kernel's default of 16 MB.
@@ -83,7 +151,11 @@ pub(super) fn disk(facts: &Facts, registry: Option<&Registry>) -> Vec<Finding> {
             ));
         }
         Ok(rate) => {
-            let what = format!("{folder} took {}; the devices send at most {} (estimated)", mb(*rate), mb(wanted));
+            let what = format!(
+                "{folder} took {}; the devices send at most {} (estimated)",
+                megabytes(*rate),
+                megabytes(wanted)
+            );
             found.push(if *rate < wanted {
                 Finding::warn("disk", what, "record on a faster disk: --out DIR")
             } else {

@@ -34,6 +34,7 @@ pub fn doctor(
     out: &mut dyn Write,
 ) -> io::Result<bool> {
     let mut facts = facts::collect(Path::new("/"));
+    facts::ask_can(&mut facts.can);
     facts.disk = disk(episodes);
     report(&facts, registry, format, out)
 }

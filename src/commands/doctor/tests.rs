@@ -212,13 +212,18 @@ fn wrong(facts: &Facts, registry: &Registry) -> Vec<String> {
         .collect()
 }
 
+fn can(state: &str) -> Interface {
+    let (name, state) = ("can0".to_owned(), state.to_owned());
+    Interface { name, state, bitrate: Some(500_000), bus_off: false, queue: None, port: None }
+}
+
 type Change = fn(&mut Facts);
 
 #[test]
 fn one_thing_wrong_is_one_finding() {
     let (registry, facts) = well();
     assert_eq!(wrong(&facts, &registry), Vec::<String>::new());
-    let cases: [(Change, &str); 19] = [
+    let cases: [(Change, &str); 20] = [
         (|facts| facts.usb[1].mbit = 12.0, "Bad speed: [device.cam_wrist] runs at 12 Mbit/s"),
         (|facts| facts.usb[2].autosuspends = true, "Warn suspend: [device.tactile_tip]"),
         (
@@ -261,16 +266,23 @@ fn one_thing_wrong_is_one_finding() {
         (
             |facts| {
                 let port = Some("1-3".into());
-                facts.can.push(Interface { name: "can0".into(), state: "down".into(), queue: Some(1000), port });
+                facts.can.push(Interface { queue: Some(1000), port, ..can("down") });
             },
             "Warn can: can0 is down",
         ),
         (
             |facts| {
                 let port = Some("1-3".into());
-                facts.can.push(Interface { name: "can0".into(), state: "up".into(), queue: Some(10), port });
+                facts.can.push(Interface { queue: Some(10), port, ..can("up") });
             },
             "Warn can: can0 queues 10 frames",
+        ),
+        (
+            |facts| {
+                let port = Some("1-3".into());
+                facts.can.push(Interface { bus_off: true, port, ..can("up") });
+            },
+            "Bad can: can0 has left the bus",
         ),
     ];
     for (change, expected) in cases {
@@ -332,4 +344,24 @@ fn the_disk_is_tried_and_nothing_is_left_behind() {
     assert!(disk.rate.is_ok_and(|rate| rate > 0.0));
     assert!(disk.size >= disk.free && disk.size > 0);
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+}
+
+#[test]
+fn a_bus_at_another_rate_than_its_entry_says_is_bad() {
+    let text = "[device.arm]\nvid = \"1\"\npid = \"2\"\nnode = \"can\"\nbit = 0\n[device.arm.can]\nbitrate = 1000000\n";
+    let registry = Registry::parse(text, None).unwrap().registry;
+    let usb = UsbDevice { port: "1-1".into(), bus: 1, mbit: 12.0, vid: 1, pid: 2, ..UsbDevice::default() };
+    for (bitrate, state, expected) in [
+        (Some(1_000_000), "up", "Ok: can0 is up"),
+        (None, "up", "Ok: can0 is up"),
+        (Some(500_000), "up", "Bad: can0 runs at 500000 bit/s, and its entry says 1000000"),
+        (Some(500_000), "down", "Warn: can0 is down"),
+    ] {
+        let interface = Interface { bitrate, port: Some("1-1".into()), ..can(state) };
+        let facts = Facts { usb: vec![usb.clone()], can: vec![interface], ..Facts::default() };
+        let found = judge::judge(&facts, Some(&registry), None);
+        let found = found.iter().find(|finding| finding.about == "can").unwrap();
+        let said = format!("{:?}: {}", found.level, found.what);
+        assert!(said.starts_with(expected), "{said}");
+    }
 }

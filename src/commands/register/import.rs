@@ -75,9 +75,11 @@ impl Reader {
                 return Err(format!("it is found by mDNS ({service}), and what it speaks is not known"));
             };
             let text = |key: &str, value: &str| (format!("lan.{key}"), Setting::Text(value.to_owned()));
+            // Its pictures are large and few: by their pixels they would be given most of the shared memory.
+            let size = (*protocol == "iphone").then(|| ("max_bytes".to_owned(), Setting::Text("2MiB".to_owned())));
             return Ok(Self {
                 node: "lan".to_owned(),
-                settings: vec![text("protocol", protocol), text("mdns", service)],
+                settings: vec![text("protocol", protocol), text("mdns", service)].into_iter().chain(size).collect(),
             });
         }
         let is_it = |attachment: &&Attachment| {
