@@ -168,6 +168,5 @@ pub(crate) fn board(names: &[&str]) -> Board {
         modules: Vec::new(),
         path: None,
         text: String::new(),
-        modules: Vec::new(),
     })
 }

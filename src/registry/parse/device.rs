@@ -13,7 +13,7 @@ use crate::registry::diagnostic::did_you_mean;
 use crate::registry::section::{At, Problems, Section};
 use crate::registry::spec::{
     ActionSpec, CanAdapter, CanProtocol, CanSpec, DeviceSpec, Hook, Hooks, IdentitySpec, LanSpec, Mount, NodeSpec,
-    Opens, UsbSpec, WhenStale,
+    Opens, WhenStale,
 };
 
 /// Kinds of node this version has a driver for.
