@@ -155,7 +155,7 @@ impl Driver {
         match self {
             Self::Motors(driver) => driver.order(order),
             Self::Sim(driver) => {
-                driver.order(order);
+                driver.joints.order(order);
                 Ok(())
             }
             _ => Ok(()),
@@ -166,7 +166,7 @@ impl Driver {
     pub fn take_notice(&mut self) -> Option<ActuatorNotice> {
         match self {
             Self::Motors(driver) => driver.take_notice(),
-            Self::Sim(driver) => driver.take_notice(),
+            Self::Sim(driver) => driver.joints.take_notice(),
             _ => None,
         }
     }

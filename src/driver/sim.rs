@@ -21,7 +21,6 @@ use tokio::time::Instant;
 use self::joints::Joints;
 use self::pictures::{PICTURES, Pictures, Scene, encode, fill, write_picture};
 use super::{DriverError, Reading, unblock};
-use crate::action::{ActuatorNotice, Order};
 use crate::provenance::{Format, Negotiated};
 use crate::registry::scenario::{self, SimDevice, SimSource, TaskPart};
 use crate::registry::{DeviceSpec, MOTOR_CHANNELS, NodeSpec};
@@ -50,7 +49,8 @@ pub struct Sim {
     /// The sample in `payload` is to be sent once more, with this stamp.
     again: Option<Stamp>,
     controls: BTreeMap<String, i64>,
-    joints: Joints,
+    /// Its motors, if it has some.
+    pub(super) joints: Joints,
     /// It was told to record.
     records: bool,
 }
@@ -138,16 +138,6 @@ impl Sim {
             _ => return Err(DriverError::Fatal(format!("{} is no actuator", self.device.name))),
         }
         Ok(())
-    }
-
-    /// Lets its motors move, or stops them.
-    pub(super) fn order(&mut self, order: Order) {
-        self.joints.order(order);
-    }
-
-    /// What its motors have to tell.
-    pub(super) fn take_notice(&mut self) -> Option<ActuatorNotice> {
-        self.joints.take_notice()
     }
 
     /// Tells the device to record, or to end that.

@@ -5,7 +5,7 @@ use crate::registry::MOTOR_CHANNELS;
 
 /// See the module's comment.
 #[derive(Debug, Default)]
-pub(super) struct Joints {
+pub(in crate::driver) struct Joints {
     positions: Vec<f64>,
     is_armed: bool,
     has_moved: bool,
@@ -30,7 +30,7 @@ impl Joints {
         true
     }
 
-    pub(super) fn order(&mut self, order: Order) {
+    pub(in crate::driver) fn order(&mut self, order: Order) {
         if self.positions.is_empty() {
             return;
         }
@@ -43,7 +43,7 @@ impl Joints {
         self.notice = Some(ActuatorNotice { arming, text: text.to_owned(), is_problem: false });
     }
 
-    pub(super) fn take_notice(&mut self) -> Option<ActuatorNotice> {
+    pub(in crate::driver) fn take_notice(&mut self) -> Option<ActuatorNotice> {
         self.notice.take()
     }
 
