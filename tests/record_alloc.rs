@@ -175,7 +175,8 @@ async fn only_chunks_allocate() {
         memory_budget: 1 << 29,
         disk_reserve: None,
     };
-    let registry = Arc::new(Registry { rig, devices: vec![device], path: None, text: String::new() });
+    let registry =
+        Arc::new(Registry { rig, devices: vec![device], modules: Vec::new(), path: None, text: String::new() });
     let board = Arc::new(Board::new(&registry));
     let (starter, begun) = mpsc::channel();
     let [allocations, quiet, done] = std::array::from_fn(|_| Arc::new(AtomicU64::new(0)));

@@ -3,7 +3,7 @@
 
 use std::fmt;
 
-use super::spec::{CanAdapter, Framing, Mount, NodeSpec, Opens, Parse, PixelFormat, WhenStale};
+use super::spec::{CanAdapter, CanProtocol, Framing, Mount, NodeSpec, Opens, Parse, PixelFormat, WhenStale};
 use crate::modality::ModalityKind;
 
 impl PixelFormat {
@@ -120,7 +120,12 @@ impl NodeSpec {
             Self::Serial(serial) if serial.parse == Parse::Raw => {
                 format!("{} baud {} raw", serial.baud, serial.framing)
             }
-            Self::Can(can) => format!("{} {} bit/s", can.adapter, can.bitrate),
+            Self::Can(can) => match &can.protocol {
+                CanProtocol::Raw => format!("{} {} bit/s raw", can.adapter, can.bitrate),
+                CanProtocol::Damiao(damiao) => {
+                    format!("{} {} bit/s damiao x{}", can.adapter, can.bitrate, damiao.motors.len())
+                }
+            },
             Self::Lan(lan) => lan.format(),
             Self::Serial(serial) => {
                 format!("{} baud {} {} x{}", serial.baud, serial.framing, serial.parse, serial.channels)

@@ -165,7 +165,9 @@ pub(crate) fn board(names: &[&str]) -> Board {
             disk_reserve: None,
         },
         devices: names.iter().enumerate().map(device).collect(),
+        modules: Vec::new(),
         path: None,
         text: String::new(),
+        modules: Vec::new(),
     })
 }

@@ -19,7 +19,7 @@ use crate::control::can::CanFrame;
 use crate::control::damiao::codec::{self, Feedback, Mit, MotorStatus, Order, Ranges};
 use crate::control::damiao::model;
 use crate::control::damiao::parameter::{self, ControlMode, Parameter, Reply, TIMEOUT_UNIT_US, Value};
-use crate::control::limits::Limits;
+use crate::control::limits::{Limits, within_torque};
 use crate::registry::{MotorMode, MotorSpec};
 use crate::time::Stamp;
 
@@ -285,6 +285,19 @@ impl Motor {
             if status == MotorStatus::Enabled {
                 self.phase = Phase::On;
             }
+        } else if self.phase == Phase::On {
+            // It waits for the others, and somebody may lean on it.
+            *command = self.bound(*command, limits);
+        }
+    }
+
+    /// The command next to `command` that where the joint is allows.
+    pub(super) fn bound(&self, command: f64, limits: &Limits) -> f64 {
+        let Some(Feedback { q, .. }) = self.feedback else { return command };
+        match self.spec.mode {
+            MotorMode::Mit { kp, .. } => within_torque(command, q, self.spec.torque, kp),
+            MotorMode::PositionVelocity => command,
+            MotorMode::Velocity => limits.brake(command, q, self.spec.position),
         }
     }
 

@@ -79,6 +79,26 @@ fn a_unit_is_named_by_serial_by_port_or_as_the_only_one_of_its_model() {
 }
 
 #[test]
+fn a_can_interface_is_brought_up_with_the_bit_rate_of_its_entry() {
+    let text = "[device.arm]\nvid = \"1d50\"\npid = \"606f\"\nserial_number = \"A '%k` $x\"\nnode = \"can\"\n\
+                [device.arm.can]\nbitrate = 500000\n";
+    let all = artifacts(&Registry::parse(text, None).unwrap().registry);
+    let rules = text_of(&all, "99-rapid.rules");
+    assert_eq!(
+        rule_lines(&rules),
+        ["ACTION==\"add\", SUBSYSTEM==\"net\", ATTR{type}==\"280\", ATTRS{idVendor}==\"1d50\", \
+          ATTRS{idProduct}==\"606f\", ATTRS{serial}==\"A '%k` $x\", \
+          RUN+=\"/usr/sbin/ip link set dev $name up type can bitrate 500000 restart-ms 100\""]
+    );
+    let unit = text_of(&all, "rapid.service");
+    assert!(unit.contains("\nRestrictAddressFamilies=AF_UNIX AF_NETLINK AF_CAN\n"), "{unit}");
+    // An adapter that is a serial line is one like any other.
+    let slcan = format!("{text}adapter = \"slcan\"\n");
+    let line = text_of(&artifacts(&Registry::parse(&slcan, None).unwrap().registry), "99-rapid.rules");
+    assert!(rule_lines(&line)[0].starts_with("SUBSYSTEM==\"tty\"") && !line.contains("RUN+="), "{line}");
+}
+
+#[test]
 fn the_service_may_open_usb_devices_only_where_a_program_does() {
     let program = "[device.a]\nvid = \"1\"\npid = \"1\"\nnode = \"p\"\n";
     let tty = format!("{program}[device.a.process]\nopens = \"tty\"\n");

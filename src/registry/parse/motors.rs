@@ -69,9 +69,14 @@ fn motors(table: &Section<'_>, problems: &mut Problems<'_>) -> Option<Vec<MotorS
         table.missing(problems, "motors", example);
         return None;
     }
+    let listed =
+        table.fields().into_iter().find(|(_, key, _)| *key == "motors")?.2.get_ref().as_array().map(|list| list.len());
     let entries = table.tables(problems, "motors");
-    if entries.is_empty() || entries.len() > MOST {
-        table.report(problems, "motors", format!("{} motors", entries.len()), format!("list 1 to {MOST} motors"));
+    if let Some(count) = listed.filter(|count| !(1..=MOST).contains(count)) {
+        table.report(problems, "motors", format!("{count} motors"), format!("list 1 to {MOST} motors"));
+        return None;
+    }
+    if listed != Some(entries.len()) {
         return None;
     }
     let mut read: Vec<(Section<'_>, Option<MotorSpec>)> = Vec::new();
@@ -264,7 +269,7 @@ pub(super) fn axes(
     let Some(written) = written else { return Some(of_motors) };
     let Some(table) = section.table(problems, "action") else { return Some(of_motors) };
     if written.names.len() != of_motors.names.len() {
-        let message = format!("{} axes for {} motors", written.names.len(), of_motors.names.len());
+        let message = format!("axes: {}, motors: {}", written.names.len(), of_motors.names.len());
         table.report(problems, "names", message, "remove the table: the axes follow from the motors");
         return None;
     }
