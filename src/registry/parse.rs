@@ -12,6 +12,7 @@ mod can;
 mod device;
 mod file;
 mod hooks;
+mod identity;
 mod lan;
 mod module;
 mod motors;
@@ -32,9 +33,9 @@ use device::Draft;
 use program::Programs;
 use verdict::Whose;
 
-pub(super) use device::is_port;
 pub use device::{like_a_name, name_problem};
 pub use file::read_file;
+pub(super) use identity::is_port;
 
 /// The registry used when there is no file: the rig `rapid --sim` simulates.
 pub const BUILTIN: &str = include_str!("../../devices.toml");
