@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use rapid::driver::{Driver, DriverError, camera};
-use rapid::registry::{CameraSpec, DeviceNode, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, WhenStale};
+use rapid::registry::{CameraSpec, DeviceNode, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, UsbSpec, WhenStale};
 use rapid::time::Stamp;
 
 #[tokio::main]
@@ -74,7 +74,7 @@ fn device(arguments: &[String]) -> Result<DeviceSpec, Box<dyn std::error::Error>
     Ok(DeviceSpec {
         name: "camera".to_owned(),
         id: rapid::modality::ModalityId::new(0).ok_or("bit")?,
-        identity: IdentitySpec { vid: 0, pid: 0, serial: None, port: None },
+        identity: IdentitySpec::Usb(UsbSpec { vid: 0, pid: 0, serial: None, port: None }),
         node: NodeSpec::Camera(camera),
         topic: "/camera".to_owned(),
         mount: None,
@@ -84,6 +84,7 @@ fn device(arguments: &[String]) -> Result<DeviceSpec, Box<dyn std::error::Error>
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
         action: None,
+        hooks: rapid::registry::Hooks::default(),
         verdict: rapid::registry::VerdictSpec::of(
             rapid::modality::ModalityKind::Image,
             Duration::from_millis(500),

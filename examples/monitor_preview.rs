@@ -11,7 +11,9 @@ use std::time::Duration;
 use rapid::headless::{self, HeadlessOptions};
 use rapid::mask::PhysicalMask;
 use rapid::modality::ModalityId;
-use rapid::registry::{CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, WhenStale};
+use rapid::registry::{
+    CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, UsbSpec, WhenStale,
+};
 use rapid::sample::Epoch;
 use rapid::status::{Board, Command, Level, LogLine, RecordingStatus, SlotState, What};
 use rapid::time::{Stamp, realtime_ns};
@@ -61,7 +63,7 @@ fn registry(count: u8) -> Registry {
             topic: format!("/rapid/{name}"),
             name,
             id: ModalityId::new(bit)?,
-            identity: IdentitySpec { vid: 0x046d, pid: 0x0825, serial: None, port: None },
+            identity: IdentitySpec::Usb(UsbSpec { vid: 0x046d, pid: 0x0825, serial: None, port: None }),
             node: NodeSpec::Camera(CameraSpec {
                 width: 640,
                 height: 480,
@@ -81,6 +83,7 @@ fn registry(count: u8) -> Registry {
             ),
             latency: Duration::ZERO,
             action: None,
+            hooks: rapid::registry::Hooks::default(),
         })
     };
     Registry {

@@ -26,6 +26,7 @@ use crate::bus::{Bus, BusError, TopicId};
 use crate::fault;
 use crate::headless::style::ColourChoice;
 use crate::headless::{self, HeadlessOptions};
+use crate::hotplug::lan::LanMonitor;
 use crate::hotplug::script::Script;
 use crate::hotplug::udev::UdevMonitor;
 use crate::hotplug::{HotplugError, HotplugStream};
@@ -80,6 +81,8 @@ pub struct Options {
     pub policy: Option<PolicyOptions>,
     /// Begin an episode at the start.
     pub record: bool,
+    /// Arm the actuator as soon as it is there, once.
+    pub arm: bool,
     /// How long to record, or to run when nothing is recorded.
     pub duration: Option<Duration>,
     /// Keeps this rig apart from another on the machine.
@@ -180,7 +183,10 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     let recorder = Recorder::spawn(bus.inbox()?, RecorderConfig::new(Arc::clone(&registry), Arc::clone(&board)))?;
     // Before the screen: what fails until here is said on an ordinary terminal.
     let hotplug: HotplugStream = match options.devices {
-        Devices::Machine => Box::pin(UdevMonitor::open()?),
+        Devices::Machine => match LanMonitor::open(&registry) {
+            Some(lan) => Box::pin(futures::stream::select(UdevMonitor::open()?, lan)),
+            None => Box::pin(UdevMonitor::open()?),
+        },
         Devices::Simulated(scenario) => Box::pin(Script::new(scenario)),
     };
     let screen_stop = CancellationToken::new();
@@ -189,7 +195,8 @@ pub async fn run(options: Options) -> Result<(), AppError> {
 
     let rig_stop = CancellationToken::new();
     let (rig_commands, rig_asked) = mpsc::channel(16);
-    let mut rig = Rig::new(&registry, &bus, presence, Arc::clone(&board));
+    let mut rig =
+        Rig::new(&registry, &bus, presence, Arc::clone(&board)).following(recorder.episode()).arming(options.arm);
     let rig_ended = CancellationToken::new();
     let hurry = rig.hurry();
     let rig = tokio::spawn({

@@ -8,11 +8,17 @@ use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::parser::ValueSource;
 use clap::{ArgAction, ArgMatches, Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueHint};
 
+mod ablation;
+mod calibrate;
 mod compare;
 mod policy;
+mod register;
 
+pub use ablation::{AblationArgs, Count};
+pub use calibrate::Calibration;
 pub use compare::CompareArgs;
 pub use policy::{EvalArgs, PolicyArgs};
+pub use register::{RegisterArgs, UnregisterArgs};
 
 /// Records robot demonstrations from sensors that come and go
 #[derive(Debug, Parser)]
@@ -70,22 +76,6 @@ Examples:
   rapid recover episodes
   rapid recover copied/20260101_place-block_001.mcap";
 
-const LATENCY: &str = "\
-How: stop a running rapid (the camera must be free), darken the room, and point the camera at this
-terminal from near by, so that the terminal fills most of its picture; full screen and full
-brightness are best. Then start this: the terminal flashes white and black in a pattern that fits at
-one delay only, up to three times a second. It ends with the line for the camera's entry.
-Switch automatic exposure off (`controls` of the entry) if the pictures do not follow.
-
-What comes out includes what the terminal and its screen take, often 10 to 40 ms. An LED takes next
-to nothing: --led takes one of /sys/class/leds (needs the right to write there).
-
-Examples:
-  rapid calibrate latency --device cam_wrist
-  rapid calibrate latency --device cam_wrist --light-delay 15ms
-  sudo rapid calibrate latency --device cam_wrist --led ACT --duration 1m
-  rapid calibrate latency --sim --device cam_wrist          how it goes, without a camera";
-
 const RUN: &str = "Options of a run";
 const GENERAL: &str = "General options";
 
@@ -137,6 +127,9 @@ pub struct RunArgs {
     /// Property of the episode, such as finger=soft; may be repeated
     #[arg(long, value_name = "KEY=VALUE", value_parser = tag)]
     pub tag: Vec<(String, String)>,
+    /// Module that is mounted and has no sensor of its own; may be repeated
+    #[arg(long, value_name = "NAME")]
+    pub module: Vec<String>,
     /// Observations a second [default: as the registry says]
     #[arg(long, value_name = "HZ", value_parser = rate)]
     pub rate: Option<f64>,
@@ -149,6 +142,9 @@ pub struct RunArgs {
     /// Demonstrations to record, each of another trial
     #[arg(long, value_name = "COUNT", default_value_t = 1, requires = "expert")]
     pub episodes: usize,
+    /// Let the actuator move as soon as it is there; without this `rapid arm` or a key of the monitor does
+    #[arg(long)]
+    pub arm: bool,
     /// Half width of an observation's window [default: as the registry says]
     #[arg(long, value_name = "TIME", value_parser = window)]
     pub window: Option<Duration>,
@@ -168,8 +164,22 @@ pub enum Command {
         #[command(flatten)]
         simulation: SimArgs,
     },
+    /// Adds an entry to the registry for a device that is plugged in
+    #[command(after_help = register::REGISTER)]
+    Register(Box<RegisterArgs>),
+    /// Takes an entry out of the registry; everything else in it stays as it is
+    Unregister(UnregisterArgs),
     /// Checks the registry and says everything that is wrong with it
     Check,
+    /// Looks for what on this machine stands in the way: bandwidth, permissions, rules, limits, disk
+    #[command(after_help = "Exit code: 0 if nothing is bad, otherwise 1.\n\nExamples:\n  rapid doctor\n  \
+        rapid doctor --out /data/episodes      that disk\n  \
+        rapid doctor --json | jq -r 'select(.level == \"bad\") | .fix'")]
+    Doctor {
+        /// Folder for episodes, whose disk is tried
+        #[arg(long, value_name = "DIR", default_value = "episodes", value_hint = ValueHint::DirPath)]
+        out: PathBuf,
+    },
     /// Writes what follows from the registry: udev rules, descriptors, systemd unit
     #[command(after_help = "Examples:\n  rapid artifacts                look at them first, in udev/\n  \
         sudo rapid artifacts --install")]
@@ -193,6 +203,12 @@ pub enum Command {
         #[arg(long)]
         watch: bool,
     },
+    /// Lets the actuator of a running rapid move: motors are enabled, and follow actions
+    #[command(after_help = "An actuator that was unplugged, failed or was disarmed needs this again.\n\nExamples:\n  \
+        rapid arm\n  rapid arm --instance left")]
+    Arm,
+    /// Stops the actuator of a running rapid: its motors are disabled
+    Disarm,
     /// Tells what an episode holds: verdict, rates, gaps, lateness, presence over time
     #[command(after_help = "Of one file a report; of a folder or of several files one line each, GOOD, SUSPECT or \
         BAD.\n\nExamples:\n  rapid inspect episodes/20260101_place-block_001.mcap\n  rapid inspect episodes\n  \
@@ -225,34 +241,13 @@ pub enum Command {
     /// Tries a policy on the simulated task, with a sensor that is pulled out
     #[command(after_help = policy::EVAL)]
     Eval(EvalArgs),
+    /// Lists the configurations of a comparison, the episodes recorded of each, and what is next
+    #[command(after_help = ablation::ABLATION)]
+    Ablation(AblationArgs),
     /// Prints a completion script: source <(rapid completions bash)
     Completions {
         /// Shell
         shell: clap_complete::Shell,
-    },
-}
-
-/// What can be measured.
-#[derive(Debug, Subcommand)]
-pub enum Calibration {
-    /// Measures how late a camera's pictures are, by flashing a light in front of it
-    #[command(after_help = LATENCY)]
-    Latency {
-        /// Entry of the camera [default: the only one that is plugged in]
-        #[arg(long, value_name = "NAME")]
-        device: Option<String>,
-        /// How long to flash: 5s to 10m
-        #[arg(long, value_name = "TIME", default_value = "20s", value_parser = flashing)]
-        duration: Duration,
-        /// Flash an LED instead of this terminal: its name, or its folder
-        #[arg(long, value_name = "NAME|DIR", value_hint = ValueHint::DirPath)]
-        led: Option<PathBuf>,
-        /// How late the light itself is, if you know; taken off
-        #[arg(long, value_name = "TIME", default_value = "0ms", value_parser = light_delay)]
-        light_delay: Duration,
-        /// Where devices come from.
-        #[command(flatten)]
-        simulation: SimArgs,
     },
 }
 
@@ -290,6 +285,7 @@ impl Cli {
         {
             let fix = match name {
                 "devices" => "write `rapid devices --sim`",
+                "register" => "write `rapid register --sim`",
                 "calibrate" => "write `rapid calibrate latency --sim`",
                 _ => "leave --sim out, or name a scenario file",
             };
@@ -309,7 +305,7 @@ fn stray(matches: &ArgMatches, command: &str) -> Option<String> {
     let known = run
         .get_arguments()
         .chain(policy.get_arguments())
-        .chain(simulation.get_arguments().filter(|_| !matches!(command, "devices" | "calibrate")));
+        .chain(simulation.get_arguments().filter(|_| !matches!(command, "devices" | "calibrate" | "register")));
     let typed = |id: &str| matches.value_source(id) == Some(ValueSource::CommandLine);
     known.map(|argument| argument.get_id().as_str()).find(|id| typed(id)).map(str::to_owned)
 }
@@ -336,21 +332,6 @@ fn duration(text: &str) -> Result<Duration, String> {
         Ok(Duration::ZERO) => Err("must be longer than nothing".to_owned()),
         Ok(duration) => Ok(duration),
         Err(_) => Err("write a number and a unit, for example 30s, 500ms or 2m".to_owned()),
-    }
-}
-
-fn flashing(text: &str) -> Result<Duration, String> {
-    match duration(text)? {
-        length if (Duration::from_secs(5)..=Duration::from_mins(10)).contains(&length) => Ok(length),
-        _ => Err("must lie between 5s and 10m".to_owned()),
-    }
-}
-
-fn light_delay(text: &str) -> Result<Duration, String> {
-    match humantime::parse_duration(text) {
-        Ok(delay) if delay <= Duration::from_secs(1) => Ok(delay),
-        Ok(_) => Err("must be 1s at most".to_owned()),
-        Err(_) => Err("write a number and a unit, for example 15ms".to_owned()),
     }
 }
 

@@ -3,7 +3,9 @@
 //! Invariant: every error is printed here, once.
 
 mod failure;
+mod places;
 mod policy;
+mod register;
 
 use std::io::{self, IsTerminal, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -17,6 +19,8 @@ use clap::CommandFactory;
 use tokio_util::sync::CancellationToken;
 
 use self::failure::Failure;
+use self::places::{find_registry, load, registry_or_builtin, registry_path};
+use crate::action::Order;
 use crate::app::{self, AppError, Devices, Options, Screen, mask_path};
 use crate::cli::{Calibration, Cli, Command, Global, PolicyArgs, RunArgs, SimArgs};
 use crate::commands::calibrate::LatencyOptions;
@@ -91,6 +95,13 @@ fn print(global: &Global, before: SimArgs, command: Command) -> Result<(), Failu
                 out,
             )
         }
+        Command::Register(args) => register::register(global, before, &args, format, out),
+        Command::Unregister(args) => register::unregister(global, &args, format, out),
+        Command::Doctor { out: episodes } => {
+            let registry = registry_path(global).and_then(|path| load(&path)).map_err(|failure| failure.to_string());
+            let registry = registry.as_ref().map_err(String::as_str);
+            if commands::doctor::doctor(registry, &episodes, format, out)? { Ok(()) } else { Err(Failure::Found) }
+        }
         Command::Artifacts { install, to } => {
             let registry = load(&registry_path(global)?)?;
             if install {
@@ -99,6 +110,8 @@ fn print(global: &Global, before: SimArgs, command: Command) -> Result<(), Failu
             Ok(commands::artifacts::write(&registry, &to, out)?)
         }
         Command::Mask { watch } => mask(global, watch),
+        Command::Arm => Ok(commands::arm::order(global.instance.as_deref(), Order::Arm, out)?),
+        Command::Disarm => Ok(commands::arm::order(global.instance.as_deref(), Order::Disarm, out)?),
         Command::Calibrate { what: Calibration::Latency { device, duration, led, light_delay, simulation } } => {
             let source = Source::of(if simulation.sim.is_some() { simulation } else { before });
             let (registry, attached) = plugged(global, source)?;
@@ -110,6 +123,7 @@ fn print(global: &Global, before: SimArgs, command: Command) -> Result<(), Failu
             Outcome::BadConfiguration => Err(Failure::Told),
         },
         Command::Recover { paths } => recover(&paths, format),
+        Command::Ablation(args) => Ok(commands::ablation::ablation(&registry_or_builtin(global)?, &args, format, out)?),
         Command::Eval(args) => policy::eval(args, format),
         Command::Completions { shell } => Ok(commands::completions::completions(&mut Cli::command(), shell, out)?),
         Command::Replay { .. } => Ok(()),
@@ -259,6 +273,7 @@ fn run(global: &Global, args: &RunArgs, source: Source, policy: Option<PolicyArg
     if let Some(window) = args.window {
         registry.rig.sync_window = window;
     }
+    let modules = modules(&registry, args)?;
     if args.record {
         prepare(&args.out).map_err(Failure::Folder)?;
     }
@@ -274,12 +289,25 @@ fn run(global: &Global, args: &RunArgs, source: Source, policy: Option<PolicyArg
         registry,
         devices,
         screen,
-        episode: EpisodeRequest { out: args.out.clone(), task: args.task.clone(), tags: args.tag.clone(), duration },
+        episode: EpisodeRequest {
+            out: args.out.clone(),
+            task: args.task.clone(),
+            tags: args.tag.clone(),
+            modules,
+            duration,
+        },
         record: args.record,
+        arm: args.arm,
         duration,
         instance: global.instance.clone(),
     };
     Ok(block_on(app::run(options))??)
+}
+
+/// The modules that were said to be mounted, if the registry knows them.
+fn modules(registry: &Registry, args: &RunArgs) -> Result<Vec<String>, Failure> {
+    let mounted = crate::registry::mounted(&registry.modules, &args.module)?;
+    Ok(mounted.into_iter().map(|module| module.name.clone()).collect())
 }
 
 /// The folder an episode is to be written to at once: better refused before the devices are started.
@@ -290,45 +318,11 @@ fn prepare(out: &Path) -> Result<(), RecordError> {
     rustix::fs::access(out, enter_and_write).map_err(|error| refused(error.into()))
 }
 
-fn registry_or_builtin(global: &Global) -> Result<Registry, Failure> {
-    find_registry(global).map_or_else(|| Ok(Registry::builtin()), |path| load(&path))
-}
-
 fn scenario(file: Option<&Path>, registry: &Registry) -> Result<Scenario, Failure> {
     match file {
         Some(file) => Ok(Scenario::load(file, registry)?),
         None => Ok(Scenario::demo(registry)),
     }
-}
-
-/// Reads a registry; its warnings go to standard error.
-fn load(path: &Path) -> Result<Registry, Failure> {
-    let loaded = Registry::load(path)?;
-    for warning in &loaded.warnings {
-        let _ = writeln!(io::stderr(), "{} {warning}", stderr_palette().warn("warning:"));
-    }
-    Ok(loaded.registry)
-}
-
-fn registry_path(global: &Global) -> Result<PathBuf, Failure> {
-    find_registry(global).ok_or_else(|| Failure::NoRegistry(usual_places()))
-}
-
-/// The registry named, or the first of the usual places where there is one.
-fn find_registry(global: &Global) -> Option<PathBuf> {
-    if let Some(path) = &global.config {
-        return Some(path.clone());
-    }
-    usual_places().into_iter().find(|path| path.exists())
-}
-
-fn usual_places() -> Vec<PathBuf> {
-    let home = || std::env::var_os("HOME").map(|home| PathBuf::from(home).join(".config"));
-    let config = std::env::var_os("XDG_CONFIG_HOME").map(PathBuf::from).filter(|path| path.is_absolute());
-    let mut places = vec![PathBuf::from("devices.toml")];
-    places.extend(config.or_else(home).map(|folder| folder.join("rapid/devices.toml")));
-    places.push(PathBuf::from("/etc/rapid/devices.toml"));
-    places
 }
 
 /// Runs `work` on a runtime of its own. When it is done nothing is waited for: a thread that is

@@ -25,6 +25,8 @@
 //!       status                                   the board every stage reports on
 //!       text   outlet                            words and lines for people
 //!       folder                                   files others cannot lead astray
+//!       control                                  from an action to what a motor is told, and whether
+//!       realtime                                 threads that keep a beat
 //!       panics                                   where their messages go
 //!       episode_format                           an episode's file, record by record
 //!  L0   modality   mask   sample   action   time   random   provenance   flash     nouns
@@ -118,6 +120,7 @@ pub mod panics;
 pub mod policy;
 pub mod provenance;
 pub mod random;
+pub mod realtime;
 pub mod record;
 pub mod registry;
 pub mod rig;

@@ -21,7 +21,7 @@ use proc_macro2::{Delimiter, TokenStream, TokenTree};
 /// Modules by layer, lowest first. A module sees those of lower layers.
 const LAYERS: &[&[&str]] = &[
     &["modality", "mask", "sample", "time", "action", "random", "provenance", "flash"],
-    &["registry", "status", "text", "outlet", "folder", "episode_format", "fault", "panics", "control"],
+    &["registry", "status", "text", "outlet", "folder", "episode_format", "fault", "panics", "realtime", "control"],
     &["hotplug", "driver", "bus", "sync", "calibration"],
     &["rig", "record", "policy"],
     &["app", "lockstep", "compare", "tui", "headless", "logging"],
@@ -54,7 +54,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("crc32fast", &["episode_format"]),
     ("crossterm", &["tui"]),
     ("futures", &["hotplug", "driver", "bus", "rig", "record", "app", "tui", "headless", "commands"]),
-    ("hdrhistogram", &["record/quality", "policy/live"]),
+    ("hdrhistogram", &["record/quality", "policy/live", "driver/can"]),
     ("http_body_util", &["driver/lan"]),
     ("humantime", &["registry", "cli", "commands"]),
     ("hyper", &["driver/lan"]),
@@ -83,7 +83,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("tokio", &[ABOVE_NOUNS]),
     ("tokio_serial", &["driver/serial"]),
     ("tokio_util", &[ABOVE_NOUNS]),
-    ("thread_priority", &["rig/presence"]),
+    ("thread_priority", &["realtime"]),
     ("toml", &["registry"]),
     ("toml_edit", &["registry"]),
     ("tracing", &[ABOVE_NOUNS]),
@@ -108,6 +108,7 @@ const LOCKS: &[&str] = &["Mutex", "RwLock", "Condvar", "ReentrantMutex", "Semaph
 const LOCK_HOMES: &[(&str, &str)] = &[
     ("bus/shared", "the handle of a loan: made, locked and dropped by one thread"),
     ("status/board", "what a screen shows: written when a state changes and twice a second, read by the screen"),
+    ("rig/attendant", "the hooks of an entry run one after the other"),
     ("rig/worker", "a program waits for the end of the one before"),
     ("registry/scenario", "the light that a simulated camera looks at while it is calibrated"),
     ("policy/library", "onnxruntime is loaded once, before the first chunk"),

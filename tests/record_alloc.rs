@@ -16,7 +16,9 @@ use rapid::bus::TopicId;
 use rapid::mask::PhysicalMask;
 use rapid::modality::ModalityId;
 use rapid::record::{EpisodeRequest, Recorder, RecorderConfig, Source, encode, schema::SampleSchema};
-use rapid::registry::{CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, WhenStale};
+use rapid::registry::{
+    CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, UsbSpec, WhenStale,
+};
 use rapid::sample::{Encoding, Epoch, SampleHeader};
 use rapid::status::Board;
 use rapid::sync::{SyncModality, SyncSample, Synchronizer};
@@ -142,7 +144,7 @@ async fn only_chunks_allocate() {
     let device = DeviceSpec {
         name: "cam".to_owned(),
         id: ID,
-        identity: IdentitySpec { vid: 1, pid: 1, serial: None, port: None },
+        identity: IdentitySpec::Usb(UsbSpec { vid: 1, pid: 1, serial: None, port: None }),
         node: NodeSpec::Camera(CameraSpec {
             width: 640,
             height: 480,
@@ -158,6 +160,7 @@ async fn only_chunks_allocate() {
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
         action: None,
+        hooks: rapid::registry::Hooks::default(),
         verdict: rapid::registry::VerdictSpec::of(
             rapid::modality::ModalityKind::Image,
             Duration::from_millis(500),
@@ -172,7 +175,8 @@ async fn only_chunks_allocate() {
         memory_budget: 1 << 29,
         disk_reserve: None,
     };
-    let registry = Arc::new(Registry { rig, devices: vec![device], path: None, text: String::new() });
+    let registry =
+        Arc::new(Registry { rig, devices: vec![device], modules: Vec::new(), path: None, text: String::new() });
     let board = Arc::new(Board::new(&registry));
     let (starter, begun) = mpsc::channel();
     let [allocations, quiet, done] = std::array::from_fn(|_| Arc::new(AtomicU64::new(0)));

@@ -9,7 +9,10 @@ use std::path::{Path, PathBuf};
 use proptest::prelude::*;
 use rapid::modality::ModalityKind;
 use rapid::registry::scenario::Scenario;
-use rapid::registry::{BUILTIN, Framing, Loaded, NodeSpec, Opens, POOL_SPARE, Parse, Registry, VerdictSpec};
+use rapid::registry::{
+    BUILTIN, CanAdapter, CanProtocol, DeviceSpec, Framing, Hook, LanFind, LanPicture, LanProtocol, Loaded, MotorKind,
+    MotorMode, NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream, Probe, Registry, VerdictSpec,
+};
 
 fn files(folder: &str) -> Vec<PathBuf> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/registry").join(folder);
@@ -74,6 +77,22 @@ fn defaults_are_those_of_the_documentation() {
 }
 
 #[test]
+fn modules_arrive_and_are_mounted_by_name() {
+    let modules = valid("modules").registry.modules;
+    let [get, soft, pinch] = modules.as_slice() else { panic!("three modules") };
+    assert_eq!((get.mount.to_string().as_str(), get.devices.as_slice()), ("tip", &["tactile_tip".to_owned()][..]));
+    assert_eq!(soft.tags[1], ("material".to_owned(), "tpu".to_owned()));
+    assert_eq!((pinch.devices.len(), pinch.tags.len()), (0, 0));
+    let mounted = |names: &[&str]| {
+        let names: Vec<String> = names.iter().map(|name| (*name).to_owned()).collect();
+        rapid::registry::mounted(&modules, &names).map(|found| found.len()).map_err(|error| error.to_string())
+    };
+    assert_eq!(mounted(&["soft_tip", "pinch", "pinch"]), Ok(2));
+    assert!(mounted(&["soft_tpi"]).unwrap_err().contains("did you mean \"soft_tip\"?"));
+    assert!(mounted(&["soft_tip", "get"]).unwrap_err().contains("both sit in the slot tip"));
+}
+
+#[test]
 fn a_program_and_its_settings_arrive() {
     let Loaded { registry, warnings } = valid("process");
     assert_eq!(warnings, []);
@@ -91,14 +110,68 @@ fn a_program_and_its_settings_arrive() {
 }
 
 #[test]
+fn hooks_arrive_and_one_of_them_may_be_the_node() {
+    let Loaded { registry, warnings } = valid("hooks");
+    assert_eq!(warnings, []);
+    let [cam, imu] = registry.devices.as_slice() else { panic!("two devices") };
+    let said = |device: &DeviceSpec| -> Vec<(&str, String)> {
+        let text = |hook: &Hook| format!("{} {:?}", hook.program.display(), hook.args);
+        device.hooks.all().map(|(key, hook)| (key, text(hook))).collect()
+    };
+    let of_cam = [
+        ("on_attach", r#"/bin/sh ["-c", "exit"]"#.to_owned()),
+        ("on_detach", "/bin/sh []".to_owned()),
+        ("on_record_start", r#"/bin/sh ["", "a b"]"#.to_owned()),
+        ("on_record_stop", r#"/bin/sh ["$HOME; no shell reads this"]"#.to_owned()),
+    ];
+    assert_eq!(said(cam), of_cam);
+    assert_eq!(said(imu), [("on_detach", "/bin/sh []".to_owned())]);
+    let NodeSpec::Process(process) = &imu.node else { panic!("a program") };
+    assert_eq!((process.program.to_str(), process.args.join(" ")), (Some("/bin/sh"), "-c exit".to_owned()));
+}
+
+#[test]
+fn devices_on_the_network_arrive() {
+    let Loaded { registry, warnings } = valid("lan");
+    assert_eq!(warnings, []);
+    let lan = |name: &str| match &registry.named(name).unwrap().node {
+        NodeSpec::Lan(lan) => lan.clone(),
+        node => panic!("{node:?}"),
+    };
+    let picture = |width, height, fps| LanPicture { width, height, fps };
+    let host = |text: &str| text.parse().unwrap();
+    let fixed = |text: &str, probe, port| LanFind::Host { host: host(text), probe, port };
+    assert_eq!(lan("cam_lan").find, fixed("192.168.1.7", Probe::Tcp, 8081));
+    let path = "/video?size=1".to_owned();
+    let protocol = LanProtocol::Mjpeg { port: Some(8081), path, picture: picture(1280, 720, 25) };
+    assert_eq!(lan("cam_lan").protocol, protocol);
+    assert_eq!(lan("lidar").find, fixed("192.168.1.201", Probe::Udp, 2368));
+    assert_eq!((lan("lidar").lease.as_secs(), lan("gopro").lease.as_secs()), (1, 3));
+    assert_eq!(lan("lidar_asked").find, fixed("fd00::7", Probe::Http, 80));
+    assert_eq!(lan("gopro").protocol, LanProtocol::Gopro { port: 8080, download: true });
+    assert_eq!(lan("gopro").find, LanFind::Adapter { host: None });
+    assert_eq!(lan("cam_behind_adapter").find, LanFind::Adapter { host: Some(host("10.0.0.2")) });
+    let instance = Some("iPhone 15-iPhoneVIO".to_owned());
+    assert_eq!(lan("phone").find, LanFind::Mdns { service: "_iphonevio._tcp".to_owned(), instance });
+    let protocol = LanProtocol::Iphone { port: 5556, stream: PhoneStream::Pose, picture: picture(1920, 1440, 30) };
+    assert_eq!(lan("phone_pose").protocol, protocol);
+    let modality = |name: &str| registry.named(name).unwrap().modality();
+    assert_eq!((modality("phone").kind, modality("phone").shape), (ModalityKind::Image, vec![1440, 1920]));
+    assert_eq!((modality("phone_pose").kind, modality("phone_pose").shape), (ModalityKind::Scalars, vec![16]));
+    assert_eq!((modality("lidar").kind, modality("gopro").kind), (ModalityKind::Bytes, ModalityKind::Bytes));
+    let stall = |name: &str| registry.named(name).unwrap().stall_after.as_millis();
+    assert_eq!((stall("cam_lan"), stall("lidar"), stall("gopro")), (500, 500, 10_000));
+}
+
+#[test]
 fn every_key_arrives() {
     let Loaded { registry, warnings } = valid("every_key");
     assert_eq!(warnings[0].message, "port has no effect beside a serial number: the unit is recognised in every port");
     let [tof, cam] = registry.devices.as_slice() else { panic!("two devices") };
     assert_eq!((cam.id.bit(), cam.topic.as_str(), cam.depth, cam.max_bytes), (63, "/a/b-c_d", 100, 1 << 20));
     assert_eq!((cam.latency.as_micros(), tof.latency.as_micros()), (36_500, 0));
-    assert_eq!(cam.identity.serial.as_deref(), Some("with \"quotes\" and spaces"));
-    assert_eq!(cam.identity.port.as_deref(), Some("1-2.3"));
+    assert_eq!(cam.identity.serial(), Some("with \"quotes\" and spaces"));
+    assert_eq!(cam.identity.usb().unwrap().port.as_deref(), Some("1-2.3"));
     let NodeSpec::Camera(camera) = &cam.node else { panic!("a camera") };
     assert_eq!((camera.width, camera.height, camera.fps), (1, 2, 1000));
     assert_eq!(camera.controls, [("gain".to_owned(), -3)]);
@@ -106,6 +179,43 @@ fn every_key_arrives() {
     assert_eq!((serial.baud, serial.framing, serial.parse, serial.channels), (9600, Framing::Cobs, Parse::Raw, 0));
     assert_eq!((tof.max_bytes, tof.depth), (4096, 2048));
     assert_eq!(registry.rig.sync_window.as_micros(), 12_500);
+}
+
+#[test]
+fn a_bus_and_its_motors_arrive() {
+    let Loaded { registry, warnings } = valid("can");
+    assert_eq!(warnings, []);
+    let [bus, line, hand] = registry.devices.as_slice() else { panic!("three devices") };
+    let [raw, slcan, motors] = [bus, line, hand].map(|device| {
+        let NodeSpec::Can(can) = &device.node else { panic!("a CAN adapter") };
+        can
+    });
+    assert_eq!((raw.adapter, raw.bitrate, &raw.protocol), (CanAdapter::SocketCan, 1_000_000, &CanProtocol::Raw));
+    assert_eq!((slcan.adapter, slcan.bitrate, &slcan.protocol), (CanAdapter::Slcan, 250_000, &CanProtocol::Raw));
+    assert_eq!((bus.modality().kind, bus.modality().shape, bus.max_bytes), (ModalityKind::Bytes, vec![], 128 * 24));
+    assert_eq!((bus.topic.as_str(), bus.action.as_ref()), ("/rapid/can/bus", None));
+
+    assert_eq!((hand.modality().kind, hand.modality().shape, hand.max_bytes), (ModalityKind::Scalars, vec![18], 144));
+    let CanProtocol::Damiao(damiao) = &motors.protocol else { panic!("motors") };
+    let ms = std::time::Duration::from_millis;
+    assert_eq!((damiao.hz, damiao.deadman), (500, Some(ms(80))));
+    assert_eq!((damiao.disable_after, damiao.timeout, damiao.silent_after), (ms(2000), ms(200), ms(20)));
+    let [gripper, roll, wheel] = damiao.motors.as_slice() else { panic!("three motors") };
+    assert_eq!((gripper.slave, gripper.master, gripper.kind), (5, 0x15, MotorKind::Dmh3510));
+    assert_eq!((gripper.mode, gripper.position), (MotorMode::Mit { kp: 0.8, kd: 0.05 }, [-1.5, 0.25]));
+    // What is not written is a tenth of the motor's torque, and slow.
+    assert_eq!((gripper.velocity, gripper.torque, gripper.slew), (2.0, 0.1, 2.0));
+    assert_eq!((gripper.max_mos, gripper.max_rotor), (80.0, 80.0));
+    assert_eq!((roll.slave, roll.master, roll.mode), (6, 0, MotorMode::PositionVelocity));
+    assert_eq!((roll.velocity, roll.torque, roll.slew), (10.0, 5.0, 4.0));
+    assert_eq!((roll.max_mos, roll.max_rotor), (70.0, 90.0));
+    assert_eq!((wheel.master, wheel.mode, wheel.slew), (0x7fe, MotorMode::Velocity, 20.0));
+    let axes = hand.action.as_ref().unwrap();
+    assert_eq!(
+        (axes.names.join(" "), axes.units.join(" ")),
+        ("gripper wrist.roll wheel".into(), "rad rad rad/s".into())
+    );
+    assert_eq!((axes.min.as_slice(), axes.max.as_slice()), (&[-1.5, -3.0, -2.0][..], &[0.25, 3.0, 2.0][..]));
 }
 
 #[test]

@@ -74,6 +74,7 @@ impl Conductor {
                     Command::ToggleRecording => self.toggle().await?,
                     // A rig that is so far behind will not get to it in time either.
                     Command::Restart(id) => { let _ = self.rig_commands.try_send(RigCommand::Restart(id)); }
+                    Command::Order(order) => { let _ = self.rig_commands.try_send(RigCommand::Order(order)); }
                     Command::Quit => return output,
                 },
                 // After the events: what became of its episode says more.

@@ -1,16 +1,21 @@
-//! What the actuator is told: the topic of actions, for the one stream that reads the device.
+//! What the actuator is told: the topic of actions and that of orders, for the one stream that reads the
+//! device.
 
+use iceoryx2::node::Node;
 use iceoryx2::port::subscriber::Subscriber;
 
+use super::orders::Orders;
 use super::{BusError, Service, TopicFactory, TopicSpec, topic_error};
-use crate::action::MAX_ACTION;
+use crate::action::{MAX_ACTION, Order};
 use crate::sample::{Encoding, SampleHeader};
+use crate::time::Stamp;
 
 /// The consumer of actions.
 pub struct Actions {
     topic: String,
     depth: usize,
     subscriber: Subscriber<Service, [u8], SampleHeader>,
+    orders: Orders,
 }
 
 impl std::fmt::Debug for Actions {
@@ -20,16 +25,21 @@ impl std::fmt::Debug for Actions {
 }
 
 impl Actions {
-    pub(super) fn open(spec: &TopicSpec, factory: &TopicFactory) -> Result<Self, BusError> {
+    pub(super) fn open(node: &Node<Service>, spec: &TopicSpec, factory: &TopicFactory) -> Result<Self, BusError> {
         let subscriber = factory.subscriber_builder().buffer_size(spec.depth).create();
         let subscriber = subscriber.map_err(|error| topic_error(&spec.name, &error))?;
-        Ok(Self { topic: spec.name.clone(), depth: spec.depth, subscriber })
+        Ok(Self { topic: spec.name.clone(), depth: spec.depth, subscriber, orders: Orders::open(node)? })
     }
 
-    /// Writes the newest action that waits into `action` and forgets the older ones; `None` if none waits.
-    /// What is no list of at most [`MAX_ACTION`] finite numbers is no action, whoever published it.
-    pub fn newest<'a>(&self, action: &'a mut [f64; MAX_ACTION]) -> Option<&'a [f64]> {
-        let mut axes = None;
+    /// The oldest order that another program gave and nobody took.
+    pub fn order(&self) -> Option<Order> {
+        self.orders.next()
+    }
+
+    /// Writes the newest action that waits into `action` and forgets the older ones; gives it with the tick it
+    /// is the action of, or `None` if none waits. What is no list of at most [`MAX_ACTION`] finite numbers is no action, whoever published it.
+    pub fn newest<'a>(&self, action: &'a mut [f64; MAX_ACTION]) -> Option<(&'a [f64], Stamp)> {
+        let mut newest = None;
         for _ in 0..self.depth {
             let Ok(Some(sample)) = self.subscriber.receive() else { break };
             let (numbers, rest) = sample.payload().as_chunks::<8>();
@@ -41,8 +51,9 @@ impl Actions {
             for (place, number) in action.iter_mut().zip(numbers) {
                 *place = f64::from_le_bytes(*number);
             }
-            axes = Some(numbers.len());
+            newest = Some((numbers.len(), Stamp(sample.user_header().capture_ns)));
         }
-        action.get(..axes?)
+        let (axes, tick) = newest?;
+        Some((action.get(..axes)?, tick))
     }
 }

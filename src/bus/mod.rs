@@ -16,6 +16,7 @@
 mod actions;
 mod inbox;
 mod ingress;
+mod orders;
 mod place;
 mod service;
 mod shared;
@@ -38,6 +39,7 @@ use service::Service;
 pub use actions::Actions;
 pub use inbox::Inbox;
 pub use ingress::{Given, Ingress, Watch};
+pub use orders::give as give_order;
 pub use topic::{TopicId, TopicSpec};
 pub use writer::Writer;
 
@@ -116,6 +118,7 @@ pub struct Bus {
     topics: Vec<(TopicSpec, TopicFactory)>,
     wake: EventFactory<Service>,
     ingresses: Vec<(ModalityId, Arc<Ingress>)>,
+    instance: Option<String>,
     node: Arc<Node<Service>>,
 }
 
@@ -171,8 +174,15 @@ impl Bus {
             .map(|device| Ok((device.id, Arc::new(Ingress::open(&node, device)?))))
             .collect::<Result<Vec<_>, BusError>>()?;
         let actions = topics.iter().find(|(spec, _)| spec.id == TopicId::Action);
-        let actions = actions.map(|(spec, factory)| Actions::open(spec, factory).map(Arc::new)).transpose()?;
-        Ok(Self { writers, actions, topics, wake, ingresses, node: Arc::new(node) })
+        let actions = actions.map(|(spec, factory)| Actions::open(&node, spec, factory).map(Arc::new)).transpose()?;
+        let instance = instance.map(str::to_owned);
+        Ok(Self { writers, actions, topics, wake, ingresses, instance, node: Arc::new(node) })
+    }
+
+    /// What keeps this rig apart from others of the machine, if anything does.
+    #[must_use]
+    pub fn instance(&self) -> Option<&str> {
+        self.instance.as_deref()
     }
 
     /// Where the program that reads modality `id` publishes; `None` if no program does.

@@ -1,6 +1,6 @@
 use super::*;
 use crate::modality::ModalityId;
-use crate::registry::{DeviceSpec, IdentitySpec, NodeSpec, Parse, RigSpec, SerialSpec, WhenStale};
+use crate::registry::{DeviceSpec, IdentitySpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbSpec, WhenStale};
 use std::time::Duration;
 
 fn registry(depth: usize) -> Registry {
@@ -17,7 +17,7 @@ fn registry(depth: usize) -> Registry {
         devices: vec![DeviceSpec {
             name: "motor".into(),
             id,
-            identity: IdentitySpec { vid: 1, pid: 2, serial: None, port: None },
+            identity: IdentitySpec::Usb(UsbSpec { vid: 1, pid: 2, serial: None, port: None }),
             node: NodeSpec::Serial(SerialSpec {
                 baud: 115_200,
                 framing: crate::registry::Framing::Line,
@@ -32,12 +32,14 @@ fn registry(depth: usize) -> Registry {
             when_stale: WhenStale::Hold,
             latency: Duration::ZERO,
             action: None,
+            hooks: crate::registry::Hooks::default(),
             verdict: crate::registry::VerdictSpec::of(
                 crate::modality::ModalityKind::Image,
                 Duration::from_millis(500),
                 Some(30.0),
             ),
         }],
+        modules: Vec::new(),
         path: None,
         text: String::new(),
     }

@@ -88,6 +88,8 @@ pub fn install(registry: &Registry, out: &mut dyn Write) -> Result<(), Artifacts
     for arguments in [
         ["control", "--reload"].as_slice(),
         &["trigger", "--action=change", "--subsystem-match=video4linux", "--subsystem-match=tty"],
+        // CAN interfaces alone: others are none of ours.
+        &["trigger", "--action=add", "--subsystem-match=net", "--attr-match=type=280"],
     ] {
         run("udevadm", arguments)?;
     }

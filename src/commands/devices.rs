@@ -6,7 +6,9 @@ use serde::Serialize;
 
 use super::Format;
 use crate::driver::camera::{CameraInfo, query};
-use crate::registry::{Assigner, Assignment, Attachment, DeviceNode, DeviceSpec, IdentitySpec, Registry, UsbIdentity};
+use crate::registry::{
+    Assigner, Assignment, Attachment, DeviceNode, DeviceSpec, IdentitySpec, Registry, Unit, UsbSpec,
+};
 use crate::text;
 
 /// One node that is plugged in.
@@ -16,7 +18,7 @@ pub struct Plugged {
     pub node: String,
     /// What its device says it is.
     #[serde(flatten)]
-    pub usb: UsbIdentity,
+    pub unit: Unit,
     /// The entry it is, if any.
     pub entry: Option<String>,
     /// Why it is that entry, or none.
@@ -71,7 +73,7 @@ pub fn list(entries: Entries<'_>, attached: &[Attachment], formats: Formats) -> 
             },
             _ => (None, None),
         };
-        Plugged { node: attachment.node.label(), usb: attachment.usb.clone(), entry, reasons, camera, camera_error }
+        Plugged { node: attachment.node.label(), unit: attachment.unit.clone(), entry, reasons, camera, camera_error }
     };
     attached.iter().filter(|attachment| is_worth_a_line(entries, attachment)).map(plugged).collect()
 }
@@ -144,12 +146,12 @@ fn print_text(plugged: &[Plugged], missing: &[&DeviceSpec], out: &mut dyn Write)
         writeln!(out, "No camera and no serial device is plugged in.")?;
     }
     let cells = |device: &Plugged| {
-        let usb = &device.usb;
+        let unit = &device.unit;
         let entry = device.entry.as_ref().map_or("not used".to_owned(), |entry| format!("[device.{entry}]"));
-        let serial = usb.serial.as_ref().map_or("no serial".to_owned(), |serial| format!("serial {serial:?}"));
-        let port = format!("port {}", usb.port);
-        let product = usb.product.as_deref().unwrap_or("(no product name)");
-        let model = format!("{:04x}:{:04x}", usb.vid, usb.pid);
+        let serial = unit.serial().map_or("no serial".to_owned(), |serial| format!("serial {serial:?}"));
+        let port = unit.location();
+        let product = unit.usb().and_then(|usb| usb.product.as_deref()).unwrap_or("(no product name)");
+        let model = unit.model();
         [entry, device.node.clone(), model, port, serial, product.to_owned()]
             .map(|cell| text::plain(&cell).into_owned())
     };
@@ -175,7 +177,11 @@ fn print_text(plugged: &[Plugged], missing: &[&DeviceSpec], out: &mut dyn Write)
         }
     }
     for entry in missing {
-        let IdentitySpec { vid, pid, serial, port } = &entry.identity;
+        let Some(UsbSpec { vid, pid, serial, port }) = entry.identity.usb() else {
+            // It is looked for while `rapid` runs.
+            writeln!(out, "[device.{}] is on the network", entry.name)?;
+            continue;
+        };
         let unit = match (serial, port) {
             (Some(serial), _) => format!(" serial {serial:?}"),
             (None, Some(port)) => format!(" at port {port}"),

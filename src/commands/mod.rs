@@ -1,5 +1,7 @@
 //! Subcommands that need no rig: each writes to a given stream and says how it ended.
 
+pub mod ablation;
+pub mod arm;
 pub mod artifacts;
 pub mod calibrate;
 pub mod check;
@@ -7,11 +9,13 @@ pub mod compare;
 pub mod completions;
 pub mod demonstrate;
 pub mod devices;
+pub mod doctor;
 pub mod eval;
 pub mod inspect;
 pub mod mask;
 pub mod progress;
 pub mod recover;
+pub mod register;
 
 /// How a listing is written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

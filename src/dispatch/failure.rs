@@ -39,6 +39,10 @@ pub(super) enum Failure {
     #[error(transparent)]
     Artifacts(#[from] commands::artifacts::ArtifactsError),
     #[error(transparent)]
+    Register(#[from] commands::register::RegisterError),
+    #[error(transparent)]
+    Order(#[from] commands::arm::OrderError),
+    #[error(transparent)]
     Mask(#[from] commands::mask::MaskError),
     #[error(transparent)]
     Calibrate(#[from] commands::calibrate::CalibrateError),
@@ -66,12 +70,19 @@ pub(super) enum Failure {
     Compare(#[from] CompareFailure),
     #[error(transparent)]
     Demonstrate(#[from] commands::demonstrate::DemonstrateError),
+    #[error(transparent)]
+    Module(#[from] crate::registry::ModuleError),
+    #[error(transparent)]
+    Ablation(#[from] commands::ablation::AblationError),
     /// What was typed makes no sense together.
     #[error("{0}")]
     Arguments(&'static str),
     /// What was wrong has been printed.
     #[error("")]
     Told,
+    /// What was looked for has been found, and printed.
+    #[error("")]
+    Found,
     #[error("output: {0}")]
     Output(#[from] io::Error),
     /// Whatever was done has been undone on the way here.
@@ -100,6 +111,7 @@ impl Failure {
             | Self::Folder(_)
             | Self::Inspect(InspectError::NotMcap(_))
             | Self::Arguments(_)
+            | Self::Module(_)
             | Self::Bundle(_)
             | Self::Eval(EvalError::Bundle(_))
             | Self::Compare(
@@ -118,8 +130,10 @@ impl Failure {
                 2
             }
             Self::Calibrate(error) if error.is_bad_argument() => 2,
+            Self::Ablation(error) if error.is_bad_argument() => 2,
+            Self::Register(error) if error.is_bad_argument() => 2,
             Self::Recover(outcome) if outcome.is_bad_argument() => 2,
-            Self::NoPolicy(_) | Self::App(AppError::Required(_)) => 3,
+            Self::NoPolicy(_) | Self::App(AppError::Required(_)) | Self::Order(commands::arm::OrderError::Nobody) => 3,
             _ => 1,
         }
     }

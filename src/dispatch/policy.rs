@@ -86,8 +86,14 @@ pub(super) fn demonstrate(global: &Global, args: &RunArgs, source: &Source) -> R
         return Err(Failure::Arguments(text));
     }
     prepare(&args.out).map_err(Failure::Folder)?;
-    let request =
-        EpisodeRequest { out: args.out.clone(), task: args.task.clone(), tags: args.tag.clone(), duration: None };
+    let modules = super::modules(&crate::registry::Registry::task(), args)?;
+    let request = EpisodeRequest {
+        out: args.out.clone(),
+        task: args.task.clone(),
+        tags: args.tag.clone(),
+        modules,
+        duration: None,
+    };
     let format = if global.json { Format::Json } else { Format::Text };
     let (seed, episodes) = (args.seed, args.episodes);
     interruptible(move |stop| commands::demonstrate::run(&request, seed, episodes, format, stop, &mut io::stdout()))

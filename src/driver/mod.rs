@@ -8,6 +8,8 @@
 //! Invariant: no bytes from a device make a driver panic.
 
 pub mod camera;
+pub mod can;
+pub mod lan;
 pub mod process;
 pub mod replay;
 pub mod serial;
@@ -15,10 +17,12 @@ pub mod sim;
 
 use std::sync::Arc;
 
+use crate::action::{ActuatorNotice, Order};
 use crate::provenance::Negotiated;
 use crate::registry::scenario::{SimDevice, SimSource};
-use crate::registry::{DeviceNode, DeviceSpec, NodeSpec};
+use crate::registry::{CanProtocol, DeviceNode, DeviceSpec, NodeSpec};
 use crate::sample::Encoding;
+use crate::status::Episode;
 use crate::time::Stamp;
 
 /// One sample as the device gave it, borrowed until the next read.
@@ -61,6 +65,12 @@ pub enum Driver {
     Camera(Box<camera::Camera>),
     /// A serial line.
     Serial(Box<serial::Serial>),
+    /// Motors behind a CAN adapter.
+    Motors(Box<can::motors::Motors>),
+    /// The frames of a CAN bus.
+    Can(Box<can::raw::Raw>),
+    /// A device on the network.
+    Lan(Box<lan::Lan>),
     /// A device that exists only in a scenario.
     Sim(Box<sim::Sim>),
     /// One topic of a recorded episode.
@@ -80,9 +90,20 @@ impl Driver {
             (NodeSpec::Serial(serial), DeviceNode::Tty(path)) => {
                 Ok(Self::Serial(Box::new(serial::Serial::open(serial, path, spec.max_bytes).await?)))
             }
+            (NodeSpec::Can(can), DeviceNode::Net(_) | DeviceNode::Tty(_)) => match &can.protocol {
+                CanProtocol::Damiao(motors) => {
+                    Ok(Self::Motors(Box::new(can::motors::Motors::open(can, motors, node).await?)))
+                }
+                CanProtocol::Raw => Ok(Self::Can(Box::new(can::raw::Raw::open(can, node).await?))),
+            },
             (_, DeviceNode::Sim(device)) => Self::open_sim(spec, device).await,
             (NodeSpec::Camera(_), node) => Err(wrong_kind(spec, "camera", node)),
             (NodeSpec::Serial(_), node) => Err(wrong_kind(spec, "serial line", node)),
+            (NodeSpec::Can(_), node) => Err(wrong_kind(spec, "CAN adapter", node)),
+            (NodeSpec::Lan(settings), node @ (DeviceNode::Net(_) | DeviceNode::Lan { .. })) => {
+                Ok(Self::Lan(Box::new(lan::Lan::open(spec, settings, node).await?)))
+            }
+            (NodeSpec::Lan(_), node) => Err(wrong_kind(spec, "network device", node)),
             // The rig supervises programs itself: `process` only starts and ends them.
             (NodeSpec::Process(_), node) => Err(wrong_kind(spec, "program", node)),
         }
@@ -105,21 +126,76 @@ impl Driver {
         match self {
             Self::Camera(driver) => driver.read().await,
             Self::Serial(driver) => driver.read().await,
+            Self::Motors(driver) => driver.read().await,
+            Self::Can(driver) => driver.read().await,
+            Self::Lan(driver) => driver.read().await,
             Self::Sim(driver) => driver.read().await,
             Self::Replay(driver) => driver.read().await,
         }
     }
 
-    /// Tells an actuator where to go: a target an axis, in the order and the units of its table of actions.
+    /// Tells an actuator where to go: a target an axis, in the order and the units of its table of actions, as of
+    /// `tick` of the control grid.
     ///
     /// # Errors
     /// When the device takes no actions, or others.
-    pub fn command(&mut self, target: &[f64]) -> Result<(), DriverError> {
+    pub fn command(&mut self, target: &[f64], tick: Stamp) -> Result<(), DriverError> {
         match self {
+            Self::Motors(driver) => driver.command(target, tick),
             Self::Sim(driver) => driver.command(target),
-            Self::Camera(_) | Self::Serial(_) | Self::Replay(_) => {
-                Err(DriverError::Fatal("this version commands simulated actuators alone".to_owned()))
+            _ => Err(DriverError::Fatal("of real devices, motors behind a CAN adapter alone take actions".to_owned())),
+        }
+    }
+
+    /// Lets an actuator move, or stops it. One that needs no leave takes it for said.
+    ///
+    /// # Errors
+    /// When it does not take orders now.
+    pub fn order(&mut self, order: Order) -> Result<(), DriverError> {
+        match self {
+            Self::Motors(driver) => driver.order(order),
+            Self::Sim(driver) => {
+                driver.order(order);
+                Ok(())
             }
+            _ => Ok(()),
+        }
+    }
+
+    /// What an actuator has to tell, oldest first.
+    pub fn take_notice(&mut self) -> Option<ActuatorNotice> {
+        match self {
+            Self::Motors(driver) => driver.take_notice(),
+            Self::Sim(driver) => driver.take_notice(),
+            _ => None,
+        }
+    }
+
+    /// Tells a device that records by itself of the episode in progress, or with `None` that there is
+    /// none: when one begins or ends, and of one in progress when the device is opened. Returns at once:
+    /// what takes time is done by [`Self::read`] or a task of the driver's own.
+    ///
+    /// # Errors
+    /// When the device cannot do it, for people; it is read on.
+    pub fn record(&mut self, episode: Option<&Arc<Episode>>) -> Result<(), DriverError> {
+        match self {
+            Self::Lan(driver) => driver.record(episode.map(|episode| episode.file.clone())),
+            Self::Sim(driver) => {
+                driver.record(episode.is_some());
+                Ok(())
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Ends in order what the device does by itself: the run ends, or the device was unplugged. Is given
+    /// up after a moment. A driver that is only dropped has been read to its end, or was given up.
+    pub async fn close(self) {
+        match self {
+            Self::Motors(driver) => driver.close().await,
+            Self::Sim(mut driver) => driver.record(false),
+            Self::Lan(driver) => driver.close().await,
+            _ => {}
         }
     }
 
@@ -129,6 +205,9 @@ impl Driver {
         match self {
             Self::Camera(driver) => driver.description().to_owned(),
             Self::Serial(driver) => driver.description().to_owned(),
+            Self::Motors(driver) => driver.description().to_owned(),
+            Self::Can(driver) => driver.description().to_owned(),
+            Self::Lan(driver) => driver.description().to_owned(),
             Self::Sim(driver) => driver.description(),
             Self::Replay(driver) => driver.description().to_owned(),
         }
@@ -141,6 +220,9 @@ impl Driver {
         match self {
             Self::Camera(driver) => driver.negotiated(),
             Self::Serial(driver) => driver.negotiated(),
+            Self::Motors(driver) => driver.negotiated(),
+            Self::Can(driver) => driver.negotiated(),
+            Self::Lan(driver) => driver.negotiated(),
             Self::Sim(driver) => driver.negotiated(),
             Self::Replay(driver) => driver.negotiated(),
         }
@@ -152,6 +234,8 @@ fn wrong_kind(spec: &DeviceSpec, wished: &str, node: &DeviceNode) -> DriverError
         DeviceNode::Video(_) => "a camera",
         DeviceNode::Tty(_) => "a serial line",
         DeviceNode::Usb(_) => "a USB device",
+        DeviceNode::Net(_) => "a network interface",
+        DeviceNode::Lan { .. } => "on the network",
         DeviceNode::Sim(_) => "simulated",
     };
     DriverError::Fatal(format!(

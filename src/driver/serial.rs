@@ -12,10 +12,11 @@
 mod framing;
 mod parse;
 
+use std::os::fd::{FromRawFd as _, IntoRawFd as _, OwnedFd};
 use std::path::Path;
 
 use tokio::io::AsyncReadExt as _;
-use tokio_serial::{ClearBuffer, SerialPort as _, SerialStream};
+use tokio_serial::{ClearBuffer, SerialPort as _, SerialPortBuilder, SerialStream};
 
 use self::framing::{Cut, Framer};
 use super::{DriverError, Reading, unblock};
@@ -236,14 +237,29 @@ pub fn decode<'p>(
 }
 
 fn open_line(path: &Path, baud: u32) -> Result<SerialStream, DriverError> {
-    let Some(name) = path.to_str() else {
-        return Err(DriverError::Fatal(format!("{}: the path is not UTF-8", path.display())));
-    };
-    let stream = SerialStream::open(&tokio_serial::new(name, baud).exclusive(true))
-        .map_err(|error| open_error(path, baud, &error))?;
+    let stream = SerialStream::open(&line(path, baud)?).map_err(|error| open_error(path, baud, &error))?;
     // Whatever waited in the kernel is older than this opening.
     let _ = stream.clear(ClearBuffer::Input);
     Ok(stream)
+}
+
+/// The line at `path` for ourselves alone, 8 bits without parity, for who reads and writes it by itself.
+/// Neither waits.
+pub(super) fn open_raw(path: &Path, baud: u32) -> Result<OwnedFd, DriverError> {
+    let port = line(path, baud)?.open_native().map_err(|error| open_error(path, baud, &error))?;
+    let _ = port.clear(ClearBuffer::All);
+    // SAFETY: the port gives its descriptor away and does not close it.
+    let fd = unsafe { OwnedFd::from_raw_fd(port.into_raw_fd()) };
+    rustix::fs::fcntl_setfl(&fd, rustix::fs::OFlags::NONBLOCK)
+        .map_err(|error| DriverError::Retry(format!("{}: {error}", path.display())))?;
+    Ok(fd)
+}
+
+fn line(path: &Path, baud: u32) -> Result<SerialPortBuilder, DriverError> {
+    let Some(name) = path.to_str() else {
+        return Err(DriverError::Fatal(format!("{}: the path is not UTF-8", path.display())));
+    };
+    Ok(tokio_serial::new(name, baud).exclusive(true))
 }
 
 fn open_error(path: &Path, baud: u32, error: &tokio_serial::Error) -> DriverError {

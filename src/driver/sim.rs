@@ -6,6 +6,7 @@
 //!
 //! Invariant: the sequence goes on over a replug; a number that is skipped is told in `lost`.
 
+mod joints;
 mod pictures;
 pub mod task;
 
@@ -17,11 +18,13 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
+use self::joints::Joints;
 use self::pictures::{PICTURES, Pictures, Scene, encode, fill, write_picture};
 use super::{DriverError, Reading, unblock};
+use crate::action::{ActuatorNotice, Order};
 use crate::provenance::{Format, Negotiated};
 use crate::registry::scenario::{self, SimDevice, SimSource, TaskPart};
-use crate::registry::{DeviceSpec, NodeSpec};
+use crate::registry::{DeviceSpec, MOTOR_CHANNELS, NodeSpec};
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
 use crate::time::{Stamp, nanoseconds};
 
@@ -47,6 +50,9 @@ pub struct Sim {
     /// The sample in `payload` is to be sent once more, with this stamp.
     again: Option<Stamp>,
     controls: BTreeMap<String, i64>,
+    joints: Joints,
+    /// It was told to record.
+    records: bool,
 }
 
 #[derive(Debug)]
@@ -87,14 +93,30 @@ impl Sim {
         let grid = Grid { begun: device.begun, rate: u64::from(rate.max(1)) };
         let next = grid.first_after(stamp_of(Instant::now()));
         let (payload, controls) = (Vec::with_capacity(capacity), BTreeMap::new());
-        Ok(Self { device, content, grid, next, backlog, payload, owed: 0, again: None, controls })
+        Ok(Self {
+            device,
+            content,
+            grid,
+            next,
+            backlog,
+            payload,
+            owed: 0,
+            again: None,
+            controls,
+            joints: Joints::default(),
+            records: false,
+        })
     }
 
-    /// With the controls that `spec` sets: a simulated camera has those and no others.
+    /// With the controls that `spec` sets: a simulated camera has those and no others. With its motors,
+    /// which are where they are told to be.
     #[must_use]
     pub(super) fn with_controls(mut self, spec: &NodeSpec) -> Self {
         if let NodeSpec::Camera(camera) = spec {
             self.controls = camera.controls.iter().cloned().collect();
+        }
+        if let NodeSpec::Can(can) = spec {
+            self.joints = Joints::new(can.channels() / MOTOR_CHANNELS);
         }
         self
     }
@@ -104,6 +126,9 @@ impl Sim {
     /// # Errors
     /// When the device is no actuator, or takes another count of numbers.
     pub(super) fn command(&mut self, target: &[f64]) -> Result<(), DriverError> {
+        if self.joints.command(target) {
+            return Ok(());
+        }
         match (&self.content, target.try_into()) {
             (Content::Task { part: TaskPart::Arm, trial }, Ok(target)) => trial.trial().command(target),
             (Content::Task { part: TaskPart::Arm, .. }, Err(_)) => {
@@ -113,6 +138,24 @@ impl Sim {
             _ => return Err(DriverError::Fatal(format!("{} is no actuator", self.device.name))),
         }
         Ok(())
+    }
+
+    /// Lets its motors move, or stops them.
+    pub(super) fn order(&mut self, order: Order) {
+        self.joints.order(order);
+    }
+
+    /// What its motors have to tell.
+    pub(super) fn take_notice(&mut self) -> Option<ActuatorNotice> {
+        self.joints.take_notice()
+    }
+
+    /// Tells the device to record, or to end that.
+    pub(super) fn record(&mut self, record: bool) {
+        if self.records != record {
+            self.records = record;
+            self.device.record(record);
+        }
     }
 
     /// The next sample.
@@ -146,7 +189,10 @@ impl Sim {
                     let lit = pictures.shows_light() && self.device.light.was_lit(captured.before(faults.latency));
                     pictures.write(sequence, lit, &mut self.payload);
                 }
-                Content::Values { channels, seed } => write_values(*channels, *seed, sequence, &mut self.payload),
+                Content::Values { channels, seed } => {
+                    write_values(*channels, *seed, sequence, &mut self.payload);
+                    self.joints.write(&mut self.payload);
+                }
                 Content::Task { part, trial } => {
                     let mut trial = trial.trial();
                     trial.advance_to(u32::try_from(point).unwrap_or(u32::MAX));
@@ -261,7 +307,17 @@ pub(super) fn check(spec: &DeviceSpec, device: &SimDevice) -> Result<(), DriverE
             }
             (format!("{channels} numbers"), serial.channels.to_string())
         }
+        (SimSource::Serial { channels, .. }, NodeSpec::Can(can)) => {
+            // Frames have no channels; something is sent all the same.
+            if can.channels() == 0 || *channels == can.channels() {
+                return Ok(());
+            }
+            (format!("{channels} numbers"), can.channels().to_string())
+        }
+        // What stands for it sends as much as it likes.
+        (SimSource::Camera { .. } | SimSource::Serial { .. }, NodeSpec::Lan(_)) => return Ok(()),
         (SimSource::Camera { .. }, NodeSpec::Serial(_)) => (String::from("pictures"), String::from("a serial line")),
+        (SimSource::Camera { .. }, NodeSpec::Can(_)) => (String::from("pictures"), String::from("a CAN adapter")),
         (SimSource::Serial { .. }, NodeSpec::Camera(_)) => (String::from("numbers"), String::from("a camera")),
         (SimSource::Task { .. } | SimSource::Process | SimSource::Replay { .. }, _) | (_, NodeSpec::Process(_)) => {
             return Ok(());

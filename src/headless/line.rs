@@ -79,16 +79,20 @@ impl Columns {
     pub(super) fn line(self, event: &Event, wall_ns: u64) -> String {
         let palette = self.palette;
         let (subject, bit, word, rest) = match &event.what {
-            What::Attach { device, bit, node, usb, .. } => {
-                let serial = usb.serial.as_deref().map(|serial| format!(" serial {serial}")).unwrap_or_default();
-                (device, Some(bit), pad("attached"), format!("{node} port {}{serial}", usb.port))
+            What::Attach { device, bit, node, unit, .. } => {
+                let serial = unit.serial().map(|serial| format!(" serial {serial}")).unwrap_or_default();
+                (device, Some(bit), pad("attached"), format!("{node} {}{serial}", unit.location()))
             }
             What::Opened { device, bit, provenance } => {
                 let driver = provenance.negotiated.driver.as_ref();
                 let driver = driver.map(|driver| {
                     format!("  driver {} {}", driver.name, driver.version.as_deref().unwrap_or_default())
                 });
-                let firmware = provenance.usb.firmware.as_deref().map(|firmware| format!("  firmware {firmware}"));
+                let firmware = provenance
+                    .unit
+                    .usb()
+                    .and_then(|usb| usb.firmware.as_deref())
+                    .map(|firmware| format!("  firmware {firmware}"));
                 let rest =
                     [Some(format!("epoch {}", provenance.epoch.0)), firmware, driver].into_iter().flatten().collect();
                 (device, Some(bit), pad("opened"), rest)
@@ -126,6 +130,10 @@ impl Columns {
                 (&"policy".to_owned(), None, word, rest)
             }
             What::Recovered { text, .. } => (&"episode".to_owned(), None, palette.warn(&pad("repaired")), text.clone()),
+            What::Actuator { device, bit, arming, is_problem, text } => {
+                let word = pad(arming.word());
+                (device, Some(bit), if *is_problem { palette.warn(&word) } else { word }, text.clone())
+            }
             What::Log { level, text } => {
                 let word = palette.level(*level, &pad(level.word()));
                 (&"log".to_owned(), None, word, text.clone())

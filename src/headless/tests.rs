@@ -109,7 +109,7 @@ fn all_events() -> Vec<What> {
             device: "cam_wrist".to_owned(),
             bit: id(0),
             node: "/dev/video0".to_owned(),
-            usb: usb(),
+            unit: usb().into(),
             driver: None,
         },
         What::Opened {
@@ -119,7 +119,7 @@ fn all_events() -> Vec<What> {
                 epoch: Epoch(3),
                 node: "/dev/video0".to_owned(),
                 attached: TAKEN,
-                usb: usb(),
+                unit: usb().into(),
                 negotiated: Negotiated {
                     driver: Some(KernelDriver { name: "uvcvideo".to_owned(), version: Some("6.1.0".to_owned()) }),
                     ..Negotiated::default()

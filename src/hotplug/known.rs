@@ -125,7 +125,8 @@ mod tests {
     fn node(path: &str, number: u32) -> Present {
         let port = path.split('/').next().unwrap_or_default();
         let usb = UsbIdentity { vid: 1, pid: 2, serial: None, port: port.into(), ..UsbIdentity::default() };
-        let attachment = Attachment { syspath: path.into(), node: DeviceNode::Tty(path.into()), usb, driver: None };
+        let attachment =
+            Attachment { syspath: path.into(), node: DeviceNode::Tty(path.into()), unit: usb.into(), driver: None };
         Present { attachment, device_number: Some(number.to_string()) }
     }
 

@@ -1,12 +1,13 @@
 //! Hot-plug: a stream of what is plugged in and pulled out, whatever the source.
 //!
-//! `udev` watches the machine, `script` plays a scenario; both yield the same [`HotplugEvent`]s and
+//! `udev` watches the machine, `lan` the network, `script` plays a scenario; all yield the same [`HotplugEvent`]s and
 //! nothing beyond can tell them apart.
 //!
 //! Invariant: what is attached when the stream begins is told as `Added` before anything else.
 //! Invariant: a node told twice as `Added` without a removal between is the same attachment.
 
 mod known;
+pub mod lan;
 pub mod script;
 pub mod udev;
 
@@ -44,6 +45,12 @@ pub enum Witness {
     Udev,
     /// It was missing when the devices were enumerated again.
     Enumeration,
+    /// A device on the network said so itself.
+    Goodbye,
+    /// Nothing was heard of a device on the network for its lease, or nobody is at its port any more.
+    Lease,
+    /// The link to a device on the network is down.
+    Link,
     /// A scenario.
     Script,
 }
@@ -56,6 +63,9 @@ impl Witness {
             Self::Kernel => "kernel",
             Self::Udev => "udev",
             Self::Enumeration => "enumeration",
+            Self::Goodbye => "goodbye",
+            Self::Lease => "lease",
+            Self::Link => "link",
             Self::Script => "script",
         }
     }

@@ -13,7 +13,7 @@ use tokio::time::{Instant, Sleep, sleep_until};
 
 use super::{HotplugError, HotplugEvent, Witness};
 use crate::registry::scenario::{self, Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, SimDevice};
-use crate::registry::{Attachment, DeviceNode};
+use crate::registry::{Attachment, DeviceNode, Unit};
 use crate::time::Stamp;
 
 /// Plays a [`Scenario`] on tokio's clock, from the moment it is made.
@@ -143,8 +143,9 @@ pub fn attached(scenario: &Scenario) -> Vec<Attachment> {
 fn attachment(device: &ScenarioDevice, begun: Stamp) -> (Attachment, Arc<SimDevice>) {
     let sim = Arc::new(SimDevice::new(&device.name, device.source.clone(), begun).with_faults(device.faults));
     let syspath = PathBuf::from("/sim").join(&device.usb.port);
-    let (node, usb) = (DeviceNode::Sim(Arc::clone(&sim)), device.usb.clone());
-    (Attachment { syspath, node, usb, driver: Some(Box::new(scenario::driver())) }, sim)
+    let unit = device.lan.clone().map_or_else(|| Unit::Usb(device.usb.clone()), Unit::Lan);
+    let node = DeviceNode::Sim(Arc::clone(&sim));
+    (Attachment { syspath, node, unit, driver: Some(Box::new(scenario::driver())) }, sim)
 }
 
 impl Stream for Script {
@@ -179,6 +180,7 @@ mod tests {
         ScenarioDevice {
             name: name.into(),
             usb: UsbIdentity { vid: 1, pid: 2, serial: None, port: port.into(), ..UsbIdentity::default() },
+            lan: None,
             source: SimSource::Serial { channels: 1, hz: 100, seed: 1 },
             plugged,
             faults: SimFaults::default(),
@@ -191,7 +193,7 @@ mod tests {
 
     fn word(event: &HotplugEvent) -> String {
         match event {
-            HotplugEvent::Added(attachment) => format!("+{}", attachment.usb.port),
+            HotplugEvent::Added(attachment) => format!("+{}", attachment.unit.place()),
             HotplugEvent::Removed { syspath, .. } => format!("-{}", syspath.display()),
         }
     }

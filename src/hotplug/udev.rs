@@ -23,7 +23,7 @@ use crate::registry::{Attachment, DeviceNode, UsbIdentity};
 use crate::time::Stamp;
 
 /// Subsystems whose nodes are opened, beside the USB devices themselves.
-const NODE_SUBSYSTEMS: [&str; 2] = ["video4linux", "tty"];
+const NODE_SUBSYSTEMS: [&str; 3] = ["video4linux", "tty", "net"];
 
 /// See the module's comment.
 pub struct UdevMonitor {
@@ -158,19 +158,21 @@ fn attached() -> Result<Vec<Present>, HotplugError> {
     // In the order of ports, so that a start assigns equal units the same way each time.
     found.sort_by(|a, b| {
         let (a, b) = (&a.attachment, &b.attachment);
-        (&a.usb.port, &a.syspath).cmp(&(&b.usb.port, &b.syspath))
+        (a.unit.place(), &a.syspath).cmp(&(b.unit.place(), &b.syspath))
     });
     Ok(found)
 }
 
 /// The attachment of a node that can be opened; `None` for any other device.
 fn present(device: &Device) -> Option<Present> {
-    let path = device.devnode()?.to_owned();
+    let path = || Some(device.devnode()?.to_owned());
     let node = match device.subsystem()?.to_str()? {
-        "video4linux" if captures(device) => DeviceNode::Video(path),
-        "tty" => DeviceNode::Tty(path),
+        "video4linux" if captures(device) => DeviceNode::Video(path()?),
+        "tty" => DeviceNode::Tty(path()?),
+        // An interface has a name and no node.
+        "net" => DeviceNode::Net(device.sysname().to_str()?.to_owned()),
         // Of this subsystem, only the devices themselves have a node.
-        "usb" => DeviceNode::Usb(path),
+        "usb" => DeviceNode::Usb(path()?),
         _ => return None,
     };
     let usb_device = match &node {
@@ -192,8 +194,12 @@ fn present(device: &Device) -> Option<Present> {
         manufacturer: text("manufacturer"),
         firmware: text("bcdDevice").map(|release| release_number(&release)),
     };
-    let attachment =
-        Attachment { syspath: device.syspath().to_owned(), node, usb, driver: kernel_driver(device).map(Box::new) };
+    let attachment = Attachment {
+        syspath: device.syspath().to_owned(),
+        node,
+        unit: usb.into(),
+        driver: kernel_driver(device).map(Box::new),
+    };
     Some(Present { attachment, device_number: text("devnum") })
 }
 

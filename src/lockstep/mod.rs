@@ -190,7 +190,7 @@ impl Lockstep {
             device: self.name(id),
             bit: id,
             node: attachment.node.label(),
-            usb: attachment.usb.clone(),
+            unit: attachment.unit.clone(),
             driver: attachment.driver.as_deref().cloned(),
         };
         taker.event(&self.told(what));
@@ -214,7 +214,7 @@ impl Lockstep {
                 epoch,
                 node: attachment.node.label(),
                 attached: now,
-                usb: attachment.usb.clone(),
+                unit: attachment.unit.clone(),
                 negotiated: Negotiated { driver, bus, ..Negotiated::default() },
                 latency_ns: nanoseconds(lane.spec.latency),
             };

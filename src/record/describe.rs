@@ -5,12 +5,12 @@ use crate::status::What;
 /// An event for people.
 pub(super) fn describe(what: &What) -> String {
     match what {
-        What::Attach { device, node, usb, .. } => match &usb.serial {
-            Some(serial) => format!("{device} attached: {node}, port {}, serial {serial}", usb.port),
-            None => format!("{device} attached: {node}, port {}", usb.port),
-        },
+        What::Attach { device, node, unit, .. } => {
+            let serial = unit.serial().map(|serial| format!(", serial {serial}")).unwrap_or_default();
+            format!("{device} attached: {node}, {}{serial}", unit.location())
+        }
         What::Opened { device, provenance, .. } => {
-            let unit = provenance.usb.serial.as_deref().unwrap_or("without a serial number");
+            let unit = provenance.unit.serial().unwrap_or("without a serial number");
             format!("{device} opened in epoch {}: unit {unit}", provenance.epoch.0)
         }
         What::Detach { device, witness, .. } => format!("{device} detached, told by {witness}"),
@@ -22,7 +22,8 @@ pub(super) fn describe(what: &What) -> String {
         What::Recording { file } => format!("recording {}", file.display()),
         What::Episode { file, .. } => format!("finished {}", file.display()),
         What::Recovered { text, .. } | What::Log { text, .. } => text.clone(),
-        What::DiskLow { .. }
+        What::Actuator { .. }
+        | What::DiskLow { .. }
         | What::ClockStep { .. }
         | What::Policy { .. }
         | What::Chunk(_)

@@ -35,6 +35,8 @@ pub struct EpisodeRequest {
     pub task: String,
     /// `key=value` pairs of the user.
     pub tags: Vec<(String, String)>,
+    /// Names of the modules that are mounted, as far as nothing tells of them but the user.
+    pub modules: Vec<String>,
     /// The episode ends by itself after exactly this time of capture, if given.
     pub duration: Option<Duration>,
 }

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use serde_json::{Map, Value, json};
 
-use super::episode::EpisodeRequest;
+use super::configuration::{self, Configuration};
 use super::provenance::Units;
 use super::quality::{Quality, Spread};
 use crate::registry::{DeviceSpec, Registry, WhenStale};
@@ -19,6 +19,7 @@ pub(super) const POLICY: &str = "policy";
 
 /// The record at the beginning.
 ///
+/// `configuration` `{modules, present}` names the modules mounted and the modalities whose bits were set.
 /// JSON: `layout` `{name: bit}`, `modalities` `[{name, bit, topic, kind, shape, when_stale,
 /// latency_ns}]`, `serials` `{name: serial or null}` of what was attached when the episode began,
 /// `provenance` (see [`Units::epochs`]) of what ran then, `tags` `{key: value}`, `policy` `{name, hash,
@@ -28,7 +29,8 @@ pub(super) const POLICY: &str = "policy";
 /// a frame's samples are chosen: a sample stands for the moment `log_time - latency_ns`.
 pub(super) fn beginning(
     registry: &Registry,
-    request: &EpisodeRequest,
+    task: &str,
+    configuration: &Configuration,
     units: &Units,
     clock: WallClock,
     begin: Stamp,
@@ -52,13 +54,14 @@ pub(super) fn beginning(
         })
         .collect();
     let tags: Map<String, Value> =
-        request.tags.iter().map(|(key, value)| (key.clone(), value.clone().into())).collect();
+        configuration.tags.iter().map(|(key, value)| (key.clone(), value.clone().into())).collect();
     let host = rustix::system::uname();
     let mut said = text_map([
         ("software", concat!("rapid ", env!("CARGO_PKG_VERSION")).to_owned()),
         ("rig", registry.rig.name.clone()),
-        ("task", request.task.clone()),
+        ("task", task.to_owned()),
         ("tags", Value::Object(tags).to_string()),
+        (configuration::KEY, json!(configuration).to_string()),
         ("layout", Value::Object(layout).to_string()),
         ("modalities", Value::Array(modalities).to_string()),
         ("serials", units.serials().to_string()),

@@ -52,7 +52,9 @@ impl Attached {
     /// Takes an event.
     pub(super) fn take(&mut self, event: &Event) {
         match &event.what {
-            What::Attach { device, usb, .. } => drop(self.serials.insert(device.clone(), usb.serial.clone())),
+            What::Attach { device, unit, .. } => {
+                drop(self.serials.insert(device.clone(), unit.serial().map(str::to_owned)));
+            }
             What::Detach { device, .. } => drop(self.serials.remove(device)),
             What::Opened { device, provenance, .. } => {
                 self.running.insert(device.clone(), opened(event.stamp, provenance));
@@ -94,7 +96,9 @@ impl Units {
     /// Takes an event.
     pub(super) fn take(&mut self, event: &Event) {
         match &event.what {
-            What::Attach { device, usb, .. } => drop(self.serials.insert(device.clone(), usb.serial.clone())),
+            What::Attach { device, unit, .. } => {
+                drop(self.serials.insert(device.clone(), unit.serial().map(str::to_owned)));
+            }
             What::Opened { device, provenance, .. } => {
                 self.end(device, event.stamp);
                 self.epochs.entry(device.clone()).or_default().push(opened(event.stamp, provenance));
@@ -166,7 +170,8 @@ mod tests {
 
     fn attach(ms: u64, serial: &str) -> Event {
         let bit = ModalityId::new(0).unwrap();
-        let what = What::Attach { device: "cam".into(), bit, node: String::new(), usb: unit(serial), driver: None };
+        let what =
+            What::Attach { device: "cam".into(), bit, node: String::new(), unit: unit(serial).into(), driver: None };
         Event { stamp: Stamp(ms * 1_000_000), what }
     }
 
@@ -175,7 +180,7 @@ mod tests {
             epoch: Epoch(epoch),
             node: "/dev/video0".into(),
             attached: Stamp(ms),
-            usb: unit(serial),
+            unit: unit(serial).into(),
             negotiated: Negotiated::default(),
             latency_ns: 0,
         };

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::sync::mpsc::{self, Sender};
 use std::thread::JoinHandle;
 
-use tokio::sync::oneshot;
+use tokio::sync::{oneshot, watch};
 use tokio_util::sync::CancellationToken;
 
 use super::RecordError;
@@ -17,7 +17,7 @@ use super::source::Source;
 use super::space::{Asker, Disk};
 use super::writer::{Order, Reply, Writer};
 use crate::registry::Registry;
-use crate::status::Board;
+use crate::status::{Board, EpisodeWatch};
 use crate::time::WallClock;
 
 type Opener = Box<dyn FnMut(File) -> Box<dyn Sink> + Send>;
@@ -58,6 +58,7 @@ pub struct Recorder {
     orders: Option<Sender<Order>>,
     thread: Option<JoinHandle<()>>,
     ended: CancellationToken,
+    episode: EpisodeWatch,
 }
 
 impl Recorder {
@@ -69,19 +70,26 @@ impl Recorder {
         let (orders, inbox) = mpsc::channel();
         let events = config.board.events();
         let ended = CancellationToken::new();
+        let (tell, episode) = watch::channel(None);
         let guard = ended.clone().drop_guard();
         let thread = std::thread::Builder::new().name("writer".to_owned()).spawn(move || {
             // Dropped by a panic too.
             let _guard = guard;
-            Writer::new(config, inbox, events).run(source);
+            Writer::new(config, inbox, events, tell).run(source);
         })?;
-        Ok(Self { orders: Some(orders), thread: Some(thread), ended })
+        Ok(Self { orders: Some(orders), thread: Some(thread), ended, episode })
     }
 
     /// Cancelled when the thread has ended: before the handle is dropped, by a panic.
     #[must_use]
     pub fn ended(&self) -> CancellationToken {
         self.ended.clone()
+    }
+
+    /// The episode in progress: from when its file is open until its last sample is written.
+    #[must_use]
+    pub fn episode(&self) -> EpisodeWatch {
+        self.episode.clone()
     }
 
     /// Begins an episode; returns the name its file will have.

@@ -73,12 +73,14 @@ impl SampleSchema {
                 PixelFormat::Mjpg => Self::CompressedImage,
                 PixelFormat::Yuyv | PixelFormat::Grey => Self::RawImage,
             },
-            NodeSpec::Serial(_) | NodeSpec::Process(_) => match device.modality().kind {
-                ModalityKind::Scalars => Self::Scalars,
-                // A program's raw pictures get a channel of their own when the first one comes.
-                ModalityKind::Image => Self::CompressedImage,
-                ModalityKind::Bytes => Self::Bytes,
-            },
+            NodeSpec::Serial(_) | NodeSpec::Process(_) | NodeSpec::Can(_) | NodeSpec::Lan(_) => {
+                match device.modality().kind {
+                    ModalityKind::Scalars => Self::Scalars,
+                    // A program's raw pictures get a channel of their own when the first one comes.
+                    ModalityKind::Image => Self::CompressedImage,
+                    ModalityKind::Bytes => Self::Bytes,
+                }
+            }
         }
     }
 

@@ -23,6 +23,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::announce::Announcer;
+use super::configuration::Configuration;
 use super::describe::describe;
 use super::encode::EventText;
 use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest};
@@ -94,7 +95,9 @@ impl Session {
     pub(super) fn begin(beginning: Beginning<'_>, masks: &MaskHistory) -> io::Result<Self> {
         let Beginning { registry, board, request, path, sink, attached, clock, begin } = beginning;
         let units = Units::new(attached);
-        let said = metadata::beginning(&registry, request, &units, clock, begin);
+        let mask = masks.at(begin).map_or(PhysicalMask::default(), |(_, mask, _)| *mask);
+        let configuration = Configuration::of(&registry, &request.modules, &request.tags, mask);
+        let said = metadata::beginning(&registry, &request.task, &configuration, &units, clock, begin);
         let mut file = EpisodeFile::begin(sink, &registry, clock, begin, said)?;
         let settle = SETTLE + registry.devices.iter().map(|device| device.latency).max().unwrap_or_default();
         let mut measures = Measures::new(&Measured::all(&registry), Frames::of(&registry, begin, settle));

@@ -20,7 +20,7 @@ use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::registry::{
     CameraSpec, DeviceSpec, Framing, IdentitySpec, NodeSpec, Parse, PixelFormat, Registry, RigSpec, SerialSpec,
-    UsbIdentity, VerdictSpec, WhenStale,
+    UsbIdentity, UsbSpec, VerdictSpec, WhenStale,
 };
 use crate::sample::{Encoding, FLAG_ERROR, SampleHeader};
 use crate::status::{Board, Grade, Level, What};
@@ -93,7 +93,7 @@ fn device(bit: u8, name: &str, node: NodeSpec) -> DeviceSpec {
     DeviceSpec {
         name: name.to_owned(),
         id: id(bit),
-        identity: IdentitySpec { vid: 1, pid: bit.into(), serial: None, port: None },
+        identity: IdentitySpec::Usb(UsbSpec { vid: 1, pid: bit.into(), serial: None, port: None }),
         node,
         topic: format!("/rapid/{name}"),
         mount: None,
@@ -103,6 +103,7 @@ fn device(bit: u8, name: &str, node: NodeSpec) -> DeviceSpec {
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
         action: None,
+        hooks: crate::registry::Hooks::default(),
         verdict,
     }
 }
@@ -134,6 +135,7 @@ pub(super) fn registry() -> Registry {
             device(NEVER, "never", camera(PixelFormat::Yuyv)),
             device(RAW, "raw", camera(PixelFormat::Grey)),
         ],
+        modules: Vec::new(),
         path: None,
         text: "[rig]\nname = \"bench\"\n".to_owned(),
     }
@@ -171,6 +173,7 @@ impl Bench {
             out: self.folder.path().join("out"),
             task: "place block".to_owned(),
             tags: vec![("finger".to_owned(), "soft".to_owned())],
+            modules: Vec::new(),
             duration,
         }
     }
@@ -241,7 +244,8 @@ impl Bench {
             device: "raw".to_owned(),
             bit: id(RAW),
             node: "/dev/video7".to_owned(),
-            usb: UsbIdentity { port: "1-2".to_owned(), serial: Some("S7".to_owned()), ..UsbIdentity::default() },
+            unit: UsbIdentity { port: "1-2".to_owned(), serial: Some("S7".to_owned()), ..UsbIdentity::default() }
+                .into(),
             driver: None,
         };
         self.board.announce(attach);

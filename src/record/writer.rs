@@ -14,7 +14,7 @@ use std::sync::mpsc::{Receiver, TryRecvError};
 use std::time::Duration;
 
 use tokio::sync::broadcast::{self, error::TryRecvError as EventError};
-use tokio::sync::oneshot;
+use tokio::sync::{oneshot, watch};
 
 use super::RecordError;
 use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest, PARTIAL};
@@ -25,7 +25,7 @@ use super::source::Source;
 use super::space::{Finding, Space};
 use super::streams::Streams;
 use crate::fault;
-use crate::status::{Event, Level, RecordingStatus, What};
+use crate::status::{Episode, Event, Level, RecordingStatus, What};
 use crate::time::{ClockWatch, Stamp};
 
 /// Longest wait for samples: what an order, an event or a due frame may have to wait.
@@ -57,6 +57,8 @@ pub(super) struct Writer {
     streams: Streams,
     attached: Attached,
     session: Option<Session>,
+    /// Told of the session.
+    episode: watch::Sender<Option<Arc<Episode>>>,
     /// Room for the session's file.
     space: Option<Space>,
     clock: ClockWatch,
@@ -73,7 +75,12 @@ enum Turn {
 }
 
 impl Writer {
-    pub(super) fn new(mut config: RecorderConfig, inbox: Receiver<Order>, events: broadcast::Receiver<Event>) -> Self {
+    pub(super) fn new(
+        mut config: RecorderConfig,
+        inbox: Receiver<Order>,
+        events: broadcast::Receiver<Event>,
+        episode: watch::Sender<Option<Arc<Episode>>>,
+    ) -> Self {
         let clock = ClockWatch::new((config.clock)());
         Self {
             config,
@@ -82,6 +89,7 @@ impl Writer {
             streams: Streams::new(),
             attached: Attached::default(),
             session: None,
+            episode,
             space: None,
             clock,
             clock_looked: Stamp::default(),
@@ -219,6 +227,7 @@ impl Writer {
         self.config.board.set_recording(Some(session.status(begin)));
         self.config.board.announce(What::Recording { file: finished.clone() });
         self.session = Some(session);
+        self.episode.send_replace(Some(Arc::new(Episode::new(&finished))));
         self.space = Some(space);
         (self.flushed, self.reported) = (begin, begin);
         Ok(finished)
@@ -274,6 +283,7 @@ impl Writer {
 
     fn finish(&mut self, now: Stamp, reason: Option<String>) {
         let Some(session) = self.session.take() else { return };
+        self.episode.send_replace(None);
         let report = session.finish(now, &self.streams.masks, reason);
         if let Some(space) = self.space.take() {
             space.release();

@@ -2,13 +2,16 @@
 //!
 //! Invariant: strings here come from the device and are not to be trusted.
 
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use serde::Serialize;
 
-use super::scenario::SimDevice;
+use super::scenario::{SimDevice, SimSource};
 use crate::provenance::KernelDriver;
+use crate::time::Stamp;
 
 /// What a USB device says it is, and where it is plugged in.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Default, Serialize)]
@@ -38,6 +41,104 @@ pub(super) fn usb_id<S: serde::Serializer>(id: &u16, serializer: S) -> Result<S:
     serializer.collect_str(&format_args!("{id:04x}"))
 }
 
+/// What a device on the network says it is, and where it was found.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Default, Serialize)]
+pub struct LanIdentity {
+    /// The entry that asked for it: nobody else on the network is looked at.
+    #[serde(skip)]
+    pub entry: String,
+    /// Where it answers, for example `192.168.1.7:8080`.
+    pub address: String,
+    /// Name of the service instance it announced, if it was found by that.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub instance: Option<String>,
+}
+
+/// What a device says it is.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize)]
+#[serde(untagged)]
+pub enum Unit {
+    /// A USB device.
+    Usb(UsbIdentity),
+    /// A device on the network.
+    Lan(LanIdentity),
+}
+
+impl Unit {
+    /// The USB device, if it is one.
+    #[must_use]
+    pub const fn usb(&self) -> Option<&UsbIdentity> {
+        match self {
+            Self::Usb(usb) => Some(usb),
+            Self::Lan(_) => None,
+        }
+    }
+
+    /// What tells it from others of its model, if it says so: a serial number, or the name of its service.
+    #[must_use]
+    pub fn serial(&self) -> Option<&str> {
+        match self {
+            Self::Usb(usb) => usb.serial.as_deref(),
+            Self::Lan(lan) => lan.instance.as_deref(),
+        }
+    }
+
+    /// Where it is: its USB port, or its address.
+    #[must_use]
+    pub fn place(&self) -> &str {
+        match self {
+            Self::Usb(usb) => &usb.port,
+            Self::Lan(lan) => &lan.address,
+        }
+    }
+
+    /// Where it is, for people.
+    #[must_use]
+    pub fn location(&self) -> String {
+        let what = if self.usb().is_some() { "port" } else { "address" };
+        format!("{what} {}", self.place())
+    }
+
+    /// Its model, or the word `lan`.
+    #[must_use]
+    pub fn model(&self) -> String {
+        match self {
+            Self::Usb(usb) => format!("{:04x}:{:04x}", usb.vid, usb.pid),
+            Self::Lan(_) => "lan".to_owned(),
+        }
+    }
+}
+
+impl From<UsbIdentity> for Unit {
+    fn from(usb: UsbIdentity) -> Self {
+        Self::Usb(usb)
+    }
+}
+
+/// When a device on the network was last heard of by its driver, for whoever keeps its lease.
+#[derive(Debug, Clone, Default)]
+pub struct Heard(Arc<AtomicU64>);
+
+impl Heard {
+    /// It was heard of, now.
+    pub fn now(&self) {
+        self.0.store(Stamp::now().0, Ordering::Relaxed);
+    }
+
+    /// When that was; the beginning of time if it never was.
+    #[must_use]
+    pub fn at(&self) -> Stamp {
+        Stamp(self.0.load(Ordering::Relaxed))
+    }
+}
+
+impl PartialEq for Heard {
+    /// Two nodes are the same whenever they were heard of.
+    fn eq(&self, _: &Self) -> bool {
+        true
+    }
+}
+
 /// A node that can be opened.
 #[derive(Debug, Clone, PartialEq)]
 pub enum DeviceNode {
@@ -47,6 +148,16 @@ pub enum DeviceNode {
     Tty(PathBuf),
     /// The USB device itself, for example `/dev/bus/usb/001/005`.
     Usb(PathBuf),
+    /// A network interface by its name, for example `can0`: a CAN adapter, or a network adapter with a device
+    /// behind it.
+    Net(String),
+    /// A device on the network.
+    Lan {
+        /// Where it is to be reached.
+        address: SocketAddr,
+        /// When its driver heard of it.
+        heard: Heard,
+    },
     /// A simulated device.
     Sim(Arc<SimDevice>),
 }
@@ -60,7 +171,7 @@ pub struct Attachment {
     /// The node.
     pub node: DeviceNode,
     /// The device it belongs to.
-    pub usb: UsbIdentity,
+    pub unit: Unit,
     /// The kernel's driver of it.
     pub driver: Option<Box<KernelDriver>>,
 }
@@ -74,11 +185,19 @@ impl Attachment {
 }
 
 impl DeviceNode {
+    /// Is it a topic of a recorded episode, which needs no program?
+    #[must_use]
+    pub fn is_recording(&self) -> bool {
+        matches!(self, Self::Sim(device) if matches!(device.source, SimSource::Replay { .. }))
+    }
+
     /// The node as shown to people.
     #[must_use]
     pub fn label(&self) -> String {
         match self {
             Self::Video(path) | Self::Tty(path) | Self::Usb(path) => path.display().to_string(),
+            Self::Net(interface) => interface.clone(),
+            Self::Lan { address, .. } => address.to_string(),
             Self::Sim(device) => format!("sim:{}", device.name),
         }
     }

@@ -4,7 +4,8 @@
 //!
 //! 1. A unit with the vid, pid and serial number of an entry belongs to that entry alone.
 //! 2. Otherwise a unit at the port of an entry that has a port and no serial number belongs to it.
-//! 3. Otherwise it is one of the interchangeable units of the entries with neither: it takes the
+//! 3. A device on the network belongs to the entry that looked for it.
+//! 4. Otherwise it is one of the interchangeable units of the entries with neither: it takes the
 //!    entry it had last, if that is free (recognised by its serial number if it has one, otherwise
 //!    by its port), or the free entry with the lowest bit, and stays there while plugged.
 //!
@@ -15,13 +16,15 @@
 //! Invariant: two units never collapse into one entry, and one unit (one port) never takes two
 //! entries of one kind.
 
+mod entry;
+
 use std::collections::VecDeque;
 use std::path::Path;
 
-use super::attachment::{Attachment, DeviceNode, UsbIdentity};
-use super::scenario::{SimSource, TaskPart};
-use super::spec::{DeviceSpec, IdentitySpec, NodeSpec, Opens, Registry};
+use super::attachment::{Attachment, DeviceNode, Unit, UsbIdentity};
+use super::spec::Registry;
 use crate::modality::ModalityId;
+use entry::{Entry, Kind, Rule, rule};
 
 /// What an attached node is to the rig.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -75,34 +78,9 @@ pub struct Assigner {
 }
 
 #[derive(Debug, Clone)]
-struct Entry {
-    id: ModalityId,
-    name: String,
-    identity: IdentitySpec,
-    kind: Kind,
-    /// A program reads it.
-    is_process: bool,
-}
-
-#[derive(Debug, Clone)]
 struct Node {
     attachment: Attachment,
     assigned: Option<ModalityId>,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Kind {
-    Camera,
-    Serial,
-    Usb,
-}
-
-/// The rule above by which a unit fits an entry.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum Rule {
-    Serial,
-    Port,
-    Model,
 }
 
 /// A rig never sees more units of one kind than this; a device that makes up serial numbers does.
@@ -123,14 +101,14 @@ impl Assigner {
     pub fn replaces(&self, attachment: &Attachment) -> bool {
         self.attached
             .iter()
-            .any(|node| node.attachment.syspath == attachment.syspath && node.attachment.usb != attachment.usb)
+            .any(|node| node.attachment.syspath == attachment.syspath && node.attachment.unit != attachment.unit)
     }
 
     /// A node is there. Told twice of the same node, says the same.
     pub fn attach(&mut self, attachment: &Attachment) -> Assignment {
         let known = self.attached.iter().position(|node| node.attachment.syspath == attachment.syspath);
         if let Some(node) = known.and_then(|index| self.attached.get_mut(index)) {
-            if node.attachment.usb == attachment.usb
+            if node.attachment.unit == attachment.unit
                 && let Some(id) = node.assigned
             {
                 node.attachment = attachment.clone();
@@ -181,6 +159,7 @@ impl Assigner {
         let reasons = fitting.iter().map(|(rule, entry)| match rule {
             Rule::Serial => format!("vid:pid and serial number are those of [device.{}]", entry.name),
             Rule::Port => format!("vid:pid and port are those of [device.{}]", entry.name),
+            Rule::Lan => format!("it was found for [device.{}]", entry.name),
             Rule::Model => format!("vid:pid are those of [device.{}], which takes any such unit", entry.name),
         });
         Explanation { reasons: reasons.collect(), fits: fitting.iter().map(|(_, entry)| entry.id).collect() }
@@ -196,10 +175,16 @@ impl Assigner {
         }
         let free = |id: ModalityId| self.attached_as(id).is_none();
         let chosen = match rule {
-            Rule::Serial | Rule::Port => Some(best.id).filter(|id| free(*id)),
+            Rule::Serial | Rule::Port | Rule::Lan => Some(best.id).filter(|id| free(*id)),
             Rule::Model => {
                 let mut pool = fitting.iter().map(|(_, entry)| entry.id).filter(|id| free(*id));
-                let last = self.recall(&attachment.usb).into_iter().find(|id| pool.clone().any(|free| free == *id));
+                let last = attachment
+                    .unit
+                    .usb()
+                    .map(|usb| self.recall(usb))
+                    .unwrap_or_default()
+                    .into_iter()
+                    .find(|id| pool.clone().any(|free| free == *id));
                 last.or_else(|| pool.next())
             }
         };
@@ -216,12 +201,11 @@ impl Assigner {
 
     /// The entries a node fits by the best rule that applies, ascending by bit.
     fn fitting(&self, attachment: &Attachment) -> Vec<(Rule, &Entry)> {
-        let usb = &attachment.usb;
         let fits: Vec<_> = self
             .entries
             .iter()
             .filter(|entry| entry.reads(&attachment.node))
-            .filter_map(|entry| Some((rule(&entry.identity, usb)?, entry)))
+            .filter_map(|entry| Some((rule(entry, &attachment.unit)?, entry)))
             .collect();
         let best = fits.iter().map(|(rule, _)| *rule).min();
         fits.into_iter().filter(|(rule, _)| Some(*rule) == best).collect()
@@ -230,9 +214,9 @@ impl Assigner {
     /// Another node of the same unit that already is an entry this one fits: a camera may offer
     /// several capture nodes.
     fn other_node(&self, attachment: &Attachment) -> Option<&Node> {
-        let usb = &attachment.usb;
+        let usb = attachment.unit.usb()?;
         self.attached.iter().find(|node| {
-            let other = &node.attachment.usb;
+            let Some(other) = node.attachment.unit.usb() else { return false };
             let same_unit = (other.vid, other.pid, &other.port) == (usb.vid, usb.pid, &usb.port);
             let entry = self.entries.iter().find(|entry| Some(entry.id) == node.assigned);
             same_unit && other.serial == usb.serial && entry.is_some_and(|entry| entry.reads(&attachment.node))
@@ -240,11 +224,9 @@ impl Assigner {
     }
 
     fn refuse(&self, attachment: &Attachment) -> Assignment {
-        let entry = self.entries.iter().find(|entry| rule(&entry.identity, &attachment.usb).is_some());
+        let entry = self.entries.iter().find(|entry| rule(entry, &attachment.unit).is_some());
         // Hubs and keyboards are USB devices too: only one that an entry nearly means is worth a word.
-        let usb = &attachment.usb;
-        let nearly =
-            |entry: &Entry| entry.kind == Kind::Usb && (entry.identity.vid, entry.identity.pid) == (usb.vid, usb.pid);
+        let nearly = |entry: &Entry| entry.kind == Kind::Usb && entry.is_model(&attachment.unit);
         if entry.is_none() && matches!(attachment.node, DeviceNode::Usb(_)) && !self.entries.iter().any(nearly) {
             return Assignment::WrongNode { reason: format!("no entry reads {}", attachment.node.label()) };
         }
@@ -257,15 +239,15 @@ impl Assigner {
     }
 
     fn near_misses(&self, attachment: &Attachment) -> Vec<String> {
-        let usb = &attachment.usb;
-        let same_model = |entry: &&Entry| (entry.identity.vid, entry.identity.pid) == (usb.vid, usb.pid);
+        let Unit::Usb(usb) = &attachment.unit else { return vec!["no entry looks for it".to_owned()] };
         let mut reasons: Vec<String> = self
             .entries
             .iter()
-            .filter(same_model)
-            .map(|entry| {
+            .filter(|entry| entry.is_model(&attachment.unit))
+            .filter_map(|entry| Some((entry, entry.identity.usb()?)))
+            .map(|(entry, wished)| {
                 let name = &entry.name;
-                match (&entry.identity.serial, &entry.identity.port) {
+                match (&wished.serial, &wished.port) {
                     (Some(serial), _) if usb.serial.as_deref() != Some(serial) => {
                         let says = usb.serial.as_ref().map_or("has none".to_owned(), |own| format!("says {own:?}"));
                         format!("vid:pid match [device.{name}], but its serial is {serial:?} and this unit {says}")
@@ -302,8 +284,7 @@ impl Assigner {
     }
 
     fn place(&mut self, node: Node) {
-        if let Some(id) = node.assigned {
-            let usb = node.attachment.usb.clone();
+        if let (Some(id), Some(usb)) = (node.assigned, node.attachment.unit.usb().cloned()) {
             self.remembered.retain(|(past, _)| {
                 (past.vid, past.pid, &past.serial, &past.port) != (usb.vid, usb.pid, &usb.serial, &usb.port)
             });
@@ -334,62 +315,7 @@ impl Assigner {
     }
 
     fn port_of(&self, id: ModalityId) -> String {
-        self.attached_as(id).map_or_else(String::new, |node| format!("{:?}", node.usb.port))
-    }
-}
-
-impl Entry {
-    fn new(device: &DeviceSpec) -> Self {
-        let (kind, is_process) = match &device.node {
-            NodeSpec::Camera(_) => (Kind::Camera, false),
-            NodeSpec::Serial(_) => (Kind::Serial, false),
-            NodeSpec::Process(process) => match process.opens {
-                Opens::Video => (Kind::Camera, true),
-                Opens::Tty => (Kind::Serial, true),
-                Opens::Usb => (Kind::Usb, true),
-            },
-        };
-        Self { id: device.id, name: device.name.clone(), identity: device.identity.clone(), kind, is_process }
-    }
-
-    fn reads(&self, node: &DeviceNode) -> bool {
-        match node {
-            DeviceNode::Video(_) => self.kind == Kind::Camera,
-            DeviceNode::Tty(_) => self.kind == Kind::Serial,
-            DeviceNode::Usb(_) => self.kind == Kind::Usb,
-            DeviceNode::Sim(device) => match device.source {
-                SimSource::Camera { .. } | SimSource::Task { part: TaskPart::Wrist | TaskPart::Tactile, .. } => {
-                    self.kind == Kind::Camera && !self.is_process
-                }
-                SimSource::Serial { .. } | SimSource::Task { part: TaskPart::Arm, .. } => {
-                    self.kind == Kind::Serial && !self.is_process
-                }
-                SimSource::Process => self.is_process,
-                // A recorded topic stands for whatever recorded it.
-                SimSource::Replay { .. } => true,
-            },
-        }
-    }
-}
-
-impl Kind {
-    const fn label(self) -> &'static str {
-        match self {
-            Self::Camera => "camera",
-            Self::Serial => "serial line",
-            Self::Usb => "USB device",
-        }
-    }
-}
-
-fn rule(entry: &IdentitySpec, usb: &UsbIdentity) -> Option<Rule> {
-    if (entry.vid, entry.pid) != (usb.vid, usb.pid) {
-        return None;
-    }
-    match (&entry.serial, &entry.port) {
-        (Some(serial), _) => (usb.serial.as_ref() == Some(serial)).then_some(Rule::Serial),
-        (None, Some(port)) => (usb.port == *port).then_some(Rule::Port),
-        (None, None) => Some(Rule::Model),
+        self.attached_as(id).map_or_else(String::new, |node| format!("{:?}", node.unit.place()))
     }
 }
 

@@ -4,10 +4,13 @@
 //! attached device is which entry (`identity`), what a simulation plays (`scenario_file`) and the
 //! files udev and systemd read (`artifacts`).
 
+pub mod ablation;
 pub mod artifacts;
 mod attachment;
 mod diagnostic;
+pub mod edit;
 mod identity;
+pub mod import;
 mod limits;
 mod parse;
 pub mod scenario;
@@ -19,14 +22,16 @@ pub mod trust;
 pub mod units;
 mod words;
 
-pub use attachment::{Attachment, DeviceNode, UsbIdentity};
+pub use attachment::{Attachment, DeviceNode, Heard, LanIdentity, Unit, UsbIdentity};
 pub(crate) use diagnostic::did_you_mean;
 pub use diagnostic::{Diagnostic, RegistryErrors};
 pub use identity::{Assigner, Assignment, Detached, Explanation};
 pub use limits::{Limits, VerdictSpec};
-pub use parse::{BUILTIN, Loaded};
+pub use parse::{BUILTIN, Loaded, like_a_name, name_problem, read_file};
 pub use spec::{
-    ActionSpec, CameraSpec, DamiaoSpec, DeviceSpec, Framing, IdentitySpec, MAX_BORROWED, MAX_SUBSCRIBERS, MotorKind,
-    MotorMode, MotorSpec, Mount, NodeSpec, Opens, POOL_SPARE, Parse, PixelFormat, ProcessSpec, Registry, RigSpec,
-    SerialSpec, WhenStale,
+    ActionSpec, CAN_BATCH, CAN_RECORD, CAN_RESTART_MS, CameraSpec, CanAdapter, CanProtocol, CanSpec, DamiaoSpec,
+    DeviceSpec, Framing, Hook, Hooks, IdentitySpec, LanFind, LanPicture, LanProtocol, LanSpec, MAX_BORROWED,
+    MAX_MOTORS, MAX_SUBSCRIBERS, MOTOR_CHANNELS, ModuleError, ModuleSpec, MotorKind, MotorMode, MotorSpec, Mount,
+    NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream, PixelFormat, Probe, ProcessSpec, Registry, RigSpec,
+    SLCAN_BITRATES, SerialSpec, UsbSpec, WhenStale, mounted,
 };

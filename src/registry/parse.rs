@@ -8,8 +8,14 @@
 
 mod action;
 mod budget;
+mod can;
 mod device;
 mod file;
+mod hooks;
+mod identity;
+mod lan;
+mod module;
+mod motors;
 mod node;
 mod process;
 mod program;
@@ -20,15 +26,16 @@ use std::time::Duration;
 
 use super::diagnostic::{Diagnostic, RegistryErrors};
 use super::section::{At, Problems, Section, file_label, read};
-use super::spec::{Registry, RigSpec};
+use super::spec::{IdentitySpec, Registry, RigSpec};
 use super::trust::distrust;
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use device::Draft;
 use program::Programs;
 use verdict::Whose;
 
-pub(super) use device::is_port;
-pub(super) use file::read_file;
+pub use device::{like_a_name, name_problem};
+pub use file::read_file;
+pub(super) use identity::is_port;
 
 /// The registry used when there is no file: the rig `rapid --sim` simulates.
 pub const BUILTIN: &str = include_str!("../../devices.toml");
@@ -77,7 +84,7 @@ impl Registry {
         let document = read(text, &mut problems);
         problems.check()?;
         let root = Section::new(document.get_ref(), 0, String::new());
-        root.allow(&mut problems, &["rig", "verdict", "device"]);
+        root.allow(&mut problems, &["rig", "verdict", "device", "module"]);
         let rig = rig(&root, &mut problems);
         let verdict = verdict::read(&root, Whose::Rig, &mut problems);
         let programs = path.map_or(Programs::Nowhere, Programs::Beside);
@@ -88,14 +95,16 @@ impl Registry {
         check_identities(&drafts, &mut problems);
         check_topics(&drafts, &mut problems);
         check_actuators(&drafts, &mut problems);
+        lan::check_ports(&drafts, &mut problems);
         let mut warnings = assign_bits(&mut drafts, &mut problems);
         warnings.extend(unused_ports(&drafts, &problems));
-        warnings.extend(drafts.iter().filter_map(|draft| program::distrusted(draft, &problems)));
+        warnings.extend(drafts.iter().flat_map(|draft| program::distrusted(draft, &problems)));
         warnings.extend(budget::fit(&mut drafts, rig.memory_budget, root.at_of("rig"), &mut problems));
+        let modules = module::modules(&root, &drafts, &mut problems);
         problems.check()?;
         let mut devices: Vec<_> = drafts.into_iter().filter_map(|draft| draft.finish(&verdict)).collect();
         devices.sort_by_key(|device| device.id);
-        let registry = Self { rig, devices, path: path.map(Path::to_path_buf), text: text.to_owned() };
+        let registry = Self { rig, devices, modules, path: path.map(Path::to_path_buf), text: text.to_owned() };
         Ok(Loaded { registry, warnings })
     }
 
@@ -186,9 +195,9 @@ fn drafts<'a>(root: &Section<'a>, programs: Programs<'_>, problems: &mut Problem
 /// device may have one entry for its camera and one for its serial line.
 fn check_identities(drafts: &[Draft<'_>], problems: &mut Problems<'_>) {
     for (index, draft) in drafts.iter().enumerate() {
-        let Some(identity) = &draft.identity else { continue };
+        let Some(identity) = draft.identity.as_ref().and_then(IdentitySpec::usb) else { continue };
         let same_unit = |other: &&Draft<'_>| {
-            let Some(earlier) = &other.identity else { return false };
+            let Some(earlier) = other.identity.as_ref().and_then(IdentitySpec::usb) else { return false };
             let same_model = (earlier.vid, earlier.pid, other.opens()) == (identity.vid, identity.pid, draft.opens());
             let same_place = match (&identity.serial, &earlier.serial) {
                 (Some(serial), Some(earlier)) => serial == earlier,
@@ -212,7 +221,8 @@ fn check_identities(drafts: &[Draft<'_>], problems: &mut Problems<'_>) {
 
 fn unused_ports(drafts: &[Draft<'_>], problems: &Problems<'_>) -> Vec<Diagnostic> {
     let both = drafts.iter().filter(|draft| {
-        draft.identity.as_ref().is_some_and(|identity| identity.serial.is_some() && identity.port.is_some())
+        let usb = draft.identity.as_ref().and_then(IdentitySpec::usb);
+        usb.is_some_and(|usb| usb.serial.is_some() && usb.port.is_some())
     });
     let warn = |draft: &Draft<'_>| {
         let message = "port has no effect beside a serial number: the unit is recognised in every port".to_owned();
@@ -247,7 +257,8 @@ fn check_actuators(drafts: &[Draft<'_>], problems: &mut Problems<'_>) {
     let Some(first) = actuators.next() else { return };
     for draft in actuators {
         let message = format!("[{}] is an actuator already, and a rig has one", first.section.entry);
-        draft.section.report(problems, "action", message, "remove one of the two action tables");
+        let fix = "remove one of the two action tables; the motors of a CAN bus have one without being asked";
+        draft.section.report(problems, "action", message, fix);
     }
 }
 

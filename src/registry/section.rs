@@ -354,20 +354,21 @@ impl<'a> Section<'a> {
         Some(Section::new(table, value.span().start, entry))
     }
 
-    /// The tables of `[[key]]`, named `key 1`, `key 2`, ...
+    /// The tables of `[[key]]`, named `key 1`, `key 2`, ..., below this one's name.
     pub(super) fn tables(&self, problems: &mut Problems<'_>, key: &str) -> Vec<Section<'a>> {
         let Some(value) = self.field(key) else { return Vec::new() };
+        let name = self.child(key);
         let DeValue::Array(array) = value.get_ref() else {
-            self.wrong_type(problems, key, "a list of tables", format!("write [[{key}]] with two brackets"));
+            self.wrong_type(problems, key, "a list of tables", format!("write [[{name}]] with two brackets"));
             return Vec::new();
         };
         let mut sections = Vec::new();
         for (index, item) in array.iter().enumerate() {
-            let entry = format!("{key} {}", index + 1);
+            let entry = format!("{name} {}", index + 1);
             if let DeValue::Table(table) = item.get_ref() {
                 sections.push(Section::new(table, item.span().start, entry));
             } else {
-                problems.report(item.span().start, &entry, "not a table", format!("write [[{key}]] tables"));
+                problems.report(item.span().start, &entry, "not a table", format!("write [[{name}]] tables"));
             }
         }
         sections

@@ -4,6 +4,10 @@
 //! unique; no two entries of one kind of node mean the same unit; `Registry::devices` is in
 //! ascending order of bit.
 
+mod can;
+mod hooks;
+mod lan;
+mod module;
 mod motors;
 
 use std::path::PathBuf;
@@ -11,11 +15,18 @@ use std::time::Duration;
 
 use serde::Serialize;
 
+pub use hooks::{Hook, Hooks};
+
 use super::limits::VerdictSpec;
 use crate::modality::{Modality, ModalityId, ModalityKind};
 use crate::sample::SampleHeader;
 
-pub use motors::{DamiaoSpec, MotorKind, MotorMode, MotorSpec};
+pub use can::{
+    CAN_BATCH, CAN_RECORD, CAN_RESTART_MS, CanAdapter, CanProtocol, CanSpec, MOTOR_CHANNELS, SLCAN_BITRATES,
+};
+pub use lan::{LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, Probe};
+pub use module::{ModuleError, ModuleSpec, mounted};
+pub use motors::{DamiaoSpec, MAX_MOTORS, MotorKind, MotorMode, MotorSpec};
 
 /// Samples that the pool of a topic holds beyond its depth: what 8 subscribers hold back, 4 each, the
 /// one being written, and one that is on its way out. The bus reserves them.
@@ -37,6 +48,8 @@ pub struct Registry {
     pub rig: RigSpec,
     /// One entry a modality, ascending by bit, at least one, at most 64.
     pub devices: Vec<DeviceSpec>,
+    /// What can be mounted, in the order of the file.
+    pub modules: Vec<ModuleSpec>,
     /// Where the text came from, for messages. `None` for the built-in registry.
     pub path: Option<PathBuf>,
     /// The text itself, recorded with every episode.
@@ -69,7 +82,7 @@ pub struct DeviceSpec {
     pub name: String,
     /// Bit in the mask.
     pub id: ModalityId,
-    /// Which USB device this is.
+    /// Which device this is.
     pub identity: IdentitySpec,
     /// How it is read.
     pub node: NodeSpec,
@@ -93,6 +106,8 @@ pub struct DeviceSpec {
     pub verdict: VerdictSpec,
     /// The device is an actuator, and takes these actions.
     pub action: Option<ActionSpec>,
+    /// What is run when something happens to it.
+    pub hooks: Hooks,
 }
 
 /// `[device.NAME.action]`: what an actuator may be told. All lists have one entry an axis, `1..=64` of
@@ -109,9 +124,36 @@ pub struct ActionSpec {
     pub max: Vec<f64>,
 }
 
+/// Which device an entry means.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize)]
+#[serde(untagged)]
+pub enum IdentitySpec {
+    /// A USB device.
+    Usb(UsbSpec),
+    /// A device on the network: [`NodeSpec::Lan`] says where it is looked for.
+    Lan {},
+}
+
+impl IdentitySpec {
+    /// The USB device, if it is one.
+    #[must_use]
+    pub const fn usb(&self) -> Option<&UsbSpec> {
+        match self {
+            Self::Usb(usb) => Some(usb),
+            Self::Lan {} => None,
+        }
+    }
+
+    /// Its serial number, if the entry has one.
+    #[must_use]
+    pub fn serial(&self) -> Option<&str> {
+        self.usb()?.serial.as_deref()
+    }
+}
+
 /// Which USB device an entry means.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize)]
-pub struct IdentitySpec {
+pub struct UsbSpec {
     /// USB vendor id.
     #[serde(serialize_with = "super::attachment::usb_id")]
     pub vid: u16,
@@ -133,6 +175,10 @@ pub enum NodeSpec {
     Serial(SerialSpec),
     /// A program that reads the device and publishes.
     Process(ProcessSpec),
+    /// A CAN adapter.
+    Can(CanSpec),
+    /// A device on the network, or behind a network adapter.
+    Lan(LanSpec),
 }
 
 /// `[device.NAME.camera]`.
@@ -202,6 +248,8 @@ pub enum Opens {
     /// The USB device itself, `/dev/bus/usb/...`: for programs that use libusb or find the device
     /// themselves.
     Usb,
+    /// Its network interface, which has no path: `can` and `lan` read it, no program.
+    Net,
 }
 
 /// Message boundaries on a serial line.
@@ -262,6 +310,8 @@ impl DeviceSpec {
             (NodeSpec::Serial(_), ModalityKind::Bytes) => Vec::new(),
             (NodeSpec::Serial(serial), _) => vec![u32::try_from(serial.channels).unwrap_or(u32::MAX)],
             (NodeSpec::Process(process), _) => process.shape.clone(),
+            (NodeSpec::Can(can), _) => can.shape(),
+            (NodeSpec::Lan(lan), _) => lan.shape(),
         };
         Modality { name: self.name.clone(), kind, shape }
     }
@@ -276,6 +326,8 @@ impl NodeSpec {
             Self::Serial(serial) if serial.parse == Parse::Raw => ModalityKind::Bytes,
             Self::Serial(_) => ModalityKind::Scalars,
             Self::Process(process) => process.kind,
+            Self::Can(can) => can.modality_kind(),
+            Self::Lan(lan) => lan.modality_kind(),
         }
     }
 }

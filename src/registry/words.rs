@@ -3,7 +3,7 @@
 
 use std::fmt;
 
-use super::spec::{Framing, Mount, NodeSpec, Opens, Parse, PixelFormat, WhenStale};
+use super::spec::{CanAdapter, CanProtocol, Framing, Mount, NodeSpec, Opens, Parse, PixelFormat, WhenStale};
 use crate::modality::ModalityKind;
 
 impl PixelFormat {
@@ -23,9 +23,21 @@ impl Mount {
         [("front", Self::Front), ("tip", Self::Tip), ("top", Self::Top), ("bottom", Self::Bottom)];
 }
 
+impl CanAdapter {
+    /// Every kind of adapter and its name.
+    pub const WORDS: [(&str, Self); 3] =
+        [("socketcan", Self::SocketCan), ("slcan", Self::Slcan), ("damiao", Self::Damiao)];
+}
+
 impl Opens {
     /// Every node a program may open and its name.
     pub const WORDS: [(&str, Self); 3] = [("video", Self::Video), ("tty", Self::Tty), ("usb", Self::Usb)];
+
+    /// The word for it.
+    #[must_use]
+    pub fn word(self) -> &'static str {
+        if self == Self::Net { "net" } else { word(&Self::WORDS, &self) }
+    }
 }
 
 /// What the samples of a program may hold.
@@ -65,9 +77,15 @@ impl fmt::Display for WhenStale {
     }
 }
 
-impl fmt::Display for Opens {
+impl fmt::Display for CanAdapter {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(word(&Self::WORDS, self))
+    }
+}
+
+impl fmt::Display for Opens {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.word())
     }
 }
 
@@ -82,13 +100,15 @@ impl fmt::Display for Framing {
 }
 
 impl NodeSpec {
-    /// The kind of node: `camera`, `serial` or `process`.
+    /// The kind of node: `camera`, `serial`, `can`, `lan` or `process`.
     #[must_use]
     pub const fn kind(&self) -> &'static str {
         match self {
             Self::Camera(_) => "camera",
             Self::Serial(_) => "serial",
             Self::Process(_) => "process",
+            Self::Can(_) => "can",
+            Self::Lan(_) => "lan",
         }
     }
 
@@ -100,6 +120,13 @@ impl NodeSpec {
             Self::Serial(serial) if serial.parse == Parse::Raw => {
                 format!("{} baud {} raw", serial.baud, serial.framing)
             }
+            Self::Can(can) => match &can.protocol {
+                CanProtocol::Raw => format!("{} {} bit/s raw", can.adapter, can.bitrate),
+                CanProtocol::Damiao(damiao) => {
+                    format!("{} {} bit/s damiao x{}", can.adapter, can.bitrate, damiao.motors.len())
+                }
+            },
+            Self::Lan(lan) => lan.format(),
             Self::Serial(serial) => {
                 format!("{} baud {} {} x{}", serial.baud, serial.framing, serial.parse, serial.channels)
             }

@@ -7,14 +7,19 @@
 //! Invariant: nothing here waits for a device; a stream that is to end is told so and forgotten.
 //! Invariant: the end of a stream, by value or by panic, is an event like any other.
 
+mod attendant;
+mod logbook;
+mod output;
 mod owner;
 pub mod presence;
+mod programs;
 pub mod slot;
 mod stream;
 mod worker;
 
 pub use owner::Rig;
 
+use crate::action::Order;
 use crate::hotplug::HotplugError;
 use crate::modality::ModalityId;
 use presence::PresenceError;
@@ -35,4 +40,6 @@ pub enum RigError {
 pub enum RigCommand {
     /// Start a failed device again.
     Restart(ModalityId),
+    /// Let the actuator move, or stop it.
+    Order(Order),
 }

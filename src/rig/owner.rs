@@ -6,23 +6,26 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use futures::StreamExt;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 use tokio::task::{Id, JoinError, JoinSet};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep, timeout};
 use tokio_util::sync::CancellationToken;
 
+use super::attendant::Post;
 use super::presence::{JsonDevice, Presence};
+use super::programs::Programs;
 use super::slot::{Effects, End, Input, Slot};
-use super::stream::{Numbers, Report, Reported, Stream};
-use super::worker::{Seat, Workers};
+use super::stream::{Controls, Numbers, Reported, Stream};
+use super::worker::Seat;
 use super::{RigCommand, RigError};
-use crate::bus::{Actions, Bus, TopicId, Writer};
+use crate::action::Order;
+use crate::bus::{Bus, TopicId, Writer};
 use crate::hotplug::{HotplugEvent, HotplugStream, Witness};
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::registry::{Assigner, Assignment, Attachment, DeviceSpec, Registry};
 use crate::sample::Epoch;
-use crate::status::{Board, Level, SlotState, What};
+use crate::status::{Board, EpisodeWatch, SlotState, What};
 use crate::time::Stamp;
 
 /// The JSON file is written this often, and at every change.
@@ -47,7 +50,11 @@ pub struct Rig {
     tasks: HashMap<Id, (ModalityId, Epoch)>,
     reports: mpsc::Sender<Reported>,
     /// The programs, if an entry needs one.
-    workers: Option<Workers>,
+    programs: Option<Programs>,
+    /// The episode in progress.
+    episode: EpisodeWatch,
+    /// To the actuator.
+    orders: watch::Sender<Option<Order>>,
 }
 
 /// A slot and what belongs to it.
@@ -63,8 +70,10 @@ struct Modality {
     stop: CancellationToken,
     /// Where its program works, if it has one.
     seat: Option<Seat>,
-    /// What it is told, if it is the actuator.
-    actions: Option<Arc<Actions>>,
+    /// Where its hooks are run, if a program is run at all.
+    post: Option<Post>,
+    /// What it is told, if it is the actuator and no program reads it.
+    controls: Option<Controls>,
     /// What was agreed with the device, or why it does not run.
     detail: String,
 }
@@ -73,18 +82,30 @@ impl Rig {
     /// A rig with every slot empty, which publishes through `presence`.
     #[must_use]
     pub fn new(registry: &Registry, bus: &Bus, presence: Presence, board: Arc<Board>) -> Self {
-        let workers = Workers::new(registry, bus, &board);
+        let programs = Programs::new(registry, bus, &board);
+        let prefix = bus.membership().prefix();
+        let orders = watch::Sender::new(None);
         let modality = |spec: &DeviceSpec| {
             let writer = bus.writer(TopicId::Modality(spec.id))?;
+            let spec = Arc::new(spec.clone());
+            let seat = programs.as_ref().and_then(|programs| Seat::new(programs, &spec, bus));
+            let post = programs
+                .as_ref()
+                .map(|programs| Post::new(programs, &spec, prefix.clone(), seat.as_ref().map(Seat::turn)));
             Some(Modality {
-                spec: Arc::new(spec.clone()),
                 slot: Slot::new(registry.rig.cooldown),
                 writer,
                 numbers: Arc::default(),
                 attached: Stamp::default(),
                 stop: CancellationToken::new(),
-                actions: spec.action.as_ref().and_then(|_| bus.actions()),
-                seat: workers.as_ref().and_then(|workers| workers.seat(spec, bus)),
+                // A program that moves its device listens itself.
+                controls: spec.action.as_ref().filter(|_| seat.is_none()).and_then(|_| {
+                    let orders = orders.subscribe();
+                    Some(Controls::new(bus.actions()?, orders, false))
+                }),
+                seat,
+                post,
+                spec,
                 detail: String::new(),
             })
         };
@@ -99,20 +120,9 @@ impl Rig {
             streams: JoinSet::new(),
             tasks: HashMap::new(),
             reports: mpsc::channel(1).0,
-            workers,
-        }
-    }
-
-    /// Cancelled, it kills the programs that are being ended.
-    #[must_use]
-    pub fn hurry(&self) -> CancellationToken {
-        self.workers.as_ref().map_or_else(CancellationToken::new, Workers::hurry)
-    }
-
-    /// After a run, waits for the programs of its devices, which it told to end.
-    pub async fn programs_ended(&self) {
-        if let Some(workers) = &self.workers {
-            workers.ended().await;
+            programs,
+            episode: watch::channel(None).1,
+            orders,
         }
     }
 
@@ -144,7 +154,11 @@ impl Rig {
                     None => break Ok(()),
                 },
                 Some((id, epoch, report)) = reported.recv() => self.report(id, epoch, report),
-                Some(RigCommand::Restart(id)) = commands.recv() => self.apply(id, Input::Restart),
+                Some(command) = commands.recv() => match command {
+                    RigCommand::Restart(id) => self.apply(id, Input::Restart),
+                    // Without an actuator nobody listens.
+                    RigCommand::Order(order) => drop(self.orders.send(Some(order))),
+                },
                 () = sleep(deadline.since(Stamp::now())) => self.deadlines_passed(),
                 _ = json.tick() => self.json_is_stale = true,
             }
@@ -165,9 +179,9 @@ impl Rig {
                 match self.assigner.attach(&attachment) {
                     Assignment::Entry(id) => self.attached(id, attachment),
                     Assignment::Waiting { reason } | Assignment::Unregistered { reason } => {
-                        let usb = &attachment.usb;
-                        let serial = usb.serial.as_deref().unwrap_or("no serial");
-                        let device = format!("{:04x}:{:04x} ({serial}) at {}", usb.vid, usb.pid, usb.port);
+                        let unit = &attachment.unit;
+                        let serial = unit.serial().unwrap_or("no serial");
+                        let device = format!("{} ({serial}) at {}", unit.model(), unit.place());
                         self.board.announce(What::Unregistered { device, reason });
                     }
                     Assignment::WrongNode { reason } => tracing::debug!(%reason, "node not used"),
@@ -186,11 +200,12 @@ impl Rig {
             device: modality.spec.name.clone(),
             bit: id,
             node: attachment.node.label(),
-            usb: attachment.usb.clone(),
+            unit: attachment.unit.clone(),
             driver: attachment.driver.as_deref().cloned(),
         };
         modality.attached = Stamp::now();
         self.board.announce(what);
+        self.attend(id, &attachment);
         self.apply(id, Input::Attached(attachment));
     }
 
@@ -199,6 +214,7 @@ impl Rig {
         for id in detached.freed {
             self.tell_detach(id, witness.word());
             self.apply(id, Input::Detached);
+            self.dismiss(id);
         }
         for (id, attachment) in detached.assigned {
             self.attached(id, attachment);
@@ -231,32 +247,6 @@ impl Rig {
             End::Retry | End::Fatal => modality.detail = reason,
         }
         self.apply(id, Input::Ended(epoch, end));
-    }
-
-    fn report(&mut self, id: ModalityId, epoch: Epoch, report: Report) {
-        // A report may arrive after the end of its stream, whose reason must stay.
-        let Some(modality) = self.modality(id).filter(|modality| modality.slot.is_current(epoch)) else { return };
-        match report {
-            Report::Opened(description, provenance) => {
-                modality.detail = description;
-                let device = modality.spec.name.clone();
-                self.show(id);
-                self.board.announce(What::Opened { device, bit: id, provenance });
-            }
-            Report::Silent(limit) => {
-                modality.detail = format!("{}; it has sent nothing for {} s", modality.detail, limit.as_secs());
-                let text = format!("{}: open, but it has sent nothing for {} s", modality.spec.name, limit.as_secs());
-                self.show(id);
-                self.board.announce(What::Log { level: Level::Warn, text });
-            }
-            Report::Started => self.apply(id, Input::Started(epoch)),
-            Report::Stalled => self.apply(id, Input::Stalled(epoch)),
-            Report::Resumed => self.apply(id, Input::Resumed(epoch)),
-            Report::Refused(reason) => {
-                let text = format!("{}: {reason}", modality.spec.name);
-                self.board.announce(What::Log { level: Level::Error, text });
-            }
-        }
     }
 
     fn deadlines_passed(&mut self) {
@@ -315,7 +305,7 @@ impl Rig {
     }
 
     fn start(&mut self, id: ModalityId, epoch: Epoch, attachment: Attachment) {
-        let (board, reports) = (Arc::clone(&self.board), self.reports.clone());
+        let (board, reports, episode) = (Arc::clone(&self.board), self.reports.clone(), self.episode.clone());
         let Some(modality) = self.modality(id) else { return };
         modality.stop = CancellationToken::new();
         let stream = Stream {
@@ -329,7 +319,8 @@ impl Rig {
             reports,
             stop: modality.stop.clone(),
             seat: modality.seat.clone(),
-            actions: modality.actions.clone(),
+            controls: modality.controls.clone(),
+            episode,
         };
         let task = self.streams.spawn(stream.run());
         self.tasks.insert(task.id(), (id, epoch));
@@ -339,13 +330,6 @@ impl Rig {
         let board = Arc::clone(&self.board);
         let Some(modality) = self.modality(id) else { return };
         board.set_slot(id, modality.slot.state(), modality.slot.epoch(), &modality.detail);
-    }
-
-    fn announce_state(&mut self, id: ModalityId) {
-        let (mask, count, board) = (self.mask, self.modalities.len(), Arc::clone(&self.board));
-        let Some(modality) = self.modality(id) else { return };
-        let (device, detail, state) = (modality.spec.name.clone(), modality.detail.clone(), modality.slot.state());
-        board.announce(What::State { device, bit: id, state, mask: mask.hex(count), detail });
     }
 
     fn write_json(&self) {
@@ -389,5 +373,7 @@ impl Rig {
     }
 }
 
+mod programs;
+mod report;
 #[cfg(test)]
 mod tests;

@@ -4,6 +4,9 @@
 //! own; what publishing costs is said in `bus`.
 //! Invariant: a stream that was told to stop publishes no more.
 
+mod controls;
+mod source;
+
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
@@ -13,16 +16,14 @@ use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until, timeout};
 use tokio_util::sync::CancellationToken;
 
 use super::slot::End;
-use super::worker::{MOST_SILENT_BEATS, Seat, Worker};
-use crate::action::MAX_ACTION;
-use crate::bus::{Actions, Writer};
-use crate::driver::{Driver, DriverError, Reading};
+use super::worker::Seat;
+use crate::action::ActuatorNotice;
+use crate::bus::Writer;
+use crate::driver::{DriverError, Reading};
 use crate::fault;
-use crate::provenance::Negotiated;
-use crate::registry::scenario::SimSource;
-use crate::registry::{Attachment, DeviceNode, DeviceSpec, NodeSpec};
+use crate::registry::{Attachment, DeviceSpec, NodeSpec};
 use crate::sample::{Epoch, SampleHeader};
-use crate::status::{Board, Provenance};
+use crate::status::{Board, EpisodeWatch, Provenance};
 use crate::time::{Stamp, nanoseconds};
 
 /// A device that does not open within this time is tried again.
@@ -34,8 +35,13 @@ const SILENT_AFTER: Duration = Duration::from_secs(2);
 /// A camera always sends: one that has sent nothing for this long is opened again. Six of these and the
 /// delays between them fit into the minute in which five restarts are allowed.
 const CAMERA_LIMIT: Duration = Duration::from_secs(5);
+/// How long a device may take to be closed in order.
+const CLOSE_LIMIT: Duration = Duration::from_secs(2);
 /// How often the actuator is asked whether it was told something.
 const ACTIONS_EVERY: Duration = Duration::from_millis(2);
+
+pub(super) use controls::Controls;
+use source::Source;
 
 /// What a stream tells the rig while it runs.
 #[derive(Debug, Clone, PartialEq)]
@@ -52,6 +58,8 @@ pub(super) enum Report {
     Resumed,
     /// Samples or actions are lost, and why; told once an epoch.
     Refused(String),
+    /// What an actuator has to tell.
+    Actuator(ActuatorNotice),
 }
 
 /// A report with its sender.
@@ -92,90 +100,36 @@ pub(super) struct Stream {
     /// Where the program of the entry works, if it has one.
     pub(super) seat: Option<Seat>,
     /// What it is told, if it is the actuator.
-    pub(super) actions: Option<Arc<Actions>>,
-}
-
-/// Where the samples of a stream come from.
-#[derive(Debug)]
-enum Source {
-    Driver(Driver),
-    Worker(Box<Worker>),
-}
-
-impl Source {
-    async fn open(stream: &Stream) -> Result<Self, DriverError> {
-        let Stream { spec, attachment, epoch, seat, .. } = stream;
-        match (&spec.node, seat) {
-            // A recorded topic needs no program.
-            (NodeSpec::Process(process), Some(seat)) if !is_recording(&attachment.node) => {
-                Ok(Self::Worker(Box::new(Worker::open(seat, spec, process, attachment, *epoch).await?)))
-            }
-            _ => Ok(Self::Driver(Driver::open(spec, &attachment.node).await?)),
-        }
-    }
-
-    async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
-        match self {
-            Self::Driver(driver) => driver.read().await,
-            Self::Worker(worker) => worker.read().await,
-        }
-    }
-
-    fn description(&self) -> String {
-        match self {
-            Self::Driver(driver) => driver.description(),
-            Self::Worker(worker) => worker.description(),
-        }
-    }
-
-    fn command(&mut self, target: &[f64]) -> Result<(), DriverError> {
-        match self {
-            Self::Driver(driver) => driver.command(target),
-            Self::Worker(_) => Err(DriverError::Fatal("a program of the rig takes no actions".to_owned())),
-        }
-    }
-
-    fn negotiated(&self) -> Negotiated {
-        match self {
-            Self::Driver(driver) => driver.negotiated(),
-            // What a program agrees with its device, only the program knows.
-            Self::Worker(worker) => Negotiated { card: Some(worker.description()), ..Negotiated::default() },
-        }
-    }
-
-    /// A source that is silent for this long is opened anew.
-    fn patience(&self, stall_after: Duration) -> Option<Duration> {
-        match self {
-            Self::Driver(_) => None,
-            Self::Worker(_) => Some(stall_after * MOST_SILENT_BEATS),
-        }
-    }
-}
-
-fn is_recording(node: &DeviceNode) -> bool {
-    matches!(node, DeviceNode::Sim(device) if matches!(device.source, SimSource::Replay { .. }))
+    pub(super) controls: Option<Controls>,
+    /// The episode in progress, of which devices are told that record by themselves.
+    pub(super) episode: EpisodeWatch,
 }
 
 impl Stream {
     /// Reads the device until it ends or the stream is told to stop. The reason is for people.
     pub(super) async fn run(self) -> (End, String) {
-        let stop = self.stop.clone();
         let stopped = || (End::Gone, "stopped".to_owned());
-        tokio::select! {
+        let opened = tokio::select! {
             biased;
-            () = stop.cancelled() => stopped(),
-            end = self.read() => end,
-        }
-    }
-
-    async fn read(self) -> (End, String) {
-        let opened = timeout(OPEN_LIMIT, Source::open(&self)).await;
+            () = self.stop.cancelled() => return stopped(),
+            opened = timeout(OPEN_LIMIT, Source::open(&self)) => opened,
+        };
         let mut source = match opened {
             Ok(Ok(source)) => source,
             Ok(Err(error)) => return end(&error),
             Err(_) => return (End::Retry, format!("did not open within {} s", OPEN_LIMIT.as_secs())),
         };
-        self.report(Report::Opened(source.description(), Box::new(self.provenance(&source)))).await;
+        tokio::select! {
+            biased;
+            () = self.stop.cancelled() => {}
+            end = self.read(&mut source) => return end,
+        }
+        source.close().await;
+        stopped()
+    }
+
+    async fn read(&self, source: &mut Source) -> (End, String) {
+        self.report(Report::Opened(source.description(), Box::new(self.provenance(source)))).await;
         let patience = source.patience(self.spec.stall_after);
         let mut pulse = Pulse::Silent;
         let mut refused = false;
@@ -185,9 +139,18 @@ impl Stream {
         tokio::pin!(silent);
         let mut told = interval(ACTIONS_EVERY);
         told.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let mut action = [0.0; MAX_ACTION];
-        // What was said before it was there was not meant for now.
-        let _ = self.actions.as_ref().and_then(|actions| actions.newest(&mut action));
+        let mut controls = self.controls.clone();
+        if let Some(controls) = &mut controls
+            && let Err(error) = controls.begin(source)
+        {
+            return end(&error);
+        }
+        let mut episode = self.episode.clone();
+        if episode.borrow_and_update().is_some() {
+            episode.mark_changed();
+        }
+        let news = changed(episode.clone());
+        tokio::pin!(news);
         // The timer is looked at when it fires, not set anew at every sample.
         let mut newest = Instant::now();
         loop {
@@ -210,16 +173,24 @@ impl Stream {
                         pulse = Pulse::Beating;
                         self.report(report).await;
                     }
+                    // A device that always has something to read never lets us get to `news`.
+                    self.tell(source, &mut episode).await;
                 }
-                _ = told.tick(), if self.actions.is_some() => {
-                    let newest = self.actions.as_ref().and_then(|actions| actions.newest(&mut action));
-                    if let Some(target) = newest
-                        && let Err(error) = source.command(target)
+                _ = told.tick(), if controls.is_some() => {
+                    if let Some(controls) = &mut controls
+                        && let Err(error) = controls.pass_on(source)
                         && !refused
                     {
                         refused = true;
                         self.report(Report::Refused(format!("it does not move: {error}"))).await;
                     }
+                    while let Some(notice) = source.take_notice() {
+                        self.report(Report::Actuator(notice)).await;
+                    }
+                }
+                () = &mut news => {
+                    self.tell(source, &mut episode).await;
+                    news.set(changed(episode.clone()));
                 }
                 reason = &mut silent, if pulse == Pulse::Silent => return (End::Retry, reason),
                 () = &mut stall => {
@@ -241,6 +212,18 @@ impl Stream {
         }
     }
 
+    /// Tells the device what is new of the episode in progress, if anything is.
+    async fn tell(&self, source: &mut Source, episode: &mut EpisodeWatch) {
+        if !episode.has_changed().unwrap_or(false) {
+            return;
+        }
+        let now = episode.borrow_and_update().clone();
+        if let Err(error) = source.record(now.as_ref()) {
+            let verb = if now.is_some() { "start" } else { "stop" };
+            self.report(Report::Refused(format!("it does not {verb} recording: {error}"))).await;
+        }
+    }
+
     /// Says that the device sends nothing; ends, with the reason, when it is to be opened again.
     async fn silence(&self) -> String {
         let opened = Instant::now();
@@ -248,7 +231,7 @@ impl Stream {
         let Some(at) = opened.checked_add(say) else { return std::future::pending().await };
         sleep_until(at).await;
         self.report(Report::Silent(say)).await;
-        if !matches!(self.spec.node, NodeSpec::Camera(_)) || is_recording(&self.attachment.node) {
+        if !matches!(self.spec.node, NodeSpec::Camera(_)) || self.attachment.node.is_recording() {
             return std::future::pending().await;
         }
         let limit = CAMERA_LIMIT.max(2 * say);
@@ -263,7 +246,7 @@ impl Stream {
             epoch: self.epoch,
             node: self.attachment.node.label(),
             attached: self.attached,
-            usb: self.attachment.usb.clone(),
+            unit: self.attachment.unit.clone(),
             negotiated,
             latency_ns: nanoseconds(self.spec.latency),
         }
@@ -310,6 +293,14 @@ enum Pulse {
     Silent,
     Beating,
     Stalled,
+}
+
+/// Returns when there is news of an episode.
+async fn changed(mut episode: EpisodeWatch) {
+    if episode.changed().await.is_err() {
+        // Nobody records any more.
+        std::future::pending::<()>().await;
+    }
 }
 
 fn end(error: &DriverError) -> (End, String) {

@@ -11,82 +11,49 @@
 
 mod intake;
 mod keeper;
-mod output;
 
-use std::ffi::OsString;
 use std::sync::Arc;
-use std::time::Duration;
 
 use tokio::sync::{Mutex, oneshot};
 use tokio::time::timeout;
 use tokio_util::sync::{CancellationToken, DropGuard};
-use tokio_util::task::TaskTracker;
 
+use super::programs::{Environment, MARGIN, Programs, environment};
 use crate::bus::{Bus, Given, Ingress, Membership, Watch};
-use crate::driver::process::{Launch, Spawner};
+use crate::driver::process::Launch;
 use crate::driver::{DriverError, Reading};
-use crate::registry::{Attachment, DeviceSpec, NodeSpec, ProcessSpec, Registry};
+use crate::registry::{Attachment, DeviceSpec, ProcessSpec};
 use crate::sample::Epoch;
 use crate::status::{Board, Level, What};
 use crate::time::Stamp;
 use intake::{Intake, Judged};
-use keeper::{Keeper, TERM_LIMIT};
+use keeper::Keeper;
+pub(super) use keeper::{TERM_LIMIT, describe};
 
 /// A program that is silent for this many heartbeats is started again.
 pub(super) const MOST_SILENT_BEATS: u32 = 5;
-/// Beyond the time a program has to end, what the kernel and a busy machine may take.
-const MARGIN: Duration = Duration::from_secs(2);
-
-/// All programs of the rig.
-#[derive(Debug, Clone)]
-pub(super) struct Workers {
-    spawner: Spawner,
-    membership: Membership,
-    board: Arc<Board>,
-    keepers: TaskTracker,
-    /// Programs that are being ended get no more time.
-    hurry: CancellationToken,
-}
-
-impl Workers {
-    /// `None` where no entry needs a program.
-    pub(super) fn new(registry: &Registry, bus: &Bus, board: &Arc<Board>) -> Option<Self> {
-        registry.devices.iter().any(|device| matches!(device.node, NodeSpec::Process(_))).then(|| Self {
-            spawner: Spawner::start(),
-            membership: bus.membership(),
-            board: Arc::clone(board),
-            keepers: TaskTracker::new(),
-            hurry: CancellationToken::new(),
-        })
-    }
-
-    /// Where the program of one entry works; `None` if the entry has none.
-    pub(super) fn seat(&self, spec: &DeviceSpec, bus: &Bus) -> Option<Seat> {
-        let ingress = bus.ingress(spec.id)?;
-        Some(Seat { workers: self.clone(), ingress, turn: Arc::default() })
-    }
-
-    /// Cancelled, it takes from every program what is left of its time to end.
-    pub(super) fn hurry(&self) -> CancellationToken {
-        self.hurry.clone()
-    }
-
-    /// Waits until every program has ended; they have been told to.
-    pub(super) async fn ended(&self) {
-        self.keepers.close();
-        if timeout(TERM_LIMIT + MARGIN, self.keepers.wait()).await.is_err() {
-            tracing::warn!(programs = self.keepers.len(), "did not end even when killed and are abandoned");
-        }
-    }
-}
 
 /// The place of an entry's programs, one after the other.
 #[derive(Debug, Clone)]
 pub(super) struct Seat {
-    workers: Workers,
+    programs: Programs,
+    membership: Membership,
     ingress: Arc<Ingress>,
     /// Held as long as a program of this entry lives.
     turn: Arc<Mutex<()>>,
+}
+
+impl Seat {
+    /// Where the program of one entry works; `None` if the entry has none.
+    pub(super) fn new(programs: &Programs, spec: &DeviceSpec, bus: &Bus) -> Option<Self> {
+        let ingress = bus.ingress(spec.id)?;
+        Some(Self { programs: programs.clone(), membership: bus.membership(), ingress, turn: Arc::default() })
+    }
+
+    /// Held as long as a program of the entry lives.
+    pub(super) fn turn(&self) -> Arc<Mutex<()>> {
+        Arc::clone(&self.turn)
+    }
 }
 
 /// A running program, as its stream sees it. Dropped, it tells the program to end.
@@ -119,7 +86,7 @@ impl Worker {
         let watch = seat.ingress.watch().map_err(|error| DriverError::Retry(error.to_string()))?;
         if seat.turn.try_lock().is_err() {
             let text = format!("{}: waits for its previous process to end", spec.name);
-            seat.workers.board.announce(What::Log { level: Level::Info, text });
+            seat.programs.board.announce(What::Log { level: Level::Info, text });
         }
         let wait = timeout(TERM_LIMIT + MARGIN, Arc::clone(&seat.turn).lock_owned());
         let turn = wait.await.map_err(|_| DriverError::Retry("its previous process has not ended".to_owned()))?;
@@ -129,27 +96,26 @@ impl Worker {
         let stop = CancellationToken::new();
         let (started, has_started) = oneshot::channel();
         let (ending, ended) = oneshot::channel();
-        let workers = &seat.workers;
+        let programs = &seat.programs;
         let keeper = Keeper {
             name: spec.name.clone(),
-            workers: workers.clone(),
+            programs: programs.clone(),
+            membership: seat.membership.clone(),
             stop: stop.clone(),
             turn,
             started,
             ended: ending,
         };
-        let launch = Launch {
-            program: process.program.clone(),
-            args: process.args.clone(),
-            env: environment(spec, attachment, epoch, &seat.ingress, &workers.membership),
-        };
-        workers.keepers.spawn(keeper.keep(launch));
+        let mut env: Environment = environment(spec, attachment, seat.ingress.topic(), &seat.membership.prefix());
+        env.push(("RAPID_EPOCH", Some(epoch.0.to_string().into())));
+        let launch = Launch { program: process.program.clone(), args: process.args.clone(), env };
+        programs.tasks.spawn(keeper.keep(launch));
         let stop = stop.drop_guard();
         let pid = has_started.await.unwrap_or_else(|_| Err(DriverError::Retry("its keeper ended".to_owned())))?;
         let program = process.program.file_name().unwrap_or_default().to_string_lossy();
         Ok(Self {
             name: spec.name.clone(),
-            board: Arc::clone(&workers.board),
+            board: Arc::clone(&programs.board),
             ingress: Arc::clone(&seat.ingress),
             watch,
             intake: Intake::new(spec.id, epoch, process),
@@ -209,26 +175,4 @@ impl Worker {
             }
         }
     }
-}
-
-/// What a program is told of its device and of the bus.
-fn environment(
-    spec: &DeviceSpec,
-    attachment: &Attachment,
-    epoch: Epoch,
-    ingress: &Ingress,
-    membership: &Membership,
-) -> Vec<(&'static str, Option<OsString>)> {
-    let text = |text: &str| Some(OsString::from(text));
-    vec![
-        ("DEVICE_NAME", text(&spec.name)),
-        ("DEVICE_NODE", text(&attachment.node.label())),
-        // No such variable rather than one that holds what cannot be said in it.
-        ("DEVICE_SERIAL", attachment.usb.serial.as_deref().filter(|serial| !serial.contains('\0')).and_then(text)),
-        ("DEVICE_ADDR", text(&attachment.usb.port)),
-        ("RAPID_TOPIC", text(ingress.topic())),
-        ("RAPID_EPOCH", text(&epoch.0.to_string())),
-        ("RAPID_BIT", text(&spec.id.to_string())),
-        ("RAPID_BUS_PREFIX", text(&membership.prefix())),
-    ]
 }

@@ -6,9 +6,10 @@ use std::time::Duration;
 use serde::Serialize;
 
 use super::{Chunk, Grade, Level, SlotState, Verdict};
+use crate::action::Arming;
 use crate::modality::ModalityId;
 use crate::provenance::{KernelDriver, Negotiated};
-use crate::registry::UsbIdentity;
+use crate::registry::Unit;
 use crate::sample::Epoch;
 use crate::text;
 use crate::time::Stamp;
@@ -37,7 +38,7 @@ pub enum What {
         node: String,
         /// The unit.
         #[serde(flatten)]
-        usb: UsbIdentity,
+        unit: Unit,
         /// The kernel's driver of it.
         driver: Option<KernelDriver>,
     },
@@ -181,6 +182,19 @@ pub enum What {
         /// Of a hundred one was slower.
         latency_p99_ms: f64,
     },
+    /// An actuator was armed or disarmed, or disabled itself.
+    Actuator {
+        /// Modality.
+        device: String,
+        /// Its bit.
+        bit: ModalityId,
+        /// May it move now?
+        arming: Arming,
+        /// Somebody should look after it.
+        is_problem: bool,
+        /// What happened, for people.
+        text: String,
+    },
     /// A line of the log that has no event of its own.
     Log {
         /// Severity.
@@ -201,7 +215,7 @@ pub struct Provenance {
     pub attached: Stamp,
     /// The unit.
     #[serde(flatten)]
-    pub usb: UsbIdentity,
+    pub unit: Unit,
     /// What was agreed with it. The driver is hot-plug's where the open node names none.
     #[serde(flatten)]
     pub negotiated: Negotiated,
@@ -221,9 +235,9 @@ impl What {
     #[must_use]
     pub fn sentence(&self) -> Option<(Level, String)> {
         Some(match self {
-            Self::Attach { device, node, usb, .. } => {
-                let serial = usb.serial.as_deref().map(|serial| format!(", serial {serial}")).unwrap_or_default();
-                (Level::Info, format!("{device} attached ({node} at port {}{serial})", usb.port))
+            Self::Attach { device, node, unit, .. } => {
+                let serial = unit.serial().map(|serial| format!(", serial {serial}")).unwrap_or_default();
+                (Level::Info, format!("{device} attached ({node} at {}{serial})", unit.location()))
             }
             // The slot's state changes with it and names the witness, or what was agreed.
             Self::Detach { .. } | Self::Opened { .. } => return None,
@@ -301,6 +315,9 @@ impl What {
             }
             // Something was lost before this run began.
             Self::Recovered { text, .. } => (Level::Warn, text.clone()),
+            Self::Actuator { device, is_problem, text, .. } => {
+                (if *is_problem { Level::Warn } else { Level::Info }, format!("{device}: {text}"))
+            }
             Self::Log { level, text } => (*level, text.clone()),
         })
     }

@@ -6,7 +6,9 @@ use std::time::Duration;
 use super::{Board, DeviceStatus, Level, LogLine, PolicyStatus, RecordingStatus, SlotState, Snapshot};
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
-use crate::registry::{CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, WhenStale};
+use crate::registry::{
+    CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, UsbSpec, WhenStale,
+};
 use crate::sample::Epoch;
 use crate::time::Stamp;
 
@@ -130,7 +132,7 @@ pub(crate) fn board(names: &[&str]) -> Board {
     let device = |(bit, name): (usize, &&str)| DeviceSpec {
         name: (*name).to_owned(),
         id: id(u8::try_from(bit).unwrap()),
-        identity: IdentitySpec { vid: 0x046d, pid: 0x0825, serial: None, port: None },
+        identity: IdentitySpec::Usb(UsbSpec { vid: 0x046d, pid: 0x0825, serial: None, port: None }),
         node: NodeSpec::Camera(CameraSpec {
             width: 640,
             height: 480,
@@ -146,6 +148,7 @@ pub(crate) fn board(names: &[&str]) -> Board {
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
         action: None,
+        hooks: crate::registry::Hooks::default(),
         verdict: crate::registry::VerdictSpec::of(
             crate::modality::ModalityKind::Image,
             Duration::from_millis(500),
@@ -162,7 +165,9 @@ pub(crate) fn board(names: &[&str]) -> Board {
             disk_reserve: None,
         },
         devices: names.iter().enumerate().map(device).collect(),
+        modules: Vec::new(),
         path: None,
         text: String::new(),
+        modules: Vec::new(),
     })
 }

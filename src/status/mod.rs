@@ -5,6 +5,7 @@
 //! Invariant: a screen holds no handle into a stage.
 
 pub mod board;
+mod episode;
 mod event;
 #[cfg(test)]
 pub(crate) mod literal;
@@ -17,6 +18,7 @@ use std::time::Duration;
 
 use serde::Serialize;
 
+use crate::action::Order;
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::sample::Epoch;
@@ -24,6 +26,7 @@ use crate::text;
 use crate::time::Stamp;
 
 pub use board::{Board, EpisodeEnd};
+pub use episode::{Episode, EpisodeWatch};
 pub use event::{Event, Provenance, What};
 pub use policy::{Chunk, ObservedSamples, PolicyStatus};
 pub use verdict::{Grade, Verdict};
@@ -178,6 +181,8 @@ pub enum Command {
     ToggleRecording,
     /// Start a failed device again.
     Restart(ModalityId),
+    /// Let the actuator move, or stop it.
+    Order(Order),
     /// End the program.
     Quit,
 }

@@ -9,10 +9,12 @@ use ratatui::widgets::{Block, Clear, Padding, Paragraph};
 use super::theme::Theme;
 use crate::status::SlotState;
 
-const KEYS: [(&str, &str); 8] = [
+const KEYS: [(&str, &str); 10] = [
     ("space", "start an episode, end the one in progress"),
     ("up, down", "select a device"),
     ("r", "restart the selected device, if it failed"),
+    ("a, a", "arm the actuator: motors are enabled and follow actions"),
+    ("d", "disarm it: motors are disabled"),
     ("p", "pause the view; everything else goes on"),
     ("pgup, pgdn", "scroll the log; esc goes to its end"),
     ("?", "this help"),

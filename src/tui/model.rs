@@ -10,6 +10,7 @@ use std::time::Duration;
 use crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 
 use super::theme::Edge;
+use crate::action::Order;
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::status::rates::Rates;
 use crate::status::{Command, DeviceStatus, SlotState, Snapshot};
@@ -85,6 +86,8 @@ pub struct Model {
     scroll: usize,
     help: bool,
     quit: Quit,
+    /// The user has asked to arm the actuator: the next key counts.
+    arming: bool,
     notice: Option<(String, Stamp)>,
 }
 
@@ -106,6 +109,7 @@ impl Model {
             scroll: 0,
             help: false,
             quit: Quit::No,
+            arming: false,
             notice: None,
         };
         model.read();
@@ -183,6 +187,8 @@ impl Model {
         if self.quit == Quit::Asked {
             self.quit = Quit::No;
         }
+        // Only the key after the first asks for it.
+        let armed = std::mem::take(&mut self.arming);
         if self.help {
             // A key that closes the help does nothing else.
             self.help = false;
@@ -192,6 +198,11 @@ impl Model {
             // A key held down must not start and stop episodes at the keyboard's repeat rate.
             KeyCode::Char(' ') if key.kind == KeyEventKind::Press => return self.toggle_recording(),
             KeyCode::Char('r') => return self.restart(),
+            KeyCode::Char('a') if key.kind == KeyEventKind::Press => return self.arm(armed),
+            KeyCode::Char('d') => {
+                self.say("disarming the actuator");
+                return Effect::Send(Command::Order(Order::Disarm));
+            }
             KeyCode::Char('p') => self.toggle_pause(),
             KeyCode::Char('?') | KeyCode::F(1) => self.help = true,
             KeyCode::Up | KeyCode::Char('k') => self.selected = self.selected.saturating_sub(1),
@@ -214,6 +225,17 @@ impl Model {
         }
         self.quit = Quit::Ending;
         Effect::Send(Command::Quit)
+    }
+
+    /// Asks first: something is going to move.
+    fn arm(&mut self, asked: bool) -> Effect {
+        if asked {
+            self.say("arming the actuator");
+            return Effect::Send(Command::Order(Order::Arm));
+        }
+        self.arming = true;
+        self.say("a again to let the actuator move, any other key not to");
+        Effect::None
     }
 
     fn toggle_recording(&mut self) -> Effect {

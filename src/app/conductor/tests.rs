@@ -64,8 +64,13 @@ impl Bench {
         let config = RecorderConfig { sink: Box::new(sink), ..RecorderConfig::new(registry, Arc::clone(&board)) };
         let recorder = Recorder::spawn(Quiet, config).unwrap();
         let (keys, asked) = mpsc::channel(16);
-        let episode =
-            EpisodeRequest { out: out.path().to_owned(), task: "test".to_owned(), tags: Vec::new(), duration: None };
+        let episode = EpisodeRequest {
+            out: out.path().to_owned(),
+            task: "test".to_owned(),
+            tags: Vec::new(),
+            modules: Vec::new(),
+            duration: None,
+        };
         let conductor = Conductor {
             events: board.events(),
             board: Arc::clone(&board),

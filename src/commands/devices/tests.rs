@@ -3,6 +3,7 @@ use std::sync::Arc;
 use insta::assert_snapshot;
 
 use super::*;
+use crate::registry::UsbIdentity;
 use crate::registry::scenario::{SimDevice, SimSource};
 
 /// A wrist camera by its serial number, two interchangeable cameras, a serial line by its port.
@@ -54,7 +55,7 @@ fn usb(ids: (u16, u16), serial: Option<&str>, port: &str, product: Option<&str>)
 
 fn attachment(node: DeviceNode, usb: UsbIdentity) -> Attachment {
     let syspath = format!("/sys/{}/{}", usb.port, node.label().replace('/', "_"));
-    Attachment { syspath: syspath.into(), node, usb, driver: None }
+    Attachment { syspath: syspath.into(), node, unit: usb.into(), driver: None }
 }
 
 fn video(number: u8, ids: (u16, u16), serial: Option<&str>, port: &str) -> Attachment {

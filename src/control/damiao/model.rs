@@ -10,19 +10,7 @@ use crate::registry::MotorKind;
 /// PMAX in rad, VMAX in rad/s and TMAX in Nm as they leave the factory.
 #[must_use]
 pub const fn shipped(kind: MotorKind) -> [f64; 3] {
-    match kind {
-        MotorKind::Dm3507 | MotorKind::Dm4310 => [12.5, 30.0, 10.0],
-        MotorKind::Dm4310V48 => [12.5, 50.0, 10.0],
-        MotorKind::Dm4340 => [12.5, 8.0, 28.0],
-        MotorKind::Dm4340V48 => [12.5, 10.0, 28.0],
-        MotorKind::Dm6006 => [12.5, 45.0, 20.0],
-        MotorKind::Dm8006 => [12.5, 45.0, 40.0],
-        MotorKind::Dm8009 => [12.5, 45.0, 54.0],
-        MotorKind::Dm10010L => [12.5, 25.0, 200.0],
-        MotorKind::Dm10010 => [12.5, 20.0, 200.0],
-        MotorKind::Dmh3510 => [12.5, 280.0, 1.0],
-        MotorKind::Dmh6215 | MotorKind::Dmg6220 => [12.5, 45.0, 10.0],
-    }
+    kind.shipped()
 }
 
 /// Does a motor of this kind usually count in these ranges?

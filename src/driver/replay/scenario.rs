@@ -7,7 +7,7 @@ use super::episode::{EpisodeDescription, describe};
 use super::{DriverError, fatal};
 use crate::modality::ModalityId;
 use crate::registry::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, SimFaults, SimSource};
-use crate::registry::{DeviceSpec, Registry, UsbIdentity};
+use crate::registry::{DeviceSpec, LanIdentity, Registry, UsbIdentity};
 
 /// A device is attached before its first sample, with which its bit begins: by this much.
 const LEAD: Duration = Duration::from_millis(100);
@@ -39,6 +39,7 @@ pub fn scenario(file: &Path) -> Result<Replayed, DriverError> {
     let device = |spec: &DeviceSpec| ScenarioDevice {
         name: spec.name.clone(),
         usb: usb_identity(spec),
+        lan: lan_identity(spec),
         source: SimSource::Replay { file: file.to_owned(), topic: spec.topic.clone(), begin_ns: episode.begin_ns },
         plugged: episode.mask.first().is_some_and(|(_, mask)| mask.contains(spec.id)),
         faults: SimFaults::default(),
@@ -68,14 +69,20 @@ fn plug_events(episode: &EpisodeDescription, name: &str, id: ModalityId) -> Vec<
     events
 }
 
+/// A device on the network is found by its entry.
+fn lan_identity(spec: &DeviceSpec) -> Option<LanIdentity> {
+    let found = || LanIdentity { entry: spec.name.clone(), address: String::from("replay"), instance: None };
+    spec.identity.usb().is_none().then(found)
+}
+
 /// What the entry says the device is; a port is made up where it names none.
 fn usb_identity(spec: &DeviceSpec) -> UsbIdentity {
-    let identity = &spec.identity;
+    let identity = spec.identity.usb();
     UsbIdentity {
-        vid: identity.vid,
-        pid: identity.pid,
-        serial: identity.serial.clone(),
-        port: identity.port.clone().unwrap_or_else(|| format!("9-{}", spec.id.bit() + 1)),
+        vid: identity.map_or(0, |usb| usb.vid),
+        pid: identity.map_or(0, |usb| usb.pid),
+        serial: spec.identity.serial().map(str::to_owned),
+        port: identity.and_then(|usb| usb.port.clone()).unwrap_or_else(|| format!("9-{}", spec.id.bit() + 1)),
         product: Some(String::from("replay")),
         ..UsbIdentity::default()
     }

@@ -116,3 +116,22 @@ fn impossible_pictures_are_refused() {
     assert!(encode(1, 1, 1, 7).is_ok());
     assert!(encode(2, 300, 1, 7).is_ok());
 }
+
+#[tokio::test]
+async fn simulated_motors_are_where_they_were_told_to_be() {
+    let text = "[device.arm]\nvid = \"1d50\"\npid = \"606f\"\nnode = \"can\"\n[device.arm.can]\nprotocol = \"damiao\"\n\
+                motors = [{ name = \"a\", slave = 1, type = \"DM4310\", kp = 1, kd = 0.1, position = [-1, 1] },\n\
+                          { name = \"b\", slave = 2, type = \"DM4310\", kp = 1, kd = 0.1, position = [-1, 1] }]\n";
+    let registry = crate::registry::Registry::parse(text, None).unwrap().registry;
+    let arm = &registry.devices[0];
+    let sends = |channels| device(SimSource::Serial { channels, hz: 1000, seed: 1 });
+    assert!(check(arm, &sends(11)).is_err());
+    let twelve = sends(12);
+    check(arm, &twelve).unwrap();
+    let mut sim = Sim::open(twelve).await.unwrap().with_controls(&arm.node);
+    assert!(sim.command(&[0.5]).is_err(), "a target is missing");
+    sim.command(&[0.5, -0.25]).unwrap();
+    let bytes = sim.read().await.unwrap().bytes.to_vec();
+    let values: Vec<f64> = bytes.chunks(8).map(|value| f64::from_le_bytes(value.try_into().unwrap())).collect();
+    assert_eq!((values.len(), values[0], values[6]), (12, 0.5, -0.25));
+}

@@ -5,6 +5,7 @@
 //!
 //! Invariant: no file makes this panic, and memory does not grow with a file's payloads.
 
+mod brief;
 mod collect;
 mod judge;
 mod list;
@@ -28,6 +29,7 @@ use crate::text;
 use collect::Collected;
 
 pub use super::walk::FileEnd;
+pub use brief::{Brief, brief};
 pub use list::{Listed, episodes, list, render_list};
 pub use policy::{HoldReport, PolicyReport};
 pub use render::{Paint, render};

@@ -192,7 +192,13 @@ fn a_slow_sensor_makes_its_frame_and_every_frame_waits_for_it() {
 /// What a device that is plugged in says on the board.
 fn attach(name: &str, bit: u8) -> What {
     let usb = UsbIdentity { port: "1-3".to_owned(), ..UsbIdentity::default() };
-    What::Attach { device: name.to_owned(), bit: id(bit), node: "/dev/video9".to_owned(), usb, driver: None }
+    What::Attach {
+        device: name.to_owned(),
+        bit: id(bit),
+        node: "/dev/video9".to_owned(),
+        unit: usb.into(),
+        driver: None,
+    }
 }
 
 #[tokio::test]

@@ -5,36 +5,43 @@ use std::fmt::Write as _;
 
 use super::HEADER;
 use crate::modality::ModalityKind;
-use crate::registry::spec::{DeviceSpec, NodeSpec};
+use crate::registry::spec::{DeviceSpec, IdentitySpec, NodeSpec};
 
 /// The descriptor of one entry; `stable_path` is the name the rules give it, if they can.
 pub(super) fn descriptor(device: &DeviceSpec, stable_path: Option<&str>) -> String {
-    let usb = &device.identity;
     let slot = device.mount.map_or_else(|| "null".to_owned(), |mount| quoted(&mount.to_string()));
-    let optional = |text: Option<&str>| text.map_or_else(|| "null".to_owned(), quoted);
     format!(
         "{HEADER}\n\
          module: {}\n\
          slot: {slot}\n\
          sensors:\n{}\
-         bring_up: \"usb\"\n\
-         identity:\n  \
-           vid: \"{:04x}\"\n  \
-           pid: \"{:04x}\"\n  \
-           serial: {}\n  \
-           port: {}\n\
+         bring_up: \"{}\"\n\
+         {}\
          path: {}\n\
          topic: {}\n\
          bit: {}\n",
         quoted(&device.name),
         sensor(&device.node),
+        if device.identity.usb().is_some() { "usb" } else { "lan" },
+        identity(&device.identity),
+        optional(stable_path),
+        quoted(&device.topic),
+        device.id,
+    )
+}
+
+fn optional(text: Option<&str>) -> String {
+    text.map_or_else(|| "null".to_owned(), quoted)
+}
+
+fn identity(identity: &IdentitySpec) -> String {
+    let Some(usb) = identity.usb() else { return "identity: null\n".to_owned() };
+    format!(
+        "identity:\n  vid: \"{:04x}\"\n  pid: \"{:04x}\"\n  serial: {}\n  port: {}\n",
         usb.vid,
         usb.pid,
         optional(usb.serial.as_deref()),
         optional(usb.port.as_deref()),
-        optional(stable_path),
-        quoted(&device.topic),
-        device.id,
     )
 }
 
@@ -49,6 +56,10 @@ fn sensor(node: &NodeSpec) -> String {
             "  - kind: \"{kind}\"\n    baud: {}\n    framing: \"{}\"\n    parse: \"{}\"\n    channels: {}\n",
             serial.baud, serial.framing, serial.parse, serial.channels
         ),
+        NodeSpec::Can(can) => {
+            format!("  - kind: \"{kind}\"\n    adapter: \"{}\"\n    bitrate: {}\n", can.adapter, can.bitrate)
+        }
+        NodeSpec::Lan(lan) => format!("  - kind: \"{kind}\"\n    format: {}\n", quoted(&lan.format())),
         NodeSpec::Process(process) => {
             let program = process.program.file_name().unwrap_or_default().to_string_lossy();
             let shape = match (process.kind, process.shape.as_slice()) {

@@ -4,11 +4,19 @@
 //! `[`, alternatives are separated by `|`, and `\"` stands for a quote (systemd,
 //! `src/udev/udev-rules.c`: `rule_line_add_token`, `udev_rule_parse_value`). Match values undergo
 //! no `%` or `$` substitution; assigned values do, but those are only names we have validated.
+//!
+//! A network interface has no node and no name of ours. That of a CAN adapter is brought up with the bit
+//! rate of its entry at each plug, which only root may do. `RUN` starts the program itself, no shell, with
+//! words split at spaces; the one word that comes from outside is `$name`, the name that the interface has
+//! after udev's rules, which the kernel takes without spaces and `/` and which no device chooses.
 
 use std::fmt::Write as _;
 
 use super::HEADER;
-use crate::registry::spec::{DeviceSpec, NodeSpec, Opens, Registry};
+use crate::registry::spec::{CAN_RESTART_MS, CanAdapter, DeviceSpec, NodeSpec, Opens, Registry, UsbSpec};
+
+/// What linux/if_arp.h calls a CAN interface (`ARPHRD_CAN`).
+const ARPHRD_CAN: u32 = 280;
 
 /// The rules of a whole registry.
 pub(super) fn rules(registry: &Registry) -> String {
@@ -19,20 +27,35 @@ pub(super) fn rules(registry: &Registry) -> String {
          # read before this file.\n"
     );
     for device in &registry.devices {
-        let usb = &device.identity;
+        let Some(usb) = device.identity.usb() else { continue };
         // Writing to a String cannot fail.
         let _ = writeln!(text, "\n# {}: {:04x}:{:04x}", device.name, usb.vid, usb.pid);
-        let _ = match identify(registry, device) {
-            Ok(identity) => writeln!(text, "{}", rule(device, &identity)),
-            Err(reason) => writeln!(text, "# No stable name: {reason}."),
+        let bitrate = if let NodeSpec::Can(can) = &device.node { Some(can.bitrate) } else { None };
+        let _ = match (opens(device), bitrate) {
+            (Opens::Net, Some(bitrate)) => match single_out(registry, device, usb) {
+                Ok(identity) => writeln!(text, "{}", bring_up(usb, &identity, bitrate)),
+                Err(reason) => writeln!(text, "# Not brought up: {reason}."),
+            },
+            _ => match identify(registry, device) {
+                Ok(identity) => writeln!(text, "{}", rule(device, usb, &identity)),
+                Err(reason) => writeln!(text, "# No stable name: {reason}."),
+            },
         };
     }
     text
 }
 
-/// The matches that single out an entry's unit among all others, or why there are none.
+/// The matches that single out the node of an entry's unit, or why there are none.
 pub(super) fn identify(registry: &Registry, device: &DeviceSpec) -> Result<String, String> {
-    let usb = &device.identity;
+    let Some(usb) = device.identity.usb() else { return Err("it is no USB device".to_owned()) };
+    if opens(device) == Opens::Net {
+        return Err("a network interface has no path".to_owned());
+    }
+    single_out(registry, device, usb)
+}
+
+/// The matches that single out an entry's unit among all others, or why there are none.
+fn single_out(registry: &Registry, device: &DeviceSpec, usb: &UsbSpec) -> Result<String, String> {
     if let Some(serial) = &usb.serial {
         return match quoted_match(serial) {
             Some(serial) => Ok(format!(", {}{{serial}}==\"{serial}\"", keys(device).0)),
@@ -46,7 +69,8 @@ pub(super) fn identify(registry: &Registry, device: &DeviceSpec) -> Result<Strin
         return Ok(format!(", {}==\"{port}\"", keys(device).1));
     }
     let same_model = |other: &&DeviceSpec| {
-        (other.identity.vid, other.identity.pid) == (usb.vid, usb.pid) && subsystem(other) == subsystem(device)
+        let is_model = other.identity.usb().is_some_and(|other| (other.vid, other.pid) == (usb.vid, usb.pid));
+        is_model && subsystem(other) == subsystem(device)
     };
     if registry.devices.iter().filter(same_model).count() == 1 {
         return Ok(String::new());
@@ -54,21 +78,31 @@ pub(super) fn identify(registry: &Registry, device: &DeviceSpec) -> Result<Strin
     Err("several entries are of this model and this one has neither serial number nor port".to_owned())
 }
 
-fn rule(device: &DeviceSpec, identity: &str) -> String {
+fn rule(device: &DeviceSpec, usb: &UsbSpec, identity: &str) -> String {
     // A camera has several nodes; index 0 is the one that captures pictures.
     let (index, group) = match opens(device) {
         Opens::Video => (", ATTR{index}==\"0\"", "video"),
         Opens::Tty => ("", "dialout"),
-        Opens::Usb => (", ENV{DEVTYPE}==\"usb_device\"", "plugdev"),
+        Opens::Usb | Opens::Net => (", ENV{DEVTYPE}==\"usb_device\"", "plugdev"),
     };
     let attr = keys(device).0;
     format!(
         "SUBSYSTEM==\"{}\"{index}, {attr}{{idVendor}}==\"{:04x}\", {attr}{{idProduct}}==\"{:04x}\"{identity}, \
          SYMLINK+=\"rapid/{}\", GROUP=\"{group}\", MODE=\"0660\", TAG+=\"uaccess\", RUN{{builtin}}+=\"uaccess\"",
         subsystem(device),
-        device.identity.vid,
-        device.identity.pid,
+        usb.vid,
+        usb.pid,
         device.name,
+    )
+}
+
+/// Brings up the CAN interface of a unit when it is plugged in.
+fn bring_up(usb: &UsbSpec, identity: &str, bitrate: u32) -> String {
+    format!(
+        "ACTION==\"add\", SUBSYSTEM==\"net\", ATTR{{type}}==\"{ARPHRD_CAN}\", ATTRS{{idVendor}}==\"{:04x}\", \
+         ATTRS{{idProduct}}==\"{:04x}\"{identity}, RUN+=\"/usr/sbin/ip link set dev $name up type can bitrate {bitrate} \
+         restart-ms {CAN_RESTART_MS}\"",
+        usb.vid, usb.pid,
     )
 }
 
@@ -77,6 +111,7 @@ const fn subsystem(device: &DeviceSpec) -> &'static str {
         Opens::Video => "video4linux",
         Opens::Tty => "tty",
         Opens::Usb => "usb",
+        Opens::Net => "net",
     }
 }
 
@@ -86,6 +121,11 @@ pub(super) const fn opens(device: &DeviceSpec) -> Opens {
         NodeSpec::Camera(_) => Opens::Video,
         NodeSpec::Serial(_) => Opens::Tty,
         NodeSpec::Process(process) => process.opens,
+        NodeSpec::Can(can) => match can.adapter {
+            CanAdapter::SocketCan => Opens::Net,
+            CanAdapter::Slcan | CanAdapter::Damiao => Opens::Tty,
+        },
+        NodeSpec::Lan(_) => Opens::Net,
     }
 }
 
@@ -94,7 +134,7 @@ pub(super) const fn opens(device: &DeviceSpec) -> Opens {
 const fn keys(device: &DeviceSpec) -> (&'static str, &'static str) {
     match opens(device) {
         Opens::Usb => ("ATTR", "KERNEL"),
-        Opens::Video | Opens::Tty => ("ATTRS", "KERNELS"),
+        Opens::Video | Opens::Tty | Opens::Net => ("ATTRS", "KERNELS"),
     }
 }
 

@@ -5,6 +5,7 @@ use proptest::prelude::*;
 use yaml_rust2::{Yaml, YamlLoader};
 
 use super::*;
+use crate::registry::IdentitySpec;
 
 fn text_of(all: &[Artifact], path: &str) -> String {
     all.iter().find(|artifact| artifact.path == Path::new(path)).unwrap().contents.clone()
@@ -16,7 +17,8 @@ fn rule_lines(rules: &str) -> Vec<&str> {
 
 fn with_serial(serial: &str) -> Registry {
     let mut registry = Registry::builtin();
-    registry.devices[0].identity.serial = Some(serial.to_owned());
+    let IdentitySpec::Usb(usb) = &mut registry.devices[0].identity else { panic!("a USB device") };
+    usb.serial = Some(serial.to_owned());
     registry
 }
 
@@ -74,6 +76,26 @@ fn a_unit_is_named_by_serial_by_port_or_as_the_only_one_of_its_model() {
     assert_eq!(rules.matches("# No stable name: several entries are of this model").count(), 2);
     let descriptor = text_of(&artifacts(&registry), "descriptors/three.yaml");
     assert!(descriptor.contains("\npath: null\n"), "{descriptor}");
+}
+
+#[test]
+fn a_can_interface_is_brought_up_with_the_bit_rate_of_its_entry() {
+    let text = "[device.arm]\nvid = \"1d50\"\npid = \"606f\"\nserial_number = \"A '%k` $x\"\nnode = \"can\"\n\
+                [device.arm.can]\nbitrate = 500000\n";
+    let all = artifacts(&Registry::parse(text, None).unwrap().registry);
+    let rules = text_of(&all, "99-rapid.rules");
+    assert_eq!(
+        rule_lines(&rules),
+        ["ACTION==\"add\", SUBSYSTEM==\"net\", ATTR{type}==\"280\", ATTRS{idVendor}==\"1d50\", \
+          ATTRS{idProduct}==\"606f\", ATTRS{serial}==\"A '%k` $x\", \
+          RUN+=\"/usr/sbin/ip link set dev $name up type can bitrate 500000 restart-ms 100\""]
+    );
+    let unit = text_of(&all, "rapid.service");
+    assert!(unit.contains("\nRestrictAddressFamilies=AF_UNIX AF_NETLINK AF_CAN\n"), "{unit}");
+    // An adapter that is a serial line is one like any other.
+    let slcan = format!("{text}adapter = \"slcan\"\n");
+    let line = text_of(&artifacts(&Registry::parse(&slcan, None).unwrap().registry), "99-rapid.rules");
+    assert!(rule_lines(&line)[0].starts_with("SUBSYSTEM==\"tty\"") && !line.contains("RUN+="), "{line}");
 }
 
 #[test]

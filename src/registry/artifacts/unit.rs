@@ -1,7 +1,7 @@
 //! `rapid.service`: records without a screen from boot to shutdown.
 
 use super::{HEADER, rules};
-use crate::registry::spec::{Opens, Registry};
+use crate::registry::spec::{DeviceSpec, NodeSpec, Opens, Registry};
 
 /// Where the unit expects the registry.
 pub const SYSTEM_REGISTRY: &str = "/etc/rapid/devices.toml";
@@ -12,6 +12,8 @@ pub(super) fn unit(registry: &Registry) -> String {
     let rig = &registry.rig.name;
     // Programs that open the USB device itself; the group is that of the rules.
     let usb = registry.devices.iter().any(|device| rules::opens(device) == Opens::Usb);
+    let is_bus = |device: &DeviceSpec| matches!(device.node, NodeSpec::Can(_)) && rules::opens(device) == Opens::Net;
+    let can = if registry.devices.iter().any(is_bus) { " AF_CAN" } else { "" };
     let (make_group, group, allow) = if usb {
         ("#   groupadd --system --force plugdev\n", " plugdev", "DeviceAllow=char-usb_device rw\n")
     } else {
@@ -62,7 +64,7 @@ ProtectControlGroups=yes
 ProtectHostname=yes
 NoNewPrivileges=yes
 CapabilityBoundingSet=
-RestrictAddressFamilies=AF_UNIX AF_NETLINK
+RestrictAddressFamilies=AF_UNIX AF_NETLINK{can}
 RestrictNamespaces=yes
 RestrictSUIDSGID=yes
 LockPersonality=yes

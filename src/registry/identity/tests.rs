@@ -68,12 +68,17 @@ fn unit(model: u16, serial: Option<&str>, port: &str) -> UsbIdentity {
 
 fn video(number: u32, usb: UsbIdentity) -> Attachment {
     let syspath = PathBuf::from(format!("/sys/devices/usb1/{}/video4linux/video{number}", usb.port));
-    Attachment { syspath, node: DeviceNode::Video(format!("/dev/video{number}").into()), usb, driver: None }
+    Attachment {
+        syspath,
+        node: DeviceNode::Video(format!("/dev/video{number}").into()),
+        unit: usb.into(),
+        driver: None,
+    }
 }
 
 fn tty(usb: UsbIdentity) -> Attachment {
     let syspath = PathBuf::from(format!("/sys/devices/usb1/{}/tty/ttyACM0", usb.port));
-    Attachment { syspath, node: DeviceNode::Tty("/dev/ttyACM0".into()), usb, driver: None }
+    Attachment { syspath, node: DeviceNode::Tty("/dev/ttyACM0".into()), unit: usb.into(), driver: None }
 }
 
 fn device_path(port: &str) -> PathBuf {
@@ -199,7 +204,7 @@ fn a_node_told_twice_is_one_node_and_a_missed_removal_is_seen() {
     assert_eq!(assigner.attach(&node), entry(2));
     assert!(!assigner.replaces(&node));
     let mut other = node.clone();
-    other.usb = unit(1, Some("A"), "1-5");
+    other.unit = unit(1, Some("A"), "1-5").into();
     assert!(assigner.replaces(&other));
     assert_eq!(assigner.detach(&other.syspath).freed, [id(2)]);
     assert_eq!(assigner.attach(&other), entry(0));
@@ -291,8 +296,8 @@ proptest! {
             let units: BTreeSet<_> = assigner
                 .attached
                 .iter()
-                .filter(|node| node.attachment.usb.vid == 2 && matches!(node.attachment.node, DeviceNode::Video(_)))
-                .map(|node| (node.attachment.usb.port.clone(), node.attachment.usb.serial.clone()))
+                .filter(|node| node.attachment.unit.usb().is_some_and(|usb| usb.vid == 2) && matches!(node.attachment.node, DeviceNode::Video(_)))
+                .map(|node| (node.attachment.unit.place().to_owned(), node.attachment.unit.serial().map(str::to_owned)))
                 .collect();
             let running = believed.0.iter().filter(|(id, _)| matches!(id.bit(), 2 | 3)).count();
             prop_assert_eq!(running, units.len().min(2));

@@ -3,21 +3,25 @@
 use std::path::Path;
 use std::time::Duration;
 
-use super::program::Programs;
+use toml::de::DeValue;
+
+use super::program::{For, Programs};
 use super::verdict::{VerdictTable, Whose};
-use super::{action, node, process, verdict};
+use super::{action, can, hooks, identity, lan, motors, node, process, verdict};
 use crate::modality::ModalityId;
 use crate::registry::diagnostic::did_you_mean;
 use crate::registry::section::{At, Problems, Section};
-use crate::registry::spec::{ActionSpec, DeviceSpec, IdentitySpec, Mount, NodeSpec, Opens, WhenStale};
+use crate::registry::spec::{
+    ActionSpec, CanAdapter, CanProtocol, CanSpec, DeviceSpec, Hook, Hooks, IdentitySpec, LanSpec, Mount, NodeSpec,
+    Opens, UsbSpec, WhenStale,
+};
 
 /// Kinds of node this version has a driver for.
-pub(super) const BUILT_IN: [(&str, Kind); 2] = [("camera", Kind::Camera), ("serial", Kind::Serial)];
-/// Kinds of node that are designed but have no driver in this version.
-const PLANNED: [&str; 2] = ["can", "lan"];
-/// Keys that only planned kinds of node have.
-const PLANNED_KEYS: [&str; 4] = ["can", "lan", "on_attach", "on_detach"];
-const KEYS: [&str; 18] = [
+pub(super) const BUILT_IN: [(&str, Kind); 4] =
+    [("camera", Kind::Camera), ("serial", Kind::Serial), ("can", Kind::Can), ("lan", Kind::Lan)];
+/// Says that `on_attach` is the program that reads the device.
+const PROCESS: &str = "process";
+const KEYS: [&str; 24] = [
     "vid",
     "pid",
     "serial",
@@ -33,10 +37,19 @@ const KEYS: [&str; 18] = [
     "when_stale",
     "latency",
     "camera",
+    "can",
+    "lan",
     "process",
     "verdict",
     "action",
+    "on_attach",
+    "on_detach",
+    "on_record_start",
+    "on_record_stop",
 ];
+
+/// In bytes.
+const LONGEST_NAME: usize = 64;
 
 /// The mask is 64 bits wide.
 const HIGHEST_BIT: i64 = 63;
@@ -49,6 +62,8 @@ const LONGEST_LATENCY: Duration = Duration::from_secs(1);
 pub(super) enum Kind {
     Camera,
     Serial,
+    Can,
+    Lan,
     Process,
 }
 
@@ -63,7 +78,7 @@ pub(super) struct Draft<'a> {
     pub(super) topic: String,
     pub(super) bit: Option<At<u8>>,
     pub(super) id: Option<ModalityId>,
-    mount: Option<Mount>,
+    pub(super) mount: Option<Mount>,
     stall_after: Duration,
     pub(super) max_bytes: u64,
     pub(super) depth: u64,
@@ -73,13 +88,18 @@ pub(super) struct Draft<'a> {
     latency: Duration,
     verdict: VerdictTable,
     pub(super) action: Option<ActionSpec>,
+    hooks: Hooks,
 }
 
 impl Draft<'_> {
     /// The entry, with what `[verdict]` says for all; `None` only if a problem with it was reported.
     pub(super) fn finish(self, rig: &VerdictTable) -> Option<DeviceSpec> {
         let node = self.node?;
-        let fps = if let NodeSpec::Camera(camera) = &node { Some(f64::from(camera.fps)) } else { None };
+        let fps = match &node {
+            NodeSpec::Camera(camera) => Some(f64::from(camera.fps)),
+            NodeSpec::Lan(lan) => lan.rate(),
+            _ => None,
+        };
         Some(DeviceSpec {
             verdict: verdict::spec(node.modality_kind(), self.stall_after, fps, rig, &self.verdict),
             name: self.name,
@@ -94,6 +114,7 @@ impl Draft<'_> {
             when_stale: self.when_stale,
             latency: self.latency,
             action: self.action,
+            hooks: self.hooks,
         })
     }
 
@@ -112,14 +133,26 @@ impl Draft<'_> {
             NodeSpec::Camera(_) => Opens::Video,
             NodeSpec::Serial(_) => Opens::Tty,
             NodeSpec::Process(process) => process.opens,
+            NodeSpec::Can(can) if can.adapter != CanAdapter::SocketCan => Opens::Tty,
+            NodeSpec::Can(_) | NodeSpec::Lan(_) => Opens::Net,
         })
     }
 
-    /// The program that reads it, if one does.
-    pub(super) fn program(&self) -> Option<&Path> {
+    /// The programs that are run for it, each with the key that names it.
+    pub(super) fn programs(&self) -> impl Iterator<Item = (&'static str, &Path)> {
+        let key = if attach_is_node(&self.section) { "on_attach" } else { "node" };
+        let node = self.node.as_ref().and_then(|node| match node {
+            NodeSpec::Process(process) => Some((key, process.program.as_path())),
+            NodeSpec::Camera(_) | NodeSpec::Serial(_) | NodeSpec::Can(_) | NodeSpec::Lan(_) => None,
+        });
+        node.into_iter().chain(self.hooks.all().map(|(key, hook)| (key, hook.program.as_path())))
+    }
+
+    /// Its settings, if it is on the network.
+    pub(super) fn lan(&self) -> Option<&LanSpec> {
         match self.node.as_ref()? {
-            NodeSpec::Process(process) => Some(&process.program),
-            NodeSpec::Camera(_) | NodeSpec::Serial(_) => None,
+            NodeSpec::Lan(lan) => Some(lan),
+            _ => None,
         }
     }
 
@@ -138,21 +171,28 @@ pub(super) fn read<'a>(
     check_name(name, &section, problems);
     check_keys(&section, problems);
     let kind = kind(&section, problems);
-    let identity = identity(&section, problems);
+    let identity = identity::identity(kind, &section, problems);
     let mut heartbeat = None;
     let settings = match kind {
         Some(Kind::Camera) => Some(NodeSpec::Camera(node::camera(&section, problems))),
         Some(Kind::Serial) => node::serial(&section, problems).map(NodeSpec::Serial),
-        Some(Kind::Process) => section.text(problems, "node").and_then(|program| {
-            let (process, silent) = process::process(&section, program.value, programs, problems)?;
-            heartbeat = Some(silent);
-            Some(NodeSpec::Process(process))
-        }),
+        Some(Kind::Can) => can::can(&section, problems).map(NodeSpec::Can),
+        Some(Kind::Lan) => lan::lan(&section, problems).map(NodeSpec::Lan),
+        Some(Kind::Process) => {
+            process::process(&section, program(&section, programs, problems), problems).map(|(process, silent)| {
+                heartbeat = Some(silent);
+                NodeSpec::Process(process)
+            })
+        }
         None => None,
     };
     if kind.is_some_and(|kind| kind != Kind::Process) && section.has("process") {
         let message = format!("a built-in node has no table [{}]", section.child("process"));
         section.report(problems, "process", message, "remove the table, or write node = the name of a program");
+    }
+    if kind.is_some_and(|kind| kind != Kind::Can) && section.has("can") {
+        let message = format!("only a CAN adapter has a table [{}]", section.child("can"));
+        section.report(problems, "can", message, "remove the table, or write node = \"can\"");
     }
     let topic = topic(&section, problems).unwrap_or_else(|| default_topic(kind, name));
     let bit = section
@@ -166,6 +206,10 @@ pub(super) fn read<'a>(
         .unwrap_or_else(|| node::default_stall(settings.as_ref()));
     let latency = section.duration(problems, "latency", Duration::ZERO..=LONGEST_LATENCY).unwrap_or_default();
     let max_bytes = node::max_bytes(&section, settings.as_ref(), problems);
+    let mut action = action::action(&section, problems);
+    if let Some(NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(damiao), .. })) = &settings {
+        action = motors::axes(damiao, action, &section, problems);
+    }
     let written = section.integer(problems, "depth", 2..=4096).and_then(|depth| u64::try_from(depth.value).ok());
     Draft {
         name: name.to_owned(),
@@ -182,25 +226,47 @@ pub(super) fn read<'a>(
         when_stale,
         latency,
         verdict: verdict::read(&section, Whose::Device, problems),
-        action: action::action(&section, problems),
+        action,
+        hooks: hooks::hooks(&section, attach_is_node(&section), programs, problems),
         node: settings,
         section,
     }
 }
 
 fn check_name(name: &str, section: &Section<'_>, problems: &mut Problems<'_>) {
-    let legal = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
-    let begins = name.starts_with(|c: char| c.is_ascii_lowercase());
-    if begins && name.len() <= 64 && name.chars().all(legal) {
-        return;
+    if let Some((message, fix)) = name_problem(name) {
+        problems.report(section.at, &section.entry, message, fix);
     }
-    let better: String = name.to_lowercase().chars().map(|c| if legal(c) { c } else { '_' }).take(64).collect();
-    let fix = if better.starts_with(|c: char| c.is_ascii_lowercase()) {
-        format!("use lower-case letters, digits and `_`, at most 64, for example [device.{better}]")
-    } else {
-        "begin with a lower-case letter; then lower-case letters, digits and `_`, at most 64".to_owned()
+}
+
+/// Why `name` cannot be a modality's name, and what to do about it; `None` if it can.
+#[must_use]
+pub fn name_problem(name: &str) -> Option<(String, String)> {
+    let begins = name.starts_with(|c: char| c.is_ascii_lowercase());
+    if begins && name.len() <= LONGEST_NAME && name.chars().all(in_a_name) {
+        return None;
+    }
+    let fix = match like_a_name(name) {
+        Some(better) => {
+            format!("use lower-case letters, digits and `_`, at most {LONGEST_NAME}, for example [device.{better}]")
+        }
+        None => {
+            format!("begin with a lower-case letter; then lower-case letters, digits and `_`, at most {LONGEST_NAME}")
+        }
     };
-    problems.report(section.at, &section.entry, format!("{name:?} cannot be a modality's name"), fix);
+    Some((format!("{name:?} cannot be a modality's name"), fix))
+}
+
+/// The name that is nearest to any text, if one is near.
+#[must_use]
+pub fn like_a_name(text: &str) -> Option<String> {
+    let better: String =
+        text.to_lowercase().chars().map(|c| if in_a_name(c) { c } else { '_' }).take(LONGEST_NAME).collect();
+    better.starts_with(|c: char| c.is_ascii_lowercase()).then_some(better)
+}
+
+const fn in_a_name(c: char) -> bool {
+    c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_'
 }
 
 fn check_keys(section: &Section<'_>, problems: &mut Problems<'_>) {
@@ -208,106 +274,45 @@ fn check_keys(section: &Section<'_>, problems: &mut Problems<'_>) {
         if KEYS.contains(&key) {
             continue;
         }
-        if PLANNED_KEYS.contains(&key) {
-            let fix = "remove it; this version reads camera and serial devices, and through programs";
-            problems.report(at, &section.entry, format!("{key:?} is not supported by this version of rapid"), fix);
-        } else {
-            let fix = did_you_mean(key, &KEYS, "known keys here");
-            problems.report(at, &section.entry, format!("unknown key {key:?}"), fix);
-        }
+        let fix = did_you_mean(key, &KEYS, "known keys here");
+        problems.report(at, &section.entry, format!("unknown key {key:?}"), fix);
     }
 }
 
 fn kind(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<Kind> {
     if !section.has("node") {
-        section.missing(problems, "node", "write node = \"camera\", \"serial\" or the name of a program");
+        section.missing(
+            problems,
+            "node",
+            "write node = \"camera\", \"serial\", \"can\", \"lan\" or the name of a program",
+        );
         return None;
     }
     let text = section.text(problems, "node")?.value;
-    if PLANNED.contains(&text) {
-        let fix = "built in are \"camera\" and \"serial\"; leave the entry out until then, or name a program";
-        section.report(problems, "node", format!("node {text:?} is not supported by this version of rapid"), fix);
-        return None;
-    }
-    if text == "process" {
-        let fix = "write node = the name of the program, for example node = \"tactile_publisher\"";
+    if text == PROCESS && !section.has("on_attach") {
+        let fix = "write node = the name of the program, for example node = \"tactile_publisher\", or add on_attach = \
+                   [\"tactile_publisher\", \"argument\"]";
         section.report(problems, "node", "node \"process\" does not say which program".to_owned(), fix);
         return None;
     }
     Some(BUILT_IN.iter().find(|(name, _)| *name == text).map_or(Kind::Process, |(_, kind)| *kind))
 }
 
-fn identity(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<IdentitySpec> {
-    for key in ["vid", "pid"] {
-        if !section.has(key) {
-            let fix = format!("write the four hexadecimal digits lsusb shows, for example {key} = \"046d\"");
-            section.missing(problems, key, &fix);
-        }
-    }
-    let vid = section.usb_id(problems, "vid");
-    let pid = section.usb_id(problems, "pid");
-    let serial = serial_number(section, problems);
-    let port = section.text(problems, "port").filter(|port| {
-        let legal = is_port(port.value);
-        if !legal {
-            let fix = "write it as the kernel does, bus-port.port, for example port = \"1-2.3\"; `lsusb -t` shows it";
-            section.report(problems, "port", format!("{:?} is not a USB port path", port.value), fix);
-        }
-        legal
-    });
-    let port = port.map(|port| port.value.to_owned());
-    Some(IdentitySpec { vid: vid?, pid: pid?, serial, port })
+/// Is `on_attach` the program that reads the device?
+fn attach_is_node(section: &Section<'_>) -> bool {
+    let is_process = |key: &str, value: &DeValue<'_>| key == "node" && value.as_str() == Some(PROCESS);
+    section.has("on_attach") && section.fields().iter().any(|(_, key, value)| is_process(key, value.get_ref()))
 }
 
-/// `serial = "..."`, or `serial_number = "..."` where `serial` is the table of the serial line: in
-/// TOML one key cannot be both.
-fn serial_number(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<String> {
-    let as_text = section.has("serial") && !section.is_table("serial");
-    if as_text && section.has("serial_number") {
-        let message = "serial and serial_number are the same thing".to_owned();
-        section.report(problems, "serial_number", message, "keep one of the two");
+/// The program that reads the device: what `node` names, or with `node = "process"` what `on_attach` does.
+fn program(section: &Section<'_>, programs: Programs<'_>, problems: &mut Problems<'_>) -> Option<Hook> {
+    if attach_is_node(section) {
+        return hooks::hook(section, "on_attach", programs, problems);
     }
-    let key = if as_text { "serial" } else { "serial_number" };
-    let serial = section.text(problems, key)?.value;
-    match check_serial(serial) {
-        Ok(()) => Some(serial.to_owned()),
-        Err((message, fix)) => {
-            section.report(problems, key, message, fix);
-            None
-        }
-    }
-}
-
-/// A serial number ends up in rules and descriptors: it must at least be one line of text.
-fn check_serial(serial: &str) -> Result<(), (String, &'static str)> {
-    /// A USB string descriptor holds at most 126 UTF-16 units.
-    const LONGEST: usize = 126;
-    if serial.is_empty() {
-        return Err(("the serial number is empty".to_owned(), "remove the key if the device has none"));
-    }
-    if serial.chars().any(|c| c.is_control() || matches!(c, '\u{2028}' | '\u{2029}' | '\u{feff}')) {
-        return Err((
-            format!("the serial number {serial:?} contains control characters"),
-            "identify the device by its port instead: port = \"1-2.3\"",
-        ));
-    }
-    if serial.encode_utf16().count() > LONGEST {
-        return Err((
-            "the serial number is longer than a USB device can report".to_owned(),
-            "copy it from `rapid devices` or `lsusb -v`: at most 126 characters",
-        ));
-    }
-    Ok(())
-}
-
-/// `1-2.3`: bus, port at the root hub, ports at the hubs below (at most 5 hubs in a row, USB 2.0
-/// section 4.1.1).
-pub(crate) fn is_port(text: &str) -> bool {
-    let number = |part: &str| {
-        (1..=3).contains(&part.len()) && part.bytes().all(|byte| byte.is_ascii_digit()) && !part.starts_with('0')
-    };
-    let Some((bus, ports)) = text.split_once('-') else { return false };
-    number(bus) && ports.split('.').count() <= 6 && ports.split('.').all(number)
+    let name = section.text(problems, "node")?;
+    let found = programs.find(For::Node, name.value);
+    let program = found.map_err(|(message, fix)| section.report(problems, "node", message, fix)).ok()?;
+    Some(Hook { program, args: Vec::new() })
 }
 
 fn default_topic(kind: Option<Kind>, name: &str) -> String {

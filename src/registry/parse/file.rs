@@ -13,7 +13,10 @@ use crate::registry::trust::distrust;
 const LARGEST: u64 = 1 << 20;
 
 /// The text of a file a person wrote. `when_missing` is the fix when there is none.
-pub(crate) fn read_file(path: &Path, when_missing: &str) -> Result<String, RegistryErrors> {
+///
+/// # Errors
+/// When it cannot be read, is no ordinary file of text, or may be changed by others while we are root.
+pub fn read_file(path: &Path, when_missing: &str) -> Result<String, RegistryErrors> {
     let label = file_label(Some(path), "");
     let problem = |message: String, fix: String| RegistryErrors::whole_file(label.clone(), message, fix);
     // Without waiting: opening a named pipe would wait for its writer.

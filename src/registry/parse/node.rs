@@ -6,7 +6,7 @@ use std::time::Duration;
 use crate::modality::ModalityKind;
 use crate::registry::diagnostic::nearest;
 use crate::registry::section::{Problems, Section};
-use crate::registry::spec::{CameraSpec, Framing, NodeSpec, Parse, PixelFormat, SerialSpec};
+use crate::registry::spec::{CAN_BATCH, CAN_RECORD, CameraSpec, Framing, NodeSpec, Parse, PixelFormat, SerialSpec};
 
 pub(super) fn camera(section: &Section<'_>, problems: &mut Problems<'_>) -> CameraSpec {
     if section.is_table("serial") {
@@ -106,6 +106,7 @@ pub(super) fn default_stall(node: Option<&NodeSpec>) -> Duration {
     const LEAST: Duration = Duration::from_millis(500);
     match node {
         Some(NodeSpec::Camera(camera)) => (Duration::from_secs(10) / camera.fps.max(1)).max(LEAST),
+        Some(NodeSpec::Lan(lan)) => lan.stall(LEAST),
         _ => LEAST,
     }
 }
@@ -128,6 +129,11 @@ pub(super) fn max_bytes(section: &Section<'_>, node: Option<&NodeSpec>, problems
             // Numbers travel as 64-bit floats.
             _ => (8 * serial.channels as u64, 8 * serial.channels as u64),
         },
+        Some(NodeSpec::Can(can)) => match can.channels() {
+            0 => ((CAN_BATCH * CAN_RECORD) as u64, (CAN_BATCH * CAN_RECORD) as u64),
+            channels => (8 * channels as u64, 8 * channels as u64),
+        },
+        Some(NodeSpec::Lan(lan)) => lan.max_bytes(),
         Some(NodeSpec::Process(process)) => match (process.kind, process.shape.as_slice()) {
             (ModalityKind::Image, [height, width]) => {
                 ((2 * u64::from(*width) * u64::from(*height)).max(SMALLEST_JPEG), 1024)
@@ -144,6 +150,7 @@ pub(super) fn max_bytes(section: &Section<'_>, node: Option<&NodeSpec>, problems
 pub(super) fn default_depth(node: Option<&NodeSpec>) -> u64 {
     match node {
         Some(NodeSpec::Camera(camera)) => (2 * u64::from(camera.fps)).clamp(16, 1024),
+        Some(NodeSpec::Lan(lan)) => lan.depth(),
         // Of a camera with 30 pictures a second, and of what may be as large.
         Some(NodeSpec::Process(process)) if process.kind != ModalityKind::Scalars => 60,
         _ => 2048,

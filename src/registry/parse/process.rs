@@ -4,21 +4,19 @@ use std::time::Duration;
 
 use toml::de::DeValue;
 
-use super::program::Programs;
 use crate::modality::ModalityKind;
 use crate::registry::section::{Problems, Section};
-use crate::registry::spec::{Opens, ProcessSpec};
+use crate::registry::spec::{Hook, Opens, ProcessSpec};
 use crate::registry::words::KINDS;
 
 const KEYS: [&str; 7] = ["args", "opens", "kind", "channels", "width", "height", "heartbeat"];
 /// As good as any program that only looks whether its device still answers once a second.
 const DEFAULT_HEARTBEAT: Duration = Duration::from_secs(2);
 
-/// The program of an entry and how long it may be silent; `None` if a problem with it was reported.
+/// How an entry's `program` is run and how long it may be silent; `None` if a problem with it was reported.
 pub(super) fn process(
     section: &Section<'_>,
-    name: &str,
-    programs: Programs<'_>,
+    program: Option<Hook>,
     problems: &mut Problems<'_>,
 ) -> Option<(ProcessSpec, Duration)> {
     for key in ["camera", "serial"].into_iter().filter(|key| section.is_table(key)) {
@@ -29,23 +27,28 @@ pub(super) fn process(
         let fix = format!("write heartbeat in [{}]", section.child("process"));
         section.report(problems, "stall_after", "a program has a heartbeat instead of stall_after".to_owned(), fix);
     }
-    let program = programs.find(name).map_err(|(message, fix)| section.report(problems, "node", message, fix)).ok();
-    let bare = |program| ProcessSpec {
+    let bare = |Hook { program, args }| ProcessSpec {
         program,
-        args: Vec::new(),
+        args,
         opens: Opens::Usb,
         kind: ModalityKind::Bytes,
         shape: Vec::new(),
     };
     let Some(table) = section.table(problems, "process") else { return Some((bare(program?), DEFAULT_HEARTBEAT)) };
     table.allow(problems, &KEYS);
-    let args = args(&table, problems);
+    let given = args(&table, problems);
+    if table.has("args") && program.as_ref().is_some_and(|program| !program.args.is_empty()) {
+        let fix = "keep those of on_attach or these".to_owned();
+        table.report(problems, "args", "on_attach gives the program arguments already".to_owned(), fix);
+    }
     let opens = table.choice(problems, "opens", &Opens::WORDS).unwrap_or(Opens::Usb);
     let kind = table.choice(problems, "kind", &KINDS).unwrap_or(ModalityKind::Bytes);
     let shape = shape(&table, kind, problems);
     let range = Duration::from_millis(10)..=Duration::from_hours(1);
     let heartbeat = table.duration(problems, "heartbeat", range).unwrap_or(DEFAULT_HEARTBEAT);
-    Some((ProcessSpec { args, opens, kind, shape, ..bare(program?) }, heartbeat))
+    let mut process = ProcessSpec { opens, kind, shape, ..bare(program?) };
+    process.args.extend(given);
+    Some((process, heartbeat))
 }
 
 fn args(table: &Section<'_>, problems: &mut Problems<'_>) -> Vec<String> {

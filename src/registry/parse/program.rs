@@ -26,18 +26,36 @@ pub(super) enum Programs<'a> {
     Nowhere,
 }
 
+/// Which key names the program, for messages.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum For {
+    /// `node`, which may also be a word for what is built in.
+    Node,
+    /// The first text of this key.
+    Hook(&'static str),
+}
+
+impl For {
+    const fn key(self) -> &'static str {
+        match self {
+            Self::Node => "node",
+            Self::Hook(key) => key,
+        }
+    }
+}
+
 /// What is wrong, and the fix.
 type Wrong = (String, String);
 
 impl Programs<'_> {
     /// The program of this name.
-    pub(super) fn find(self, name: &str) -> Result<PathBuf, Wrong> {
+    pub(super) fn find(self, purpose: For, name: &str) -> Result<PathBuf, Wrong> {
         let Self::Beside(file) = self else { return Ok(PathBuf::from(name)) };
         let found = if Path::new(name).is_absolute() {
             Some(PathBuf::from(name)).filter(|path| path.exists())
         } else {
             if name.is_empty() || name.contains(['/', '\0']) || name == "." || name == ".." {
-                let message = format!("node {name:?} is not the name of a program");
+                let message = format!("{} {name:?} is not the name of a program", purpose.key());
                 return Err((message, "write its name, for a program beside this file, or its absolute path".into()));
             }
             let beside = folder_of(file);
@@ -47,23 +65,29 @@ impl Programs<'_> {
                 .map(|folder| folder.join(name))
                 .find(|path| path.is_file())
         };
-        let path = found.ok_or_else(|| self.missing(name))?;
+        let path = found.ok_or_else(|| self.missing(purpose, name))?;
         check(&path)?;
         Ok(path)
     }
 
-    fn missing(self, name: &str) -> Wrong {
-        let message = format!("node {name:?} is neither built in nor a program");
+    fn missing(self, purpose: For, name: &str) -> Wrong {
+        let place = "a program must lie beside this file or on PATH, or be written with its absolute path";
+        let (message, words, otherwise) = match purpose {
+            For::Node => (
+                format!("node {name:?} is neither built in nor a program"),
+                &super::device::BUILT_IN[..],
+                format!("built in are camera, serial, can and lan; {place}"),
+            ),
+            For::Hook(key) => (format!("{key} {name:?} is not a program"), &[][..], place.to_owned()),
+        };
         let near = match self {
             Self::Beside(file) => executables(&folder_of(file)),
             Self::Nowhere => Vec::new(),
         };
-        let known = super::device::BUILT_IN.iter().map(|(name, _)| *name).chain(near.iter().map(String::as_str));
+        let known = words.iter().map(|(name, _)| *name).chain(near.iter().map(String::as_str));
         let fix = match nearest(name, known) {
             Some(name) => format!("did you mean {name:?}?"),
-            None => "built in are \"camera\" and \"serial\"; a program must lie beside this file or on PATH, or be \
-                     written with its absolute path"
-                .to_owned(),
+            None => otherwise,
         };
         (message, fix)
     }
@@ -120,13 +144,15 @@ fn trusted(path: &Path, label: &str) -> Result<(), Wrong> {
     }
 }
 
-/// A warning for a program that others could change. As root it has been refused.
-pub(super) fn distrusted(draft: &Draft<'_>, problems: &Problems<'_>) -> Option<Diagnostic> {
-    let path = draft.program()?;
-    // What is not looked for, as nothing will be run, is not there either.
-    let reason = distrust(path).ok().flatten()?;
-    let message = format!("the program {}: {reason}", printable(&path.display().to_string()));
-    Some(problems.diagnostic(draft.section.at_of("node"), &draft.section.entry, message, reason.fix()))
+/// Warnings for the programs of an entry that others could change. As root they have been refused.
+pub(super) fn distrusted(draft: &Draft<'_>, problems: &Problems<'_>) -> Vec<Diagnostic> {
+    let warn = |(key, path): (&str, &Path)| {
+        // What is not looked for, as nothing will be run, is not there either.
+        let reason = distrust(path).ok().flatten()?;
+        let message = format!("the program {}: {reason}", printable(&path.display().to_string()));
+        Some(problems.diagnostic(draft.section.at_of(key), &draft.section.entry, message, reason.fix()))
+    };
+    draft.programs().filter_map(warn).collect()
 }
 
 #[cfg(test)]
@@ -145,12 +171,12 @@ mod tests {
         let (file, program) = (dir.path().join("devices.toml"), dir.path().join("tactile_publisher"));
         write(&program, "#!/bin/sh\n").unwrap();
         let programs = Programs::Beside(&file);
-        let message = |name: &str| programs.find(name).unwrap_err();
+        let message = |name: &str| programs.find(For::Node, name).unwrap_err();
         assert!(message("tactile_publisher").0.ends_with("tactile_publisher may not be run by this user"));
         allow(&program, 0o755);
-        assert_eq!(programs.find("tactile_publisher").unwrap(), program);
-        assert_eq!(programs.find(program.to_str().unwrap()).unwrap(), program);
-        assert!(programs.find("sh").unwrap().is_absolute(), "on PATH");
+        assert_eq!(programs.find(For::Node, "tactile_publisher").unwrap(), program);
+        assert_eq!(programs.find(For::Node, program.to_str().unwrap()).unwrap(), program);
+        assert!(programs.find(For::Node, "sh").unwrap().is_absolute(), "on PATH");
         assert_eq!(message("tactile_publishr").1, "did you mean \"tactile_publisher\"?");
         assert_eq!(message("camra").1, "did you mean \"camera\"?");
         assert!(message("/no/such/program").0.contains("neither built in nor a program"));
@@ -159,7 +185,7 @@ mod tests {
             assert!(message(name).0.contains("is not the name of a program"), "{name:?}");
         }
         assert!(message("folder").0.contains("neither built in nor a program"));
-        assert_eq!(Programs::Nowhere.find("anything").unwrap(), Path::new("anything"));
+        assert_eq!(Programs::Nowhere.find(For::Node, "anything").unwrap(), Path::new("anything"));
     }
 
     #[test]
@@ -169,20 +195,27 @@ mod tests {
         allow(dir.path(), 0o755);
         let (file, program) = (dir.path().join("devices.toml"), dir.path().join("p"));
         write(&program, "").unwrap();
-        let text = "[device.a]\nvid = \"1\"\npid = \"2\"\nbit = 0\nnode = \"p\"\n";
-        let told = |mode| {
+        let entry = "[device.a]\nvid = \"1\"\npid = \"2\"\nbit = 0\n";
+        let told = |mode, keys: &str| {
+            let text = format!("{entry}{keys}\n");
             allow(&program, mode);
-            match Registry::parse(text, Some(&file)) {
+            match Registry::parse(&text, Some(&file)) {
                 Ok(loaded) => (loaded.warnings, false),
                 Err(errors) => (errors.diagnostics, true),
             }
         };
-        assert_eq!(told(0o755), (Vec::new(), false));
-        let (diagnostics, refused) = told(0o777);
-        assert_eq!(refused, rustix::process::geteuid().is_root());
-        assert_eq!(diagnostics.len(), 1, "{diagnostics:?}");
-        assert!(diagnostics[0].message.ends_with("p: other users may write to it (mode 0777)"), "{diagnostics:?}");
-        assert_eq!((diagnostics[0].entry.as_deref(), diagnostics[0].line), (Some("device.a"), 5));
+        for keys in [
+            "node = \"p\"",
+            "on_record_stop = [\"p\", \"x\"]\nnode = \"camera\"",
+            "on_attach = [\"p\"]\nnode = \"process\"",
+        ] {
+            assert_eq!(told(0o755, keys), (Vec::new(), false));
+            let (diagnostics, refused) = told(0o777, keys);
+            assert_eq!(refused, rustix::process::geteuid().is_root());
+            assert_eq!(diagnostics.len(), 1, "{diagnostics:?}");
+            assert!(diagnostics[0].message.ends_with("p: other users may write to it (mode 0777)"), "{diagnostics:?}");
+            assert_eq!((diagnostics[0].entry.as_deref(), diagnostics[0].line), (Some("device.a"), 5));
+        }
     }
 
     #[test]

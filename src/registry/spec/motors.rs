@@ -5,11 +5,13 @@
 
 use std::time::Duration;
 
+/// Motors of one bus, at the most: an action has an axis each, a sample 6 numbers each.
+pub const MAX_MOTORS: usize = 10;
+
 /// `protocol = "damiao"`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DamiaoSpec {
-    /// One motor an axis, in the order of samples and actions, `1..=10` of them (a sample has 6 numbers
-    /// a motor, an action at most 64). No two are [`Self::indistinct`].
+    /// One motor an axis, in the order of samples and actions, `1..=`[`MAX_MOTORS`] of them. No two are [`Self::indistinct`].
     pub motors: Vec<MotorSpec>,
     /// Commands a second to each motor, `10..=1000`, default 200.
     pub hz: u32,
@@ -123,6 +125,25 @@ impl MotorKind {
             Self::Dmg6220 => "DMG6220",
             Self::Dmh3510 => "DMH3510",
             Self::Dmh6215 => "DMH6215",
+        }
+    }
+
+    /// PMAX in rad, VMAX in rad/s and TMAX in Nm as the motor leaves the factory. Source: the tables of the
+    /// public drivers `DM_CAN.py` and of `LeRobot`.
+    #[must_use]
+    pub const fn shipped(self) -> [f64; 3] {
+        match self {
+            Self::Dm3507 | Self::Dm4310 => [12.5, 30.0, 10.0],
+            Self::Dm4310V48 => [12.5, 50.0, 10.0],
+            Self::Dm4340 => [12.5, 8.0, 28.0],
+            Self::Dm4340V48 => [12.5, 10.0, 28.0],
+            Self::Dm6006 => [12.5, 45.0, 20.0],
+            Self::Dm8006 => [12.5, 45.0, 40.0],
+            Self::Dm8009 => [12.5, 45.0, 54.0],
+            Self::Dm10010L => [12.5, 25.0, 200.0],
+            Self::Dm10010 => [12.5, 20.0, 200.0],
+            Self::Dmh3510 => [12.5, 280.0, 1.0],
+            Self::Dmh6215 | Self::Dmg6220 => [12.5, 45.0, 10.0],
         }
     }
 

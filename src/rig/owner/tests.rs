@@ -10,7 +10,7 @@ use super::*;
 use crate::hotplug::HotplugError;
 use crate::registry::scenario::{SimDevice, SimSource};
 use crate::registry::{
-    DeviceNode, Framing, IdentitySpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbIdentity, WhenStale,
+    DeviceNode, Framing, IdentitySpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbIdentity, UsbSpec, WhenStale,
 };
 use crate::rig::presence::{Claim, read_mask};
 use crate::status::Event;
@@ -25,7 +25,7 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
     let device = |(bit, name): (u8, &str)| DeviceSpec {
         name: name.into(),
         id: ModalityId::new(bit).expect("below 64"),
-        identity: IdentitySpec { vid: 1, pid: 2, serial: None, port: None },
+        identity: IdentitySpec::Usb(UsbSpec { vid: 1, pid: 2, serial: None, port: None }),
         node: NodeSpec::Serial(serial.clone()),
         topic: format!("/rapid/serial/{name}"),
         mount: None,
@@ -35,6 +35,7 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
         when_stale: WhenStale::Hold,
         latency: Duration::ZERO,
         action: None,
+        hooks: crate::registry::Hooks::default(),
         verdict: crate::registry::VerdictSpec::of(
             crate::modality::ModalityKind::Image,
             Duration::from_millis(500),
@@ -51,6 +52,7 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
             disk_reserve: None,
         },
         devices: [(0, "a"), (1, "b")].into_iter().map(device).collect(),
+        modules: Vec::new(),
         path: None,
         text: String::new(),
     }
@@ -91,7 +93,12 @@ impl Bench {
                 self.units.insert(port, Arc::clone(&unit));
                 let usb = UsbIdentity { vid: 1, pid: 2, serial: None, port: (*port).into(), ..UsbIdentity::default() };
                 let syspath = PathBuf::from("/test").join(port);
-                self.tell(HotplugEvent::Added(Attachment { syspath, node: DeviceNode::Sim(unit), usb, driver: None }));
+                self.tell(HotplugEvent::Added(Attachment {
+                    syspath,
+                    node: DeviceNode::Sim(unit),
+                    unit: usb.into(),
+                    driver: None,
+                }));
             }
             Pull(port) => self.units[port].unplug(),
             Removed(port, witness) => {
@@ -130,7 +137,7 @@ impl Bench {
 
 fn word(what: &What) -> Option<String> {
     match what {
-        What::Attach { device, usb, .. } => Some(format!("{device} at {}", usb.port)),
+        What::Attach { device, unit, .. } => Some(format!("{device} at {}", unit.place())),
         What::Detach { device, witness, .. } => Some(format!("{device} gone {witness}")),
         What::State { device, state, .. } => Some(format!("{device} {}", state.word())),
         What::Unregistered { .. } => Some("unused".into()),
@@ -273,6 +280,64 @@ async fn the_first_witness_wins_and_no_replug_is_lost() {
         let got = told(Duration::from_millis(100), Duration::from_millis(150), steps).await;
         assert_eq!(got, [up, *expected].concat(), "{name}");
     }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn devices_are_told_of_the_episode_in_progress() {
+    let name = format!("ownere{}", std::process::id());
+    let path = PathBuf::from(format!("/dev/shm/rapid_test_mask_{name}"));
+    let registry = registry(Duration::from_millis(100), Duration::from_millis(150));
+    let board = Arc::new(Board::new(&registry));
+    let bus = Bus::open(&registry, Some(&name)).expect("bus");
+    let claim = Claim::new(&path, 2).expect("claim");
+    let presence = Presence::start(claim, bus.writer(TopicId::Mask).expect("mask"), Arc::clone(&board)).expect("mask");
+    let (hotplug, plugged) = unbounded();
+    let (commands, asked) = mpsc::channel(4);
+    let (tell, episode) = watch::channel(None);
+    let stop = CancellationToken::new();
+    let mut rig = Rig::new(&registry, &bus, presence, Arc::clone(&board)).following(episode);
+    let mut bench = Bench { hotplug, commands, events: board.events(), units: HashMap::new(), path, told: Vec::new() };
+    let running = tokio::spawn({
+        let stop = stop.clone();
+        async move { rig.run(Box::pin(plugged), asked, stop).await }
+    });
+    let come_to = async |unit: &Arc<SimDevice>, told: (u32, u32)| {
+        let begun = Instant::now();
+        while unit.recordings() != told {
+            assert!(begun.elapsed() < PATIENCE, "{:?} instead of {told:?}", unit.recordings());
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+    };
+    let begin = |number: u8| {
+        let file = PathBuf::from(format!("/episodes/{number}.mcap"));
+        tell.send_replace(Some(Arc::new(crate::status::Episode::new(&file))));
+    };
+
+    for step in [Plug("1", CHANNELS), Until("a streaming")] {
+        bench.step(&step).await;
+    }
+    let first = Arc::clone(&bench.units["1"]);
+    assert_eq!(first.recordings(), (0, 0), "there is no episode");
+    begin(1);
+    come_to(&first, (1, 0)).await;
+    // One that is silent is told as well.
+    first.set_silent(true);
+    bench.step(&Until("a stalled")).await;
+    tell.send_replace(None);
+    come_to(&first, (1, 1)).await;
+    begin(2);
+    come_to(&first, (2, 1)).await;
+    // One that comes during the episode, while another is pulled.
+    for step in [Plug("2", CHANNELS), Until("b streaming"), Removed("1", Witness::Kernel), Until("a absent")] {
+        bench.step(&step).await;
+    }
+    let second = Arc::clone(&bench.units["2"]);
+    come_to(&second, (1, 0)).await;
+    come_to(&first, (2, 2)).await;
+    // The run ends before its episode does.
+    stop.cancel();
+    running.await.expect("no panic").expect("no error");
+    come_to(&second, (1, 1)).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -17,16 +17,12 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use thread_priority::unix::{
-    RealtimeThreadSchedulePolicy, ThreadSchedulePolicy, set_thread_priority_and_policy, thread_native_id,
-};
-use thread_priority::{ThreadPriority, ThreadPriorityValue};
-
 use tokio_util::sync::{CancellationToken, DropGuard};
 
 use crate::bus::Writer;
 use crate::fault;
 use crate::mask::PhysicalMask;
+use crate::realtime::{MASK_PRIORITY, use_fifo};
 use crate::sample::{Encoding, SampleHeader};
 use crate::status::Board;
 use crate::time::{Stamp, realtime_ns};
@@ -40,8 +36,6 @@ use file::MaskFile;
 pub const PERIOD: Duration = Duration::from_millis(2);
 /// `SampleHeader::id` of a mask sample: no modality.
 pub const MASK_ID: u32 = u32::MAX;
-/// Above ordinary threads, below the kernel's own interrupt threads (50).
-const FIFO_PRIORITY: u8 = 40;
 
 /// The publisher. Dropping it publishes an empty mask and removes the files.
 #[derive(Debug)]
@@ -146,12 +140,12 @@ struct Beat {
 
 impl Beat {
     fn run(mut self) {
-        match use_fifo() {
+        match use_fifo(MASK_PRIORITY) {
             Ok(()) => tracing::debug!("thread mask runs under SCHED_FIFO"),
             Err(reason) => tracing::warn!(
                 reason,
                 "the mask has no real-time priority, so that a busy machine may delay it: run rapid as rapid.service does, \
-                 or give the user `rtprio {FIFO_PRIORITY}` in /etc/security/limits.conf"
+                 or give the user `rtprio {MASK_PRIORITY}` in /etc/security/limits.conf"
             ),
         }
         let mut due = Stamp::now();
@@ -205,14 +199,6 @@ impl Beat {
         payload[8..].copy_from_slice(&sequence.to_le_bytes());
         self.writer.publish(header, &payload).map_err(|error| error.to_string())
     }
-}
-
-/// Puts the calling thread under `SCHED_FIFO`, which needs `CAP_SYS_NICE` or an `RLIMIT_RTPRIO`.
-fn use_fifo() -> Result<(), String> {
-    let priority = ThreadPriorityValue::try_from(FIFO_PRIORITY)?;
-    let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
-    set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Crossplatform(priority), policy)
-        .map_err(|error| format!("{error:?}"))
 }
 
 #[cfg(test)]

@@ -11,14 +11,15 @@ use tokio::sync::{OwnedMutexGuard, oneshot};
 use tokio::time::{sleep, timeout};
 use tokio_util::sync::CancellationToken;
 
-use super::Workers;
-use super::output::Output;
+use super::super::output::Output;
+use super::super::programs::Programs;
+use crate::bus::Membership;
 use crate::driver::DriverError;
 use crate::driver::process::{Child, Launch};
-use crate::status::{Level, What};
+use crate::status::Level;
 
 /// How long a child has to end after SIGTERM.
-pub(super) const TERM_LIMIT: Duration = Duration::from_secs(5);
+pub(in crate::rig) const TERM_LIMIT: Duration = Duration::from_secs(5);
 /// How long what a child published last is left for its reader.
 const LAST_SAMPLES: Duration = Duration::from_secs(1);
 
@@ -26,7 +27,8 @@ const LAST_SAMPLES: Duration = Duration::from_secs(1);
 #[derive(Debug)]
 pub(super) struct Keeper {
     pub(super) name: String,
-    pub(super) workers: Workers,
+    pub(super) programs: Programs,
+    pub(super) membership: Membership,
     /// The child is to end.
     pub(super) stop: CancellationToken,
     /// The entry's turn: given back when the child is gone.
@@ -47,8 +49,8 @@ enum End {
 impl Keeper {
     /// From the start of the child to its end.
     pub(super) async fn keep(self, launch: Launch) {
-        let Self { name, workers, stop, turn, started, ended } = self;
-        let mut child = match workers.spawner.spawn(launch).await {
+        let Self { name, programs, membership, stop, turn, started, ended } = self;
+        let mut child = match programs.spawner.spawn(launch).await {
             Ok(child) => child,
             Err(error) => {
                 let _ = started.send(Err(error));
@@ -58,10 +60,11 @@ impl Keeper {
         let id = child.id();
         // Where the stream has been told to stop meanwhile, nobody listens, here and below.
         let _ = started.send(Ok(id));
-        let mut output = Output::new(&name, &workers.board);
+        programs.logbook.write(&name, &format!("started as process {id}"));
+        let mut output = Output::new(&name, None, &programs);
         let end = tokio::select! {
             biased;
-            end = until_end(&child, &stop, &workers.hurry) => end,
+            end = until_end(&child, &stop, &programs.hurry) => end,
             () = output.follow(&child.stdout, &child.stderr) => End::Own,
         };
         output.finish(&child.stdout, &child.stderr);
@@ -70,14 +73,13 @@ impl Keeper {
             Err(error) => format!("its process {id} cannot be reaped: {error}"),
         };
         if end == End::Killed {
-            let text = format!("{name}: process {id} did not end on SIGTERM and was killed");
-            workers.board.announce(What::Log { level: Level::Warn, text });
+            output.note(Level::Warn, &format!("process {id} did not end on SIGTERM and was killed"));
         }
+        programs.logbook.write(&name, &reason);
         tracing::debug!(device = %name, process = id, "{reason}");
         let _ = ended.send(reason);
         // What the child published last goes with its memory.
         let _ = timeout(LAST_SAMPLES, stop.cancelled()).await;
-        let membership = workers.membership.clone();
         // A panic in there is said by the runtime and leaves only files behind.
         let _ = tokio::task::spawn_blocking(move || membership.sweep()).await;
         drop(turn);
@@ -103,7 +105,7 @@ async fn until_end(child: &Child, stop: &CancellationToken, hurry: &Cancellation
 }
 
 /// How a process ended, for people.
-fn describe(status: ExitStatus) -> String {
+pub(in crate::rig) fn describe(status: ExitStatus) -> String {
     match (status.code(), status.signal()) {
         (Some(code), _) => format!("its process ended with code {code}"),
         (None, Some(signal)) => match rustix::process::Signal::from_named_raw(signal).and_then(name) {

@@ -44,6 +44,27 @@ pub fn units() -> Vec<Vec<u8>> {
     all.map(|text| text.as_bytes().to_vec()).to_vec()
 }
 
+/// Lines of CAN adapters that speak slcan.
+#[must_use]
+pub fn slcan() -> Vec<Vec<u8>> {
+    vec![
+        b"\x03\rz\rZ\r\x07t10021133\rT1ABCDEF980123456789ABCDEFFFFF\rr1002\rR000000058\r".to_vec(),
+        b"\x00V1013\rN1234\rF00\rt10t7FF0\rgarbage t0018112233445566778\rt00181122334455667788ea5f\r".to_vec(),
+    ]
+}
+
+/// The line of Damiao's CAN adapter.
+#[must_use]
+pub fn damiao_serial() -> Vec<Vec<u8>> {
+    let message = |kind: u8, format: u8, id: u32| {
+        [&[0xaa, kind, format][..], &id.to_le_bytes(), &[0x15, 0x7f, 0xff, 0x7f, 0xf7, 0xff, 0x1c, 0x1a, 0x55]].concat()
+    };
+    let all = [0, 1, 0x11, 2, 0x12, 3, 0x13, 0xee].map(|kind| message(kind, 8, 0x15)).concat();
+    let odd = [message(0x11, 0x48, 0x1234_5678), message(0x11, 0x82, 5), message(0x11, 9, 5)].concat();
+    let cut = [&[0xaa, 0x11, 8][..], &message(0x11, 8, 0x15), &[0x55, 0xaa], &message(0x11, 3, 0x16)].concat();
+    [all, odd, cut].into_iter().map(|bytes| [vec![4], bytes].concat()).collect()
+}
+
 /// Streams of each framing and content.
 #[must_use]
 pub fn serial() -> Vec<Vec<u8>> {

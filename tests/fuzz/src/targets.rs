@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use rapid::commands;
+use rapid::control::can::CanFrame;
 use rapid::driver;
 use rapid::headless::style::Palette;
 use rapid::mask::{MaskRecord, RECORD_LEN};
@@ -18,8 +19,8 @@ use rapid::registry::artifacts::{ArtifactKind, artifacts};
 use rapid::registry::scenario::Scenario;
 use rapid::registry::units::{parse_duration, parse_size, show_duration, show_size};
 use rapid::registry::{
-    Assigner, Assignment, Attachment, DeviceNode, DeviceSpec, Framing, NodeSpec, Opens, Parse, ProcessSpec, Registry,
-    RegistryErrors, SerialSpec, UsbIdentity,
+    Assigner, Assignment, Attachment, CanAdapter, DeviceNode, DeviceSpec, Framing, NodeSpec, Opens, Parse, ProcessSpec,
+    Registry, RegistryErrors, SerialSpec, Unit, UsbIdentity,
 };
 use rapid::text as shown;
 use yaml_rust2::{Yaml, YamlLoader};
@@ -103,6 +104,62 @@ pub fn serial(bytes: &[u8]) {
         };
         assert!(permitted, "{} bytes of {spec:?}", payload.len());
     }
+}
+
+/// A CAN adapter that speaks slcan: what it says depends on the bytes alone, and a frame that is sent
+/// again comes back as it was.
+pub fn slcan(bytes: &[u8]) {
+    use driver::can::slcan::{Decoder, Event, encode};
+    let Some((cut, stream)) = short(bytes).and_then(<[u8]>::split_first) else { return };
+    let decode = |pieces: &mut dyn Iterator<Item = &[u8]>| {
+        let (mut decoder, mut events) = (Decoder::default(), Vec::new());
+        for mut piece in pieces {
+            while !piece.is_empty() {
+                let (taken, event) = decoder.feed(piece);
+                piece = &piece[taken..];
+                events.extend(event);
+            }
+        }
+        events
+    };
+    let whole = decode(&mut std::iter::once(stream));
+    assert_eq!(whole, decode(&mut stream.chunks(usize::from(*cut) % 7 + 1)), "how the bytes were cut");
+    for event in &whole {
+        let Event::Frame(frame, _) = event else { continue };
+        legal_frame(frame);
+        assert_eq!(decode(&mut std::iter::once(encode(frame).bytes())), [Event::Frame(*frame, None)]);
+    }
+}
+
+/// Damiao's CAN adapter: what it says depends on the bytes alone, and every byte of it is of a message or
+/// was passed over.
+pub fn damiao_serial(bytes: &[u8]) {
+    use driver::can::damiao_serial::{Decoder, Kind, RECEIVED, encode};
+    let Some((cut, stream)) = short(bytes).and_then(<[u8]>::split_first) else { return };
+    let decode = |pieces: &mut dyn Iterator<Item = &[u8]>| {
+        let (mut decoder, mut messages) = (Decoder::default(), Vec::new());
+        for mut piece in pieces {
+            while !piece.is_empty() {
+                let (taken, message) = decoder.feed(piece);
+                piece = &piece[taken..];
+                messages.extend(message);
+            }
+        }
+        (messages, decoder.skipped())
+    };
+    let whole = decode(&mut std::iter::once(stream));
+    assert_eq!(whole, decode(&mut stream.chunks(usize::from(*cut) % 7 + 1)), "how the bytes were cut");
+    let used = whole.0.len() * RECEIVED + usize::try_from(whole.1).expect("a count of bytes");
+    assert!((stream.len().saturating_sub(RECEIVED)..=stream.len()).contains(&used), "{used} of {}", stream.len());
+    for message in whole.0.iter().filter(|message| message.kind == Kind::Received) {
+        legal_frame(&message.frame);
+        assert!(encode(&message.frame).is_some());
+    }
+}
+
+fn legal_frame(frame: &CanFrame) {
+    assert!(frame.len <= 8 && frame.id <= if frame.extended { 0x1fff_ffff } else { 0x7ff }, "{frame:?}");
+    assert!(!frame.error && frame.data[usize::from(frame.len)..].iter().all(|byte| *byte == 0), "{frame:?}");
 }
 
 /// One recorded message, of each schema.
@@ -208,7 +265,7 @@ pub fn strings(bytes: &[u8]) {
         syspath: PathBuf::from("/sys/devices/1-1/1-1:1.0/video4linux/video0"),
         node: DeviceNode::Video(PathBuf::from("/dev/video0")),
         driver: None,
-        usb: UsbIdentity {
+        unit: Unit::Usb(UsbIdentity {
             firmware: None,
             manufacturer: None,
             vid: 1,
@@ -216,7 +273,7 @@ pub fn strings(bytes: &[u8]) {
             serial: Some(serial.to_owned()),
             port: "1-1".to_owned(),
             product: Some(serial.to_owned()),
-        },
+        }),
     };
     let registry = match Registry::parse(&text, None) {
         Ok(loaded) => loaded.registry,
@@ -301,6 +358,12 @@ fn check_artifacts(registry: &Registry) {
             shape: Vec::new(),
         });
     }
+    let bus = |device: &DeviceSpec| {
+        matches!(&device.node, NodeSpec::Can(can) if can.adapter == CanAdapter::SocketCan).then(|| device.node.clone())
+    };
+    if let (Some(bus), Some(last)) = (registry.devices.iter().find_map(bus), harmless.devices.last_mut()) {
+        last.node = bus;
+    }
     let expected = unit_without_names(&text_of_unit(&harmless).replace(&harmless.rig.name, ""));
     for artifact in artifacts(registry) {
         let text = &artifact.contents;
@@ -328,6 +391,10 @@ fn check_rules(registry: &Registry, text: &str) {
     let mut named = BTreeSet::new();
     for rule in &rules {
         let value = |key: &str| rule.iter().find(|token| token.key == key).map(|token| token.value.as_str());
+        if let Some(command) = value("RUN") {
+            check_command(registry, rule, command);
+            continue;
+        }
         let link = value("SYMLINK").expect("every rule gives a name");
         assert!(named.insert(link.to_owned()), "two rules for {link}");
         let device = registry.devices.iter().find(|device| format!("rapid/{}", device.name) == link);
@@ -342,7 +409,7 @@ fn check_rules(registry: &Registry, text: &str) {
         let keys: BTreeSet<_> = rule.iter().map(|token| &token.key).collect();
         assert_eq!(keys.len(), rule.len(), "a key twice in {rule:?}");
         assert_eq!(value("RUN{builtin}"), Some("uaccess"));
-        let serial = device.identity.serial.as_deref();
+        let serial = device.identity.serial();
         assert_eq!(value(serial_key).is_some(), serial.is_some());
         if let (Some(pattern), Some(serial)) = (value(serial_key), serial) {
             assert!(rules::matches(pattern, serial), "{pattern:?} does not match {serial:?}");
@@ -353,6 +420,28 @@ fn check_rules(registry: &Registry, text: &str) {
             }
         }
     }
+}
+
+/// A CAN interface is brought up, and nothing else: the words are ours and a number of the registry.
+fn check_command(registry: &Registry, rule: &[Token], command: &str) {
+    const KEYS: [&str; 8] = [
+        "ACTION==",
+        "SUBSYSTEM==",
+        "ATTR{type}==",
+        "ATTRS{idVendor}==",
+        "ATTRS{idProduct}==",
+        "ATTRS{serial}==",
+        "KERNELS==",
+        "RUN+=",
+    ];
+    for Token { key, operator, .. } in rule {
+        assert!(KEYS.contains(&format!("{key}{operator}").as_str()), "{key}{operator} in a rule");
+    }
+    let commands = registry.devices.iter().filter_map(|device| {
+        let NodeSpec::Can(can) = &device.node else { return None };
+        Some(format!("/usr/sbin/ip link set dev $name up type can bitrate {} restart-ms 100", can.bitrate))
+    });
+    assert!(commands.into_iter().any(|known| known == command), "udev would run {command:?}");
 }
 
 /// One document with the keys we know, and the values of the registry.
@@ -370,7 +459,7 @@ fn check_descriptor(registry: &Registry, path: &Path, text: &str) {
     };
     assert_eq!(keys(document), "module slot sensors bring_up identity path topic bit ");
     assert_eq!(keys(&document["identity"]), "vid pid serial port ");
-    assert_eq!(document["identity"]["serial"].as_str(), device.identity.serial.as_deref());
+    assert_eq!(document["identity"]["serial"].as_str(), device.identity.serial());
     assert_eq!(document["topic"].as_str(), Some(device.topic.as_str()));
     assert_eq!(document["module"].as_str(), Some(device.name.as_str()));
 }

@@ -82,6 +82,16 @@ published() {
 # is VALUE COMMAND...: the command prints exactly this.
 is() { local value=$1; shift; [ "$("$@")" = "$value" ]; }
 
+# can_up NAME: brings a CAN interface up at the bus's rate.
+can_up() { ip link set "$1" up type can bitrate 1000000 || fail "$1 does not come up"; }
+
+# lan_rule ADDRESS/BITS: every network adapter that is plugged from now on gets this address, as a DHCP client would see to.
+lan_rule() {
+  echo "ACTION==\"add\", SUBSYSTEM==\"net\", ENV{ID_NET_DRIVER}==\"cdc_ether\", RUN+=\"/sbin/ip addr add $1 dev \$name\", RUN+=\"/sbin/ip link set \$name up\"" \
+    >/etc/udev/rules.d/90-bench-lan.rules
+  udevadm control --reload
+}
+
 # held fd|task: descriptors or threads rapid has.
 held() { ls "/proc/$rapid_pid/$1" | wc -l; }
 

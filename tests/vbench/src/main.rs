@@ -12,12 +12,17 @@ use vbench::emu::function::{Function, PictureStore};
 use vbench::emu::log::{Log, Moment};
 use vbench::emu::script;
 use vbench::emu::spec::{DeviceSpec, PORTS};
-use vbench::probe::{beat, mask, uevent, v4l};
+use vbench::probe::{beat, can, lan, mask, uevent, v4l};
 
 const USAGE: &str = "\
-usage: usbemu SPEC...                    emulate; commands on stdin (plug, unplug, hub, silent, port, sleep, t0, at, say, quit)
+usage: usbemu SPEC...                    emulate; commands on stdin (plug, unplug, hub, silent, port, sleep, t0,
+                                         at, say, fault, mute, hot, power, ask, flood, busoff, link, quit)
        usbemu --read NODE FRAMES         read a camera, print what came as one JSON object
        usbemu --first-frames             open each camera that comes, print how soon its first frame came
+       usbemu --can NAME FRAME...        send each (ID#DATA), print the next frame that comes or -
+       usbemu --can-stream NAME FRAME US send one every US microseconds until the interface is gone
+       usbemu --can-count NAME FRAMES    read generated frames, print how many were lost
+       usbemu --lidar PORT PACKETS       read a LiDAR's packets, print how many were lost
        usbemu --watch-mask [SECONDS]     print each change of the physical mask as a JSON line
        usbemu --watch-uevents            print what the kernel and udev tell of devices, a JSON line each
        usbemu --beat MICROSECONDS FILE   sleep to absolute deadlines, note each waking in FILE
@@ -25,7 +30,9 @@ usage: usbemu SPEC...                    emulate; commands on stdin (plug, unplu
 SPEC: uvc:vid=046d,pid=0825,serial=A,port=0,mode=MJPG-640x480@30[,mode=..]
       acm:vid=2e8a,pid=000a,serial=B,hz=100
       ftdi:vid=0403,pid=6001,serial=C,hz=50
-      feed=FILE with any of them: send the records of this file";
+      gsusb:serial=D,motor=5/15/DMH3510[,motor=..]   slcan:..   damiao:..
+      ecm:serial=C3441325012345[,gopro=MEGABYTES][,lidar=HZ]
+      feed=FILE with the first three: send the records of this file";
 
 type Failure = Box<dyn std::error::Error>;
 
@@ -41,6 +48,10 @@ fn main() -> ExitCode {
         ["--first-frames"] => v4l::first_frames(&Log::new(Box::new(io::stdout()))).map_err(Failure::from),
         ["--watch-uevents"] => uevent::watch(&Log::new(Box::new(io::stdout()))).map_err(Failure::from),
         ["--beat", micros, file] => beat(micros, file),
+        ["--can", name, ref frames @ ..] if !frames.is_empty() => can::ask(name, frames).map_err(Failure::from),
+        ["--can-stream", name, frame, micros] => stream(name, frame, micros),
+        ["--can-count", name, frames] => count(name, frames),
+        ["--lidar", port, packets] => lidar(port, packets),
         ["--watch-mask"] => watch(None),
         ["--watch-mask", seconds] => watch(Some(seconds)),
         _ => emulate(&words),
@@ -72,6 +83,21 @@ fn emulate(specs: &[&str]) -> Result<(), Failure> {
 
 fn read(node: &str, frames: &str) -> Result<(), Failure> {
     println!("{}", v4l::read(Path::new(node), frames.parse()?)?);
+    Ok(())
+}
+
+fn stream(name: &str, frame: &str, micros: &str) -> Result<(), Failure> {
+    println!("{}", can::stream(name, frame, Duration::from_micros(micros.parse()?))?);
+    Ok(())
+}
+
+fn count(name: &str, frames: &str) -> Result<(), Failure> {
+    println!("{}", can::count(name, frames.parse()?)?);
+    Ok(())
+}
+
+fn lidar(port: &str, packets: &str) -> Result<(), Failure> {
+    println!("{}", lan::count(port.parse()?, packets.parse()?)?);
     Ok(())
 }
 

@@ -30,23 +30,25 @@ pub enum ProgramError {
 
 /// The `rapid` under test: `RAPID_BIN`, else the newer of the workspace's release and debug builds.
 pub fn rapid() -> Result<PathBuf, ProgramError> {
-    let workspace = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap_or(Path::new("."));
-    let mut places = vec![workspace.join("target")];
-    places.extend(std::env::var_os("CARGO_TARGET_DIR").map(PathBuf::from));
-    let candidates =
-        places.iter().flat_map(|target| ["release", "debug"].map(|profile| target.join(profile).join("rapid")));
-    find("rapid", "RAPID_BIN", candidates.collect())
+    find("rapid", "RAPID_BIN", built("rapid"))
 }
 
 /// The example of a program as a node: `PROCESS_NODE_BIN`, else the newer of the workspace's builds.
 pub fn process_node() -> Result<PathBuf, ProgramError> {
+    find("process_node", "PROCESS_NODE_BIN", built("examples/process_node"))
+}
+
+/// The example of a program that tells an actuator where to go: `PUBLISH_ACTION_BIN`, else the newer of the workspace's builds.
+pub fn publish_action() -> Result<PathBuf, ProgramError> {
+    find("publish_action", "PUBLISH_ACTION_BIN", built("examples/publish_action"))
+}
+
+/// Where the workspace's builds of a program may be.
+fn built(program: &str) -> Vec<PathBuf> {
     let workspace = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap_or(Path::new("."));
     let mut places = vec![workspace.join("target")];
     places.extend(std::env::var_os("CARGO_TARGET_DIR").map(PathBuf::from));
-    let candidates = places
-        .iter()
-        .flat_map(|target| ["release", "debug"].map(|profile| target.join(profile).join("examples/process_node")));
-    find("process_node", "PROCESS_NODE_BIN", candidates.collect())
+    places.iter().flat_map(|target| ["release", "debug"].map(|profile| target.join(profile).join(program))).collect()
 }
 
 /// This crate's own emulator: `USBEMU_BIN`, else beside the running test or tool.

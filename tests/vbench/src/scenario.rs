@@ -46,6 +46,7 @@ pub struct Scenario {
     timeline: Vec<(u64, String)>,
     watch_mask: bool,
     node_program: bool,
+    action_program: bool,
     limit: Duration,
 }
 
@@ -69,6 +70,7 @@ impl Scenario {
             timeline: Vec::new(),
             watch_mask: false,
             node_program: false,
+            action_program: false,
             limit: Duration::from_secs(120),
         }
     }
@@ -130,6 +132,13 @@ impl Scenario {
         self
     }
 
+    /// Puts `publish_action`, the example of a program that tells an actuator where to go, beside `devices.toml`.
+    #[must_use]
+    pub fn action_program(mut self) -> Self {
+        self.action_program = true;
+        self
+    }
+
     /// Puts a file beside `devices.toml`, in `/tmp/bench`; the name may have folders.
     #[must_use]
     pub fn file(mut self, name: &str, contents: impl Into<Vec<u8>>) -> Self {
@@ -162,11 +171,16 @@ impl Scenario {
             let written = fs::create_dir_all(path.parent().unwrap_or(&path)).and_then(|()| fs::write(&path, contents));
             written.map_err(|error| ScenarioError::Share(path, error))
         };
-        if self.node_program {
-            let words = install(&programs::process_node()?)?;
+        let examples = [
+            ("process_node", self.node_program.then(programs::process_node)),
+            ("publish_action", self.action_program.then(programs::publish_action)),
+        ];
+        for (name, program) in examples {
+            let Some(program) = program else { continue };
+            let words = install(&program?)?;
             // It may have to be run through a loader; a registry names one file.
-            write("process_node", format!("#!/bin/sh\nexec {} \"$@\"\n", self::words(&words)).as_bytes())?;
-            let path = inside.join("process_node");
+            write(name, format!("#!/bin/sh\nexec {} \"$@\"\n", self::words(&words)).as_bytes())?;
+            let path = inside.join(name);
             fs::set_permissions(&path, PermissionsExt::from_mode(0o755))
                 .map_err(|error| ScenarioError::Share(path, error))?;
         }

@@ -107,10 +107,15 @@ pub fn string(identity: &Identity, index: u8) -> Option<Vec<u8>> {
         3 if !identity.serial.is_empty() => &identity.serial,
         _ => return None,
     };
+    Some(self::text(text))
+}
+
+/// A string descriptor.
+pub fn text(text: &str) -> Vec<u8> {
     // bLength is one byte: 126 UTF-16 units at most.
     let units: Vec<u8> = text.encode_utf16().take(126).flat_map(u16::to_le_bytes).collect();
     let length = u8::try_from(units.len() + 2).expect("126 units fit a byte");
-    Some([&[length, STRING], &units[..]].concat())
+    [&[length, STRING], &units[..]].concat()
 }
 
 /// A configuration under construction.
@@ -130,8 +135,13 @@ impl Configuration {
 
     /// Appends an interface (alternate setting 0).
     pub fn interface(&mut self, number: u8, endpoints: u8, class: [u8; 3]) -> &mut Self {
+        self.setting(number, 0, endpoints, class)
+    }
+
+    /// Appends an alternate setting of an interface.
+    pub fn setting(&mut self, number: u8, setting: u8, endpoints: u8, class: [u8; 3]) -> &mut Self {
         let [c, s, p] = class;
-        self.push(&[INTERFACE, number, 0, endpoints, c, s, p, 0])
+        self.push(&[INTERFACE, number, setting, endpoints, c, s, p, 0])
     }
 
     /// Appends a bulk endpoint; bit 7 of the address is set for data to the host.
@@ -153,7 +163,7 @@ impl Configuration {
 
     /// The whole configuration descriptor.
     pub fn finish(&self) -> Vec<u8> {
-        let interfaces = walk(&self.body).filter(|d| d[1] == INTERFACE).count();
+        let interfaces = walk(&self.body).filter(|d| d[1] == INTERFACE && d[3] == 0).count();
         let total = u16::try_from(self.body.len() + 9).expect("configurations stay far below 64 KiB").to_le_bytes();
         let count = u8::try_from(interfaces).expect("a handful of interfaces");
         let head = [9, CONFIGURATION, total[0], total[1], count, 1, 0, 0x80, 250];
@@ -182,7 +192,8 @@ pub(crate) fn check_configuration(bytes: &[u8]) {
     let endpoints = walk(bytes).filter(|d| d[1] == 5).count();
     let declared: usize = walk(bytes).filter(|d| d[1] == INTERFACE).map(|d| usize::from(d[4])).sum();
     assert_eq!(endpoints, declared, "bNumEndpoints");
-    assert_eq!(walk(bytes).filter(|d| d[1] == INTERFACE).count(), usize::from(bytes[4]), "bNumInterfaces");
+    let interfaces = walk(bytes).filter(|d| d[1] == INTERFACE && d[3] == 0).count();
+    assert_eq!(interfaces, usize::from(bytes[4]), "bNumInterfaces");
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! What a device is, above its port: a camera or a serial line behind chapter 9's requests.
+//! What a device is, above its port: a camera, a serial line or one that is spoken with, behind chapter 9's requests.
 //!
 //! Invariant: no clock, no socket, no thread; requests and times come in, answers and packets go out.
 
@@ -8,11 +8,14 @@ use std::time::Duration;
 
 use thiserror::Error;
 
+use super::can::adapter::Adapter;
 use super::descriptor::{self, Answer, Setup};
 use super::feed::{self, FeedError, Records};
 use super::frame;
+use super::lan::ecm::Ecm;
 use super::serial::{Flavour, Serial};
 use super::spec::{DeviceSpec, Format, Identity, Kind, Mode};
+use super::talker::Talker;
 use super::uvc::{self, Pictures, Uvc};
 
 /// Address of the bulk endpoint that carries every kind's data to the host.
@@ -63,6 +66,7 @@ pub struct Function {
 enum Role {
     Uvc(Uvc),
     Serial(Serial),
+    Talker(Box<dyn Talker>),
 }
 
 impl Function {
@@ -74,6 +78,8 @@ impl Function {
             Kind::Uvc(modes) => Role::Uvc(camera(modes, first, given, store)?),
             Kind::Acm { hz } => Role::Serial(Serial::new(Flavour::Acm, *hz, first, given)),
             Kind::Ftdi { hz } => Role::Serial(Serial::new(Flavour::Ftdi, *hz, first, given)),
+            Kind::Can { protocol, motors } => Role::Talker(Box::new(Adapter::new(*protocol, motors))),
+            Kind::Ecm(net) => Role::Talker(Box::new(Ecm::new(net, &spec.identity.serial, first))),
         };
         Ok(Self { identity: spec.identity.clone(), configured: 0, role })
     }
@@ -81,17 +87,34 @@ impl Function {
     /// Back to the state of a device that was just plugged in. Numbers go on counting.
     pub fn reset(&mut self) {
         self.configured = 0;
-        self.stop();
+        match &mut self.role {
+            Role::Talker(talker) => talker.reset(),
+            Role::Uvc(_) | Role::Serial(_) => self.stop(),
+        }
     }
 
     /// Answers a control request; `data` is its data stage towards the device.
-    pub fn control(&mut self, setup: Setup, data: &[u8]) -> Answer {
+    pub fn control(&mut self, setup: Setup, data: &[u8], now_ns: u64) -> Answer {
         if setup.is_standard() {
             return self.standard(setup);
         }
         match &mut self.role {
             Role::Uvc(camera) => camera.control(setup, data),
             Role::Serial(serial) => serial.control(setup, data),
+            Role::Talker(talker) => talker.control(setup, data, now_ns),
+        }
+    }
+
+    /// It is spoken with; otherwise it sends at its own beat.
+    pub fn talks(&self) -> bool {
+        matches!(self.role, Role::Talker(_))
+    }
+
+    /// The device as one that is spoken with.
+    pub fn talker(&mut self) -> Option<&mut dyn Talker> {
+        match &mut self.role {
+            Role::Talker(talker) => Some(talker.as_mut()),
+            Role::Uvc(_) | Role::Serial(_) => None,
         }
     }
 
@@ -100,6 +123,7 @@ impl Function {
         match &self.role {
             Role::Uvc(camera) => camera.live(),
             Role::Serial(serial) => Some(serial.live()),
+            Role::Talker(_) => None,
         }
     }
 
@@ -108,6 +132,7 @@ impl Function {
         match &mut self.role {
             Role::Uvc(camera) => camera.frame(sent_ns, out),
             Role::Serial(serial) => serial.line(sent_ns, out),
+            Role::Talker(_) => out.clear(),
         }
     }
 
@@ -116,6 +141,7 @@ impl Function {
         match &self.role {
             Role::Uvc(camera) => camera.payload(whole, at, room, out),
             Role::Serial(serial) => serial.packet(whole, at, room, out),
+            Role::Talker(_) => whole.len(),
         }
     }
 
@@ -124,6 +150,7 @@ impl Function {
         match &mut self.role {
             Role::Uvc(camera) => camera.sent(),
             Role::Serial(serial) => serial.sent(),
+            Role::Talker(_) => {}
         }
     }
 
@@ -165,11 +192,19 @@ impl Function {
         let (class, configuration) = match &self.role {
             Role::Uvc(camera) => (camera.class(), camera.configuration()),
             Role::Serial(serial) => (serial.class(), serial.configuration()),
+            Role::Talker(talker) => (talker.class(), talker.configuration()),
+        };
+        let own = match &self.role {
+            Role::Talker(talker) => talker.string(index),
+            Role::Uvc(_) | Role::Serial(_) => None,
         };
         match kind {
             descriptor::DEVICE => Answer::Data(descriptor::device(&self.identity, class)),
             descriptor::CONFIGURATION => Answer::Data(configuration),
-            descriptor::STRING => descriptor::string(&self.identity, index).map_or(Answer::Stall, Answer::Data),
+            descriptor::STRING => own
+                .map(descriptor::text)
+                .or_else(|| descriptor::string(&self.identity, index))
+                .map_or(Answer::Stall, Answer::Data),
             _ => Answer::Stall,
         }
     }
@@ -205,6 +240,7 @@ fn camera(modes: &[Mode], first: u32, given: Option<Records>, store: &mut Pictur
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::emu::can::adapter::Protocol;
 
     fn get(kind: u8, index: u8) -> Setup {
         Setup { kind: 0x80, request: 6, value: u16::from_le_bytes([index, kind]), index: 0, length: 255 }
@@ -212,21 +248,27 @@ mod tests {
 
     #[test]
     fn every_kind_enumerates() {
-        let specs =
-            [DeviceSpec::uvc(0x046d, 0x0825), DeviceSpec::acm(0x2e8a, 0xa, 1.0), DeviceSpec::ftdi(0x0403, 0x6001, 1.0)];
+        let specs = [
+            DeviceSpec::uvc(0x046d, 0x0825),
+            DeviceSpec::acm(0x2e8a, 0xa, 1.0),
+            DeviceSpec::ftdi(0x0403, 0x6001, 1.0),
+            DeviceSpec::can(Protocol::GsUsb),
+            DeviceSpec::can(Protocol::Slcan),
+            DeviceSpec::ecm(),
+        ];
         for spec in specs {
             let mut function = Function::new(&spec, 0, &mut PictureStore::new()).unwrap();
-            let Answer::Data(device) = function.control(get(1, 0), &[]) else { panic!("no device descriptor") };
+            let Answer::Data(device) = function.control(get(1, 0), &[], 0) else { panic!("no device descriptor") };
             assert_eq!(device.len(), 18);
-            let Answer::Data(configuration) = function.control(get(2, 0), &[]) else { panic!("no configuration") };
+            let Answer::Data(configuration) = function.control(get(2, 0), &[], 0) else { panic!("no configuration") };
             descriptor::check_configuration(&configuration);
-            assert_eq!(function.control(get(3, 3), &[]), Answer::Stall, "no serial, no descriptor");
-            assert_eq!(function.control(get(6, 0), &[]), Answer::Stall, "no device qualifier");
-            function.control(Setup { kind: 0, request: 9, value: 1, index: 0, length: 0 }, &[]);
+            assert_eq!(function.control(get(3, 3), &[], 0), Answer::Stall, "no serial, no descriptor");
+            assert_eq!(function.control(get(6, 0), &[], 0), Answer::Stall, "no device qualifier");
+            function.control(Setup { kind: 0, request: 9, value: 1, index: 0, length: 0 }, &[], 0);
             let configured = Setup { kind: 0x80, request: 8, value: 0, index: 0, length: 1 };
-            assert_eq!(function.control(configured, &[]), Answer::Data(vec![1]));
+            assert_eq!(function.control(configured, &[], 0), Answer::Data(vec![1]));
             function.reset();
-            assert_eq!(function.control(configured, &[]), Answer::Data(vec![0]));
+            assert_eq!(function.control(configured, &[], 0), Answer::Data(vec![0]));
         }
     }
 }

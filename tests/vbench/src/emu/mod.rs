@@ -7,14 +7,22 @@
 //! reader's loss, never the emulator's.
 //! Invariant: nothing a host asks of a device panics; what is unknown is stalled, as hardware does.
 
+mod attachment;
+pub mod can;
 pub mod descriptor;
 pub mod device;
 pub mod feed;
 pub mod frame;
 pub mod function;
+pub mod lan;
 pub mod log;
+pub mod order;
+pub mod pace;
 pub mod script;
 pub mod serial;
 pub mod spec;
+mod talk;
+pub mod talker;
+pub mod told;
 pub mod uvc;
 pub mod wire;

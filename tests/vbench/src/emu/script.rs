@@ -5,6 +5,8 @@
 //! sleep MS      t0              at MS [COMMAND]   say WORD       quit
 //! ```
 //!
+//! and the orders of `order`.
+//!
 //! `t0` starts the timeline's clock; `at MS` waits until MS after it. `say` logs the word, once everything before it is done.
 //! `hub out` pulls everything that is plugged, in one go, as a hub that loses its own cable does; `hub in` returns what it pulled.
 //! The end of the input means `quit`.
@@ -21,11 +23,12 @@ use thiserror::Error;
 
 use super::device::{self, Device, PortError};
 use super::log::{Log, Moment};
+use super::order::{self, Order, Target};
 use super::spec::PORTS;
 use crate::clock;
 
 /// One line, understood.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub enum Command {
     /// Plug these devices, in this order.
     Plug(Vec<usize>),
@@ -45,6 +48,8 @@ pub enum Command {
     Origin,
     /// Wait until this long after the start of the timeline, then do.
     At(Duration, Option<Box<Command>>),
+    /// Let this happen to a device.
+    Befall(Target, Order),
     /// Log a word.
     Say(String),
     /// Unplug everything and end.
@@ -93,7 +98,10 @@ fn parse(words: &mut SplitWhitespace<'_>) -> Option<Command> {
         }
         "say" => Command::Say(words.next()?.into()),
         "quit" => Command::Quit,
-        _ => return None,
+        name => {
+            let (target, order) = order::parse(name, words)?;
+            Command::Befall(target, order)
+        }
     };
     words.next().is_none().then_some(command)
 }
@@ -167,6 +175,12 @@ impl Player<'_> {
                     self.play(*then);
                 }
             }
+            Command::Befall(target, order) => {
+                let moment = Moment::now();
+                self.with(target.device, |device| device.befall(target.motor, order));
+                let fields = json!({"device": target.device, "motor": target.motor, "order": format!("{order:?}")});
+                self.log.say("order", moment, fields);
+            }
             Command::Say(word) => self.log.say("say", Moment::now(), json!({"word": word})),
             Command::Quit => {}
         }
@@ -204,6 +218,7 @@ mod tests {
             ("at 5000", Command::At(ms(5000), None)),
             ("  at 300 unplug 1 ", Command::At(ms(300), Some(Box::new(Command::Unplug(vec![1]))))),
             ("say done", Command::Say("done".into())),
+            ("hot 1.5 95", Command::Befall(Target { device: 1, motor: Some(5) }, Order::Hot(95))),
             ("quit", Command::Quit),
         ];
         for (line, command) in cases {
@@ -213,9 +228,20 @@ mod tests {
 
     #[test]
     fn refuses_what_it_cannot_read() {
-        for line in
-            ["plug", "plug x", "hub", "hub up", "silent 0", "port 0 15", "sleep", "at", "at 5 jump", "quit now", "jump"]
-        {
+        for line in [
+            "plug",
+            "plug x",
+            "hub",
+            "hub up",
+            "silent 0",
+            "port 0 15",
+            "sleep",
+            "at",
+            "at 5 jump",
+            "quit now",
+            "jump",
+            "hot 1",
+        ] {
             assert_eq!(line.parse::<Command>(), Err(CommandError(line.into())));
         }
     }

@@ -5,6 +5,8 @@
 //! acm:port=2,vid=2e8a,pid=000a,serial=TOF1,hz=100
 //! ftdi:port=3,vid=0403,pid=6001,serial=FT1,hz=50
 //! uvc:mode=MJPG-96x96@10,feed=/tmp/bench/wrist.feed
+//! gsusb:serial=CAN1,motor=5/15/DMH3510,motor=6/16/DM4310     slcan:..  damiao:..  the same bus behind a serial line
+//! ecm:serial=C3441325012345,gopro=4,lidar=100                a network adapter, clips of 4 MB, packets a second
 //! ```
 //!
 //! A comma, a per cent sign or a control character in a string is written as in a URL: `%2c`.
@@ -15,6 +17,10 @@ use std::fmt;
 use std::str::FromStr;
 
 use thiserror::Error;
+
+use super::can::adapter::Protocol;
+use super::can::bus::MotorSpec;
+use super::lan::ecm::NetSpec;
 
 /// Ports `vhci_hcd.0` has for high-speed devices in Debian's kernels.
 pub const PORTS: u8 = 15;
@@ -65,6 +71,15 @@ pub enum Kind {
         /// Lines a second.
         hz: f64,
     },
+    /// A CAN adapter.
+    Can {
+        /// How it speaks with the host.
+        protocol: Protocol,
+        /// What is on its bus.
+        motors: Vec<MotorSpec>,
+    },
+    /// A network adapter (CDC-ECM).
+    Ecm(NetSpec),
 }
 
 /// One picture size of a camera.
@@ -93,7 +108,7 @@ pub enum Format {
 #[derive(Debug, Error, PartialEq, Eq)]
 pub enum SpecError {
     /// No such kind.
-    #[error("unknown kind `{0}`: use uvc, acm or ftdi")]
+    #[error("unknown kind `{0}`: use uvc, acm, ftdi, gsusb, slcan, damiao or ecm")]
     Kind(String),
     /// A key this kind does not have, or no `=`.
     #[error("unknown key `{key}` for {kind}")]
@@ -129,6 +144,53 @@ impl DeviceSpec {
     /// An FTDI adapter sending `hz` lines a second.
     pub fn ftdi(vid: u16, pid: u16, hz: f64) -> Self {
         Self::new(Kind::Ftdi { hz }, vid, pid)
+    }
+
+    /// A CAN adapter on a bus of its own; add motors with `motor`.
+    pub fn can(protocol: Protocol) -> Self {
+        // candleLight, CANable with its slcan firmware, and the vendor's own.
+        let (vid, pid) = match protocol {
+            Protocol::GsUsb => (0x1d50, 0x606f),
+            Protocol::Slcan => (0xad50, 0x60c4),
+            Protocol::Damiao => (0x2e88, 0x4603),
+        };
+        Self::new(Kind::Can { protocol, motors: Vec::new() }, vid, pid)
+    }
+
+    /// A network adapter with nothing behind it; add `gopro` and `lidar`.
+    pub fn ecm() -> Self {
+        Self::new(Kind::Ecm(NetSpec::default()), 0x2672, 0x0059)
+    }
+
+    /// Adds a Damiao motor to the bus. Other kinds have none and ignore it.
+    ///
+    /// # Panics
+    /// When there is no such type or an id is out of range: the caller is a test.
+    #[must_use]
+    pub fn motor(mut self, slave: u16, master: u16, kind: &str) -> Self {
+        let text = format!("{slave:x}/{master:x}/{kind}");
+        if let Kind::Can { motors, .. } = &mut self.kind {
+            motors.push(MotorSpec::parse(&text).unwrap_or_else(|| panic!("{text} is no motor")));
+        }
+        self
+    }
+
+    /// Puts a GoPro with clips of so many MB behind a network adapter; its address follows from the serial number.
+    #[must_use]
+    pub fn gopro(mut self, megabytes: u32) -> Self {
+        if let Kind::Ecm(net) = &mut self.kind {
+            net.gopro = Some(megabytes);
+        }
+        self
+    }
+
+    /// Puts a LiDAR that sends `hz` packets a second behind a network adapter.
+    #[must_use]
+    pub fn lidar(mut self, hz: f64) -> Self {
+        if let Kind::Ecm(net) = &mut self.kind {
+            net.lidar = Some(hz);
+        }
+        self
     }
 
     /// Gives it a serial number.
@@ -183,6 +245,10 @@ impl Kind {
             Self::Uvc(_) => "uvc",
             Self::Acm { .. } => "acm",
             Self::Ftdi { .. } => "ftdi",
+            Self::Can { protocol: Protocol::GsUsb, .. } => "gsusb",
+            Self::Can { protocol: Protocol::Slcan, .. } => "slcan",
+            Self::Can { protocol: Protocol::Damiao, .. } => "damiao",
+            Self::Ecm(_) => "ecm",
         }
     }
 }
@@ -196,6 +262,10 @@ impl FromStr for DeviceSpec {
             "uvc" => Self::uvc(0x1d6b, 0x0102),
             "acm" => Self::acm(0x1d6b, 0x0104, 100.0),
             "ftdi" => Self::ftdi(0x0403, 0x6001, 100.0),
+            "gsusb" => Self::can(Protocol::GsUsb),
+            "slcan" => Self::can(Protocol::Slcan),
+            "damiao" => Self::can(Protocol::Damiao),
+            "ecm" => Self::ecm(),
             other => return Err(SpecError::Kind(other.into())),
         };
         for field in fields.split(',').filter(|field| !field.is_empty()) {
@@ -217,6 +287,18 @@ impl FromStr for DeviceSpec {
                 ("feed", _) => spec.feed = string()?,
                 ("mode", Kind::Uvc(modes)) if modes.len() < MODES => {
                     modes.push(parse_mode(value).ok_or_else(|| wrong("FORMAT-WxH@FPS[/FPS..], FORMAT MJPG or YUYV"))?);
+                }
+                ("motor", Kind::Can { motors, .. }) if motors.len() < MODES => {
+                    let expected = "SLAVE/MASTER/TYPE, ids in hexadecimal, such as 5/15/DMH3510";
+                    motors.push(MotorSpec::parse(value).ok_or_else(|| wrong(expected))?);
+                }
+                ("gopro", Kind::Ecm(net)) => {
+                    let size = value.parse().ok().filter(|megabytes| (1..=64).contains(megabytes));
+                    net.gopro = Some(size.ok_or_else(|| wrong("1 to 64 MB a clip"))?);
+                }
+                ("lidar", Kind::Ecm(net)) => {
+                    let hz = value.parse().ok().filter(|hz| (0.1..=5000.0).contains(hz));
+                    net.lidar = Some(hz.ok_or_else(|| wrong("0.1 to 5000 packets a second"))?);
                 }
                 ("hz", Kind::Acm { hz } | Kind::Ftdi { hz }) => {
                     *hz = value
@@ -297,43 +379,15 @@ impl fmt::Display for DeviceSpec {
                 write!(f, ",mode={}-{}x{}@{}", mode.format, mode.width, mode.height, rates.join("/"))
             }),
             Kind::Acm { hz } | Kind::Ftdi { hz } => write!(f, ",hz={hz}"),
+            Kind::Can { motors, .. } => motors.iter().try_for_each(|motor| write!(f, ",motor={motor}")),
+            Kind::Ecm(net) => {
+                net.gopro.map_or(Ok(()), |megabytes| write!(f, ",gopro={megabytes}"))?;
+                net.lidar.map_or(Ok(()), |hz| write!(f, ",lidar={hz}"))
+            }
         }
     }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn what_is_printed_is_read_back() {
-        let camera = DeviceSpec::uvc(0x046d, 0x0825)
-            .serial("CAM00A1")
-            .port(3)
-            .mode(Format::Mjpg, 640, 480, &[30])
-            .mode(Format::Yuyv, 320, 240, &[30, 15]);
-        let hostile = DeviceSpec::uvc(1, 2).serial("a,b=%2c\n\"'\\ \0相").names("\u{1b}[2J,", "%");
-        for spec in [
-            camera,
-            hostile,
-            DeviceSpec::acm(0x2e8a, 0x000a, 100.0).serial("TOF1").feed("/tmp/bench/a,b"),
-            DeviceSpec::ftdi(0x0403, 0x6001, 0.5),
-        ] {
-            assert_eq!(spec.to_string().parse(), Ok(spec));
-        }
-    }
-
-    #[test]
-    fn mistakes_are_named() {
-        let cases = [
-            ("cam:", "unknown kind `cam`: use uvc, acm or ftdi"),
-            ("uvc:hz=3", "unknown key `hz=3` for uvc"),
-            ("acm:serial=%4", "`serial=%4`: expected text, with %25 for a per cent sign"),
-            ("acm:port=15", "`port=15`: expected a port from 0 to 14"),
-            ("uvc:mode=MJPG-640@30", "`mode=MJPG-640@30`: expected FORMAT-WxH@FPS[/FPS..], FORMAT MJPG or YUYV"),
-        ];
-        for (text, message) in cases {
-            assert_eq!(text.parse::<DeviceSpec>().unwrap_err().to_string(), message);
-        }
-    }
-}
+#[path = "spec_tests.rs"]
+mod tests;

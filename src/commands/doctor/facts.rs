@@ -1,0 +1,212 @@
+//! What is the case on a machine, as far as the doctor asks.
+//!
+//! Collecting reads files below a root folder, `/` but for tests, and opens no device.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+
+use super::usb::{UsbDevice, devices};
+
+/// See the module's comment. Whatever cannot be read is `None` or missing.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub(super) struct Facts {
+    /// USB devices, root hubs included, in the order of their ports.
+    pub(super) usb: Vec<UsbDevice>,
+    /// Nodes of USB devices that programs open.
+    pub(super) nodes: Vec<Node>,
+    /// Who runs this.
+    pub(super) user: User,
+    /// Is a udev daemon there?
+    pub(super) udev_runs: bool,
+    /// The installed rules, if there are any.
+    pub(super) rules: Option<String>,
+    /// Highest real-time priority that may be asked for.
+    pub(super) realtime: Option<u64>,
+    /// Memory that may be locked, bytes; `u64::MAX` without a limit.
+    pub(super) locked_memory: Option<u64>,
+    /// Shared memory: size and what is free, bytes.
+    pub(super) shared_memory: Option<(u64, u64)>,
+    /// Where episodes would be written.
+    pub(super) disk: Option<Disk>,
+    /// The kernel's clock source.
+    pub(super) clock: Option<String>,
+    /// CAN interfaces.
+    pub(super) can: Vec<Interface>,
+    /// Memory that all programs together may use for transfers through usbfs, MB.
+    pub(super) usbfs_mb: Option<u64>,
+}
+
+/// A node of a USB device.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Node {
+    /// `/dev/video0`
+    pub(super) path: PathBuf,
+    /// `video4linux` or `tty`
+    pub(super) subsystem: &'static str,
+    /// The USB device, by its port.
+    pub(super) port: String,
+    /// May it be read and written by who runs this?
+    pub(super) is_open_to_us: bool,
+    /// Its group, by name or number.
+    pub(super) group: String,
+    /// Its permissions.
+    pub(super) mode: u32,
+}
+
+/// Who runs this.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub(super) struct User {
+    /// Everything is allowed.
+    pub(super) is_root: bool,
+    /// Groups, by name.
+    pub(super) groups: Vec<String>,
+}
+
+/// The disk of the folder for episodes.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Disk {
+    /// The folder that was looked at.
+    pub(super) folder: PathBuf,
+    /// What may still be written, bytes.
+    pub(super) free: u64,
+    /// Its size, bytes.
+    pub(super) size: u64,
+    /// What it took a second when tried, bytes; or why it could not be tried.
+    pub(super) rate: Result<f64, String>,
+}
+
+/// A CAN interface.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Interface {
+    /// `can0`
+    pub(super) name: String,
+    /// `up`, `down` or `unknown`
+    pub(super) state: String,
+    /// Frames that wait in the kernel at most.
+    pub(super) queue: Option<u64>,
+    /// The USB device, by its port.
+    pub(super) port: Option<String>,
+}
+
+/// Reads everything but the disk, which must be tried.
+#[must_use]
+pub(super) fn collect(root: &Path) -> Facts {
+    let usb = devices(root);
+    let groups = groups(root);
+    let (realtime, locked_memory) = limits(root);
+    let mut nodes = nodes(root, "video4linux", &usb, &groups);
+    nodes.extend(self::nodes(root, "tty", &usb, &groups));
+    nodes.sort_by(|a, b| a.path.cmp(&b.path));
+    Facts {
+        can: interfaces(root, &usb),
+        nodes,
+        usb,
+        user: user(&groups),
+        udev_runs: root.join("run/udev/control").exists(),
+        rules: fs::read_to_string(root.join("etc/udev/rules.d/99-rapid.rules")).ok(),
+        realtime,
+        locked_memory,
+        shared_memory: space(&root.join("dev/shm")),
+        disk: None,
+        clock: word(&root.join("sys/devices/system/clocksource/clocksource0/current_clocksource")),
+        usbfs_mb: word(&root.join("sys/module/usbcore/parameters/usbfs_memory_mb")).and_then(|mb| mb.parse().ok()),
+    }
+}
+
+/// The first line of a file, if it is text.
+pub(super) fn word(path: &Path) -> Option<String> {
+    let text = fs::read(path).ok()?;
+    let line = String::from_utf8_lossy(text.get(..4096).unwrap_or(&text)).lines().next()?.trim().to_owned();
+    (!line.is_empty()).then_some(line)
+}
+
+/// Size and free space of the file system at `path`, bytes.
+pub(super) fn space(path: &Path) -> Option<(u64, u64)> {
+    let said = rustix::fs::statvfs(path).ok()?;
+    Some((said.f_blocks.saturating_mul(said.f_frsize), said.f_bavail.saturating_mul(said.f_frsize)))
+}
+
+/// Names of the entries of a folder, sorted.
+pub(super) fn names(folder: &Path) -> Vec<String> {
+    let entries = fs::read_dir(folder).into_iter().flatten().flatten();
+    let mut names: Vec<String> = entries.map(|entry| entry.file_name().to_string_lossy().into_owned()).collect();
+    names.sort();
+    names
+}
+
+/// The USB device that a node of sysfs belongs to, by its port: the last part of its path that is one.
+fn port_of(node: &Path, usb: &[UsbDevice]) -> Option<String> {
+    let device = fs::canonicalize(node.join("device")).ok()?;
+    let parts: Vec<String> = device.iter().map(|part| part.to_string_lossy().into_owned()).collect();
+    parts.into_iter().rev().find(|part| usb.iter().any(|device| device.port == *part))
+}
+
+fn nodes(root: &Path, subsystem: &'static str, usb: &[UsbDevice], groups: &BTreeMap<u32, String>) -> Vec<Node> {
+    let class = root.join("sys/class").join(subsystem);
+    let node = |name: &String| {
+        let port = port_of(&class.join(name), usb)?;
+        let path = root.join("dev").join(name);
+        let found = fs::metadata(&path).ok()?;
+        let read_and_write = rustix::fs::Access::READ_OK | rustix::fs::Access::WRITE_OK;
+        Some(Node {
+            is_open_to_us: rustix::fs::access(&path, read_and_write).is_ok(),
+            path: Path::new("/dev").join(name),
+            subsystem,
+            port,
+            group: groups.get(&found.gid()).cloned().unwrap_or_else(|| found.gid().to_string()),
+            mode: found.mode() & 0o777,
+        })
+    };
+    names(&class).iter().filter_map(node).collect()
+}
+
+/// Names of groups by number.
+fn groups(root: &Path) -> BTreeMap<u32, String> {
+    let text = fs::read_to_string(root.join("etc/group")).unwrap_or_default();
+    let group = |line: &str| {
+        let mut parts = line.split(':');
+        let name = parts.next()?.to_owned();
+        Some((parts.nth(1)?.parse().ok()?, name))
+    };
+    text.lines().filter_map(group).collect()
+}
+
+fn user(names: &BTreeMap<u32, String>) -> User {
+    let mut ids: Vec<u32> = rustix::process::getgroups().unwrap_or_default().iter().map(|id| id.as_raw()).collect();
+    ids.push(rustix::process::getegid().as_raw());
+    let mut groups: Vec<String> = ids.iter().filter_map(|id| names.get(id).cloned()).collect();
+    groups.sort();
+    groups.dedup();
+    User { is_root: rustix::process::geteuid().is_root(), groups }
+}
+
+/// Limits of this process, as `/proc/self/limits` lists them: real-time priority, locked memory.
+fn limits(root: &Path) -> (Option<u64>, Option<u64>) {
+    let text = fs::read_to_string(root.join("proc/self/limits")).unwrap_or_default();
+    let soft = |name: &str| {
+        let line = text.lines().find_map(|line| line.strip_prefix(name))?;
+        match line.split_whitespace().next()? {
+            "unlimited" => Some(u64::MAX),
+            number => number.parse().ok(),
+        }
+    };
+    (soft("Max realtime priority"), soft("Max locked memory"))
+}
+
+fn interfaces(root: &Path, usb: &[UsbDevice]) -> Vec<Interface> {
+    /// `ARPHRD_CAN` of `linux/if_arp.h`.
+    const CAN: &str = "280";
+    let class = root.join("sys/class/net");
+    let can = |name: &String| {
+        let folder = class.join(name);
+        (word(&folder.join("type")).as_deref() == Some(CAN)).then(|| Interface {
+            name: name.clone(),
+            state: word(&folder.join("operstate")).unwrap_or_else(|| "unknown".to_owned()),
+            queue: word(&folder.join("tx_queue_len")).and_then(|frames| frames.parse().ok()),
+            port: port_of(&folder, usb),
+        })
+    };
+    names(&class).iter().filter_map(can).collect()
+}

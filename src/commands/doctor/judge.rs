@@ -1,0 +1,339 @@
+//! From what is the case on a machine to what is wrong with it, and what to do.
+//!
+//! Pure: facts and registry in, findings out.
+
+use serde::Serialize;
+
+use super::bandwidth::{self, Wish};
+use super::facts::{Facts, Node};
+use super::machine;
+use super::usb::UsbDevice;
+use crate::registry::{DeviceSpec, NodeSpec, Opens, Registry};
+use crate::text;
+
+/// A camera that runs slower than this, Mbit/s, is in the wrong port or on a bad cable.
+const SLOWEST: f64 = 480.0;
+
+/// How bad it is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub(super) enum Level {
+    /// As it should be.
+    Ok,
+    /// It works, and may surprise.
+    Warn,
+    /// Something will not work.
+    Bad,
+}
+
+/// Something that was looked at.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub(super) struct Finding {
+    /// How bad it is.
+    pub(super) level: Level,
+    /// What it is about: one word.
+    pub(super) about: &'static str,
+    /// What is the case.
+    pub(super) what: String,
+    /// What to do, a command where there is one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) fix: Option<String>,
+}
+
+impl Finding {
+    pub(super) fn ok(about: &'static str, what: impl Into<String>) -> Self {
+        Self { level: Level::Ok, about, what: what.into(), fix: None }
+    }
+
+    pub(super) fn warn(about: &'static str, what: impl Into<String>, fix: impl Into<String>) -> Self {
+        Self { level: Level::Warn, about, what: what.into(), fix: Some(fix.into()) }
+    }
+
+    pub(super) fn bad(about: &'static str, what: impl Into<String>, fix: impl Into<String>) -> Self {
+        Self { level: Level::Bad, about, what: what.into(), fix: Some(fix.into()) }
+    }
+}
+
+/// Everything there is to say. `rules` is what `rapid artifacts` would write.
+#[must_use]
+pub(super) fn judge(facts: &Facts, registry: Option<&Registry>, rules: Option<&str>) -> Vec<Finding> {
+    let entries = registry.map(|registry| registry.devices.as_slice()).unwrap_or_default();
+    let plugged = plugged(entries, &facts.usb);
+    let mut found = Vec::new();
+    found.extend(buses(facts, &plugged));
+    found.extend(speeds(&plugged));
+    found.extend(serials(&facts.usb, entries));
+    found.extend(nodes(facts, entries, &plugged));
+    found.extend(udev(facts, rules));
+    found.extend(suspending(&plugged));
+    found.extend(can(facts, entries, &plugged));
+    found.extend(machine::limits(facts, registry));
+    found.extend(machine::disk(facts, registry));
+    found
+}
+
+/// Entries with the USB device that they mean, of those that are plugged in. Interchangeable units take
+/// the entries in the order of their ports, as at a start.
+#[must_use]
+pub(super) fn plugged<'a>(entries: &'a [DeviceSpec], usb: &'a [UsbDevice]) -> Vec<(&'a DeviceSpec, &'a UsbDevice)> {
+    let mut found: Vec<(&DeviceSpec, &UsbDevice)> = Vec::new();
+    for entry in entries {
+        let Some(wished) = entry.identity.usb() else { continue };
+        let is_free = |device: &UsbDevice| {
+            !found.iter().any(|(other, taken)| taken.port == device.port && same_node(other, entry))
+        };
+        let mut model = usb.iter().filter(|device| (device.vid, device.pid) == (wished.vid, wished.pid));
+        let unit = match (&wished.serial, &wished.port) {
+            (Some(serial), _) => model.find(|device| device.serial.as_ref() == Some(serial)),
+            (None, Some(port)) => model.find(|device| device.port == *port),
+            (None, None) => model.find(|device| is_free(device)),
+        };
+        found.extend(unit.map(|unit| (entry, unit)));
+    }
+    found
+}
+
+fn same_node(a: &DeviceSpec, b: &DeviceSpec) -> bool {
+    subsystem(a) == subsystem(b)
+}
+
+/// The subsystem of the node that an entry opens, and its group.
+const fn subsystem(entry: &DeviceSpec) -> Option<(&'static str, &'static str)> {
+    let opens = match &entry.node {
+        NodeSpec::Camera(_) => Opens::Video,
+        NodeSpec::Serial(_) => Opens::Tty,
+        NodeSpec::Process(process) => process.opens,
+        _ => return None,
+    };
+    match opens {
+        Opens::Video => Some(("video4linux", "video")),
+        Opens::Tty => Some(("tty", "dialout")),
+        Opens::Usb => Some(("usb", "plugdev")),
+        Opens::Net => None,
+    }
+}
+
+pub(super) fn mb(bytes: f64) -> String {
+    format!("{:.1} MB/s", bytes / 1e6)
+}
+
+/// Which cameras share a bus, and whether they fit.
+fn buses(facts: &Facts, plugged: &[(&DeviceSpec, &UsbDevice)]) -> Vec<Finding> {
+    let mut found = Vec::new();
+    let roots = facts.usb.iter().filter(|device| device.is_root());
+    for root in roots {
+        // What runs slower has a finding of its own, and takes next to nothing behind its hub.
+        let of_the_bus = |device: &UsbDevice| device.bus == root.bus && device.mbit >= SLOWEST;
+        let wishes: Vec<Wish> = plugged
+            .iter()
+            .filter(|(_, device)| of_the_bus(device))
+            .filter_map(|(entry, _)| {
+                let NodeSpec::Camera(camera) = &entry.node else { return None };
+                Some(Wish { name: entry.name.clone(), camera: camera.clone(), max_bytes: entry.max_bytes })
+            })
+            .collect();
+        if !wishes.is_empty() {
+            found.push(bus(root.bus, root.mbit, &wishes));
+        }
+    }
+    found
+}
+
+fn bus(bus: u32, mbit: f64, wishes: &[Wish]) -> Finding {
+    let names = wishes.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
+    let estimated = wishes.iter().any(Wish::is_estimated);
+    let most = if estimated { "at most (estimated: the largest pictures that MJPG may give) " } else { "" };
+    let (taken, budget) = (bandwidth::taken(wishes, mbit), bandwidth::budget(mbit));
+    let what = format!("bus {bus} carries {names}: {most}{} of {}", mb(taken), mb(budget));
+    let lower = bandwidth::fitting(wishes, mbit);
+    let fix = match &lower {
+        Some(lower) if lower.is_empty() => return Finding::ok("bandwidth", what),
+        Some(lower) => {
+            let lower = lower.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
+            format!("this would fit: {lower}; or plug one of them into a port of another bus")
+        }
+        None => "plug one of them into a port of another bus".to_owned(),
+    };
+    // What is only estimated may fit all the same.
+    if estimated { Finding::warn("bandwidth", what, fix) } else { Finding::bad("bandwidth", what, fix) }
+}
+
+/// Cameras that run slower than cameras do.
+fn speeds(plugged: &[(&DeviceSpec, &UsbDevice)]) -> Vec<Finding> {
+    let slow =
+        plugged.iter().filter(|(entry, device)| matches!(entry.node, NodeSpec::Camera(_)) && device.mbit < SLOWEST);
+    let say = |(entry, device): &(&DeviceSpec, &UsbDevice)| {
+        let what = format!("[device.{}] runs at {} Mbit/s, too slow for pictures", entry.name, device.mbit);
+        Finding::bad("speed", what, format!("another cable, port or hub: it is at port {}", device.port))
+    };
+    slow.map(say).collect()
+}
+
+/// Units that say the same serial number cannot be told apart by it.
+fn serials(usb: &[UsbDevice], entries: &[DeviceSpec]) -> Vec<Finding> {
+    let mut found = Vec::new();
+    for (at, device) in usb.iter().enumerate().filter(|(_, device)| !device.is_hub) {
+        let Some(serial) = &device.serial else { continue };
+        let same = |other: &&UsbDevice| {
+            (other.vid, other.pid) == (device.vid, device.pid) && other.serial.as_ref() == Some(serial)
+        };
+        if usb.iter().take(at).any(|other| same(&other)) {
+            continue;
+        }
+        let ports: Vec<&str> = usb.iter().filter(same).map(|device| device.port.as_str()).collect();
+        if ports.len() < 2 {
+            continue;
+        }
+        let what = format!(
+            "{} units of {:04x}:{:04x} say the serial number {serial:?}, at ports {}",
+            ports.len(),
+            device.vid,
+            device.pid,
+            ports.join(", ")
+        );
+        let meant = entries.iter().find(|entry| {
+            let usb = entry.identity.usb();
+            usb.is_some_and(|usb| (usb.vid, usb.pid) == (device.vid, device.pid) && usb.serial.as_ref() == Some(serial))
+        });
+        found.push(match meant {
+            Some(entry) => {
+                let fix =
+                    format!("in [device.{}] write port = {:?} instead of the serial number", entry.name, device.port);
+                Finding::bad("serials", what, fix)
+            }
+            None => Finding::warn("serials", what, "identify them by their ports: rapid register --port"),
+        });
+    }
+    found
+}
+
+/// Can the nodes of the entries that are plugged in be opened?
+fn nodes(facts: &Facts, entries: &[DeviceSpec], plugged: &[(&DeviceSpec, &UsbDevice)]) -> Vec<Finding> {
+    let mut found = Vec::new();
+    let mut open = 0;
+    for (entry, device) in plugged {
+        let Some((subsystem, group)) = subsystem(entry).filter(|(subsystem, _)| *subsystem != "usb") else { continue };
+        let own: Vec<&Node> =
+            facts.nodes.iter().filter(|node| node.port == device.port && node.subsystem == subsystem).collect();
+        if own.is_empty() {
+            let what =
+                format!("[device.{}] is plugged in at port {} and has no {subsystem} node", entry.name, device.port);
+            found.push(Finding::bad("nodes", what, "see `journalctl -k -b | tail -50` for the kernel's reason"));
+        }
+        for node in own {
+            if node.is_open_to_us {
+                open += 1;
+                continue;
+            }
+            let what = format!(
+                "{} of [device.{}] may not be opened: group {}, mode {:03o}",
+                node.path.display(),
+                entry.name,
+                node.group,
+                node.mode
+            );
+            let fix = format!("sudo usermod -aG {group} $USER, and log in again; or sudo rapid artifacts --install");
+            found.push(Finding::bad("nodes", what, fix));
+        }
+    }
+    if open > 0 {
+        found.push(Finding::ok("nodes", format!("{open} nodes of registered devices may be opened")));
+    }
+    let missing = entries.iter().filter(|entry| !plugged.iter().any(|(other, _)| other.name == entry.name));
+    let missing: Vec<String> = missing
+        .filter(|entry| entry.identity.usb().is_some())
+        .map(|entry| format!("[device.{}]", entry.name))
+        .collect();
+    if !missing.is_empty() {
+        found.push(Finding::ok("nodes", format!("not plugged in: {}", missing.join(", "))));
+    }
+    if facts.user.is_root {
+        return found;
+    }
+    let mut wanted: Vec<&str> = entries.iter().filter_map(|entry| Some(subsystem(entry)?.1)).collect();
+    wanted.sort_unstable();
+    wanted.dedup();
+    let lacking: Vec<&str> =
+        wanted.into_iter().filter(|group| !facts.user.groups.iter().any(|own| own == group)).collect();
+    if !lacking.is_empty() {
+        let what = format!(
+            "this user is not in the group {}: only who sits at the machine may open the devices",
+            lacking.join(", ")
+        );
+        found.push(Finding::warn(
+            "groups",
+            what,
+            format!("sudo usermod -aG {} $USER, and log in again", lacking.join(",")),
+        ));
+    }
+    found
+}
+
+fn udev(facts: &Facts, rules: Option<&str>) -> Vec<Finding> {
+    const INSTALL: &str = "sudo rapid artifacts --install";
+    let mut found = Vec::new();
+    if !facts.udev_runs {
+        let what = "no udev daemon runs: plugged devices are not seen";
+        found.push(Finding::bad("udev", what, "sudo systemctl start systemd-udevd"));
+    }
+    match (&facts.rules, rules) {
+        (_, None) => {}
+        (None, Some(_)) => {
+            let what = "the udev rules are not installed: no stable names /dev/rapid/NAME";
+            found.push(Finding::warn("udev", what, INSTALL));
+        }
+        (Some(installed), Some(rules)) if installed != rules => {
+            found.push(Finding::warn("udev", "the installed udev rules are not those of this registry", INSTALL));
+        }
+        (Some(_), Some(_)) => found.push(Finding::ok("udev", "the udev rules are those of this registry")),
+    }
+    found
+}
+
+fn suspending(plugged: &[(&DeviceSpec, &UsbDevice)]) -> Vec<Finding> {
+    let mut seen = Vec::new();
+    let mut found = Vec::new();
+    for (entry, device) in plugged.iter().filter(|(_, device)| device.autosuspends) {
+        if seen.contains(&&device.port) {
+            continue;
+        }
+        seen.push(&device.port);
+        let what =
+            format!("[device.{}] may be suspended by the kernel while nobody reads it, and wakes late", entry.name);
+        let fix = format!("echo on | sudo tee /sys/bus/usb/devices/{}/power/control", device.port);
+        found.push(Finding::warn("suspend", what, fix));
+    }
+    found
+}
+
+/// CAN interfaces: up, and with a queue that takes a burst.
+fn can(facts: &Facts, entries: &[DeviceSpec], plugged: &[(&DeviceSpec, &UsbDevice)]) -> Vec<Finding> {
+    /// A burst of commands to a whole arm; the kernel's default of 10 loses some of it (ENOBUFS).
+    const LEAST_QUEUE: u64 = 64;
+    let mut found = Vec::new();
+    for interface in &facts.can {
+        let entry =
+            plugged.iter().find(|(_, device)| Some(&device.port) == interface.port.as_ref()).map(|(entry, _)| entry);
+        let bitrate =
+            entry.and_then(|entry| if let NodeSpec::Can(can) = &entry.node { Some(can.bitrate) } else { None });
+        let name = &interface.name;
+        if entry.is_none() && !entries.is_empty() {
+            continue;
+        }
+        if interface.state == "down" {
+            let fix = format!("sudo ip link set {name} up type can bitrate {}", bitrate.unwrap_or(1_000_000));
+            found.push(Finding::warn(
+                "can",
+                format!("{name} is down; rapid brings it up only if it is permitted to"),
+                fix,
+            ));
+        } else {
+            found.push(Finding::ok("can", format!("{name} is up")));
+        }
+        if let Some(queue) = interface.queue.filter(|queue| *queue < LEAST_QUEUE) {
+            let what = format!("{name} queues {queue} frames at most: a burst of commands does not fit");
+            found.push(Finding::warn("can", what, format!("sudo ip link set {name} txqueuelen 256")));
+        }
+    }
+    found
+}

@@ -1,0 +1,130 @@
+//! Taking over the devices of `rapid_driver`.
+//!
+//! Its registry says no more of a device than how it is found and what to run. How it is read is seen
+//! at the device, if it is plugged in, or said by `--node`; an entry for which neither tells is written
+//! as a comment.
+
+use std::path::Path;
+
+use super::Target;
+use super::units::{kind, suggested};
+use super::wish::free_bit;
+use crate::driver::camera::query;
+use crate::registry::edit::{NewEntry, Setting};
+use crate::registry::import::{Foreign, devices, layout};
+use crate::registry::{Attachment, DeviceNode, RegistryErrors, UsbIdentity, like_a_name, name_problem, read_file};
+use crate::text;
+
+/// What announces itself by a service type, and what it speaks (`aod321/iPhoneVIO`; OpenGoPro,
+/// "mDNS").
+const PROTOCOLS: [(&str, &str); 2] = [("_iphonevio._tcp", "iphone"), ("_gopro-web._tcp", "gopro")];
+
+/// Why nothing is imported.
+#[derive(Debug, thiserror::Error)]
+pub enum ImportError {
+    /// A file is wrong.
+    #[error("{0}")]
+    File(#[from] RegistryErrors),
+    /// It lists nothing.
+    #[error("{0}: it lists no device")]
+    Empty(String),
+}
+
+/// The entries that the devices of `file` become.
+pub(super) fn read(
+    file: &Path,
+    order: Option<&Path>,
+    node: Option<&str>,
+    attached: &[Attachment],
+    target: &Target,
+) -> Result<Vec<NewEntry>, ImportError> {
+    let missing = "name the registry.toml of rapid_driver, usually ~/.config/rapid_driver/registry.toml";
+    let found = devices(&read_file(file, missing)?, file)?;
+    if found.is_empty() {
+        return Err(ImportError::Empty(file.display().to_string()));
+    }
+    let order = match order {
+        Some(path) => layout(&read_file(path, "name the mask_layout.toml beside the registry.toml")?, path)?,
+        None => Vec::new(),
+    };
+    let position = |name: &str| order.iter().position(|known| known == name).and_then(|at| u8::try_from(at).ok());
+    let mut bits: Vec<u8> = found.iter().filter_map(|device| position(&device.name)).collect();
+    let mut entries = Vec::new();
+    for device in &found {
+        let reader = Reader::of(device, node, attached);
+        // A device that is not used yet needs no bit but the one it had.
+        let free = || free_bit(target.registry.as_ref(), &bits).filter(|_| reader.is_ok());
+        let bit = position(&device.name).or_else(free);
+        bits.extend(bit);
+        entries.push(entry(device, bit, reader));
+    }
+    Ok(entries)
+}
+
+/// How a device is read.
+struct Reader {
+    node: String,
+    settings: Vec<(String, Setting)>,
+}
+
+impl Reader {
+    /// Otherwise why that is not known.
+    fn of(device: &Foreign, node: Option<&str>, attached: &[Attachment]) -> Result<Self, String> {
+        if let Some(service) = &device.service {
+            let Some((_, protocol)) = PROTOCOLS.iter().find(|(known, _)| known == service) else {
+                return Err(format!("it is found by mDNS ({service}), and what it speaks is not known"));
+            };
+            let text = |key: &str, value: &str| (format!("lan.{key}"), Setting::Text(value.to_owned()));
+            return Ok(Self {
+                node: "lan".to_owned(),
+                settings: vec![text("protocol", protocol), text("mdns", service)],
+            });
+        }
+        let is_it = |attachment: &&Attachment| {
+            let is_unit = |usb: &UsbIdentity| {
+                Some((usb.vid, usb.pid)) == device.usb && (device.serial.is_none() || usb.serial == device.serial)
+            };
+            attachment.unit.usb().is_some_and(is_unit)
+        };
+        let read = attached.iter().filter(is_it).find_map(|attachment| Some((kind(attachment)?, attachment)));
+        let settings = |attachment: &Attachment| {
+            let camera = if let DeviceNode::Video(path) = &attachment.node { query(path).ok() } else { None };
+            suggested(&attachment.node, camera.as_ref())
+        };
+        match (read, node) {
+            (Some((word, attachment)), wished) if wished.is_none_or(|wished| wished == word) => {
+                Ok(Self { node: word.to_owned(), settings: settings(attachment) })
+            }
+            (_, Some(node)) => Ok(Self { node: node.to_owned(), settings: Vec::new() }),
+            (_, None) => {
+                Err("how it is read is not known: plug it in and import again, give --node, or complete it".to_owned())
+            }
+        }
+    }
+}
+
+fn entry(device: &Foreign, bit: Option<u8>, reader: Result<Reader, String>) -> NewEntry {
+    let ours = if name_problem(&device.name).is_none() { None } else { like_a_name(&device.name) };
+    let name = ours.clone().unwrap_or_else(|| device.name.clone());
+    let mut comments = Vec::new();
+    if ours.is_some() {
+        comments.push(format!("rapid_driver called it {:?}.", text::plain(&device.name)));
+    }
+    for (key, command) in &device.commands {
+        comments.push(format!("rapid_driver ran {key}: {}", text::plain(command)));
+    }
+    let (node, settings, held_back) = match reader {
+        Ok(reader) => (reader.node, reader.settings, None),
+        Err(reason) => (if device.service.is_some() { "lan" } else { "camera" }.to_owned(), Vec::new(), Some(reason)),
+    };
+    let mut keys = Vec::new();
+    let mut put = |key: &str, value: Option<Setting>| keys.extend(value.map(|value| (key.to_owned(), value)));
+    put("vid", device.usb.map(|(vid, _)| Setting::Text(format!("{vid:04x}"))));
+    put("pid", device.usb.map(|(_, pid)| Setting::Text(format!("{pid:04x}"))));
+    let key = if node == "serial" { "serial_number" } else { "serial" };
+    put(key, device.serial.clone().map(Setting::Text));
+    put("node", Some(Setting::Text(node)));
+    put("bit", bit.map(|bit| Setting::Whole(bit.into())));
+    keys.extend(settings);
+    NewEntry { name, comments, keys, held_back }
+}

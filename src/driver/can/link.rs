@@ -1,0 +1,366 @@
+//! An open CAN adapter of any kind.
+//!
+//! Nothing here waits but [`Link::recv_until`], until its deadline at most, and opening. Frames that the
+//! controller or the kernel lost are counted, and so are those that the adapter refused to send.
+//!
+//! Invariant: nothing is allocated for a frame.
+//! Invariant: bytes from an adapter never make it panic.
+
+use std::io;
+use std::os::fd::{AsFd, AsRawFd, BorrowedFd, RawFd};
+use std::path::Path;
+use std::time::Duration;
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use tokio::io::Interest;
+use tokio::io::unix::AsyncFd;
+
+use super::line::Line;
+use super::socket::Socket;
+use crate::control::can::CanFrame;
+use crate::driver::DriverError;
+use crate::registry::{CanAdapter, CanSpec, DeviceNode};
+use crate::time::Stamp;
+
+/// An interface that goes down tells it by an error without anything to read.
+const INTEREST: Interest = Interest::READABLE.add(Interest::ERROR);
+
+/// Why a frame cannot be sent or received, by what to do next.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum LinkError {
+    /// The adapter is no longer there: wait for it to be attached again.
+    #[error("unplugged")]
+    Gone,
+    /// What is to be sent does not leave: the queue to the bus is full. Try again.
+    #[error("the queue to the bus is full: nothing on the bus acknowledges frames, or more are sent than fit")]
+    Full,
+    /// The controller left the bus after too many errors. It may return by itself; the link stays open.
+    #[error(
+        "bus-off: the adapter left the bus after too many errors; check the wiring, the 120 ohm resistors at \
+         both ends, and that all devices have one bit rate"
+    )]
+    BusOff,
+    /// Opening again later may help.
+    #[error("{0}")]
+    Retry(String),
+    /// Opening again cannot help before something is changed; the text says what.
+    #[error("{0}")]
+    Fatal(String),
+}
+
+impl LinkError {
+    /// What it is to whoever reads the device.
+    #[must_use]
+    pub fn into_driver(self) -> DriverError {
+        match self {
+            Self::Gone => DriverError::Gone,
+            Self::Fatal(text) => DriverError::Fatal(text),
+            Self::Retry(text) => DriverError::Retry(text),
+            Self::Full | Self::BusOff => DriverError::Retry(self.to_string()),
+        }
+    }
+
+    pub(super) fn of_driver(error: DriverError) -> Self {
+        match error {
+            DriverError::Gone => Self::Gone,
+            DriverError::Retry(text) => Self::Retry(text),
+            DriverError::Fatal(text) => Self::Fatal(text),
+        }
+    }
+}
+
+/// When a frame came.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Arrival {
+    /// The moment, from the kernel where it gives one.
+    pub at: Stamp,
+    /// The kernel gave it.
+    pub from_kernel: bool,
+}
+
+/// An open adapter.
+#[derive(Debug)]
+pub enum Link {
+    /// A network interface.
+    Socket(Socket),
+    /// A serial line that speaks slcan.
+    Slcan(Line),
+    /// A serial line that speaks as Damiao's adapter does.
+    Damiao(Line),
+}
+
+impl Link {
+    /// Opens the adapter of an entry at its node. May block: keep it off the runtime.
+    ///
+    /// # Errors
+    /// When the node is gone, no adapter of this kind, or cannot be opened.
+    pub fn open(spec: &CanSpec, node: &DeviceNode) -> Result<Self, LinkError> {
+        match (spec.adapter, node) {
+            (CanAdapter::SocketCan, DeviceNode::Net(name)) => Self::open_socket(name, spec.bitrate),
+            (CanAdapter::Slcan, DeviceNode::Tty(path)) => Self::open_slcan(path, spec.bitrate),
+            (CanAdapter::Damiao, DeviceNode::Tty(path)) => Self::open_damiao(path),
+            (adapter, node) => {
+                let text = format!("{} is no CAN adapter of kind \"{adapter}\": correct `adapter`", node.label());
+                Err(LinkError::Fatal(text))
+            }
+        }
+    }
+
+    /// Opens the network interface `name` and brings it up with `bitrate`. May block: keep it off the
+    /// runtime.
+    ///
+    /// # Errors
+    /// When the interface is gone, no CAN bus, or not up and may not be brought up.
+    pub fn open_socket(name: &str, bitrate: u32) -> Result<Self, LinkError> {
+        Socket::open(name, bitrate).map(Self::Socket)
+    }
+
+    /// Opens the serial line at `path`, and the bus behind it with `bitrate`. Waits for the adapter's
+    /// answers, a few hundred ms at most: keep it off the runtime.
+    ///
+    /// # Errors
+    /// When the line is gone, held by another program or not permitted, or the adapter refuses.
+    pub fn open_slcan(path: &Path, bitrate: u32) -> Result<Self, LinkError> {
+        Line::slcan(path, bitrate).map(Self::Slcan)
+    }
+
+    /// Opens the serial line at `path` to an adapter of Damiao's. May block: keep it off the runtime.
+    ///
+    /// # Errors
+    /// When the line is gone, held by another program or not permitted.
+    pub fn open_damiao(path: &Path) -> Result<Self, LinkError> {
+        Line::damiao(path).map(Self::Damiao)
+    }
+
+    /// Hands a frame to the kernel. Does not wait, and does not say that the frame was on the bus.
+    ///
+    /// # Errors
+    /// [`LinkError::Full`] when the frame was not taken and may be tried again; the others end the link.
+    pub fn send(&mut self, frame: &CanFrame) -> Result<(), LinkError> {
+        match self {
+            Self::Socket(socket) => socket.send(frame),
+            Self::Slcan(line) | Self::Damiao(line) => line.send(frame),
+        }
+    }
+
+    /// The next frame that waits, error frames of the controller included; `None` if none does.
+    ///
+    /// # Errors
+    /// When the link has ended.
+    pub fn try_recv(&mut self, frame: &mut CanFrame) -> Result<Option<Arrival>, LinkError> {
+        match self {
+            Self::Socket(socket) => socket.try_recv(frame),
+            Self::Slcan(line) | Self::Damiao(line) => line.try_recv(frame),
+        }
+    }
+
+    /// The next frame of the bus, and when it came; `None` if there is none until `deadline`. A frame
+    /// that waits already is given even when the deadline has passed.
+    ///
+    /// # Errors
+    /// [`LinkError::BusOff`] when the controller says so, after which the link may still be used; the
+    /// others end the link.
+    pub fn recv_until(&mut self, deadline: Stamp, frame: &mut CanFrame) -> Result<Option<Stamp>, LinkError> {
+        let mut hung_up = false;
+        loop {
+            while let Some(arrival) = self.try_recv(frame)? {
+                if !frame.error {
+                    return Ok(Some(arrival.at));
+                }
+                if is_bus_off(frame) {
+                    return Err(LinkError::BusOff);
+                }
+            }
+            if hung_up {
+                return Err(LinkError::Gone);
+            }
+            let left = deadline.since(Stamp::now());
+            if left.is_zero() {
+                return Ok(None);
+            }
+            hung_up = self.wait(left)?;
+        }
+    }
+
+    /// Waits for bytes from the adapter, or room to it where some wait. Says whether it hung up.
+    fn wait(&mut self, longest: Duration) -> Result<bool, LinkError> {
+        let mut wished = PollFlags::IN;
+        let unsent = matches!(self, Self::Slcan(line) | Self::Damiao(line) if line.has_unsent());
+        wished.set(PollFlags::OUT, unsent);
+        let timeout = Timespec {
+            tv_sec: longest.as_secs().try_into().unwrap_or(i64::MAX),
+            tv_nsec: longest.subsec_nanos().into(),
+        };
+        let mut fds = [PollFd::new(self, wished)];
+        let found = match poll(&mut fds, Some(&timeout)) {
+            Ok(_) => fds[0].revents(),
+            Err(rustix::io::Errno::INTR) => PollFlags::empty(),
+            Err(error) => return Err(LinkError::Retry(format!("waiting for the bus: {error}"))),
+        };
+        if unsent && found.contains(PollFlags::OUT) {
+            match self {
+                Self::Slcan(line) | Self::Damiao(line) => line.flush()?,
+                Self::Socket(_) => {}
+            }
+        }
+        // A socket tells by POLLERR that the next read says why; only a hang-up says nothing more.
+        Ok(found.intersects(PollFlags::HUP | PollFlags::NVAL))
+    }
+
+    /// Frames that were lost before they could be received, since the last call: by the controller, by
+    /// the kernel, or on the line.
+    pub fn take_lost(&mut self) -> u64 {
+        match self {
+            Self::Socket(socket) => socket.take_lost(),
+            Self::Slcan(line) | Self::Damiao(line) => line.take_lost(),
+        }
+    }
+
+    /// Frames that the adapter took and said it did not send, since the last call.
+    pub fn take_refused(&mut self) -> u64 {
+        match self {
+            Self::Socket(_) => 0,
+            Self::Slcan(line) | Self::Damiao(line) => line.take_refused(),
+        }
+    }
+
+    /// After a bus-off it returns to the bus by itself.
+    #[must_use]
+    pub const fn restarts(&self) -> bool {
+        match self {
+            Self::Socket(socket) => socket.restarts(),
+            // What these adapters do then, they do not tell.
+            Self::Slcan(_) | Self::Damiao(_) => true,
+        }
+    }
+
+    /// What was opened, for people.
+    #[must_use]
+    pub fn description(&self) -> &str {
+        match self {
+            Self::Socket(socket) => socket.description(),
+            Self::Slcan(line) | Self::Damiao(line) => line.description(),
+        }
+    }
+}
+
+impl AsFd for Link {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        match self {
+            Self::Socket(socket) => socket.as_fd(),
+            Self::Slcan(line) | Self::Damiao(line) => line.as_fd(),
+        }
+    }
+}
+
+impl AsRawFd for Link {
+    fn as_raw_fd(&self) -> RawFd {
+        self.as_fd().as_raw_fd()
+    }
+}
+
+/// A frame and when it came.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Received {
+    /// The frame.
+    pub frame: CanFrame,
+    /// When it came.
+    pub arrival: Arrival,
+}
+
+/// A link for a task.
+#[derive(Debug)]
+pub struct AsyncLink {
+    link: AsyncFd<Link>,
+    /// What ended the link after frames that were still given.
+    ended: Option<LinkError>,
+}
+
+impl AsyncLink {
+    /// Gives `link` to the runtime of the caller.
+    ///
+    /// # Errors
+    /// When the runtime cannot watch it.
+    pub fn new(link: Link) -> Result<Self, LinkError> {
+        // SAFETY: a link has one descriptor all its life, and drops it last.
+        let link = unsafe { AsyncFd::register_with_interest(link, INTEREST) };
+        let link = link.map_err(|error| LinkError::Retry(format!("watching the adapter: {error}")))?;
+        Ok(Self { link, ended: None })
+    }
+
+    /// The frames that wait, in order, error frames of the controller included: at least one, at most as
+    /// many as `into` has room for. Waits until there is one. Cancel-safe.
+    ///
+    /// # Errors
+    /// When the link has ended.
+    pub async fn recv(&mut self, into: &mut [Received]) -> Result<usize, LinkError> {
+        if into.is_empty() {
+            return Ok(0);
+        }
+        loop {
+            // What came with the bytes of the frame before is in no one's way to become readable.
+            let count = self.take_waiting(into)?;
+            if count > 0 {
+                return Ok(count);
+            }
+            let mut guard = self
+                .link
+                .ready_mut(INTEREST)
+                .await
+                .map_err(|error| LinkError::Retry(format!("waiting for the bus: {error}")))?;
+            let hung_up = guard.ready().is_read_closed();
+            let mut first = Received::default();
+            let tried = guard.try_io(|link| match link.get_mut().try_recv(&mut first.frame) {
+                Ok(Some(arrival)) => Ok(Ok(arrival)),
+                Ok(None) if hung_up => Ok(Err(LinkError::Gone)),
+                Ok(None) => Err(io::ErrorKind::WouldBlock.into()),
+                Err(error) => Ok(Err(error)),
+            });
+            if let Ok(Ok(arrival)) = tried {
+                first.arrival = arrival?;
+                let [place, rest @ ..] = into else { return Ok(0) };
+                *place = first;
+                return Ok(1 + self.take_waiting(rest)?);
+            }
+        }
+    }
+
+    fn take_waiting(&mut self, into: &mut [Received]) -> Result<usize, LinkError> {
+        if let Some(error) = self.ended.take() {
+            return Err(error);
+        }
+        let link = self.link.get_mut();
+        for (count, place) in into.iter_mut().enumerate() {
+            match link.try_recv(&mut place.frame) {
+                Ok(Some(arrival)) => place.arrival = arrival,
+                Ok(None) => return Ok(count),
+                Err(error) if count == 0 => return Err(error),
+                Err(error) => {
+                    self.ended = Some(error);
+                    return Ok(count);
+                }
+            }
+        }
+        Ok(into.len())
+    }
+
+    /// The link itself.
+    pub fn get_mut(&mut self) -> &mut Link {
+        self.link.get_mut()
+    }
+}
+
+/// The controller left the bus (`CAN_ERR_BUSOFF`, linux/can/error.h).
+#[must_use]
+pub const fn is_bus_off(frame: &CanFrame) -> bool {
+    frame.error && frame.id & 0x40 != 0
+}
+
+/// The controller had no room for frames that came (`CAN_ERR_CRTL` with `CAN_ERR_CRTL_RX_OVERFLOW`).
+#[must_use]
+pub const fn is_overflow(frame: &CanFrame) -> bool {
+    frame.error && frame.id & 0x4 != 0 && frame.data[1] & 0x1 != 0
+}
+
+#[cfg(test)]
+pub(super) mod tests;

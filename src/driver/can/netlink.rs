@@ -1,0 +1,212 @@
+//! Bringing a CAN interface up, and looking at it.
+//!
+//! An interface is up with a bit rate that only its administrator may set. `rapid artifacts --install`
+//! puts a rule in place by which udev does it at each plug; who may do so himself (root, or
+//! `CAP_NET_ADMIN`) has it done here.
+
+use serde::Serialize;
+use socketcan::CanInterface;
+use socketcan::nl::{CanState, InterfaceDetails};
+
+use super::link::LinkError;
+use crate::registry::CAN_RESTART_MS;
+
+/// A CAN interface as it is.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Interface {
+    /// It is up.
+    pub up: bool,
+    /// Bits a second; absent of one without a bus, and before one was set.
+    pub bitrate: Option<u32>,
+    /// The state of its controller, in the kernel's words.
+    pub state: Option<&'static str>,
+    /// It left the bus after too many errors.
+    pub bus_off: bool,
+    /// It returns to the bus by itself after this many ms; 0 is never.
+    pub restart_ms: Option<u32>,
+    /// Errors of sending and of receiving that its controller counts, where it tells.
+    pub errors: Option<(u16, u16)>,
+}
+
+/// What is to be done before an interface can be used.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Need {
+    Nothing,
+    /// It is down.
+    Up,
+    /// It is up with another bit rate, or has left the bus for good.
+    Anew,
+}
+
+/// Looks at the interface `name`.
+///
+/// # Errors
+/// [`LinkError::Gone`] when there is none.
+pub fn look(name: &str) -> Result<Interface, LinkError> {
+    let interface = CanInterface::open(name).map_err(|error| refusal(name, &error))?;
+    interface.details().map(|details| read(&details)).map_err(|error| refusal(name, &error))
+}
+
+/// The index of the interface `name`, by which it is told from a later one of that name.
+pub(super) fn index(name: &str) -> Option<u32> {
+    Some(CanInterface::open(name).ok()?.details().ok()?.index)
+}
+
+/// An interface that is up.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Ready {
+    /// By which it is told from a later one of the same name.
+    pub(super) index: u32,
+    /// It returns from bus-off by itself.
+    pub(super) restarts: bool,
+}
+
+/// Sees to it that the interface `name` is up with `bitrate`.
+pub(super) fn bring_up(name: &str, bitrate: u32) -> Result<Ready, LinkError> {
+    let interface = CanInterface::open(name).map_err(|error| refusal(name, &error))?;
+    let details = interface.details().map_err(|error| refusal(name, &error))?;
+    let state = read(&details);
+    match need(&state, bitrate) {
+        Need::Nothing => {
+            return Ok(Ready { index: details.index, restarts: state.restart_ms.is_some_and(|ms| ms > 0) });
+        }
+        Need::Up => {}
+        Need::Anew => {
+            tracing::warn!(interface = name, ?state.bitrate, wished = bitrate, "the interface is set up anew");
+            interface.bring_down().map_err(|error| not_set(name, bitrate, &state, &error))?;
+        }
+    }
+    interface.set_bitrate(bitrate, None).map_err(|error| not_set(name, bitrate, &state, &error))?;
+    // Not every driver can.
+    let restart = interface.set_restart_ms(CAN_RESTART_MS);
+    if let Err(error) = &restart {
+        tracing::info!(interface = name, %error, "the interface does not return from bus-off by itself");
+    }
+    interface.bring_up().map_err(|error| not_set(name, bitrate, &state, &error))?;
+    Ok(Ready { index: details.index, restarts: restart.is_ok() })
+}
+
+fn need(state: &Interface, bitrate: u32) -> Need {
+    // A virtual interface has no bit rate and needs none.
+    let fits = state.bitrate.is_none_or(|is| is == bitrate);
+    let stuck = state.bus_off && state.restart_ms.is_none_or(|ms| ms == 0);
+    match (state.up, fits && !stuck) {
+        (true, true) => Need::Nothing,
+        (true, false) => Need::Anew,
+        (false, _) => Need::Up,
+    }
+}
+
+fn read(details: &InterfaceDetails) -> Interface {
+    let can = &details.can;
+    Interface {
+        up: details.is_up,
+        bitrate: can.bit_timing.map(|timing| timing.bitrate).filter(|bitrate| *bitrate > 0),
+        state: can.state.map(|state| match state {
+            CanState::ErrorActive => "ERROR-ACTIVE",
+            CanState::ErrorWarning => "ERROR-WARNING",
+            CanState::ErrorPassive => "ERROR-PASSIVE",
+            CanState::BusOff => "BUS-OFF",
+            CanState::Stopped => "STOPPED",
+            CanState::Sleeping => "SLEEPING",
+        }),
+        bus_off: can.state == Some(CanState::BusOff),
+        restart_ms: can.restart_ms,
+        errors: can.berr_counter.map(|errors| (errors.txerr, errors.rxerr)),
+    }
+}
+
+/// The commands that do by hand what was not permitted.
+fn by_hand(name: &str, bitrate: u32, up: bool) -> String {
+    let down = if up { format!("sudo ip link set {name} down && ") } else { String::new() };
+    format!("{down}sudo ip link set {name} up type can bitrate {bitrate} restart-ms {CAN_RESTART_MS}")
+}
+
+fn not_set(name: &str, bitrate: u32, state: &Interface, error: &socketcan::Error) -> LinkError {
+    let is = match (state.up, state.bus_off, state.bitrate) {
+        (false, ..) => format!("{name} is down"),
+        (true, true, _) => format!("{name} has left the bus (bus-off)"),
+        (true, false, is) => format!("{name} is up at {} bit/s, not at {bitrate}", is.unwrap_or_default()),
+    };
+    let command = by_hand(name, bitrate, state.up);
+    match errno(error) {
+        Some(libc::EPERM | libc::EACCES) => LinkError::Fatal(format!(
+            "{is}, and setting it up is for root: run `rapid artifacts --install` once, whose udev rule does it at \
+             each plug, or `{command}`"
+        )),
+        Some(libc::ENODEV | libc::ENXIO) => LinkError::Gone,
+        Some(libc::EOPNOTSUPP) => {
+            LinkError::Fatal(format!("{is}: {name} is no CAN interface whose bit rate can be set"))
+        }
+        Some(libc::EINVAL | libc::ERANGE | libc::EDOM) => {
+            LinkError::Fatal(format!("{is}: its controller cannot do {bitrate} bit/s ({error}): correct `bitrate`"))
+        }
+        _ => LinkError::Retry(format!("{is}, and setting it up failed: {error}")),
+    }
+}
+
+fn refusal(name: &str, error: &socketcan::Error) -> LinkError {
+    match errno(error) {
+        Some(libc::ENODEV | libc::ENXIO) => LinkError::Gone,
+        _ => LinkError::Retry(format!("looking at {name}: {error}")),
+    }
+}
+
+fn errno(error: &socketcan::Error) -> Option<i32> {
+    match error {
+        socketcan::Error::Io(error) => error.raw_os_error(),
+        socketcan::Error::Nl(error) => error.errno(),
+        socketcan::Error::Can(_) => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn interface(up: bool, bitrate: Option<u32>, state: CanState, restart_ms: u32) -> Interface {
+        let mut details = InterfaceDetails::new(3);
+        details.is_up = up;
+        details.can.state = Some(state);
+        details.can.restart_ms = Some(restart_ms);
+        let mut found = read(&details);
+        found.bitrate = bitrate;
+        found
+    }
+
+    #[test]
+    fn only_what_is_not_as_wished_is_set_up() {
+        let (active, off) = (CanState::ErrorActive, CanState::BusOff);
+        for (state, expected) in [
+            (interface(true, Some(500_000), active, 0), Need::Nothing),
+            (interface(true, None, active, 0), Need::Nothing),
+            (interface(true, Some(500_000), off, 100), Need::Nothing),
+            (interface(true, Some(500_000), off, 0), Need::Anew),
+            (interface(true, Some(250_000), active, 100), Need::Anew),
+            (interface(false, Some(500_000), CanState::Stopped, 0), Need::Up),
+            (interface(false, None, CanState::Stopped, 0), Need::Up),
+        ] {
+            assert_eq!(need(&state, 500_000), expected, "{state:?}");
+        }
+    }
+
+    #[test]
+    fn an_interface_that_is_not_there_is_gone() {
+        assert_eq!(look("no-such-can0"), Err(LinkError::Gone));
+        assert_eq!(bring_up("no-such-can0", 1_000_000), Err(LinkError::Gone));
+        assert_eq!(index("no-such-can0"), None);
+    }
+
+    #[test]
+    fn what_is_not_permitted_names_the_command() {
+        let denied = socketcan::Error::from(std::io::Error::from_raw_os_error(libc::EPERM));
+        let down = interface(false, None, CanState::Stopped, 0);
+        let LinkError::Fatal(text) = not_set("can0", 1_000_000, &down, &denied) else { panic!("fatal") };
+        assert!(text.contains("`sudo ip link set can0 up type can bitrate 1000000 restart-ms 100`"), "{text}");
+        assert!(text.contains("rapid artifacts --install"), "{text}");
+        let other = interface(true, Some(500_000), CanState::ErrorActive, 0);
+        let LinkError::Fatal(text) = not_set("can0", 1_000_000, &other, &denied) else { panic!("fatal") };
+        assert!(text.contains("up at 500000 bit/s, not at 1000000"), "{text}");
+        assert!(text.contains("sudo ip link set can0 down && sudo"), "{text}");
+    }
+}

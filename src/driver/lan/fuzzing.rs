@@ -1,0 +1,54 @@
+//! The readers of strangers' bytes, for the fuzzer.
+
+use super::iphone::packet::{self, Packets};
+use super::multipart::{self, Multipart, boundary};
+use super::{gopro, jpeg};
+
+/// Bodies of a multipart stream that comes in these pieces, and how many were given up.
+pub fn multipart<'p>(
+    content_type: &str,
+    largest: usize,
+    pieces: impl IntoIterator<Item = &'p [u8]>,
+) -> (Vec<Vec<u8>>, u64) {
+    let (mut parts, mut malformed) = (Vec::new(), 0);
+    let Some(mut parser) = boundary(content_type).and_then(|boundary| Multipart::new(boundary, largest)) else {
+        return (parts, malformed);
+    };
+    for mut piece in pieces {
+        while !piece.is_empty() {
+            let (taken, cut) = parser.feed(piece);
+            piece = piece.get(taken..).unwrap_or_default();
+            match cut {
+                multipart::Cut::Open | multipart::Cut::Head => {}
+                multipart::Cut::Part => parts.push(parser.part().to_vec()),
+                multipart::Cut::Malformed => malformed += 1,
+                multipart::Cut::End => return (parts, malformed),
+            }
+        }
+    }
+    (parts, malformed)
+}
+
+/// Pictures and sessions that a phone sends in these pieces, and how many were given up.
+pub fn phone<'p>(largest: usize, pieces: impl IntoIterator<Item = &'p [u8]>) -> (Vec<Vec<u8>>, u64) {
+    let mut packets = Packets::new(largest);
+    let (mut payloads, mut malformed) = (Vec::new(), 0);
+    for mut piece in pieces {
+        while !piece.is_empty() {
+            let (taken, cut) = packets.feed(piece);
+            piece = piece.get(taken..).unwrap_or_default();
+            match cut {
+                packet::Cut::Open => {}
+                packet::Cut::Frame(_) | packet::Cut::Session => payloads.push(packets.payload().to_vec()),
+                packet::Cut::Malformed => malformed += 1,
+            }
+        }
+    }
+    (payloads, malformed)
+}
+
+/// What is looked at in a GoPro's answers and in a picture.
+pub fn answer(bytes: &[u8]) {
+    gopro::fuzz(bytes);
+    let _ = jpeg::size(bytes);
+}

@@ -1,0 +1,130 @@
+//! HTTP as devices speak it: one request a connection, every wait and every size bounded.
+
+use std::time::Duration;
+
+use http_body_util::{BodyExt, Empty};
+use hyper::body::{Bytes, Incoming};
+use hyper::client::conn::http1;
+use hyper::header::{CONNECTION, HOST, HeaderMap, HeaderName, RANGE};
+use hyper::{Request, StatusCode};
+use hyper_util::rt::TokioIo;
+use tokio::task::JoinHandle;
+use tokio::time::timeout;
+
+use super::place::Server;
+use crate::driver::DriverError;
+
+/// Headers of a reply, bytes.
+const LONGEST_HEAD: usize = 16 << 10;
+
+/// The beginning of a reply; its body is still to come.
+#[derive(Debug)]
+pub(super) struct Reply {
+    server: Server,
+    pub(super) status: StatusCode,
+    headers: HeaderMap,
+    body: Incoming,
+    _connection: Connection,
+}
+
+/// The task that carries the bytes of a connection, ended with it.
+#[derive(Debug)]
+struct Connection(JoinHandle<()>);
+
+impl Drop for Connection {
+    fn drop(&mut self) {
+        self.0.abort();
+    }
+}
+
+/// Asks for `path`, from byte `from` on if that is not 0.
+pub(super) async fn get(server: &Server, path: &str, from: u64, limit: Duration) -> Result<Reply, DriverError> {
+    let ask = async {
+        let stream = server.connect().await?;
+        let odd = |error: hyper::Error| server.place.lost(format_args!("it does not speak HTTP: {}", causes(&error)));
+        // What cameras' servers are known to get wrong is let pass.
+        let (mut sender, connection) = http1::Builder::new()
+            .max_buf_size(LONGEST_HEAD)
+            .ignore_invalid_headers_in_responses(true)
+            .allow_spaces_after_header_name_in_responses(true)
+            .handshake(TokioIo::new(stream))
+            .await
+            .map_err(odd)?;
+        let connection = Connection(tokio::spawn(async move {
+            // Whoever reads the body is told.
+            let _ = connection.await;
+        }));
+        let mut request = Request::get(path).header(HOST, server.address.to_string()).header(CONNECTION, "close");
+        if from > 0 {
+            request = request.header(RANGE, format!("bytes={from}-"));
+        }
+        let request = request.body(Empty::<Bytes>::new());
+        let request = request.map_err(|error| DriverError::Fatal(format!("{path:?} cannot be asked for: {error}")))?;
+        let reply = sender.send_request(request).await.map_err(odd)?;
+        server.place.heard();
+        let (head, body) = reply.into_parts();
+        let server = server.clone();
+        Ok(Reply { server, status: head.status, headers: head.headers, body, _connection: connection })
+    };
+    match timeout(limit, ask).await {
+        Ok(reply) => reply,
+        Err(_) => Err(server.place.lost(format_args!("no answer to {path} within {} s", limit.as_secs()))),
+    }
+}
+
+/// The whole body of an answer that is good, at most so many bytes.
+pub(super) async fn text(server: &Server, path: &str, most: usize, limit: Duration) -> Result<Vec<u8>, DriverError> {
+    let fetch = async {
+        let mut reply = get(server, path, 0, limit).await?;
+        if !reply.status.is_success() {
+            return Err(DriverError::Retry(format!("{}: {path}: {}", server.place, reply.status)));
+        }
+        let mut body = Vec::new();
+        while let Some(bytes) = reply.next().await? {
+            if body.len() + bytes.len() > most {
+                return Err(DriverError::Retry(format!("{}: {path}: more than {most} bytes", server.place)));
+            }
+            body.extend_from_slice(&bytes);
+        }
+        Ok(body)
+    };
+    match timeout(limit, fetch).await {
+        Ok(body) => body,
+        Err(_) => Err(server.place.lost(format_args!("no answer to {path} within {} s", limit.as_secs()))),
+    }
+}
+
+impl Reply {
+    /// The next bytes of the body; `None` at its end. Cancel-safe.
+    pub(super) async fn next(&mut self) -> Result<Option<Bytes>, DriverError> {
+        loop {
+            match self.body.frame().await {
+                Some(Ok(frame)) => {
+                    self.server.place.heard();
+                    // Trailers are nothing to us.
+                    if let Ok(bytes) = frame.into_data() {
+                        return Ok(Some(bytes));
+                    }
+                }
+                Some(Err(error)) => {
+                    return Err(self.server.place.lost(format_args!("the stream broke: {}", causes(&error))));
+                }
+                None => return Ok(None),
+            }
+        }
+    }
+
+    /// A header, if it is text.
+    pub(super) fn header(&self, name: HeaderName) -> Option<&str> {
+        self.headers.get(name)?.to_str().ok()
+    }
+}
+
+/// An error and what it comes from.
+fn causes(error: &hyper::Error) -> String {
+    use std::error::Error as _;
+    match error.source() {
+        Some(source) => format!("{error}: {source}"),
+        None => error.to_string(),
+    }
+}

@@ -1,0 +1,178 @@
+//! What the phone sends, out of the bytes, without I/O.
+//!
+//! The format is that of aod321/iPhoneVIO (`NetworkClient.swift`): messages of 8 bytes of header,
+//! `u32 payload length, u8 type, 3 reserved`, and the payload, little endian. Type 1 is a frame: `u32
+//! JPEG length, 16 f32 camera pose (4 by 4, column by column), f64 time of the device's own clock, f64
+//! wall clock (s since 1970), JPEG`. Type 0 is the session in JSON, once for each connection; 2 and 3
+//! are commands of a teleoperator and reachability, which are let go.
+//!
+//! Invariant: memory is bounded by the largest picture permitted, whatever comes.
+//! Invariant: nothing is allocated for a frame once the largest one has been seen.
+
+/// Header of a message, bytes.
+const HEADER: usize = 8;
+/// Of a frame, what comes before the picture, bytes.
+pub(in crate::driver::lan) const FRAME_HEAD: usize = 84;
+/// The session's JSON is some 300 bytes.
+const LARGEST_SESSION: usize = 64 << 10;
+
+const SESSION: u8 = 0;
+const FRAME: u8 = 1;
+
+/// What came of feeding bytes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(in crate::driver::lan) enum Cut {
+    /// More bytes are needed.
+    Open,
+    /// A frame is complete; its picture is [`Packets::payload`].
+    Frame(Frame),
+    /// The session's JSON is complete: [`Packets::payload`].
+    Session,
+    /// A frame that is too large, or says of its picture what cannot be.
+    Malformed,
+}
+
+/// What comes with a picture.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(in crate::driver::lan) struct Frame {
+    /// Pose of the camera, 4 by 4, column by column.
+    pub(in crate::driver::lan) pose: [f32; 16],
+    /// Capture time on the device's own clock, s.
+    pub(in crate::driver::lan) device_time: f64,
+    /// The same on the phone's wall clock, s since 1970.
+    pub(in crate::driver::lan) wall_clock: f64,
+}
+
+/// See the module's comment.
+#[derive(Debug)]
+pub(in crate::driver::lan) struct Packets {
+    header: [u8; HEADER],
+    header_filled: usize,
+    payload: Vec<u8>,
+    /// Of the payload, what is to come.
+    missing: usize,
+    /// What comes is let go.
+    skips: bool,
+    /// The message was told, and `payload` begins anew.
+    told: bool,
+    largest_picture: usize,
+}
+
+impl Packets {
+    pub(in crate::driver::lan) fn new(largest_picture: usize) -> Self {
+        Self {
+            header: [0; HEADER],
+            header_filled: 0,
+            payload: Vec::new(),
+            missing: 0,
+            skips: false,
+            told: false,
+            largest_picture,
+        }
+    }
+
+    /// The picture of the frame, or the text of the session, that is complete.
+    pub(in crate::driver::lan) fn payload(&self) -> &[u8] {
+        let skip = if self.header[4] == FRAME { FRAME_HEAD } else { 0 };
+        self.payload.get(skip..).unwrap_or_default()
+    }
+
+    /// Consumes bytes up to the end of at most one message.
+    pub(in crate::driver::lan) fn feed(&mut self, bytes: &[u8]) -> (usize, Cut) {
+        if std::mem::take(&mut self.told) {
+            self.payload.clear();
+            self.header_filled = 0;
+        }
+        let mut taken = 0;
+        while let Some(rest) = bytes.get(taken..)
+            && !rest.is_empty()
+        {
+            if self.header_filled < HEADER {
+                let count = rest.len().min(HEADER - self.header_filled);
+                let (from, to) =
+                    (rest.get(..count), self.header.get_mut(self.header_filled..self.header_filled + count));
+                if let (Some(from), Some(to)) = (from, to) {
+                    to.copy_from_slice(from);
+                }
+                self.header_filled += count;
+                taken += count;
+                if self.header_filled == HEADER {
+                    let cut = self.begin();
+                    if cut != Cut::Open {
+                        return (taken, cut);
+                    }
+                }
+                continue;
+            }
+            let count = rest.len().min(self.missing);
+            if !self.skips {
+                self.payload.extend_from_slice(rest.get(..count).unwrap_or_default());
+            }
+            self.missing -= count;
+            taken += count;
+            if self.missing == 0 {
+                let cut = self.complete();
+                if cut != Cut::Open {
+                    return (taken, cut);
+                }
+            }
+        }
+        (taken, Cut::Open)
+    }
+
+    /// After a header.
+    fn begin(&mut self) -> Cut {
+        let [a, b, c, d, kind, ..] = self.header;
+        self.missing = u32::from_le_bytes([a, b, c, d]) as usize;
+        let most = match kind {
+            SESSION => LARGEST_SESSION,
+            FRAME => FRAME_HEAD.saturating_add(self.largest_picture),
+            _ => 0,
+        };
+        self.skips = self.missing > most;
+        if self.missing == 0 {
+            return self.complete();
+        }
+        if self.skips && kind == FRAME { Cut::Malformed } else { Cut::Open }
+    }
+
+    fn complete(&mut self) -> Cut {
+        self.told = true;
+        let kind = self.header[4];
+        if self.skips {
+            // Told when it began.
+            self.payload.clear();
+            self.header_filled = 0;
+            self.told = false;
+            return Cut::Open;
+        }
+        match kind {
+            SESSION => Cut::Session,
+            FRAME => frame(&self.payload).map_or(Cut::Malformed, Cut::Frame),
+            _ => {
+                self.header_filled = 0;
+                self.told = false;
+                Cut::Open
+            }
+        }
+    }
+}
+
+fn frame(payload: &[u8]) -> Option<Frame> {
+    let (head, picture) = payload.split_at_checked(FRAME_HEAD)?;
+    let (length, rest) = head.split_first_chunk()?;
+    // What follows the picture, if anything does, is none of it.
+    if u32::from_le_bytes(*length) as usize != picture.len() {
+        return None;
+    }
+    let (poses, times) = rest.split_at_checked(64)?;
+    let mut pose = [0.0; 16];
+    for (value, bytes) in pose.iter_mut().zip(poses.as_chunks().0) {
+        *value = f32::from_le_bytes(*bytes);
+    }
+    let [device_time, wall_clock] = times.as_chunks().0 else { return None };
+    Some(Frame { pose, device_time: f64::from_le_bytes(*device_time), wall_clock: f64::from_le_bytes(*wall_clock) })
+}
+
+#[cfg(test)]
+mod tests;

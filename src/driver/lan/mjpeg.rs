@@ -1,0 +1,149 @@
+//! Cameras that send pictures over HTTP, one after another (`multipart/x-mixed-replace`).
+//!
+//! A picture's time is the moment its body began to arrive: the nearest to its capture that is known.
+
+use std::time::Duration;
+
+use hyper::StatusCode;
+use hyper::body::{Buf, Bytes};
+use hyper::header::CONTENT_TYPE;
+use tokio::time::{Instant, timeout_at};
+
+use super::http::{self, Reply};
+use super::multipart::{Cut, Multipart, boundary};
+use super::place::Server;
+use super::{PATIENCE, jpeg};
+use crate::driver::{DriverError, Reading};
+use crate::registry::LanPicture;
+use crate::sample::{Encoding, FLAG_ERROR};
+use crate::time::Stamp;
+
+const HEAD_LIMIT: Duration = Duration::from_secs(5);
+
+/// See the module's comment.
+#[derive(Debug)]
+pub(super) struct Camera {
+    name: String,
+    server: Server,
+    reply: Reply,
+    parser: Multipart,
+    /// Bytes not looked at yet, and when they came.
+    chunk: Bytes,
+    arrived: Stamp,
+    /// When the picture in progress began to arrive.
+    begun: Stamp,
+    /// When the newest picture was complete.
+    newest: Instant,
+    picture: LanPicture,
+    /// The size of a picture was looked at.
+    is_checked: bool,
+    lost: u64,
+}
+
+impl Camera {
+    pub(super) async fn open(
+        name: &str,
+        server: Server,
+        path: &str,
+        picture: LanPicture,
+        max_bytes: usize,
+    ) -> Result<Self, DriverError> {
+        let reply = http::get(&server, path, 0, HEAD_LIMIT).await?;
+        let parser = accept(name, path, &reply, max_bytes)?;
+        Ok(Self {
+            name: name.to_owned(),
+            server,
+            reply,
+            parser,
+            chunk: Bytes::new(),
+            arrived: Stamp::now(),
+            begun: Stamp::now(),
+            newest: Instant::now(),
+            picture,
+            is_checked: false,
+            lost: 0,
+        })
+    }
+
+    pub(super) async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
+        while !self.parse()? {
+            let patience = self.newest + PATIENCE;
+            // A dropped future leaves the bytes with the connection.
+            let Ok(chunk) = timeout_at(patience, self.reply.next()).await else {
+                return Err(self.server.place.lost(format_args!("no picture for {} s", PATIENCE.as_secs())));
+            };
+            let Some(chunk) = chunk? else { return Err(self.server.place.lost("the camera ended the stream")) };
+            (self.chunk, self.arrived) = (chunk, Stamp::now());
+        }
+        self.newest = Instant::now();
+        let bytes = self.parser.part();
+        let flags = if bytes.starts_with(&jpeg::START) { 0 } else { FLAG_ERROR };
+        if !self.is_checked
+            && let Some(size) = jpeg::size(bytes)
+        {
+            check_size(&self.name, size, self.picture)?;
+            self.is_checked = true;
+        }
+        Ok(Reading {
+            bytes,
+            encoding: Encoding::Mjpeg,
+            captured: self.begun,
+            flags,
+            width: self.picture.width,
+            height: self.picture.height,
+            lost: std::mem::take(&mut self.lost),
+        })
+    }
+
+    /// Looks at what came, up to the end of a picture.
+    fn parse(&mut self) -> Result<bool, DriverError> {
+        while !self.chunk.is_empty() {
+            let (taken, cut) = self.parser.feed(&self.chunk);
+            self.chunk.advance(taken);
+            match cut {
+                Cut::Open => {}
+                Cut::Head => self.begun = self.arrived,
+                Cut::Part if self.parser.part().is_empty() => {}
+                Cut::Part => return Ok(true),
+                Cut::Malformed => self.lost += 1,
+                Cut::End => return Err(self.server.place.lost("the camera ended the stream")),
+            }
+        }
+        Ok(false)
+    }
+}
+
+/// Does the entry say how large its pictures are?
+pub(super) fn check_size(name: &str, (width, height): (u32, u32), wished: LanPicture) -> Result<(), DriverError> {
+    if (width, height) == (wished.width, wished.height) {
+        return Ok(());
+    }
+    Err(DriverError::Fatal(format!(
+        "its pictures are {width}x{height}: write width = {width} and height = {height} in [device.{name}.lan], or set \
+         the camera to {}x{}",
+        wished.width, wished.height
+    )))
+}
+
+/// The parser of an answer that is a stream of pictures.
+fn accept(name: &str, path: &str, reply: &Reply, max_bytes: usize) -> Result<Multipart, DriverError> {
+    let content = reply.header(CONTENT_TYPE).unwrap_or_default();
+    let fatal = |text: String| Err(DriverError::Fatal(text));
+    match reply.status {
+        status if status.is_success() => {}
+        StatusCode::NOT_FOUND => {
+            return fatal(format!("the camera has nothing at {path}: correct path in [device.{name}.lan]"));
+        }
+        StatusCode::UNAUTHORIZED | StatusCode::FORBIDDEN => {
+            return fatal(format!("the camera refuses {path} ({}): let it be seen without a password", reply.status));
+        }
+        status => return Err(DriverError::Retry(format!("the camera answers {status} to {path}"))),
+    }
+    match boundary(content).and_then(|boundary| Multipart::new(boundary, max_bytes)) {
+        Some(parser) => Ok(parser),
+        None => fatal(format!(
+            "{path} is {content:?} and no stream of pictures (multipart/x-mixed-replace): correct path in \
+             [device.{name}.lan]"
+        )),
+    }
+}

@@ -1,0 +1,156 @@
+//! Devices on the network, and behind network adapters.
+//!
+//! Where a device is reached comes with its attachment: the interface of its USB network adapter, or
+//! an address that was found. Sockets are bound to the interface where there is one, so that a device
+//! behind an adapter is never mistaken for another with the same address elsewhere.
+//!
+//! Nobody tells that a device on the network is gone: every wait here has an end, and what is heard is
+//! noted in the node for whoever keeps its lease (`hotplug::lan`).
+//!
+//! Invariant: what a server sends is bounded: headers, bodies, pictures, packets, and the time they take.
+//! Invariant: only the device the entry means is listened to.
+
+mod gopro;
+mod http;
+mod iphone;
+mod jpeg;
+mod mjpeg;
+mod multipart;
+mod place;
+mod udp;
+
+use std::time::Duration;
+
+use super::{DriverError, Reading};
+use crate::provenance::{Format, Negotiated};
+use crate::registry::{DeviceNode, DeviceSpec, LanFind, LanPicture, LanProtocol, LanSpec};
+use place::Place;
+
+/// A camera or a phone that sends nothing whole for this long is connected to anew. Six of these and the
+/// delays between them fit into the minute in which five restarts are allowed.
+const PATIENCE: Duration = Duration::from_secs(5);
+
+/// A device on the network.
+#[derive(Debug)]
+pub struct Lan {
+    protocol: Protocol,
+    description: String,
+    negotiated: Negotiated,
+}
+
+#[derive(Debug)]
+enum Protocol {
+    Mjpeg(mjpeg::Camera),
+    Udp(udp::Packets),
+    Gopro(gopro::Gopro),
+    Iphone(iphone::Phone),
+}
+
+impl Lan {
+    /// Opens the device of `spec` at `node`.
+    ///
+    /// # Errors
+    /// When it does not answer, answers something else, or a port of ours is taken.
+    pub async fn open(spec: &DeviceSpec, lan: &LanSpec, node: &DeviceNode) -> Result<Self, DriverError> {
+        let host = match &lan.find {
+            LanFind::Adapter { host } => *host,
+            LanFind::Mdns { .. } | LanFind::Host { .. } => None,
+        };
+        let place = Place::new(node, host)?;
+        let at = place.to_string();
+        let protocol = match &lan.protocol {
+            LanProtocol::Mjpeg { port, path, picture } => {
+                let server = place.server(port.unwrap_or_else(|| place.port().unwrap_or(80)))?;
+                Protocol::Mjpeg(mjpeg::Camera::open(&spec.name, server, path, *picture, spec.max_bytes).await?)
+            }
+            LanProtocol::Udp { port } => Protocol::Udp(udp::Packets::open(place, *port, spec.max_bytes)?),
+            LanProtocol::Gopro { port, download } => {
+                Protocol::Gopro(gopro::Gopro::open(&spec.name, &place, *port, *download).await?)
+            }
+            LanProtocol::Iphone { port, stream, picture } => {
+                Protocol::Iphone(iphone::Phone::open(&spec.name, place, *port, *stream, *picture, spec.max_bytes)?)
+            }
+        };
+        let (description, format) = describe(lan, &at);
+        let negotiated = Negotiated { card: protocol.card(), bus: Some(at), format, ..Negotiated::default() };
+        Ok(Self { protocol, description, negotiated })
+    }
+
+    /// The next sample.
+    ///
+    /// # Errors
+    /// [`DriverError::Gone`] when the network adapter was unplugged, [`DriverError::Retry`] when the device
+    /// ended its stream or fell silent.
+    pub async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
+        match &mut self.protocol {
+            Protocol::Mjpeg(camera) => camera.read().await,
+            Protocol::Udp(packets) => packets.read().await,
+            Protocol::Gopro(gopro) => gopro.read().await,
+            Protocol::Iphone(phone) => phone.read().await,
+        }
+    }
+
+    /// The episode that will be this file begins, or with `None` the one in progress ends: a camera that
+    /// records by itself does so with it. Returns at once.
+    ///
+    /// # Errors
+    /// When the device does not take it.
+    pub fn record(&mut self, episode: Option<std::path::PathBuf>) -> Result<(), DriverError> {
+        match &mut self.protocol {
+            Protocol::Gopro(gopro) => gopro.record(episode),
+            Protocol::Mjpeg(_) | Protocol::Udp(_) | Protocol::Iphone(_) => Ok(()),
+        }
+    }
+
+    /// Ends in order what the device does by itself.
+    pub async fn close(self) {
+        if let Protocol::Gopro(gopro) = self.protocol {
+            gopro.close().await;
+        }
+    }
+
+    /// What was opened, for people.
+    #[must_use]
+    pub fn description(&self) -> &str {
+        &self.description
+    }
+
+    /// The same for the recording.
+    #[must_use]
+    pub fn negotiated(&self) -> Negotiated {
+        self.negotiated.clone()
+    }
+}
+
+impl Protocol {
+    /// What the device says it is, if it says so.
+    fn card(&self) -> Option<String> {
+        match self {
+            Self::Gopro(gopro) => gopro.card(),
+            Self::Mjpeg(_) | Self::Udp(_) | Self::Iphone(_) => None,
+        }
+    }
+}
+
+fn describe(lan: &LanSpec, at: &str) -> (String, Option<Format>) {
+    let pictures = |picture: LanPicture| {
+        let LanPicture { width, height, .. } = picture;
+        // How many pictures a second come is not agreed upon.
+        Some(Format::Pictures { fourcc: "MJPG".to_owned(), width, height, fps: None })
+    };
+    match &lan.protocol {
+        LanProtocol::Mjpeg { path, picture, .. } => {
+            (format!("camera at {at}, MJPG {}x{} from {path}", picture.width, picture.height), pictures(*picture))
+        }
+        LanProtocol::Udp { port } => (format!("packets from {at} to port {port}"), None),
+        LanProtocol::Gopro { .. } => (format!("GoPro at {at}"), None),
+        LanProtocol::Iphone { port, picture, .. } => {
+            let shape = lan.shape();
+            let format = if shape.len() == 2 { pictures(*picture) } else { None };
+            (format!("phone at {at}, which connects to port {port}"), format)
+        }
+    }
+}
+
+#[doc(hidden)]
+pub mod fuzzing;

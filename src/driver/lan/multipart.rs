@@ -1,0 +1,285 @@
+//! Parts of `multipart/x-mixed-replace`, as cameras send them: the parts out of the bytes, without I/O.
+//!
+//! A part is a line that begins with `--` and the boundary, header lines, an empty line and the body
+//! (RFC 2046, 5.1.1). Cameras take liberties, and these are taken too: a boundary that is announced
+//! with its dashes or sent with more of them, lines that end in a newline alone, no empty line before
+//! a boundary, no `Content-Length`. With a `Content-Length` the body is so long; without one it ends at
+//! the next boundary.
+//!
+//! A part that is too large, or whose headers are, is given up and counted; what follows is looked for
+//! at the next boundary.
+//!
+//! Invariant: memory is bounded by the largest body permitted and [`LONGEST_HEAD`], whatever comes.
+//! Invariant: nothing is allocated for a part once the largest one has been seen.
+
+/// Header lines of a part, bytes: those of a camera are under 200.
+pub(super) const LONGEST_HEAD: usize = 8 << 10;
+/// A boundary has 70 characters at most (RFC 2046, 5.1.1).
+const LONGEST_BOUNDARY: usize = 70;
+
+/// What came of feeding bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Cut {
+    /// More bytes are needed.
+    Open,
+    /// The headers of a part are over: its body is on its way.
+    Head,
+    /// A part is complete: see [`Multipart::part`].
+    Part,
+    /// A part was given up.
+    Malformed,
+    /// The last part was announced.
+    End,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum State {
+    /// Lines are let go until one is the boundary.
+    Between,
+    Head,
+    /// So many bytes of the body are to come.
+    Sized(usize),
+    /// The body ends at a boundary.
+    Unsized,
+}
+
+/// See the module's comment.
+#[derive(Debug)]
+pub(super) struct Multipart {
+    /// Without the dashes it begins with.
+    boundary: Vec<u8>,
+    state: State,
+    line: Vec<u8>,
+    /// The line in progress is longer than any that matters.
+    line_is_long: bool,
+    head: usize,
+    length: Option<usize>,
+    body: Vec<u8>,
+    /// The part was told, and `body` begins anew.
+    told: bool,
+    largest: usize,
+}
+
+impl Multipart {
+    /// `boundary` as the `Content-Type` announces it; `None` if it is none.
+    pub(super) fn new(boundary: &str, largest: usize) -> Option<Self> {
+        let boundary = boundary.trim_start_matches('-').as_bytes();
+        if boundary.is_empty() || boundary.len() > LONGEST_BOUNDARY {
+            return None;
+        }
+        Some(Self {
+            boundary: boundary.to_vec(),
+            state: State::Between,
+            line: Vec::with_capacity(LONGEST_BOUNDARY),
+            line_is_long: false,
+            head: 0,
+            length: None,
+            body: Vec::new(),
+            told: false,
+            largest,
+        })
+    }
+
+    /// The body of the part that is complete.
+    pub(super) fn part(&self) -> &[u8] {
+        &self.body
+    }
+
+    /// Consumes bytes up to the end of at most one part.
+    pub(super) fn feed(&mut self, bytes: &[u8]) -> (usize, Cut) {
+        if std::mem::take(&mut self.told) {
+            self.body.clear();
+        }
+        let mut taken = 0;
+        while let Some(rest) = bytes.get(taken..)
+            && !rest.is_empty()
+        {
+            let (count, cut) = match self.state {
+                State::Sized(missing) => self.take_sized(rest, missing),
+                State::Unsized => self.take_unsized(rest),
+                State::Between | State::Head => self.take_line(rest),
+            };
+            taken += count;
+            if cut != Cut::Open {
+                return (taken, cut);
+            }
+        }
+        (taken, Cut::Open)
+    }
+
+    fn take_sized(&mut self, bytes: &[u8], missing: usize) -> (usize, Cut) {
+        let count = missing.min(bytes.len());
+        self.body.extend_from_slice(bytes.get(..count).unwrap_or_default());
+        if count < missing {
+            self.state = State::Sized(missing - count);
+            return (count, Cut::Open);
+        }
+        (count, self.complete())
+    }
+
+    /// Lines are looked at as they come: one that is the boundary was not part of the body.
+    fn take_unsized(&mut self, bytes: &[u8]) -> (usize, Cut) {
+        let end = bytes.iter().position(|byte| *byte == b'\n').map(|at| at + 1);
+        let count = end.unwrap_or(bytes.len());
+        let piece = bytes.get(..count).unwrap_or_default();
+        self.remember(piece);
+        self.body.extend_from_slice(piece);
+        // The boundary's own line, and the line end before it, are no part of the body.
+        if self.body.len() > self.largest.saturating_add(2 * LONGEST_BOUNDARY) {
+            self.body.clear();
+            return (count, self.give_up(end.is_some()));
+        }
+        if end.is_none() {
+            return (count, Cut::Open);
+        }
+        let Some(is_last) = self.boundary_line() else {
+            self.next_line();
+            return (count, Cut::Open);
+        };
+        let boundary = self.line.len();
+        let body = self.body.len().saturating_sub(boundary);
+        self.body.truncate(body);
+        for end in [b'\n', b'\r'] {
+            if self.body.last() == Some(&end) {
+                self.body.pop();
+            }
+        }
+        self.next_line();
+        let cut = if self.body.len() > self.largest { Cut::Malformed } else { Cut::Part };
+        self.told = true;
+        self.begin(is_last);
+        (count, cut)
+    }
+
+    fn take_line(&mut self, bytes: &[u8]) -> (usize, Cut) {
+        let end = bytes.iter().position(|byte| *byte == b'\n').map(|at| at + 1);
+        let count = end.unwrap_or(bytes.len());
+        self.remember(bytes.get(..count).unwrap_or_default());
+        if self.state == State::Head {
+            self.head += count;
+            if self.head > LONGEST_HEAD {
+                return (count, self.give_up(end.is_some()));
+            }
+        }
+        if end.is_none() {
+            return (count, Cut::Open);
+        }
+        let cut = match self.state {
+            State::Head => self.head_line(),
+            _ => match self.boundary_line() {
+                Some(true) => Cut::End,
+                Some(false) => {
+                    self.begin(false);
+                    Cut::Open
+                }
+                None => Cut::Open,
+            },
+        };
+        self.next_line();
+        (count, cut)
+    }
+
+    fn head_line(&mut self) -> Cut {
+        let line = self.line.trim_ascii();
+        if line.is_empty() && !self.line_is_long {
+            return match self.length {
+                Some(length) if length > self.largest => {
+                    self.state = State::Between;
+                    Cut::Malformed
+                }
+                Some(0) => self.complete(),
+                Some(length) => {
+                    self.state = State::Sized(length);
+                    Cut::Head
+                }
+                None => {
+                    self.state = State::Unsized;
+                    Cut::Head
+                }
+            };
+        }
+        if let Some(value) = header(line, b"content-length") {
+            // A length that is no number is none.
+            self.length = std::str::from_utf8(value).ok().and_then(|digits| digits.parse().ok());
+        }
+        Cut::Open
+    }
+
+    /// The body is whole.
+    fn complete(&mut self) -> Cut {
+        self.state = State::Between;
+        self.told = true;
+        Cut::Part
+    }
+
+    /// The part is let go, perhaps in the middle of a line.
+    fn give_up(&mut self, line_ended: bool) -> Cut {
+        self.state = State::Between;
+        if line_ended {
+            self.next_line();
+        }
+        Cut::Malformed
+    }
+
+    /// After a boundary.
+    fn begin(&mut self, is_last: bool) {
+        (self.head, self.length) = (0, None);
+        if !self.told {
+            self.body.clear();
+        }
+        self.state = if is_last { State::Between } else { State::Head };
+    }
+
+    /// Is the line a boundary, and if so the last one?
+    fn boundary_line(&self) -> Option<bool> {
+        if self.line_is_long {
+            return None;
+        }
+        let line = self.line.trim_ascii_end();
+        let dashes = line.iter().take_while(|byte| **byte == b'-').count();
+        let rest = line.get(dashes..)?.strip_prefix(self.boundary.as_slice())?;
+        match rest {
+            _ if dashes < 2 => None,
+            b"" => Some(false),
+            b"--" => Some(true),
+            _ => None,
+        }
+    }
+
+    fn remember(&mut self, piece: &[u8]) {
+        // Twice a boundary leaves room for its dashes, and for the header that matters.
+        if self.line.len() + piece.len() > 2 * LONGEST_BOUNDARY {
+            self.line_is_long = true;
+        } else {
+            self.line.extend_from_slice(piece);
+        }
+    }
+
+    fn next_line(&mut self) {
+        self.line.clear();
+        self.line_is_long = false;
+    }
+}
+
+/// The value of a header line, if it is the header of this name.
+fn header<'a>(line: &'a [u8], name: &[u8]) -> Option<&'a [u8]> {
+    let colon = line.iter().position(|byte| *byte == b':')?;
+    let (key, value) = line.split_at(colon);
+    key.trim_ascii().eq_ignore_ascii_case(name).then(|| value.get(1..).unwrap_or_default().trim_ascii())
+}
+
+/// The boundary that a `Content-Type` announces.
+pub(super) fn boundary(content_type: &str) -> Option<&str> {
+    let (kind, parameters) = content_type.split_once(';')?;
+    if !kind.trim().to_ascii_lowercase().starts_with("multipart/") {
+        return None;
+    }
+    let value = parameters.split(';').find_map(|parameter| {
+        let (key, value) = parameter.split_once('=')?;
+        key.trim().eq_ignore_ascii_case("boundary").then(|| value.trim().trim_matches('"'))
+    })?;
+    (!value.is_empty()).then_some(value)
+}
+
+#[cfg(test)]
+mod tests;

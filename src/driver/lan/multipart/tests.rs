@@ -1,0 +1,125 @@
+use proptest::prelude::*;
+
+use super::*;
+
+/// What a camera that sends `pieces` one after another is read as.
+fn parts(boundary: &str, largest: usize, pieces: &[&[u8]]) -> (Vec<Vec<u8>>, usize) {
+    let mut parser = Multipart::new(boundary, largest).expect("a boundary");
+    let (mut parts, mut malformed) = (Vec::new(), 0);
+    for mut piece in pieces.iter().copied() {
+        while !piece.is_empty() {
+            let (taken, cut) = parser.feed(piece);
+            piece = &piece[taken..];
+            match cut {
+                Cut::Part => parts.push(parser.part().to_vec()),
+                Cut::Malformed => malformed += 1,
+                Cut::Head => {}
+                Cut::Open => assert!(piece.is_empty(), "stopped early"),
+                Cut::End => return (parts, malformed),
+            }
+        }
+    }
+    (parts, malformed)
+}
+
+#[track_caller]
+fn check(stream: &[u8], expected: &[&[u8]], malformed: usize) {
+    for size in [1, 2, 3, 7, stream.len()] {
+        let pieces: Vec<_> = stream.chunks(size).collect();
+        let (parts, bad) = parts("frame", 64, &pieces);
+        assert_eq!((parts, bad), (expected.iter().map(|part| part.to_vec()).collect(), malformed), "pieces of {size}");
+    }
+}
+
+#[test]
+fn the_liberties_of_cameras() {
+    // As the book has it.
+    check(
+        b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: 3\r\n\r\nabc\r\n--frame\r\nContent-Length: 2\r\n\r\nde\r\n--frame--\r\n",
+        &[b"abc", b"de"],
+        0,
+    );
+    // A length, but no line end behind the body; newlines alone; odd case; a preamble.
+    check(b"hello\n----frame\ncontent-LENGTH:3\n\nabc--frame\nContent-Length: 2\n\nde", &[b"abc", b"de"], 0);
+    // No length: the body may hold line ends, dashes and nearly a boundary.
+    check(
+        b"--frame\r\n\r\na\r\n--fram\n-b--frame\r\n--frames\r\n\r\n--frame\r\n\r\nc\r\n--frame--\r\n",
+        &[b"a\r\n--fram\n-b--frame\r\n--frames\r\n", b"c"],
+        0,
+    );
+    // Nothing in it.
+    check(b"--frame\r\nContent-Length: 0\r\n\r\n\r\n--frame\r\nContent-Length: 1\r\n\r\na", &[b"", b"a"], 0);
+}
+
+#[test]
+fn what_is_wrong_costs_its_own_part() {
+    // Announces more than is permitted.
+    check(b"--frame\r\nContent-Length: 65\r\n\r\nabc\r\n--frame\r\nContent-Length: 1\r\n\r\na", &[b"a"], 1);
+    check(
+        b"--frame\r\nContent-Length: 99999999999999999999999\r\n\r\nabc\r\n--frame\r\n\r\na\r\n--frame\r\n",
+        &[b"abc", b"a"],
+        0,
+    );
+    // Sends more than is permitted.
+    let mut stream = b"--frame\r\n\r\n".to_vec();
+    stream.extend([b'x'; 300]);
+    stream.extend(b"\r\n--frame\r\nContent-Length: 1\r\n\r\na");
+    check(&stream, &[b"a"], 1);
+    // Headers without an end.
+    let mut stream = b"--frame\r\n".to_vec();
+    stream.extend(b"X-Header: y\r\n".repeat(LONGEST_HEAD / 10));
+    stream.extend(b"\r\n--frame\r\nContent-Length: 1\r\n\r\na");
+    check(&stream, &[b"a"], 1);
+    // A length that is too short: the rest is let go.
+    check(b"--frame\r\nContent-Length: 2\r\n\r\nabc\r\n--frame\r\nContent-Length: 1\r\n\r\na", &[b"ab", b"a"], 0);
+}
+
+#[test]
+fn a_boundary_is_announced_in_many_ways() {
+    for (content_type, expected) in [
+        ("multipart/x-mixed-replace;boundary=frame", Some("frame")),
+        ("Multipart/X-Mixed-Replace; charset=x; Boundary=\"--frame\"", Some("--frame")),
+        ("multipart/x-mixed-replace; boundary= frame ", Some("frame")),
+        ("multipart/x-mixed-replace", None),
+        ("multipart/x-mixed-replace; boundary=", None),
+        ("image/jpeg; boundary=frame", None),
+    ] {
+        assert_eq!(boundary(content_type), expected, "{content_type}");
+    }
+    assert!(Multipart::new("--", 1).is_none());
+    assert!(Multipart::new(&"x".repeat(71), 1).is_none());
+}
+
+proptest! {
+    #[test]
+    fn pieces_do_not_matter(bodies in prop::collection::vec(prop::collection::vec(0_u8..=255, 0..60), 1..6),
+                            sized in prop::collection::vec(any::<bool>(), 6), cuts in prop::collection::vec(1_usize..40, 0..30)) {
+        let mut stream = Vec::new();
+        for (body, sized) in bodies.iter().zip(&sized) {
+            stream.extend(b"--frame\r\n");
+            if *sized {
+                stream.extend(format!("Content-Length: {}\r\n", body.len()).bytes());
+            }
+            stream.extend(b"\r\n");
+            stream.extend(body);
+            stream.extend(b"\r\n");
+        }
+        stream.extend(b"--frame--\r\n");
+        let mut pieces = Vec::new();
+        let mut rest = stream.as_slice();
+        for cut in &cuts {
+            let (piece, after) = rest.split_at((*cut).min(rest.len()));
+            pieces.push(piece);
+            rest = after;
+        }
+        pieces.push(rest);
+        let (found, malformed) = parts("frame", 64, &pieces);
+        prop_assert_eq!((found, malformed), (bodies, 0));
+    }
+
+    #[test]
+    fn no_bytes_break_it(stream in prop::collection::vec(prop_oneof![Just(b'-'), Just(b'\n'), Just(b'\r'), Just(b'f'), any::<u8>()], 0..400)) {
+        let (found, _) = parts("f", 16, &[&stream]);
+        prop_assert!(found.iter().all(|part| part.len() <= 16));
+    }
+}

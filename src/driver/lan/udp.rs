@@ -1,0 +1,277 @@
+//! Packets that a device sends to a port of ours: LiDARs and the like. One packet is one sample, as it
+//! came, without its IP and UDP headers.
+//!
+//! A packet's time is the moment the kernel took it from the network (`SO_TIMESTAMPNS`, socket(7)). What
+//! the kernel had to drop because nobody read (`SO_RXQ_OVFL`), and packets larger than the entry permits,
+//! are counted as lost.
+//!
+//! Invariant: nothing is allocated for a packet.
+
+use std::io;
+use std::mem::{size_of, zeroed};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr};
+use std::os::fd::{AsRawFd, FromRawFd, OwnedFd};
+use std::time::Duration;
+
+use tokio::io::Interest;
+use tokio::io::unix::AsyncFd;
+use tokio::time::timeout;
+
+use super::place::{Place, port_error};
+use crate::driver::{DriverError, Reading};
+use crate::sample::{Encoding, FLAG_DEVICE_TIME};
+use crate::time::{Stamp, realtime_ns};
+
+/// What the kernel keeps for a reader that is late, bytes; it gives as much as `net.core.rmem_max` permits.
+const BACKLOG: libc::c_int = 8 << 20;
+/// The interface is looked for after so long without a packet.
+const ASK_AFTER: Duration = Duration::from_millis(500);
+/// A packet that waited longer than this has a time that the wall clock was set in between.
+const LONGEST_WAIT: Duration = Duration::from_secs(1);
+/// Room for the two control messages that are asked for.
+const CONTROL: usize = 128;
+
+/// See the module's comment.
+#[derive(Debug)]
+pub(super) struct Packets {
+    socket: AsyncFd<OwnedFd>,
+    place: Place,
+    packet: Vec<u8>,
+    filled: usize,
+    /// What the kernel dropped so far.
+    dropped: Option<u32>,
+    lost: u64,
+    /// Time of the newest packet.
+    last: Stamp,
+}
+
+/// A packet as the kernel gives it.
+#[derive(Debug, Clone, Copy)]
+struct Received {
+    length: usize,
+    is_cut: bool,
+    from: Option<IpAddr>,
+    /// Wall clock, ns since 1970.
+    stamp: Option<u64>,
+    /// Packets of this socket that were dropped before it, since it was opened.
+    dropped: Option<u32>,
+}
+
+impl Packets {
+    /// Hears what comes to `port`; a packet has at most `max_bytes`.
+    pub(super) fn open(place: Place, port: u16, max_bytes: usize) -> Result<Self, DriverError> {
+        let socket = bind(&place, port).map_err(|error| port_error(port, &error))?;
+        // SAFETY: the descriptor is owned by what is registered.
+        let socket = unsafe { AsyncFd::register_with_interest(socket, Interest::READABLE) }
+            .map_err(|error| DriverError::Retry(format!("port {port}: {}", io::Error::from(error))))?;
+        Ok(Self {
+            socket,
+            place,
+            packet: vec![0; max_bytes],
+            filled: 0,
+            dropped: None,
+            lost: 0,
+            last: Stamp::default(),
+        })
+    }
+
+    pub(super) async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
+        let captured = loop {
+            // A dropped future leaves every packet with the kernel.
+            let ready = timeout(ASK_AFTER, self.socket.readable()).await;
+            let Ok(ready) = ready else {
+                if self.place.is_gone() {
+                    return Err(DriverError::Gone);
+                }
+                continue;
+            };
+            let mut guard = ready.map_err(|error| self.place.lost(error))?;
+            let received = match receive(guard.get_inner(), &mut self.packet) {
+                Ok(received) => received,
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
+                    guard.clear_ready();
+                    continue;
+                }
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
+                Err(error) => return Err(self.place.lost(error)),
+            };
+            drop(guard);
+            if let Some(captured) = self.take(received) {
+                break captured;
+            }
+        };
+        let (stamp, flags) = captured;
+        Ok(Reading {
+            bytes: self.packet.get(..self.filled).unwrap_or_default(),
+            encoding: Encoding::Bytes,
+            captured: stamp,
+            flags,
+            width: 0,
+            height: 0,
+            lost: std::mem::take(&mut self.lost),
+        })
+    }
+
+    /// The packet's time and flags, if it is a sample.
+    fn take(&mut self, received: Received) -> Option<(Stamp, u32)> {
+        if let Some(dropped) = received.dropped {
+            let before = self.dropped.replace(dropped).unwrap_or(0);
+            self.lost += u64::from(dropped.wrapping_sub(before));
+        }
+        if !received.from.is_some_and(|from| self.place.means(from)) {
+            return None;
+        }
+        self.place.heard();
+        if received.is_cut {
+            self.lost += 1;
+            return None;
+        }
+        if received.length == 0 {
+            return None;
+        }
+        self.filled = received.length;
+        let (stamp, flags) = stamp(received.stamp, Stamp::now(), realtime_ns());
+        // The two clocks are read one after the other, which is not always equally quick.
+        self.last = self.last.max(stamp);
+        Some((self.last, flags))
+    }
+}
+
+/// The moment on our clock of a moment on the wall clock, which the kernel gives; the moment of arrival
+/// where that cannot be right.
+fn stamp(kernel: Option<u64>, now: Stamp, wall: u64) -> (Stamp, u32) {
+    let waited = kernel.and_then(|kernel| wall.checked_sub(kernel)).map(Duration::from_nanos);
+    match waited.filter(|waited| *waited <= LONGEST_WAIT) {
+        Some(waited) => (now.before(waited), FLAG_DEVICE_TIME),
+        None => (now, 0),
+    }
+}
+
+fn bind(place: &Place, port: u16) -> io::Result<OwnedFd> {
+    let is_v6 = matches!(place.peer(), Some(IpAddr::V6(_)));
+    let family = if is_v6 { libc::AF_INET6 } else { libc::AF_INET };
+    let kind = libc::SOCK_DGRAM | libc::SOCK_NONBLOCK | libc::SOCK_CLOEXEC;
+    // SAFETY: takes no pointers.
+    let descriptor = unsafe { libc::socket(family, kind, 0) };
+    if descriptor < 0 {
+        return Err(io::Error::last_os_error());
+    }
+    // SAFETY: just opened, and ours alone.
+    let socket = unsafe { OwnedFd::from_raw_fd(descriptor) };
+    set(&socket, libc::SO_TIMESTAMPNS, &1_i32)?;
+    set(&socket, libc::SO_RXQ_OVFL, &1_i32)?;
+    set(&socket, libc::SO_RCVBUF, &BACKLOG)?;
+    if let Some(interface) = place.interface() {
+        set_bytes(&socket, libc::SO_BINDTODEVICE, interface.as_bytes())?;
+    }
+    let port = port.to_be();
+    let (family_v4, family_v6) = (libc::AF_INET as libc::sa_family_t, libc::AF_INET6 as libc::sa_family_t);
+    let result = if is_v6 {
+        // SAFETY: all zeroes are a valid address.
+        let mut address: libc::sockaddr_in6 = unsafe { zeroed() };
+        (address.sin6_family, address.sin6_port) = (family_v6, port);
+        // SAFETY: a pointer to an address of this family and size, for the call.
+        unsafe { libc::bind(descriptor, (&raw const address).cast(), length_of::<libc::sockaddr_in6>()) }
+    } else {
+        // SAFETY: all zeroes are a valid address.
+        let mut address: libc::sockaddr_in = unsafe { zeroed() };
+        (address.sin_family, address.sin_port) = (family_v4, port);
+        // SAFETY: a pointer to an address of this family and size, for the call.
+        unsafe { libc::bind(descriptor, (&raw const address).cast(), length_of::<libc::sockaddr_in>()) }
+    };
+    if result == 0 { Ok(socket) } else { Err(io::Error::last_os_error()) }
+}
+
+fn length_of<T>() -> libc::socklen_t {
+    libc::socklen_t::try_from(size_of::<T>()).unwrap_or(0)
+}
+
+fn set(socket: &OwnedFd, option: libc::c_int, value: &libc::c_int) -> io::Result<()> {
+    set_bytes(socket, option, &value.to_ne_bytes())
+}
+
+fn set_bytes(socket: &OwnedFd, option: libc::c_int, value: &[u8]) -> io::Result<()> {
+    let length = libc::socklen_t::try_from(value.len()).map_err(|_| io::ErrorKind::InvalidInput)?;
+    // SAFETY: the value is read for the call, with its length.
+    let result =
+        unsafe { libc::setsockopt(socket.as_raw_fd(), libc::SOL_SOCKET, option, value.as_ptr().cast(), length) };
+    if result == 0 { Ok(()) } else { Err(io::Error::last_os_error()) }
+}
+
+/// The control messages lie as the kernel aligns them.
+#[repr(C, align(8))]
+struct Control([u8; CONTROL]);
+
+fn receive(socket: &OwnedFd, packet: &mut [u8]) -> io::Result<Received> {
+    let mut control = Control([0; CONTROL]);
+    // SAFETY: all zeroes are valid for these.
+    let (mut from, mut message): (libc::sockaddr_storage, libc::msghdr) = unsafe { (zeroed(), zeroed()) };
+    let mut into = libc::iovec { iov_base: packet.as_mut_ptr().cast(), iov_len: packet.len() };
+    message.msg_name = (&raw mut from).cast();
+    message.msg_namelen = length_of::<libc::sockaddr_storage>();
+    message.msg_iov = &raw mut into;
+    message.msg_iovlen = 1;
+    message.msg_control = control.0.as_mut_ptr().cast();
+    message.msg_controllen = CONTROL;
+    // SAFETY: every pointer of the message is to a local or the lent packet, with its length.
+    let length = unsafe { libc::recvmsg(socket.as_raw_fd(), &raw mut message, 0) };
+    let length = usize::try_from(length).map_err(|_| io::Error::last_os_error())?;
+    let (mut stamp, mut dropped) = (None, None);
+    // SAFETY: the kernel wrote whole control messages of the length it says; `control` is still there.
+    let mut header = unsafe { libc::CMSG_FIRSTHDR(&raw const message) };
+    // SAFETY: not null, so it points to a header within `control`.
+    while let Some(found) = unsafe { header.as_ref() } {
+        // SAFETY: the data of each type is what socket(7) says, perhaps unaligned.
+        unsafe {
+            let data = libc::CMSG_DATA(header);
+            match (found.cmsg_level, found.cmsg_type) {
+                (libc::SOL_SOCKET, libc::SCM_TIMESTAMPNS) => {
+                    stamp = nanoseconds(data.cast::<libc::timespec>().read_unaligned());
+                }
+                (libc::SOL_SOCKET, libc::SO_RXQ_OVFL) => dropped = Some(data.cast::<u32>().read_unaligned()),
+                _ => {}
+            }
+            header = libc::CMSG_NXTHDR(&raw const message, header);
+        }
+    }
+    let is_cut = message.msg_flags & libc::MSG_TRUNC != 0;
+    Ok(Received { length, is_cut, from: address(&from), stamp, dropped })
+}
+
+fn nanoseconds(time: libc::timespec) -> Option<u64> {
+    u64::try_from(time.tv_sec).ok()?.checked_mul(1_000_000_000)?.checked_add(u64::try_from(time.tv_nsec).ok()?)
+}
+
+fn address(from: &libc::sockaddr_storage) -> Option<IpAddr> {
+    let from = &raw const *from;
+    // SAFETY: of either family the storage holds that type, and is large enough and aligned for both.
+    unsafe {
+        match i32::from((*from).ss_family) {
+            libc::AF_INET => {
+                Some(Ipv4Addr::from(u32::from_be((*from.cast::<libc::sockaddr_in>()).sin_addr.s_addr)).into())
+            }
+            libc::AF_INET6 => Some(Ipv6Addr::from((*from.cast::<libc::sockaddr_in6>()).sin6_addr.s6_addr).into()),
+            _ => None,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_kernels_time_becomes_ours_where_it_can_be_right() {
+        let (now, wall) = (Stamp(5_000_000_000), 1_700_000_000_000_000_000);
+        for (kernel, expected) in [
+            (Some(wall - 1_000), (Stamp(4_999_999_000), FLAG_DEVICE_TIME)),
+            (Some(wall), (now, FLAG_DEVICE_TIME)),
+            // The clock was set back, or far ahead, while the packet waited.
+            (Some(wall + 1), (now, 0)),
+            (Some(wall - 2_000_000_000), (now, 0)),
+            (None, (now, 0)),
+        ] {
+            assert_eq!(stamp(kernel, now, wall), expected, "{kernel:?}");
+        }
+    }
+}

@@ -1,0 +1,314 @@
+//! Devices that announce a service (mDNS, RFC 6762; DNS-SD, RFC 6763).
+//!
+//! The library keeps what was announced until it expires, which by default is after two minutes. So a
+//! device that its driver does not hear is asked again once a lease (RFC 6762, 10.4), and what does not
+//! answer by the end of the next is told as removed. A goodbye is told one second after it came: the
+//! library keeps to RFC 6762, 10.1, in which that is the time for somebody else to object. mdns-sd 0.21
+//! cannot ask again for an instance with a dot in its name: that one is gone when it says so, when its
+//! driver hears nothing more, or after two minutes.
+//!
+//! Invariant: of an announcement only the names and numbers are taken, each bounded.
+
+use std::collections::BTreeMap;
+use std::future::Future;
+use std::net::{IpAddr, SocketAddr, SocketAddrV6};
+use std::time::Duration;
+
+use mdns_sd::{Receiver, ResolvedService, ScopedIp, ServiceDaemon, ServiceEvent, ServiceInfo};
+use tokio::time::{MissedTickBehavior, interval};
+
+use super::super::Witness;
+use super::watch::{LOOK_EVERY, Watch};
+use crate::registry::LanSpec;
+use crate::time::Stamp;
+
+/// More devices of one service than a rig has.
+const MOST_INSTANCES: usize = 64;
+/// Addresses of an instance that are looked at.
+const MOST_ADDRESSES: usize = 8;
+/// A name of an instance has 63 bytes (RFC 6763, 4.1.1).
+const LONGEST_NAME: usize = 63;
+/// The library tells of an answer that did not come at the end of the lease, give or take this.
+const MARGIN: Duration = Duration::from_millis(100);
+/// From the end of a lease to the next question, so that what is told of the one is not taken for the other.
+const PAUSE: Duration = Duration::from_millis(200);
+/// What the app on the phone looks for, to know where to connect to.
+const VIO_SERVER: &str = "_vioserver._tcp.local.";
+
+/// The thread that speaks mDNS, which ends with this.
+pub(super) struct Browser {
+    daemon: Option<ServiceDaemon>,
+}
+
+impl std::fmt::Debug for Browser {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Browser").finish_non_exhaustive()
+    }
+}
+
+/// An entry that is found by a service.
+#[derive(Debug)]
+pub(super) struct Wanted {
+    watch: Watch,
+    /// Only the instance of this name is meant.
+    instance: Option<String>,
+    /// The port at which the device is reached, if not the announced one.
+    port: Option<u16>,
+    /// The instance that is the entry's device now.
+    current: Option<String>,
+    /// Since when the device has been asked again.
+    asked: Option<Stamp>,
+}
+
+/// An instance that is announced.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Found {
+    /// Its own name, without that of the service.
+    name: String,
+    /// The best first, at least one.
+    addresses: Vec<SocketAddr>,
+}
+
+impl Browser {
+    /// `phones` are the ports of ours that phones connect to; they are announced.
+    pub(super) fn open(phones: &[u16]) -> Option<Self> {
+        let daemon = match ServiceDaemon::new() {
+            Ok(daemon) => daemon,
+            Err(error) => {
+                tracing::error!(%error, "devices that announce themselves are not found: mDNS cannot be spoken");
+                return None;
+            }
+        };
+        for port in phones {
+            if let Err(error) = announce(&daemon, *port) {
+                tracing::error!(%error, port, "phones are not told where to connect to");
+            }
+        }
+        Some(Self { daemon: Some(daemon) })
+    }
+
+    /// Looks after the entries of a service.
+    pub(super) fn watch(&self, service: &str, wanted: Vec<Wanted>) -> impl Future<Output = ()> + use<> {
+        let domain = format!("{service}.local.");
+        let daemon = self.daemon.clone();
+        async move {
+            let Some(daemon) = daemon else { return };
+            match daemon.browse(&domain) {
+                Ok(events) => Service { domain, wanted, known: BTreeMap::new() }.run(&daemon, events).await,
+                Err(error) => tracing::error!(%error, service = domain, "devices of this service are not found"),
+            }
+        }
+    }
+}
+
+impl Drop for Browser {
+    fn drop(&mut self) {
+        // Says goodbye for what was announced; nobody waits for it.
+        if let Some(daemon) = self.daemon.take() {
+            let _ = daemon.shutdown();
+        }
+    }
+}
+
+impl Wanted {
+    pub(super) fn new(watch: Watch, instance: Option<String>, lan: &LanSpec) -> Self {
+        Self { watch, instance, port: lan.port(), current: None, asked: None }
+    }
+}
+
+/// The entries of one service, and what is announced of it.
+struct Service {
+    domain: String,
+    wanted: Vec<Wanted>,
+    /// What is announced, by full name.
+    known: BTreeMap<String, Found>,
+}
+
+impl Service {
+    async fn run(mut self, daemon: &ServiceDaemon, events: Receiver<ServiceEvent>) {
+        let mut look = interval(LOOK_EVERY);
+        look.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        loop {
+            tokio::select! {
+                event = events.recv_async() => match event {
+                    Ok(ServiceEvent::ServiceResolved(service)) => {
+                        if let Some((full, found)) = found(&service, &self.domain) {
+                            self.announced(full, found, Stamp::now()).await;
+                        }
+                    }
+                    Ok(ServiceEvent::ServiceRemoved(_, full)) => self.removed(&full, Stamp::now()).await,
+                    Ok(_) => {}
+                    Err(_) => {
+                        tracing::error!(service = self.domain, "mDNS ended: devices of this service are not found any more");
+                        return;
+                    }
+                },
+                _ = look.tick() => for (full, limit) in self.look(Stamp::now()).await {
+                    // Refused only while the library is busy: asked again a lease later.
+                    let _ = daemon.verify(full, limit);
+                },
+            }
+        }
+    }
+
+    async fn announced(&mut self, full: String, found: Found, now: Stamp) {
+        if self.known.len() >= MOST_INSTANCES && !self.known.contains_key(&full) {
+            return;
+        }
+        self.known.insert(full, found);
+        self.assign(now).await;
+    }
+
+    /// Gives what is announced to the entries, each to one.
+    async fn assign(&mut self, now: Stamp) {
+        for index in 0..self.wanted.len() {
+            let Some(wanted) = self.wanted.get(index) else { continue };
+            let full = wanted.current.clone().filter(|full| self.known.contains_key(full)).or_else(|| {
+                let is_free = |full: &&String| !self.wanted.iter().any(|other| other.current.as_ref() == Some(full));
+                let fits =
+                    |found: &Found| wanted.instance.as_ref().is_none_or(|name| name.eq_ignore_ascii_case(&found.name));
+                self.known.iter().filter(|(_, found)| fits(found)).map(|(full, _)| full).find(is_free).cloned()
+            });
+            let Some(found) = full.as_ref().and_then(|full| self.known.get(full)) else { continue };
+            let at = |address: &SocketAddr| {
+                let mut address = *address;
+                address.set_port(wanted.port.unwrap_or(address.port()));
+                address
+            };
+            let kept = wanted.watch.address().filter(|kept| found.addresses.iter().any(|found| at(found) == *kept));
+            // Announcements come in parts: an address that is good enough stays.
+            let Some(address) = kept.or_else(|| found.addresses.first().map(at)) else { continue };
+            let Some(wanted) = self.wanted.get_mut(index) else { continue };
+            (wanted.current, wanted.asked) = (full, None);
+            wanted.watch.found(address, Some(&found.name), now).await;
+        }
+    }
+
+    async fn removed(&mut self, full: &str, now: Stamp) {
+        self.known.remove(full);
+        for wanted in self.wanted.iter_mut().filter(|wanted| wanted.current.as_deref() == Some(full)) {
+            let witness = wanted.witness(now);
+            wanted.asked = None;
+            // Announcements get lost in the air; what the driver hears says more.
+            if witness == Witness::Lease && wanted.watch.is_sending(wanted.watch.length(), now) {
+                tracing::debug!(device = wanted.watch.entry(), "its announcement expired, but it is heard");
+                continue;
+            }
+            wanted.current = None;
+            wanted.watch.gone(witness, now).await;
+        }
+        self.assign(now).await;
+    }
+
+    /// Looks at leases and links; says which instances are to be asked again, and how long they have.
+    async fn look(&mut self, now: Stamp) -> Vec<(String, Duration)> {
+        let mut questions = Vec::new();
+        for wanted in &mut self.wanted {
+            let length = wanted.watch.length();
+            let announced = wanted.current.as_ref().and_then(|full| self.known.get_key_value(full));
+            if let (Some((full, found)), true) = (announced, wanted.watch.is_there()) {
+                let is_due = wanted.asked.is_none_or(|asked| now.since(asked) >= length + PAUSE);
+                // See the module's comment.
+                let can_be_asked = !found.name.contains(['.', '\\']);
+                if is_due && can_be_asked && !wanted.watch.is_sending(length, now) {
+                    questions.push((full.clone(), length));
+                    wanted.asked = Some(now);
+                }
+                wanted.watch.renew(now);
+            }
+            wanted.watch.look(now).await;
+            if !wanted.watch.is_there() {
+                wanted.current = None;
+            }
+        }
+        questions
+    }
+}
+
+impl Wanted {
+    /// Who says that its device is gone: an answer that did not come, or a goodbye.
+    fn witness(&self, now: Stamp) -> Witness {
+        match self.asked {
+            Some(asked) if now.since(asked).abs_diff(self.watch.length()) <= MARGIN => Witness::Lease,
+            _ => Witness::Goodbye,
+        }
+    }
+}
+
+fn found(service: &ResolvedService, domain: &str) -> Option<(String, Found)> {
+    let name = service.fullname.strip_suffix(domain)?.strip_suffix('.')?;
+    let addresses = ordered(service.addresses.iter().filter_map(scoped), service.port);
+    (!addresses.is_empty()).then(|| (service.fullname.clone(), Found { name: unescaped(name), addresses }))
+}
+
+/// An address with the scope that a link-local one needs. Of this computer's own only what was announced
+/// on it: nobody else has a device there.
+fn scoped(ip: &ScopedIp) -> Option<(IpAddr, u32)> {
+    let is_own = match ip {
+        ScopedIp::V4(v4) => v4.interface_ids().iter().any(|interface| interface.name == "lo"),
+        ScopedIp::V6(v6) => v6.scope_id().name == "lo",
+        _ => false,
+    };
+    if ip.is_loopback() && !is_own {
+        return None;
+    }
+    Some(match ip {
+        ScopedIp::V6(v6) if v6.addr().is_unicast_link_local() => ((*v6.addr()).into(), v6.scope_id().index),
+        ip => (ip.to_ip_addr(), 0),
+    })
+}
+
+/// Of others before our own, IPv4 first, then what needs no scope, then the rest; in the order of numbers,
+/// so that it is the same one each time.
+fn ordered(addresses: impl Iterator<Item = (IpAddr, u32)>, port: u16) -> Vec<SocketAddr> {
+    let mut usable: Vec<_> = addresses.filter(|(ip, _)| !ip.is_unspecified() && !ip.is_multicast()).collect();
+    usable.sort_by_key(|(ip, scope)| (ip.is_loopback(), ip.is_ipv6(), *scope, *ip));
+    let socket = |(ip, scope)| match ip {
+        IpAddr::V4(ip) => (ip, port).into(),
+        IpAddr::V6(ip) => SocketAddrV6::new(ip, port, 0, scope).into(),
+    };
+    usable.into_iter().take(MOST_ADDRESSES).map(socket).collect()
+}
+
+/// A label as it is written in DNS: `\.` is a dot, `\065` a byte.
+fn unescaped(label: &str) -> String {
+    let mut name = Vec::new();
+    let mut rest = label.as_bytes();
+    while let Some((first, after)) = rest.split_first()
+        && name.len() < LONGEST_NAME
+    {
+        rest = after;
+        if *first != b'\\' {
+            name.push(*first);
+            continue;
+        }
+        let digits = after.get(..3).and_then(|digits| std::str::from_utf8(digits).ok()?.parse::<u8>().ok());
+        if let Some(byte) = digits {
+            name.push(byte);
+            rest = after.get(3..).unwrap_or_default();
+        } else if let Some((escaped, after)) = after.split_first() {
+            name.push(*escaped);
+            rest = after;
+        }
+    }
+    String::from_utf8_lossy(&name).into_owned()
+}
+
+/// Tells phones where to connect to.
+fn announce(daemon: &ServiceDaemon, port: u16) -> mdns_sd::Result<()> {
+    let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+    let legal = |c: &char| c.is_ascii_alphanumeric() || *c == '-';
+    let host: String = host.trim().chars().filter(legal).take(LONGEST_NAME).collect();
+    let host = if host.is_empty() { "rapid".to_owned() } else { host };
+    let (instance, server) = (format!("rapid on {host} {port}"), format!("{host}.local."));
+    let info = ServiceInfo::new(VIO_SERVER, &instance, &server, "", port, &[("node_name", "rapid")][..])?;
+    daemon.register(info.enable_addr_auto())
+}
+
+/// Whatever a label is, its name is bounded.
+pub(super) fn fuzz(label: &str) {
+    assert!(unescaped(label).len() <= 3 * LONGEST_NAME, "a name of an instance is too long");
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,105 @@
+//! Devices at a fixed address: asked once a second whether they are there.
+//!
+//! Invariant: a device that its driver hears is not asked; it may take one connection alone.
+
+use std::future::Future;
+use std::io;
+use std::net::SocketAddr;
+use std::pin::Pin;
+use std::time::Duration;
+
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::{TcpStream, UdpSocket};
+use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
+
+use super::super::Witness;
+use super::watch::{LOOK_EVERY, Watch};
+use crate::registry::{Heard, Probe};
+use crate::time::Stamp;
+
+/// From one question to the next; also how long an answer may take.
+const EVERY: Duration = Duration::from_secs(1);
+
+/// What came of asking.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Answer {
+    /// It is there.
+    Here,
+    /// Its address answers, and nobody is at the port.
+    Nobody,
+    /// None.
+    Silence,
+}
+
+/// Looks after an entry, whose device is at `server` and is asked at `asked`.
+pub(super) async fn watch(mut watch: Watch, server: SocketAddr, asked: SocketAddr, probe: Probe) {
+    let mut look = interval(LOOK_EVERY);
+    look.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut answer: Pin<Box<dyn Future<Output = Answer> + Send>> = Box::pin(ask(probe, asked));
+    loop {
+        tokio::select! {
+            answered = &mut answer => {
+                match answered {
+                    Answer::Here => watch.found(server, None, Stamp::now()).await,
+                    Answer::Nobody => watch.gone(Witness::Lease, Stamp::now()).await,
+                    Answer::Silence => {}
+                }
+                let driver_has_port = probe == Probe::Udp && watch.is_there();
+                answer = Box::pin(next(watch.heard(), driver_has_port, probe, asked));
+            }
+            _ = look.tick() => watch.look(Stamp::now()).await,
+        }
+    }
+}
+
+/// The next question, or none if the device's driver hears it, or has the port it would be heard at.
+async fn next(heard: Heard, driver_has_port: bool, probe: Probe, asked: SocketAddr) -> Answer {
+    sleep(EVERY).await;
+    let is_heard = Stamp::now().since(heard.at()) < EVERY;
+    if is_heard || driver_has_port { Answer::Silence } else { ask(probe, asked).await }
+}
+
+async fn ask(probe: Probe, asked: SocketAddr) -> Answer {
+    let answer = async {
+        match probe {
+            Probe::Tcp => TcpStream::connect(asked).await.map(|_| Answer::Here),
+            Probe::Http => http(asked).await,
+            Probe::Udp => udp(asked).await,
+        }
+    };
+    match timeout(EVERY, answer).await {
+        Ok(Ok(answer)) => answer,
+        Ok(Err(error)) if error.kind() == io::ErrorKind::ConnectionRefused => Answer::Nobody,
+        Ok(Err(error)) => {
+            tracing::debug!(%asked, %error, "no answer");
+            Answer::Silence
+        }
+        Err(_) => Answer::Silence,
+    }
+}
+
+/// Whatever its status is, an answer is one.
+async fn http(asked: SocketAddr) -> io::Result<Answer> {
+    const BEGINNING: &[u8] = b"HTTP/1.";
+    let mut stream = TcpStream::connect(asked).await?;
+    stream.write_all(format!("HEAD / HTTP/1.1\r\nHost: {asked}\r\nConnection: close\r\n\r\n").as_bytes()).await?;
+    let mut beginning = [0; BEGINNING.len()];
+    stream.read_exact(&mut beginning).await?;
+    Ok(if beginning == BEGINNING { Answer::Here } else { Answer::Silence })
+}
+
+/// Hears a packet of the device at a port of ours, which is given back at once.
+async fn udp(asked: SocketAddr) -> io::Result<Answer> {
+    let any: SocketAddr =
+        if asked.is_ipv4() { ([0; 4], asked.port()).into() } else { ([0_u16; 8], asked.port()).into() };
+    let socket = UdpSocket::bind(any).await?;
+    loop {
+        let (_, from) = socket.recv_from(&mut [0; 1]).await?;
+        if from.ip().to_canonical() == asked.ip().to_canonical() {
+            return Ok(Answer::Here);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

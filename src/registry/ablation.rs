@@ -1,0 +1,123 @@
+//! `ablation.toml`: which configurations of a gripper are compared, and how often.
+//!
+//! ```toml
+//! task = "place block"            # optional: episodes of other tasks do not count
+//! episodes = 20                   # of each configuration, default 10
+//! tag = "finger"                  # the tag that tells the finger, the default
+//! fingers = ["rigid", "soft"]
+//! modalities = ["vision", "vision+tactile"]
+//! [words]                         # optional: the entries that a word of `modalities` means
+//! vision = ["cam_wrist"]
+//! ```
+//!
+//! Invariant: no text makes this panic; all problems are reported at once.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use super::diagnostic::RegistryErrors;
+use super::parse::read_file;
+use super::section::{Problems, Section, file_label, read};
+
+/// What is compared.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct AblationPlan {
+    /// Episodes of other tasks do not count, if given.
+    pub task: Option<String>,
+    /// Episodes of each configuration.
+    pub episodes: usize,
+    /// Key of the tag whose value is the finger.
+    pub tag: String,
+    /// Fingers, by the values of that tag.
+    pub fingers: Vec<String>,
+    /// Sets of modalities, words with `+` between.
+    pub modalities: Vec<String>,
+    /// The entries that a word means.
+    pub words: BTreeMap<String, Vec<String>>,
+}
+
+impl Default for AblationPlan {
+    fn default() -> Self {
+        Self {
+            task: None,
+            episodes: 10,
+            tag: "finger".to_owned(),
+            fingers: Vec::new(),
+            modalities: Vec::new(),
+            words: BTreeMap::new(),
+        }
+    }
+}
+
+impl AblationPlan {
+    /// Reads a plan.
+    ///
+    /// # Errors
+    /// When the file cannot be read or says something wrong: then all of it.
+    pub fn load(path: &Path) -> Result<Self, RegistryErrors> {
+        Self::parse(&read_file(path, "write one, or say --finger and --modality")?, path)
+    }
+
+    /// Reads the text of a plan; `path` names it in messages.
+    ///
+    /// # Errors
+    /// All that is wrong with the text.
+    pub fn parse(text: &str, path: &Path) -> Result<Self, RegistryErrors> {
+        let mut problems = Problems::new(file_label(Some(path), ""), text);
+        let document = read(text, &mut problems);
+        problems.check()?;
+        let root = Section::new(document.get_ref(), 0, String::new());
+        root.allow(&mut problems, &["task", "episodes", "tag", "fingers", "modalities", "words"]);
+        let task = root.text(&mut problems, "task").map(|task| task.value.to_owned());
+        let mut plan = Self { task, ..Self::default() };
+        if let Some(episodes) = root.integer(&mut problems, "episodes", 1..=1_000_000) {
+            plan.episodes = usize::try_from(episodes.value).unwrap_or(plan.episodes);
+        }
+        if let Some(tag) = root.text(&mut problems, "tag") {
+            tag.value.clone_into(&mut plan.tag);
+        }
+        for (key, list) in [("fingers", &mut plan.fingers), ("modalities", &mut plan.modalities)] {
+            if !root.has(key) {
+                root.missing(&mut problems, key, &format!("write {key} = [\"...\", \"...\"]"));
+            }
+            *list = root.texts(&mut problems, key).unwrap_or_default();
+            if root.has(key) && list.is_empty() && problems.is_empty() {
+                root.report(&mut problems, key, format!("{key} is empty"), "name at least one");
+            }
+            if let Some(twice) = list.iter().enumerate().find(|(at, word)| list.iter().take(*at).any(|w| w == *word)) {
+                root.report(&mut problems, key, format!("{:?} stands twice", twice.1), "remove one");
+            }
+        }
+        if let Some(words) = root.table(&mut problems, "words") {
+            for (_, word, _) in words.fields() {
+                if let Some(entries) = words.texts(&mut problems, word) {
+                    plan.words.insert(word.to_owned(), entries);
+                }
+            }
+        }
+        problems.check()?;
+        Ok(plan)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_plan_is_read_or_everything_wrong_with_it_is_said() {
+        let path = Path::new("ablation.toml");
+        let text = "task = \"t\"\nepisodes = 3\nfingers = [\"rigid\"]\nmodalities = [\"vision\"]\n[words]\nvision = [\"cam\"]\n";
+        let plan = AblationPlan::parse(text, path).unwrap();
+        assert_eq!(
+            (plan.episodes, plan.tag.as_str(), plan.fingers.as_slice()),
+            (3, "finger", &["rigid".to_owned()][..])
+        );
+        assert_eq!(plan.words["vision"], ["cam"]);
+        let wrong = "episodes = 0\nfingers = [\"a\", \"a\"]\nmodality = []\n";
+        let said = AblationPlan::parse(wrong, path).unwrap_err().to_string();
+        for expected in ["out of range", "\"a\" stands twice", "unknown key \"modality\"", "modalities is missing"] {
+            assert!(said.contains(expected), "{said}");
+        }
+    }
+}

@@ -1,0 +1,282 @@
+//! Changing `devices.toml` without touching what a person wrote in it: entries are added at its end
+//! and taken out whole.
+//!
+//! Pure: from one text to the next; who writes the file parses it first.
+//!
+//! Invariant: every byte of the old text is in the new one, but for those of an entry taken out.
+//! Invariant: a value, which a device may have chosen, is written as the TOML text that means it, and
+//! a comment is one line.
+
+use std::ops::Range;
+
+use toml_edit::{Array, Document, DocumentMut, Item, Table, Value};
+
+/// A value of a key.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Setting {
+    /// Text.
+    Text(String),
+    /// A whole number.
+    Whole(i64),
+    /// A list of texts.
+    Texts(Vec<String>),
+    /// As a person typed it: a number, a list, true or false if TOML takes it for one, otherwise text.
+    Typed(String),
+}
+
+/// An entry to be added.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NewEntry {
+    /// Name: the table is `[device.NAME]`.
+    pub name: String,
+    /// Lines above it.
+    pub comments: Vec<String>,
+    /// Keys and values in their order; `camera.width` stands in the table `[device.NAME.camera]`.
+    pub keys: Vec<(String, Setting)>,
+    /// The entry is written as a comment, for a person to complete: why.
+    pub held_back: Option<String>,
+}
+
+/// Why a text cannot be changed.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum EditError {
+    /// It is no TOML.
+    #[error("not TOML: {0}")]
+    Syntax(String),
+    /// A key of a new entry is no key.
+    #[error("{key:?} cannot be set: {reason}")]
+    Key {
+        /// The key.
+        key: String,
+        /// Why.
+        reason: &'static str,
+    },
+    /// There is no such entry.
+    #[error("no entry [device.{0}]")]
+    NoEntry(String),
+    /// It is not written as a table of its own.
+    #[error("[device.{0}] is not written as a table under its own header: take it out by hand")]
+    NoHeader(String),
+}
+
+/// `text` with the entries at its end.
+///
+/// # Errors
+/// When a key is none, or is given twice with different meanings.
+pub fn append(text: &str, entries: &[NewEntry]) -> Result<String, EditError> {
+    let mut added = String::new();
+    for entry in entries {
+        added.push('\n');
+        added.push_str(&written(entry)?);
+    }
+    let mut new = text.to_owned();
+    if !new.is_empty() && !new.ends_with('\n') {
+        new.push('\n');
+    }
+    let added = if new.is_empty() { added.trim_start_matches('\n') } else { &added };
+    // A file from elsewhere keeps its kind of line ends.
+    if text.contains("\r\n") {
+        new.push_str(&added.replace('\n', "\r\n"));
+    } else {
+        new.push_str(added);
+    }
+    Ok(new)
+}
+
+/// The lines of one entry, each with its end.
+///
+/// # Errors
+/// As [`append`].
+pub fn written(entry: &NewEntry) -> Result<String, EditError> {
+    let mut device = Table::new();
+    for (key, setting) in &entry.keys {
+        put(&mut device, key, setting)?;
+    }
+    let mut devices = Table::new();
+    devices.set_implicit(true);
+    devices.insert(&entry.name, Item::Table(device));
+    let mut document = DocumentMut::new();
+    document.insert("device", Item::Table(devices));
+    let table = document.to_string();
+    let mut lines: Vec<String> = entry.comments.iter().map(|comment| commented(one_line(comment))).collect();
+    match &entry.held_back {
+        Some(reason) => {
+            lines.push(commented(format!("Not in use: {}", one_line(reason))));
+            lines.extend(table.trim_matches('\n').lines().map(commented));
+        }
+        None => lines.extend(table.trim_matches('\n').lines().map(str::to_owned)),
+    }
+    let mut text = lines.join("\n");
+    text.push('\n');
+    Ok(text)
+}
+
+/// `text` without the entry `name`: its tables, what is written among them, and the comment right
+/// above. Comments that an empty line parts from it stay.
+///
+/// # Errors
+/// When there is no such entry or it is not written under headers of its own.
+pub fn remove(text: &str, name: &str) -> Result<String, EditError> {
+    let document = Document::parse(text).map_err(|error| EditError::Syntax(error.message().to_owned()))?;
+    let entry = document.as_table().get("device").and_then(|devices| devices.get(name));
+    if entry.is_none() {
+        return Err(EditError::NoEntry(name.to_owned()));
+    }
+    let mut tables = Vec::new();
+    collect(document.as_table(), &mut Vec::new(), &mut tables);
+    tables.sort_by_key(|table| table.header.start);
+    let is_own = |table: &Placed| {
+        let path: Vec<&str> = table.path.iter().map(String::as_str).collect();
+        path.starts_with(&["device", name])
+    };
+    if !tables.iter().any(is_own) {
+        return Err(EditError::NoHeader(name.to_owned()));
+    }
+    let mut gone: Vec<Range<usize>> = Vec::new();
+    for (at, table) in tables.iter().enumerate().filter(|(_, table)| is_own(table)) {
+        let follows = at > 0 && tables.get(at - 1).is_some_and(is_own);
+        let begin =
+            if follows { gone.pop().map_or(0, |last| last.start) } else { with_comment(text, table.header.start) };
+        let next = tables.get(at + 1).map_or(text.len(), |next| with_comment(text, next.header.start));
+        gone.push(begin..end_of_paragraph(text, table.end).min(next.max(begin)));
+    }
+    let mut new = String::with_capacity(text.len());
+    let mut at = 0;
+    for range in gone {
+        new.push_str(text.get(at..range.start).unwrap_or_default());
+        at = range.end;
+        // One of the two empty lines around it.
+        if new.is_empty() || new.ends_with("\n\n") || new.ends_with("\n\r\n") {
+            let rest = text.get(at..).unwrap_or_default();
+            at += rest.len() - rest.strip_prefix("\r\n").or(rest.strip_prefix('\n')).unwrap_or(rest).len();
+        }
+    }
+    let rest = text.get(at..).unwrap_or_default();
+    new.push_str(rest);
+    // The empty line that parted it from what was above.
+    if rest.is_empty() {
+        let end = new.trim_end_matches(['\n', '\r']).len();
+        new.replace_range(
+            end..,
+            if end == 0 {
+                ""
+            } else if text.contains("\r\n") {
+                "\r\n"
+            } else {
+                "\n"
+            },
+        );
+    }
+    Ok(new)
+}
+
+/// Does `text` name no device yet? False of a text that is no TOML.
+#[must_use]
+pub fn has_no_entries(text: &str) -> bool {
+    Document::parse(text).is_ok_and(|document| !document.as_table().contains_key("device"))
+}
+
+/// A table under a header of its own.
+struct Placed {
+    path: Vec<String>,
+    header: Range<usize>,
+    /// End of its last value, or of its header.
+    end: usize,
+}
+
+fn collect(table: &Table, path: &mut Vec<String>, found: &mut Vec<Placed>) {
+    if let Some(header) = table.span().filter(|_| !table.is_implicit() && !table.is_dotted() && !path.is_empty()) {
+        found.push(Placed { path: path.clone(), end: end_of_values(table).unwrap_or(header.end), header });
+    }
+    for (key, item) in table {
+        path.push(key.to_owned());
+        match item {
+            Item::Table(table) => collect(table, path, found),
+            Item::ArrayOfTables(tables) => tables.iter().for_each(|table| collect(table, path, found)),
+            Item::Value(_) | Item::None => {}
+        }
+        path.pop();
+    }
+}
+
+fn end_of_values(table: &Table) -> Option<usize> {
+    let end = |item: &Item| match item {
+        Item::Table(inner) if inner.is_dotted() => end_of_values(inner),
+        Item::Value(value) => value.span().map(|span| span.end),
+        _ => None,
+    };
+    table.iter().filter_map(|(_, item)| end(item)).max()
+}
+
+/// Where the line of `at` begins, or the comment right above it.
+fn with_comment(text: &str, at: usize) -> usize {
+    let line = |at: usize| text.get(..at).and_then(|before| before.rfind('\n')).map_or(0, |newline| newline + 1);
+    let mut begin = line(at);
+    while begin > 0 {
+        let above = line(begin - 1);
+        if !text.get(above..begin).is_some_and(|line| line.trim_start().starts_with('#')) {
+            break;
+        }
+        begin = above;
+    }
+    begin
+}
+
+/// The end of the line of `at`, and of the comment right below it.
+fn end_of_paragraph(text: &str, at: usize) -> usize {
+    let after =
+        |at: usize| text.get(at..).and_then(|rest| rest.find('\n')).map_or(text.len(), |newline| at + newline + 1);
+    let mut end = after(at);
+    while text.get(end..after(end)).is_some_and(|line| line.trim_start().starts_with('#')) {
+        end = after(end);
+    }
+    end
+}
+
+fn put(device: &mut Table, key: &str, setting: &Setting) -> Result<(), EditError> {
+    let refused = |reason| EditError::Key { key: key.to_owned(), reason };
+    let mut parts: Vec<&str> = key.split('.').collect();
+    let last = parts.pop().unwrap_or_default();
+    let legal =
+        |part: &&str| !part.is_empty() && part.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'_' | b'-'));
+    if !parts.iter().chain([&last]).all(legal) {
+        return Err(refused("write letters, digits and `_`, with dots between the tables, as camera.width"));
+    }
+    let mut table = device;
+    for part in parts {
+        let item = table.entry(part).or_insert_with(|| Item::Table(Table::new()));
+        table = item.as_table_mut().ok_or_else(|| refused("it lies in what is no table"))?;
+    }
+    if table.contains_table(last) {
+        return Err(refused("it is a table"));
+    }
+    table.insert(last, Item::Value(value(setting)));
+    Ok(())
+}
+
+fn value(setting: &Setting) -> Value {
+    match setting {
+        Setting::Text(text) => text.as_str().into(),
+        Setting::Whole(number) => (*number).into(),
+        Setting::Texts(texts) => Value::Array(texts.iter().map(String::as_str).collect::<Array>()),
+        Setting::Typed(typed) => match typed.trim().parse::<Value>() {
+            Ok(mut value) => {
+                value.decor_mut().clear();
+                value
+            }
+            Err(_) => typed.as_str().into(),
+        },
+    }
+}
+
+fn commented(line: impl AsRef<str>) -> String {
+    let line = line.as_ref();
+    if line.is_empty() { "#".to_owned() } else { format!("# {line}") }
+}
+
+fn one_line(text: &str) -> String {
+    text.replace(|c: char| c.is_control() || matches!(c, '\u{2028}' | '\u{2029}'), " ")
+}
+
+#[cfg(test)]
+mod tests;

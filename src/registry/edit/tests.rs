@@ -1,0 +1,116 @@
+//! Changes of a text, with what stays.
+
+use proptest::prelude::*;
+
+use super::*;
+
+fn entry(name: &str) -> NewEntry {
+    let keys = [("vid", Setting::Text("046d".into())), ("bit", Setting::Whole(3))];
+    let more = [("camera.width", Setting::Typed("1280".into())), ("camera.format", Setting::Typed("MJPG".into()))];
+    let keys = keys.into_iter().chain(more).map(|(key, value)| (key.to_owned(), value)).collect();
+    NewEntry { name: name.into(), comments: vec!["Webcam C270".into()], keys, held_back: None }
+}
+
+#[test]
+fn an_entry_is_added_at_the_end() {
+    let added = "# Webcam C270\n[device.cam]\nvid = \"046d\"\nbit = 3\n\n[device.cam.camera]\nwidth = 1280\nformat = \"MJPG\"\n";
+    assert_eq!(append("", &[entry("cam")]).unwrap(), added);
+    assert_eq!(append("a = 1", &[entry("cam")]).unwrap(), format!("a = 1\n\n{added}"));
+    let windows = append("a = 1\r\n", &[entry("cam")]).unwrap();
+    assert_eq!(windows, format!("a = 1\n\n{added}").replace('\n', "\r\n"));
+    let held_back = NewEntry { held_back: Some("no node".into()), ..entry("cam") };
+    let text = written(&held_back).unwrap();
+    assert!(text.lines().all(|line| line.starts_with('#')), "{text}");
+    assert!(text.contains("# Not in use: no node\n# [device.cam]\n# vid = \"046d\"\n"), "{text}");
+}
+
+#[test]
+fn keys_that_are_none_are_refused() {
+    for (first, second, reason) in [
+        ("a b", "x", "write letters"),
+        ("", "x", "write letters"),
+        ("camera..width", "x", "write letters"),
+        ("serial", "serial.baud", "what is no table"),
+        ("serial.baud", "serial", "it is a table"),
+        ("a\n[device.evil]\nb", "x", "write letters"),
+    ] {
+        let keys = [first, second].map(|key| (key.to_owned(), Setting::Text("x".into()))).to_vec();
+        let error = written(&NewEntry { keys, ..entry("cam") }).unwrap_err();
+        assert!(error.to_string().contains(reason), "{first:?}: {error}");
+    }
+}
+
+const FILE: &str = "\
+# The rig.
+[rig]
+name = \"a\" # here
+
+# Kept: of the file.
+
+# Of the left camera.
+[device.left]   # this one
+vid = \"1\" # its vendor
+# Further keys: none
+
+[device.left.camera]
+width = 640
+# height = 480
+
+# Kept: who wrote this meant the next.
+
+# Of the right one.
+[device.right]
+vid = \"2\"
+camera.width = 1 # dotted
+# its last words
+
+# Kept: the end.
+";
+
+#[test]
+fn an_entry_goes_with_its_own_comments_and_no_others() {
+    let left = remove(FILE, "left").unwrap();
+    assert_eq!(
+        left,
+        "# The rig.\n[rig]\nname = \"a\" # here\n\n# Kept: of the file.\n\n# Kept: who wrote this meant the next.\n\n\
+         # Of the right one.\n[device.right]\nvid = \"2\"\ncamera.width = 1 # dotted\n# its last words\n\n# Kept: the end.\n"
+    );
+    assert_eq!(
+        remove(&left, "right").unwrap(),
+        "# The rig.\n[rig]\nname = \"a\" # here\n\n# Kept: of the file.\n\n# Kept: who wrote this meant the next.\n\n# Kept: the end.\n"
+    );
+    assert_eq!(remove(FILE, "up").unwrap_err(), EditError::NoEntry("up".into()));
+    assert_eq!(remove("device.a.vid = \"1\"\n", "a").unwrap_err(), EditError::NoHeader("a".into()));
+    assert!(matches!(remove("a = ", "a").unwrap_err(), EditError::Syntax(_)));
+}
+
+#[test]
+fn what_is_added_can_be_taken_out_again() {
+    let with = append(FILE, &[entry("cam")]).unwrap();
+    assert!(with.starts_with(FILE));
+    assert_eq!(remove(&with, "cam").unwrap(), FILE);
+}
+
+#[test]
+fn an_entry_in_two_places_goes_from_both() {
+    let text = "[device.a]\nvid = \"1\"\n\n[device.b]\nvid = \"2\"\n\n[device.a.camera]\nwidth = 1\n";
+    assert_eq!(remove(text, "a").unwrap(), "[device.b]\nvid = \"2\"\n");
+}
+
+proptest! {
+    #[test]
+    fn whatever_a_device_says_stays_a_value_or_a_comment(serial in any::<String>(), product in any::<String>()) {
+        let keys = vec![("serial".to_owned(), Setting::Text(serial.clone()))];
+        let hostile = NewEntry { name: "x".into(), comments: vec![product], keys, held_back: None };
+        let text = append("[rig]\nname = \"a\"\n", &[hostile]).unwrap();
+        let document: DocumentMut = text.parse().unwrap();
+        prop_assert_eq!(document.as_table().len(), 2);
+        prop_assert_eq!(document["device"]["x"].as_table().unwrap().len(), 1);
+        prop_assert_eq!(document["device"]["x"]["serial"].as_str(), Some(serial.as_str()));
+    }
+
+    #[test]
+    fn no_text_makes_it_panic(text in "[a-z\\[\\]\\.\"=# \n\r]{0,80}", name in "[a-z]{0,3}") {
+        let _ = remove(&text, &name);
+    }
+}

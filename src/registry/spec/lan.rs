@@ -1,0 +1,257 @@
+//! `[device.NAME.lan]`: a device on the network, or behind a network adapter.
+
+use std::net::{IpAddr, SocketAddr};
+use std::time::Duration;
+
+use crate::modality::ModalityKind;
+
+/// See the module's comment.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LanSpec {
+    /// What it speaks.
+    pub protocol: LanProtocol,
+    /// How it is found.
+    pub find: LanFind,
+    /// For how long it counts as there after it was last heard of, 500 ms to 60 s, default 3 s.
+    pub lease: Duration,
+}
+
+/// What a device on the network speaks.
+#[derive(Debug, Clone, PartialEq)]
+pub enum LanProtocol {
+    /// Pictures over HTTP, `multipart/x-mixed-replace`; one sample a picture.
+    Mjpeg {
+        /// Port of its HTTP server; `None` is what mDNS told, or 80.
+        port: Option<u16>,
+        /// What is asked for, beginning with `/`, default `/`.
+        path: String,
+        /// What the pictures are.
+        picture: LanPicture,
+    },
+    /// Packets sent to a port of ours, one sample each.
+    Udp {
+        /// The port.
+        port: u16,
+    },
+    /// A GoPro, which records by itself; one sample a look at its state.
+    Gopro {
+        /// Port of its HTTP server, default 8080.
+        port: u16,
+        /// Are its clips fetched after the episode? Default no.
+        download: bool,
+    },
+    /// A phone that connects to us and sends pictures with the camera's pose.
+    Iphone {
+        /// The port of ours that it connects to, default 5555.
+        port: u16,
+        /// Which part is the sample.
+        stream: PhoneStream,
+        /// What the pictures are, default 1920x1440 at 30.
+        picture: LanPicture,
+    },
+}
+
+/// What the pictures of a network camera are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct LanPicture {
+    /// Pixels, `1..=8192`, default 640.
+    pub width: u32,
+    /// Pixels, `1..=8192`, default 480.
+    pub height: u32,
+    /// Frames per second, `1..=1000`, default 30.
+    pub fps: u32,
+}
+
+/// Which part of what a phone sends is the sample.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PhoneStream {
+    /// The picture, in which a comment holds the pose.
+    Image,
+    /// The pose: 16 numbers, 4 by 4, column by column.
+    Pose,
+}
+
+/// How a device on the network is found.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum LanFind {
+    /// It is a network adapter with the USB identity of the entry, or is behind one.
+    Adapter {
+        /// Its address, where the protocol does not tell it.
+        host: Option<IpAddr>,
+    },
+    /// It announces a service.
+    Mdns {
+        /// The service, for example `_iphonevio._tcp`.
+        service: String,
+        /// The instance of it, if only one is meant.
+        instance: Option<String>,
+    },
+    /// It has a fixed address, which is asked.
+    Host {
+        /// The address.
+        host: IpAddr,
+        /// How it is asked.
+        probe: Probe,
+        /// Which port is asked; for [`Probe::Udp`] the one of ours that hears it.
+        port: u16,
+    },
+}
+
+/// How a fixed address is asked whether its device is there.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Probe {
+    /// It takes a TCP connection.
+    Tcp,
+    /// It answers an HTTP request, whatever the answer is.
+    Http,
+    /// Its packets arrive.
+    Udp,
+}
+
+/// Port of a server whose port is not told.
+const HTTP_PORT: u16 = 80;
+/// The pose of a phone's camera is a matrix of 4 by 4.
+const POSE: u32 = 16;
+
+impl LanFind {
+    /// Is the device a network adapter, or behind one?
+    #[must_use]
+    pub const fn is_adapter(&self) -> bool {
+        matches!(self, Self::Adapter { .. })
+    }
+}
+
+impl LanPicture {
+    /// What a phone sends unless the entry says otherwise.
+    pub(in crate::registry) const OF_A_PHONE: Self = Self { width: 1920, height: 1440, fps: 30 };
+    /// What a camera sends unless the entry says otherwise.
+    pub(in crate::registry) const OF_A_CAMERA: Self = Self { width: 640, height: 480, fps: 30 };
+}
+
+impl LanSpec {
+    /// What its samples hold.
+    #[must_use]
+    pub const fn modality_kind(&self) -> ModalityKind {
+        match &self.protocol {
+            LanProtocol::Mjpeg { .. } | LanProtocol::Iphone { stream: PhoneStream::Image, .. } => ModalityKind::Image,
+            LanProtocol::Iphone { stream: PhoneStream::Pose, .. } => ModalityKind::Scalars,
+            LanProtocol::Udp { .. } | LanProtocol::Gopro { .. } => ModalityKind::Bytes,
+        }
+    }
+
+    /// Image: `[height, width]`. Scalars: how many. Bytes: empty.
+    #[must_use]
+    pub fn shape(&self) -> Vec<u32> {
+        match (self.modality_kind(), self.picture()) {
+            (ModalityKind::Image, Some(picture)) => vec![picture.height, picture.width],
+            (ModalityKind::Scalars, _) => vec![POSE],
+            _ => Vec::new(),
+        }
+    }
+
+    /// What its pictures are, if it sends any.
+    #[must_use]
+    pub const fn picture(&self) -> Option<LanPicture> {
+        match &self.protocol {
+            LanProtocol::Mjpeg { picture, .. } | LanProtocol::Iphone { picture, .. } => Some(*picture),
+            LanProtocol::Udp { .. } | LanProtocol::Gopro { .. } => None,
+        }
+    }
+
+    /// The format on one line: `udp port 2368`.
+    #[must_use]
+    pub fn format(&self) -> String {
+        match &self.protocol {
+            LanProtocol::Mjpeg { path, picture: LanPicture { width, height, fps }, .. } => {
+                format!("mjpeg {width}x{height} {fps} fps {path}")
+            }
+            LanProtocol::Udp { port } => format!("udp port {port}"),
+            LanProtocol::Gopro { .. } => "gopro".to_owned(),
+            LanProtocol::Iphone { stream: PhoneStream::Pose, port, .. } => format!("iphone pose port {port}"),
+            LanProtocol::Iphone { port, picture: LanPicture { width, height, fps }, .. } => {
+                format!("iphone {width}x{height} {fps} fps port {port}")
+            }
+        }
+    }
+
+    /// Largest payload in bytes, and the least that may be written instead.
+    pub(in crate::registry) fn max_bytes(&self) -> (u64, u64) {
+        /// A JPEG picture of a small, noisy scene with its tables can exceed two bytes a pixel.
+        const SMALLEST_JPEG: u64 = 64 << 10;
+        match (self.modality_kind(), self.picture()) {
+            (ModalityKind::Image, Some(picture)) => {
+                let pixels = u64::from(picture.width) * u64::from(picture.height);
+                let most = match &self.protocol {
+                    // It compresses to some fifth of a byte a pixel (quality 0.7), and its pictures are large.
+                    LanProtocol::Iphone { .. } => pixels / 2,
+                    _ => 2 * pixels,
+                };
+                (most.max(SMALLEST_JPEG), 4096)
+            }
+            (ModalityKind::Scalars, _) => (8 * u64::from(POSE), 8 * u64::from(POSE)),
+            // What an Ethernet frame carries is under 1500.
+            _ => (2048, 64),
+        }
+    }
+
+    /// Without a sample for so long it is said to be late; at least `least`.
+    pub(in crate::registry) fn stall(&self, least: Duration) -> Duration {
+        match (&self.protocol, self.picture()) {
+            // It is looked at every 3 s.
+            (LanProtocol::Gopro { .. }, _) => Duration::from_secs(10),
+            (_, Some(picture)) => (Duration::from_secs(10) / picture.fps.max(1)).max(least),
+            _ => least,
+        }
+    }
+
+    /// About two seconds of pictures, and a second of a LiDAR's packets.
+    pub(in crate::registry) fn depth(&self) -> u64 {
+        match (&self.protocol, self.picture()) {
+            (LanProtocol::Gopro { .. }, _) => 16,
+            (_, Some(picture)) => (2 * u64::from(picture.fps)).clamp(16, 1024),
+            _ => 2048,
+        }
+    }
+
+    /// The port at which the device is reached, or at which it reaches us, if the entry says.
+    #[must_use]
+    pub const fn port(&self) -> Option<u16> {
+        match &self.protocol {
+            LanProtocol::Mjpeg { port, .. } => *port,
+            LanProtocol::Udp { port } | LanProtocol::Gopro { port, .. } | LanProtocol::Iphone { port, .. } => {
+                Some(*port)
+            }
+        }
+    }
+
+    /// Where a device at this address is reached.
+    #[must_use]
+    pub fn server(&self, host: IpAddr) -> SocketAddr {
+        SocketAddr::new(host, self.port().unwrap_or(HTTP_PORT))
+    }
+
+    /// The port of this computer that it needs: of UDP or not, and its number.
+    #[must_use]
+    pub const fn own_port(&self) -> Option<(bool, u16)> {
+        match &self.protocol {
+            LanProtocol::Udp { port } => Some((true, *port)),
+            LanProtocol::Iphone { port, .. } => Some((false, *port)),
+            LanProtocol::Mjpeg { .. } | LanProtocol::Gopro { .. } => None,
+        }
+    }
+
+    /// The port of ours that a phone connects to.
+    #[must_use]
+    pub const fn phone_port(&self) -> Option<u16> {
+        match &self.protocol {
+            LanProtocol::Iphone { port, .. } => Some(*port),
+            _ => None,
+        }
+    }
+
+    /// Samples a second, where that is known.
+    #[must_use]
+    pub fn rate(&self) -> Option<f64> {
+        self.picture().map(|picture| f64::from(picture.fps))
+    }
+}

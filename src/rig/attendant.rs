@@ -1,0 +1,180 @@
+//! An attendant: runs the hooks of one attached device, in the order of what happens to it.
+//!
+//! 1. `on_attach` when it is attached.
+//! 2. `on_record_start` when an episode begins, at once if one is in progress; `on_record_stop` when
+//!    that episode is over, the device is removed, or the run ends.
+//! 3. `on_detach` when it was removed and the program that read it has ended. Not at the end of the run:
+//!    the device stays where it is.
+//!
+//! Invariant: nothing waits for an attendant but the next one of its entry and, at the very end, the run.
+//! Invariant: the hooks of an entry run one at a time, each for [`HOOK_LIMIT`] at most.
+//! Invariant: each `on_record_start` is followed by one `on_record_stop`, unless the run ends in a hurry.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::Mutex;
+use tokio::time::{sleep, timeout};
+use tokio_util::sync::CancellationToken;
+
+use super::output::Output;
+use super::programs::{Environment, MARGIN, Programs, environment};
+use super::worker::{TERM_LIMIT, describe};
+use crate::driver::process::Launch;
+use crate::registry::{Attachment, DeviceSpec, Hook};
+use crate::status::{Episode, EpisodeWatch, Level};
+
+/// A hook that has not ended by then is killed.
+pub(super) const HOOK_LIMIT: Duration = Duration::from_secs(10);
+
+/// Where the attendants of an entry work, one after the other.
+#[derive(Debug)]
+pub(super) struct Post {
+    programs: Programs,
+    spec: Arc<DeviceSpec>,
+    prefix: String,
+    /// Held as long as a program reads the device.
+    node: Option<Arc<Mutex<()>>>,
+    turn: Arc<Mutex<()>>,
+    /// Told that the device is removed.
+    gone: CancellationToken,
+}
+
+impl Post {
+    pub(super) fn new(
+        programs: &Programs,
+        spec: &Arc<DeviceSpec>,
+        prefix: String,
+        node: Option<Arc<Mutex<()>>>,
+    ) -> Self {
+        let (programs, spec) = (programs.clone(), Arc::clone(spec));
+        Self { programs, spec, prefix, node, turn: Arc::default(), gone: CancellationToken::new() }
+    }
+
+    /// A device of the entry was attached.
+    pub(super) fn attached(&mut self, attachment: &Attachment, episode: &EpisodeWatch) {
+        if self.spec.hooks.is_empty() || attachment.node.is_recording() {
+            return;
+        }
+        self.removed();
+        self.gone = CancellationToken::new();
+        let attendant = Attendant {
+            environment: environment(&self.spec, attachment, &self.spec.topic, &self.prefix),
+            programs: self.programs.clone(),
+            spec: Arc::clone(&self.spec),
+            node: self.node.clone(),
+            gone: self.gone.clone(),
+            episode: episode.clone(),
+        };
+        self.programs.tasks.spawn(attendant.attend(Arc::clone(&self.turn)));
+    }
+
+    /// It was removed.
+    pub(super) fn removed(&self) {
+        self.gone.cancel();
+    }
+}
+
+#[derive(Debug)]
+struct Attendant {
+    programs: Programs,
+    spec: Arc<DeviceSpec>,
+    environment: Environment,
+    node: Option<Arc<Mutex<()>>>,
+    gone: CancellationToken,
+    episode: EpisodeWatch,
+}
+
+impl Attendant {
+    async fn attend(mut self, turn: Arc<Mutex<()>>) {
+        let turn = turn.lock_owned().await;
+        // Plugged and pulled before it could be looked after: neither is worth a program.
+        if self.gone.is_cancelled() || self.programs.closing.is_cancelled() {
+            return;
+        }
+        let spec = Arc::clone(&self.spec);
+        self.run("on_attach", spec.hooks.attach.as_ref(), None).await;
+        while let Some(episode) = self.begun().await {
+            self.run("on_record_start", spec.hooks.record_start.as_ref(), Some(&episode)).await;
+            self.over(&episode).await;
+            self.run("on_record_stop", spec.hooks.record_stop.as_ref(), Some(&episode)).await;
+        }
+        if self.gone.is_cancelled() {
+            if let Some(node) = &self.node {
+                // Its successor need not wait for us.
+                drop(timeout(TERM_LIMIT + MARGIN, node.lock()).await);
+            }
+            self.run("on_detach", spec.hooks.detach.as_ref(), None).await;
+        }
+        drop(turn);
+    }
+
+    /// Waits for an episode; `None` when none is to come for this device.
+    async fn begun(&mut self) -> Option<Arc<Episode>> {
+        let begun = async {
+            let begun = self.episode.wait_for(Option::is_some).await.ok().and_then(|episode| episode.clone());
+            match begun {
+                Some(episode) => Some(episode),
+                // Nobody records any more.
+                None => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            biased;
+            () = self.gone.cancelled() => None,
+            () = self.programs.closing.cancelled() => None,
+            episode = begun => episode,
+        }
+    }
+
+    /// Waits until this episode is over, for this device.
+    async fn over(&mut self, episode: &Arc<Episode>) {
+        let other = |now: &Option<Arc<Episode>>| now.as_ref().is_none_or(|now| now != episode);
+        tokio::select! {
+            biased;
+            () = self.gone.cancelled() => {}
+            _ = self.episode.wait_for(other) => {}
+            () = self.programs.closing.cancelled() => {}
+        }
+    }
+
+    /// Runs a hook to its end. What goes wrong is said and changes nothing else.
+    async fn run(&self, key: &str, hook: Option<&Hook>, episode: Option<&Episode>) {
+        let Some(hook) = hook else { return };
+        if let Err(reason) = self.run_hook(key, hook, episode).await {
+            Output::new(&self.spec.name, Some(key), &self.programs).note(Level::Error, &reason);
+        }
+    }
+
+    async fn run_hook(&self, key: &str, hook: &Hook, episode: Option<&Episode>) -> Result<(), String> {
+        let Programs { spawner, hurry, .. } = &self.programs;
+        if hurry.is_cancelled() {
+            return Err("not run, as the run was interrupted twice".to_owned());
+        }
+        let mut env = self.environment.clone();
+        if let Some(episode) = episode {
+            env.push(("RAPID_EPISODE", Some(episode.file.clone().into())));
+            env.push(("SESSION_ID", Some(episode.id().into())));
+            env.push(("OUTPUT_DIR", Some(episode.folder().into())));
+        }
+        let launch = Launch { program: hook.program.clone(), args: hook.args.clone(), env };
+        let mut child = spawner.spawn(launch).await.map_err(|error| error.to_string())?;
+        tracing::debug!(device = %self.spec.name, hook = key, process = child.id(), "started");
+        let mut output = Output::new(&self.spec.name, Some(key), &self.programs);
+        let ended = tokio::select! {
+            biased;
+            () = child.ended() => Ok(()),
+            () = hurry.cancelled() => Err("killed, as the run was interrupted twice".to_owned()),
+            () = sleep(HOOK_LIMIT) => Err(format!("did not end within {} s and was killed", HOOK_LIMIT.as_secs())),
+            () = output.follow(&child.stdout, &child.stderr) => Ok(()),
+        };
+        if ended.is_err() {
+            child.kill();
+            child.ended().await;
+        }
+        output.finish(&child.stdout, &child.stderr);
+        let status = child.reap().map_err(|error| format!("its process cannot be reaped: {error}"))?;
+        ended?;
+        if status.success() { Ok(()) } else { Err(describe(status)) }
+    }
+}

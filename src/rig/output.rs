@@ -1,0 +1,248 @@
+//! What a child prints, as lines of the log and of its device's file.
+//!
+//! Invariant: the lines of a child are bounded in length and in rate; what is left out is counted and
+//! said. A child that prints faster than that is held up by its pipe, as at a slow terminal, and
+//! costs the rig a few reads each [`PAUSE`].
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::net::unix::pipe::Receiver;
+use tokio::time::sleep;
+
+use super::logbook::Logbook;
+use super::programs::Programs;
+use crate::status::{Board, Level, What};
+use crate::text;
+use crate::time::Stamp;
+
+/// Bytes of a line; what is longer is cut.
+const LONGEST: usize = 1000;
+/// Lines that may come at once...
+const BURST: f64 = 100.0;
+/// ...and lines a second in the long run.
+const RATE: f64 = 20.0;
+/// Between two reads of a child that prints too much.
+const PAUSE: Duration = Duration::from_millis(10);
+/// How often the lines left out are said.
+const TELL_EVERY: Duration = Duration::from_secs(5);
+/// Read at once.
+const CHUNK: usize = 16 << 10;
+
+/// See the module's comment.
+#[derive(Debug)]
+pub(super) struct Output {
+    device: String,
+    /// Which of the device's programs it is, as `hook: `; empty for the one that reads it.
+    whose: String,
+    board: Arc<Board>,
+    logbook: Logbook,
+    /// Standard output and standard error.
+    lines: [Lines; 2],
+    limit: Limit,
+    left_out: u64,
+    told: Stamp,
+}
+
+impl Output {
+    /// `hook` is the key of the hook that is run, if one is.
+    pub(super) fn new(device: &str, hook: Option<&str>, programs: &Programs) -> Self {
+        let now = Stamp::now();
+        Self {
+            device: device.to_owned(),
+            whose: hook.map_or_else(String::new, |hook| format!("{hook}: ")),
+            board: Arc::clone(&programs.board),
+            logbook: programs.logbook.clone(),
+            lines: [Lines::default(), Lines::default()],
+            limit: Limit::new(now),
+            left_out: 0,
+            told: now,
+        }
+    }
+
+    /// Reads both pipes; never returns. Dropped in the middle it has lost nothing.
+    pub(super) async fn follow(&mut self, stdout: &Receiver, stderr: &Receiver) {
+        loop {
+            let [out, err] = self.lines.each_ref().map(|lines| !lines.closed);
+            tokio::select! {
+                result = stdout.readable(), if out => self.look(0, result.is_ok().then_some(stdout)),
+                result = stderr.readable(), if err => self.look(1, result.is_ok().then_some(stderr)),
+                () = sleep(TELL_EVERY.saturating_sub(Stamp::now().since(self.told))), if self.left_out > 0 => {
+                    self.tell();
+                }
+                else => std::future::pending().await,
+            }
+            if self.limit.is_used_up() {
+                sleep(PAUSE).await;
+            }
+        }
+    }
+
+    /// Reads what is there and says what is left to say.
+    pub(super) fn finish(&mut self, stdout: &Receiver, stderr: &Receiver) {
+        for (index, pipe) in [stdout, stderr].into_iter().enumerate() {
+            // No more than a pipe holds: one that something still writes to would have no end.
+            for _ in 0..4 {
+                self.look(index, Some(pipe));
+            }
+            if let Some(lines) = self.lines.get_mut(index)
+                && let Some(line) = lines.rest()
+            {
+                self.say(&line);
+            }
+        }
+        self.tell();
+    }
+
+    /// Reads once; without a pipe there is nothing more to read.
+    fn look(&mut self, index: usize, pipe: Option<&Receiver>) {
+        let mut chunk = [0; CHUNK];
+        let read = match pipe.map(|pipe| pipe.try_read(&mut chunk)) {
+            Some(Ok(read)) => read,
+            Some(Err(error)) if error.kind() == std::io::ErrorKind::WouldBlock => return,
+            Some(Err(_)) | None => 0,
+        };
+        let Some(lines) = self.lines.get_mut(index) else { return };
+        lines.closed = read == 0;
+        let complete = lines.take(chunk.get(..read).unwrap_or_default());
+        for line in complete {
+            self.say(&line);
+        }
+    }
+
+    fn say(&mut self, line: &str) {
+        if !self.limit.allows(Stamp::now()) {
+            self.left_out += 1;
+            return;
+        }
+        self.note(Level::Info, line);
+    }
+
+    fn tell(&mut self) {
+        self.told = Stamp::now();
+        let left_out = std::mem::take(&mut self.left_out);
+        if left_out > 0 {
+            self.note(Level::Warn, &format!("prints too much: {left_out} lines are left out"));
+        }
+    }
+
+    /// Adds a line to the log and to the device's file.
+    pub(super) fn note(&self, level: Level, line: &str) {
+        let line = format!("{}{line}", self.whose);
+        self.logbook.write(&self.device, &line);
+        let text = format!("{}: {line}", self.device);
+        self.board.announce(What::Log { level, text });
+    }
+}
+
+/// Bytes to lines.
+#[derive(Debug, Default)]
+struct Lines {
+    line: Vec<u8>,
+    /// The rest of the line is thrown away.
+    is_cut: bool,
+    closed: bool,
+}
+
+impl Lines {
+    /// The lines that end in `bytes`, without empty ones.
+    fn take(&mut self, bytes: &[u8]) -> Vec<String> {
+        let mut complete = Vec::new();
+        for piece in bytes.split_inclusive(|byte| *byte == b'\n') {
+            let (text, ends) = match piece.split_last() {
+                Some((b'\n', text)) => (text, true),
+                _ => (piece, false),
+            };
+            let room = LONGEST - self.line.len();
+            self.is_cut |= text.len() > room;
+            self.line.extend_from_slice(text.get(..room).unwrap_or(text));
+            if ends {
+                complete.extend(self.rest());
+            }
+        }
+        complete
+    }
+
+    /// The line so far, as text that is harmless to a terminal.
+    fn rest(&mut self) -> Option<String> {
+        let mut line = text::plain(&String::from_utf8_lossy(&self.line)).trim_end().to_owned();
+        self.line.clear();
+        if std::mem::take(&mut self.is_cut) {
+            line.push('\u{2026}');
+        }
+        (!line.is_empty()).then_some(line)
+    }
+}
+
+/// A bucket of lines that may be said.
+#[derive(Debug)]
+struct Limit {
+    left: f64,
+    filled: Stamp,
+}
+
+impl Limit {
+    const fn new(now: Stamp) -> Self {
+        Self { left: BURST, filled: now }
+    }
+
+    fn allows(&mut self, now: Stamp) -> bool {
+        self.left = (self.left + now.since(self.filled).as_secs_f64() * RATE).min(BURST);
+        self.filled = now;
+        let allowed = self.left >= 1.0;
+        if allowed {
+            self.left -= 1.0;
+        }
+        allowed
+    }
+
+    fn is_used_up(&self) -> bool {
+        self.left < 1.0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    #[test]
+    fn lines_are_cut_and_harmless() {
+        let mut lines = Lines::default();
+        assert_eq!(lines.take(b"one\r\n\n\ntw"), ["one"]);
+        assert_eq!(lines.take(b"o\n\x1b[31mred\xff\n"), ["two", " [31mred\u{fffd}"]);
+        assert_eq!(lines.take(&[b'x'; 3 * LONGEST]), [""; 0]);
+        let cut = lines.take(b"y\nnext");
+        assert_eq!(cut, [format!("{}\u{2026}", "x".repeat(LONGEST))]);
+        assert_eq!(lines.rest().as_deref(), Some("next"));
+        assert_eq!(lines.rest(), None);
+    }
+
+    #[test]
+    fn a_flood_is_thinned_to_the_rate() {
+        let mut limit = Limit::new(Stamp(0));
+        let mut allowed = 0;
+        // Ten seconds, a line each 100 us.
+        for step in 0..100_000_u64 {
+            allowed += u32::from(limit.allows(Stamp(step * 100_000)));
+        }
+        assert_eq!(allowed, 100 + 200 - 1);
+        assert!(limit.is_used_up());
+        assert!(limit.allows(Stamp(11_000_000_000)), "quiet for a second, it may speak again");
+    }
+
+    proptest! {
+        #[test]
+        fn however_the_bytes_are_cut_the_lines_are_the_same(bytes: Vec<u8>, at in 0..200_usize) {
+            let (first, second) = bytes.split_at(at.min(bytes.len()));
+            let mut whole = Lines::default();
+            let mut halves = Lines::default();
+            let expected = whole.take(&bytes);
+            let mut got = halves.take(first);
+            got.extend(halves.take(second));
+            prop_assert_eq!(got, expected);
+            prop_assert_eq!(halves.rest(), whole.rest());
+        }
+    }
+}

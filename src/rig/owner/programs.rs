@@ -1,0 +1,53 @@
+//! What the owner has to do with programs and with episodes.
+
+use tokio_util::sync::CancellationToken;
+
+use super::Rig;
+use crate::modality::ModalityId;
+use crate::registry::Attachment;
+use crate::status::EpisodeWatch;
+
+impl Rig {
+    /// Tells devices and their hooks of episodes from now on.
+    #[must_use]
+    pub fn following(mut self, episode: EpisodeWatch) -> Self {
+        self.episode = episode;
+        self
+    }
+
+    /// Arms the actuator as soon as it is there, once.
+    #[must_use]
+    pub fn arming(mut self, arm: bool) -> Self {
+        for controls in self.modalities.iter_mut().filter_map(|modality| modality.controls.as_mut()) {
+            controls.arm = arm;
+        }
+        self
+    }
+
+    /// Cancelled, it kills the programs that are being ended.
+    #[must_use]
+    pub fn hurry(&self) -> CancellationToken {
+        self.programs.as_ref().map_or_else(CancellationToken::new, |programs| programs.hurry.clone())
+    }
+
+    /// After a run and the episode in it, waits for the programs of its devices, which it told to end,
+    /// and for their hooks.
+    pub async fn programs_ended(&self) {
+        if let Some(programs) = &self.programs {
+            programs.ended().await;
+        }
+    }
+
+    pub(super) fn attend(&mut self, id: ModalityId, attachment: &Attachment) {
+        let episode = self.episode.clone();
+        if let Some(post) = self.modality(id).and_then(|modality| modality.post.as_mut()) {
+            post.attached(attachment, &episode);
+        }
+    }
+
+    pub(super) fn dismiss(&mut self, id: ModalityId) {
+        if let Some(post) = self.modality(id).and_then(|modality| modality.post.as_ref()) {
+            post.removed();
+        }
+    }
+}

@@ -1,0 +1,58 @@
+//! What streams report, and what is told of them.
+
+use std::sync::Arc;
+
+use super::Rig;
+use crate::action::ActuatorNotice;
+use crate::modality::ModalityId;
+use crate::rig::slot::Input;
+use crate::rig::stream::Report;
+use crate::sample::Epoch;
+use crate::status::{Level, What};
+
+impl Rig {
+    pub(super) fn report(&mut self, id: ModalityId, epoch: Epoch, report: Report) {
+        // A report may arrive after the end of its stream, whose reason must stay.
+        let Some(modality) = self.modality(id).filter(|modality| modality.slot.is_current(epoch)) else { return };
+        match report {
+            Report::Opened(description, provenance) => {
+                modality.detail = description;
+                let device = modality.spec.name.clone();
+                self.show(id);
+                self.board.announce(What::Opened { device, bit: id, provenance });
+            }
+            Report::Silent(limit) => {
+                modality.detail = format!("{}; it has sent nothing for {} s", modality.detail, limit.as_secs());
+                let text = format!("{}: open, but it has sent nothing for {} s", modality.spec.name, limit.as_secs());
+                self.show(id);
+                self.board.announce(What::Log { level: Level::Warn, text });
+            }
+            Report::Started => {
+                // From now on it takes an order of its own.
+                if let Some(controls) = &mut modality.controls {
+                    controls.arm = false;
+                }
+                self.apply(id, Input::Started(epoch));
+            }
+            Report::Stalled => self.apply(id, Input::Stalled(epoch)),
+            Report::Resumed => self.apply(id, Input::Resumed(epoch)),
+            Report::Actuator(ActuatorNotice { arming, text, is_problem }) => {
+                modality.detail = format!("{}: {text}", arming.word());
+                let device = modality.spec.name.clone();
+                self.show(id);
+                self.board.announce(What::Actuator { device, bit: id, arming, is_problem, text });
+            }
+            Report::Refused(reason) => {
+                let text = format!("{}: {reason}", modality.spec.name);
+                self.board.announce(What::Log { level: Level::Error, text });
+            }
+        }
+    }
+
+    pub(super) fn announce_state(&mut self, id: ModalityId) {
+        let (mask, count, board) = (self.mask, self.modalities.len(), Arc::clone(&self.board));
+        let Some(modality) = self.modality(id) else { return };
+        let (device, detail, state) = (modality.spec.name.clone(), modality.detail.clone(), modality.slot.state());
+        board.announce(What::State { device, bit: id, state, mask: mask.hex(count), detail });
+    }
+}

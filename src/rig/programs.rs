@@ -1,0 +1,80 @@
+//! All child processes of the rig: what starts them, whom they are told of, and who waits for the last.
+
+use std::ffi::OsString;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::time::timeout;
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
+
+use super::attendant::HOOK_LIMIT;
+use super::logbook::Logbook;
+use super::worker::TERM_LIMIT;
+use crate::bus::Bus;
+use crate::driver::process::Spawner;
+use crate::registry::{Attachment, DeviceSpec, NodeSpec, Registry};
+use crate::status::Board;
+
+/// Beyond the time a program has to end, what the kernel and a busy machine may take.
+pub(super) const MARGIN: Duration = Duration::from_secs(2);
+
+/// See the module's comment.
+#[derive(Debug, Clone)]
+pub(super) struct Programs {
+    pub(super) spawner: Spawner,
+    pub(super) board: Arc<Board>,
+    pub(super) logbook: Logbook,
+    /// One task a child, and one an attended device.
+    pub(super) tasks: TaskTracker,
+    /// The run ends: what is not begun yet is not begun any more.
+    pub(super) closing: CancellationToken,
+    /// Children that are being ended get no more time.
+    pub(super) hurry: CancellationToken,
+}
+
+impl Programs {
+    /// `None` where no entry needs a program.
+    pub(super) fn new(registry: &Registry, bus: &Bus, board: &Arc<Board>) -> Option<Self> {
+        let mut devices = registry.devices.iter();
+        devices.any(|device| matches!(device.node, NodeSpec::Process(_)) || !device.hooks.is_empty()).then(|| Self {
+            spawner: Spawner::start(),
+            board: Arc::clone(board),
+            logbook: Logbook::start(bus.instance(), board),
+            tasks: TaskTracker::new(),
+            closing: CancellationToken::new(),
+            hurry: CancellationToken::new(),
+        })
+    }
+
+    /// Waits until every child has ended; the programs of devices have been told to, and no episode is
+    /// in progress any more.
+    pub(super) async fn ended(&self) {
+        self.closing.cancel();
+        self.tasks.close();
+        // A hook that began a moment ago, and the one that follows it.
+        let limit = TERM_LIMIT.max(2 * HOOK_LIMIT) + MARGIN;
+        if timeout(limit, self.tasks.wait()).await.is_err() {
+            tracing::warn!(programs = self.tasks.len(), "did not end even when killed and are abandoned");
+        }
+        self.logbook.flush().await;
+    }
+}
+
+/// Variables of a child's environment; one without a value is not to be there.
+pub(super) type Environment = Vec<(&'static str, Option<OsString>)>;
+
+/// What every child is told of its device.
+pub(super) fn environment(spec: &DeviceSpec, attachment: &Attachment, topic: &str, prefix: &str) -> Environment {
+    let text = |text: &str| Some(OsString::from(text));
+    vec![
+        ("DEVICE_NAME", text(&spec.name)),
+        ("DEVICE_NODE", text(&attachment.node.label())),
+        // No such variable rather than one that holds what cannot be said in it.
+        ("DEVICE_SERIAL", attachment.unit.serial().filter(|serial| !serial.contains('\0')).and_then(text)),
+        ("DEVICE_ADDR", text(attachment.unit.place())),
+        ("RAPID_TOPIC", text(topic)),
+        ("RAPID_BIT", text(&spec.id.to_string())),
+        ("RAPID_BUS_PREFIX", text(prefix)),
+    ]
+}

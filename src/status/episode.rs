@@ -1,0 +1,51 @@
+//! The episode in progress, as those are told of it who do something about it themselves: devices that
+//! record on their own, and the programs of a user.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use tokio::sync::watch;
+
+/// An episode in progress.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Episode {
+    /// The file it will be once it is finished, an absolute path.
+    pub file: PathBuf,
+}
+
+/// The episode in progress, if there is one, whenever that changes.
+pub type EpisodeWatch = watch::Receiver<Option<Arc<Episode>>>;
+
+impl Episode {
+    /// The episode that will be `file`.
+    #[must_use]
+    pub fn new(file: &Path) -> Self {
+        // Without a working folder there is nothing better than the path as it was given.
+        Self { file: std::path::absolute(file).unwrap_or_else(|_| file.to_owned()) }
+    }
+
+    /// What it is called: the name of its file without `.mcap`.
+    #[must_use]
+    pub fn id(&self) -> String {
+        self.file.file_stem().unwrap_or_default().to_string_lossy().into_owned()
+    }
+
+    /// The folder of its file.
+    #[must_use]
+    pub fn folder(&self) -> &Path {
+        self.file.parent().unwrap_or(Path::new("/"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_episode_is_named_by_its_file() {
+        let episode = Episode::new(Path::new("out/2026-11-21_place-block_001.mcap"));
+        assert!(episode.file.is_absolute());
+        assert_eq!(episode.id(), "2026-11-21_place-block_001");
+        assert!(episode.folder().ends_with("out"));
+    }
+}

@@ -1,0 +1,255 @@
+//! What happens while a device is plugged: the thread that answers the host, and the thread that keeps the beat.
+//!
+//! Invariant: one mutex per device guards function, transfers and socket; it is never held while waiting for the clock or the host.
+//! Invariant: a beat that comes late or finds no reader is skipped, not caught up: a camera does not deliver the past.
+
+use std::collections::VecDeque;
+use std::io::{Read, Write};
+use std::net::Shutdown;
+use std::os::unix::net::UnixStream;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard};
+use std::time::Duration;
+
+use serde_json::json;
+
+use super::descriptor::{Answer, Setup};
+use super::function::{DATA_IN, Function};
+use super::log::{Log, Moment};
+use super::wire::{self, HEADER_LEN, Request, Status, Submit};
+use crate::clock;
+
+/// A device as its threads and its owner see it.
+pub(super) struct Shared {
+    pub(super) index: usize,
+    state: Mutex<State>,
+    pub(super) changed: Condvar,
+    pub(super) log: Arc<Log>,
+}
+
+/// What the mutex guards.
+pub(super) struct State {
+    pub(super) function: Function,
+    pub(super) line: Option<UnixStream>,
+    /// Counts attachments: a thread of an older one that wakes late finds another number and ends.
+    pub(super) epoch: u32,
+    /// Transfers to the host that wait for data, by endpoint.
+    pub(super) waiting: [VecDeque<Waiting>; 16],
+    pub(super) silent: bool,
+    /// When a device that is spoken with is looked after next, ns of CLOCK_MONOTONIC.
+    pub(super) due_ns: u64,
+    /// The emulator has no more use for it.
+    pub(super) ended: bool,
+    pub(super) sent: u64,
+    skipped: u64,
+    pub(super) scratch: Vec<u8>,
+}
+
+/// A transfer to the host that waits for data.
+pub(super) struct Waiting {
+    pub(super) seq: u32,
+    pub(super) room: usize,
+}
+
+impl Shared {
+    pub(super) fn new(index: usize, function: Function, log: Arc<Log>) -> Self {
+        let state = State {
+            function,
+            line: None,
+            epoch: 0,
+            waiting: Default::default(),
+            silent: false,
+            due_ns: 0,
+            ended: false,
+            sent: 0,
+            skipped: 0,
+            scratch: Vec::new(),
+        };
+        Self { index, state: Mutex::new(state), changed: Condvar::new(), log }
+    }
+
+    pub(super) fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(|poisoned| poisoned.into_inner())
+    }
+
+    /// Forgets this attachment, unless another has followed it, and lets its threads end.
+    pub(super) fn hang_up(&self, epoch: u32) {
+        let mut state = self.lock();
+        if state.epoch != epoch {
+            return;
+        }
+        if let Some(line) = state.line.take() {
+            let _closed_already = line.shutdown(Shutdown::Both);
+        }
+        state.waiting = Default::default();
+        state.function.reset();
+        drop(state);
+        self.changed.notify_all();
+    }
+
+    /// Answers the host until the line ends.
+    pub(super) fn serve(&self, mut line: UnixStream, epoch: u32) {
+        let mut data = Vec::new();
+        let mut header = [0; HEADER_LEN];
+        while line.read_exact(&mut header).is_ok() {
+            let request = match wire::decode(&header) {
+                Ok(request) => request,
+                Err(error) => {
+                    let fields = json!({"device": self.index, "error": error.to_string()});
+                    self.log.say("protocol_error", Moment::now(), fields);
+                    break;
+                }
+            };
+            data.clear();
+            if let Request::Submit(Submit { is_in: false, length, .. }) = request {
+                data.resize(length as usize, 0);
+                if line.read_exact(&mut data).is_err() {
+                    break;
+                }
+            }
+            self.answer(request, &data);
+        }
+        self.hang_up(epoch);
+        let state = self.lock();
+        let fields = json!({"device": self.index, "sent": state.sent, "skipped": state.skipped});
+        self.log.say("gone", Moment::now(), fields);
+    }
+
+    fn answer(&self, request: Request, data: &[u8]) {
+        let now = Moment::now();
+        let mut state = self.lock();
+        match request {
+            Request::Unlink { seq, victim } => {
+                let found = state.take_back(victim);
+                state.write(&wire::unlink_reply(seq, if found { Status::Unlinked } else { Status::Ok }));
+            }
+            Request::Submit(submit) if submit.endpoint == 0 => {
+                let before = state.function.live();
+                let setup = Setup::parse(&submit.setup);
+                let answer = state.function.control(setup, data, now.mono_ns);
+                match answer {
+                    Answer::Data(mut bytes) => {
+                        bytes.truncate(usize::from(setup.length).min(submit.length as usize));
+                        state.reply(submit.seq, &bytes);
+                    }
+                    Answer::Done => state.write(&wire::submit_reply(submit.seq, Status::Ok, data.len())),
+                    Answer::Stall => state.write(&wire::submit_reply(submit.seq, Status::Stall, 0)),
+                }
+                let after = state.function.live();
+                if before != after {
+                    let action = if after.is_some() { "stream_on" } else { "stream_off" };
+                    self.log.say(action, Moment::now(), json!({"device": self.index}));
+                }
+            }
+            Request::Submit(Submit { seq, is_in: true, endpoint, length, .. }) => {
+                state.waiting[usize::from(endpoint)].push_back(Waiting { seq, room: length as usize });
+            }
+            Request::Submit(submit) => {
+                state.write(&wire::submit_reply(submit.seq, Status::Ok, data.len()));
+                if let Some(talker) = state.function.talker() {
+                    talker.hear(data, now.mono_ns);
+                }
+            }
+        }
+        if state.function.talks() {
+            return self.attend(&mut state, now);
+        }
+        drop(state);
+        self.changed.notify_all();
+    }
+
+    /// Sends a frame or line at every beat until the line ends.
+    pub(super) fn beat(&self, epoch: u32) {
+        let mut whole = Vec::new();
+        let mut due_ns = 0;
+        let mut state = self.lock();
+        while state.is_attached(epoch) {
+            let Some(live) = state.function.live().filter(|_| !state.silent) else {
+                due_ns = 0;
+                state = self.wait(state, Duration::from_secs(1));
+                continue;
+            };
+            let period_ns = u64::try_from(live.period.as_nanos()).unwrap_or(u64::MAX);
+            let now_ns = clock::mono_ns();
+            if due_ns == 0 {
+                due_ns = now_ns;
+            }
+            if now_ns < due_ns {
+                state = self.wait(state, clock::until(due_ns));
+                continue;
+            }
+            let late = (now_ns - due_ns) / period_ns;
+            due_ns += (late + 1) * period_ns;
+            if state.data_endpoint().is_empty() {
+                state.skipped += late + 1;
+                continue;
+            }
+            state.skipped += late;
+            state.function.produce(now_ns, &mut whole);
+            state = self.send(state, &whole, epoch, live.stream);
+        }
+    }
+
+    /// Sends `whole` packet by packet as the host asks for them; gives up when the stream or the line ends.
+    fn send<'a>(
+        &'a self,
+        mut state: MutexGuard<'a, State>,
+        whole: &[u8],
+        epoch: u32,
+        stream: u32,
+    ) -> MutexGuard<'a, State> {
+        let mut at = 0;
+        while at < whole.len() {
+            if !state.is_attached(epoch) || state.function.live().is_none_or(|live| live.stream != stream) {
+                return state;
+            }
+            let Some(transfer) = state.data_endpoint().pop_front() else {
+                state = self.wait(state, Duration::from_secs(1));
+                continue;
+            };
+            let mut packet = std::mem::take(&mut state.scratch);
+            packet.clear();
+            packet.resize(HEADER_LEN, 0);
+            at = state.function.packet(whole, at, transfer.room, &mut packet);
+            let length = packet.len() - HEADER_LEN;
+            packet[..HEADER_LEN].copy_from_slice(&wire::submit_reply(transfer.seq, Status::Ok, length));
+            state.write(&packet);
+            state.scratch = packet;
+        }
+        state.function.sent();
+        state.sent += 1;
+        state
+    }
+
+    pub(super) fn wait<'a>(&self, state: MutexGuard<'a, State>, limit: Duration) -> MutexGuard<'a, State> {
+        self.changed.wait_timeout(state, limit).unwrap_or_else(|poisoned| poisoned.into_inner()).0
+    }
+}
+
+impl State {
+    fn is_attached(&self, epoch: u32) -> bool {
+        self.epoch == epoch && self.line.is_some()
+    }
+
+    fn data_endpoint(&mut self) -> &mut VecDeque<Waiting> {
+        &mut self.waiting[usize::from(DATA_IN & 0x0f)]
+    }
+
+    fn take_back(&mut self, victim: u32) -> bool {
+        self.waiting.iter_mut().any(|queue| {
+            let place = queue.iter().position(|waiting| waiting.seq == victim);
+            place.and_then(|place| queue.remove(place)).is_some()
+        })
+    }
+
+    fn reply(&mut self, seq: u32, data: &[u8]) {
+        let header = wire::submit_reply(seq, Status::Ok, data.len());
+        self.write(&[&header[..], data].concat());
+    }
+
+    /// A write that fails means that the line has ended, which `serve` sees as well.
+    pub(super) fn write(&mut self, bytes: &[u8]) {
+        if let Some(line) = &mut self.line {
+            let _ended = line.write_all(bytes);
+        }
+    }
+}

@@ -1,0 +1,153 @@
+//! What is on the bus besides the adapter: motors, and a generator of frames.
+//!
+//! A generated frame has `FLOOD_ID`, a counter of 32 bits and the low 32 bits of its send time in us, both little-endian.
+//!
+//! Invariant: a generated frame's number is given out only when the adapter has room for it, so a hole is the reader's loss.
+
+use super::Frame;
+use super::motor::Motor;
+use super::registers::Type;
+use crate::emu::order::Order;
+use crate::emu::pace::Pace;
+use crate::emu::told::Told;
+
+/// Identifier of generated frames: no motor's, and lower in rank than all of them.
+pub const FLOOD_ID: u16 = 0x7f0;
+
+/// A motor of a specification: `5/15/DMH3510`, slave and master id in hexadecimal and its type.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct MotorSpec {
+    /// Identifier it is spoken to by.
+    pub slave: u16,
+    /// Identifier of what it answers.
+    pub master: u16,
+    /// Its type.
+    pub kind: Type,
+}
+
+impl MotorSpec {
+    /// Reads `SLAVE/MASTER/TYPE`.
+    pub fn parse(text: &str) -> Option<Self> {
+        let mut parts = text.split('/');
+        let mut id = |limit| u16::from_str_radix(parts.next()?, 16).ok().filter(|id| *id < limit);
+        let (slave, master) = (id(0x100)?, id(0x800)?);
+        let kind = Type::named(parts.next()?)?;
+        parts.next().is_none().then_some(Self { slave, master, kind })
+    }
+}
+
+impl std::fmt::Display for MotorSpec {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{:x}/{:x}/{}", self.slave, self.master, self.kind.name())
+    }
+}
+
+/// The bus.
+#[derive(Debug)]
+pub struct Bus {
+    motors: Vec<Motor>,
+    flood: Option<Pace>,
+    told: Vec<Told>,
+}
+
+impl Bus {
+    /// A bus with these motors.
+    pub fn new(motors: &[MotorSpec]) -> Self {
+        let motors = motors.iter().map(|spec| Motor::new(spec.kind, spec.slave, spec.master)).collect();
+        Self { motors, flood: None, told: Vec::new() }
+    }
+
+    /// A frame of the adapter's; what is answered is given to `answers`.
+    pub fn send(&mut self, frame: &Frame, now_ns: u64, mut answers: impl FnMut(Frame)) {
+        for motor in &mut self.motors {
+            motor.hear(frame, now_ns).into_iter().for_each(&mut answers);
+        }
+    }
+
+    /// Lets time pass; when it wants to be called again at the latest.
+    pub fn tend(&mut self, now_ns: u64) -> Option<u64> {
+        let flood = self.flood.map(|flood| flood.next_ns(now_ns));
+        self.motors.iter_mut().filter_map(|motor| motor.tend(now_ns)).chain(flood).min()
+    }
+
+    /// The next generated frame, if one is due.
+    pub fn generated(&mut self, now_ns: u64) -> Option<Frame> {
+        let number = self.flood.as_mut()?.beat(now_ns)?;
+        let [a, b, c, d] = number.to_le_bytes();
+        let [e, f, g, h, ..] = (now_ns / 1_000).to_le_bytes();
+        Some(Frame::data(FLOOD_ID, [a, b, c, d, e, f, g, h]))
+    }
+
+    /// What befalls the bus, or one motor of it; false: there is no such motor.
+    pub fn befall(&mut self, motor: Option<u16>, order: Order, now_ns: u64) -> bool {
+        if let Order::Flood(hz) = order {
+            if let Some(mut flood) = self.flood.take() {
+                self.told.push(Told::new("flood_end", flood.summary(now_ns)));
+            }
+            self.flood = (hz > 0.0).then(|| Pace::new(hz, now_ns));
+            return true;
+        }
+        let wanted = |slave| motor.is_none_or(|motor| u32::from(motor) == slave);
+        let mut found = false;
+        for motor in self.motors.iter_mut().filter(|motor| wanted(motor.slave())) {
+            motor.befall(order, now_ns);
+            found = true;
+        }
+        found
+    }
+
+    /// What the bus has to tell since the last call.
+    pub fn told(&mut self) -> impl Iterator<Item = Told> + '_ {
+        self.told.drain(..).chain(self.motors.iter_mut().flat_map(Motor::told))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    const MS: u64 = 1_000_000;
+
+    fn counters(bus: &mut Bus, now_ns: u64) -> Vec<u32> {
+        let counter = |frame: Frame| u32::from_le_bytes(frame.padded()[..4].try_into().unwrap());
+        std::iter::from_fn(|| bus.generated(now_ns)).map(counter).collect()
+    }
+
+    #[test]
+    fn a_motor_specification_is_read_as_it_is_printed() {
+        let spec = MotorSpec::parse("5/15/DMH3510").unwrap();
+        assert_eq!((spec.slave, spec.master, spec.to_string().as_str()), (0x05, 0x15, "5/15/DMH3510"));
+        for wrong in ["5", "5/15", "5/15/DM1", "100/15/DM4310", "5/800/DM4310", "5/15/DM4310/1"] {
+            assert_eq!(MotorSpec::parse(wrong), None, "{wrong}");
+        }
+    }
+
+    #[test]
+    fn each_motor_answers_for_itself() {
+        let mut bus = Bus::new(&["5/15/DMH3510", "6/16/DM4310"].map(|text| MotorSpec::parse(text).unwrap()));
+        let mut answers = Vec::new();
+        bus.send(&Frame::data(0x06, [0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xfc]), 0, |frame| answers.push(frame));
+        assert_eq!(answers.iter().map(|frame| (frame.id, frame.padded()[0])).collect::<Vec<_>>(), [(0x16, 0x16)]);
+        assert!(bus.befall(Some(0x05), Order::Mute(true), 0));
+        assert!(!bus.befall(Some(0x07), Order::Mute(true), 0), "no such motor");
+        answers.clear();
+        bus.send(&Frame::data(0x05, [0; 8]), 0, |frame| answers.push(frame));
+        assert_eq!(answers, []);
+        assert_eq!(bus.told().map(|told| told.action).collect::<Vec<_>>(), ["motor_enabled"]);
+    }
+
+    #[test]
+    fn the_generator_counts_what_it_gave_out() {
+        let mut bus = Bus::new(&[]);
+        bus.befall(None, Order::Flood(1_000.0), 0);
+        assert_eq!(counters(&mut bus, 0), [0_u32; 0]);
+        assert_eq!(counters(&mut bus, 3 * MS), [0, 1, 2]);
+        assert_eq!(bus.tend(3 * MS), Some(4 * MS));
+        bus.befall(None, Order::Flood(0.0), 4 * MS);
+        assert_eq!(counters(&mut bus, 9 * MS), [0_u32; 0]);
+        let told: Vec<Told> = bus.told().collect();
+        assert_eq!(told[0], Told::new("flood_end", json!({"sent": 3, "skipped": 0})));
+    }
+}

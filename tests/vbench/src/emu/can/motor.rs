@@ -1,0 +1,365 @@
+//! A simulated Damiao motor: what it is told over the bus, how it moves, what it answers.
+//!
+//! Frames as in the vendor's `DM_CAN.py` and LeRobot's `motors/damiao`: MIT at its slave id, position with velocity at 0x100 more,
+//! velocity at 0x200 more, parameters at 0x7FF; the answer is one feedback or parameter frame at its master id. It moves towards
+//! what it is told with a lag of the first order, never faster than VMAX, and carries no load.
+//!
+//! Invariant: every frame for a motor that can hear gets one answer, but for a register it does not have and a save while enabled.
+//! Invariant: it moves only while it is enabled; a fault and the time-out of its own disable it until somebody enables it again.
+
+use serde_json::{Value, json};
+
+use super::Frame;
+use super::motion::{Mit, reach, to_unsigned, turn};
+use super::registers::{self, Registers, Type};
+use crate::emu::order::Order;
+use crate::emu::told::Told;
+
+/// Identifier that parameters of every motor are spoken to by.
+const PARAMETERS: u32 = 0x7ff;
+/// Commands further apart than this are two runs of commands.
+const RUN_ENDS_NS: u64 = 100_000_000;
+/// From this temperature on it protects itself, degrees Celsius.
+const TOO_HOT: u8 = 120;
+const COIL_TOO_HOT: u8 = 0xc;
+const COMMUNICATION_LOST: u8 = 0xd;
+
+/// A motor on a bus.
+#[derive(Debug)]
+pub struct Motor {
+    registers: Registers,
+    saved: Registers,
+    enabled: bool,
+    powered: bool,
+    muted: bool,
+    fault: u8,
+    degrees: u8,
+    goal: Goal,
+    position: f64,
+    velocity: f64,
+    torque: f64,
+    moved_ns: u64,
+    heard_ns: u64,
+    run: Option<Run>,
+    told: Vec<Told>,
+}
+
+/// Where it is going.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Goal {
+    Rest,
+    Reach { position: f64, fastest: f64 },
+    Turn(f64),
+}
+
+/// Commands that followed each other without a pause.
+#[derive(Clone, Copy, Debug)]
+struct Run {
+    count: u64,
+    last_ns: u64,
+    longest_gap_ns: u64,
+    /// Between the positions of two commands, rad.
+    largest_step: f64,
+    position: Option<f64>,
+    enabled: bool,
+}
+
+impl Motor {
+    /// A motor as it leaves the factory, cold, disabled and at its zero.
+    pub fn new(kind: Type, slave: u16, master: u16) -> Self {
+        let registers = Registers::new(kind, slave, master);
+        Self {
+            registers,
+            saved: registers,
+            enabled: false,
+            powered: true,
+            muted: false,
+            fault: 0,
+            degrees: 30,
+            goal: Goal::Rest,
+            position: 0.0,
+            velocity: 0.0,
+            torque: 0.0,
+            moved_ns: 0,
+            heard_ns: 0,
+            run: None,
+            told: Vec::new(),
+        }
+    }
+
+    /// Identifier it is spoken to by.
+    pub fn slave(&self) -> u32 {
+        self.registers.slave
+    }
+
+    /// What it has to tell since the last call.
+    pub fn told(&mut self) -> impl Iterator<Item = Told> + '_ {
+        self.told.drain(..)
+    }
+
+    /// Hears a frame; its answer, if the frame is for it.
+    pub fn hear(&mut self, frame: &Frame, now_ns: u64) -> Option<Frame> {
+        if frame.extended || frame.remote || frame.len() != 8 || self.muted || !self.powered {
+            return None;
+        }
+        let bytes = frame.padded();
+        let slave = self.registers.slave;
+        let mode = frame.id.checked_sub(slave).filter(|offset| offset % 0x100 == 0).map(|offset| offset / 0x100 + 1);
+        self.tend(now_ns);
+        match (frame.id, mode) {
+            (PARAMETERS, _) => {
+                (u32::from(u16::from_le_bytes([bytes[0], bytes[1]])) == slave).then_some(())?;
+                self.heard_ns = now_ns;
+                self.parameter(bytes)
+            }
+            (_, Some(mode @ 1..=4)) => {
+                self.heard_ns = now_ns;
+                match bytes {
+                    [0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, word @ 0xfb..=0xfe] => self.switch(word),
+                    _ if mode == self.registers.mode => self.command(bytes, now_ns),
+                    _ => {}
+                }
+                Some(self.feedback())
+            }
+            _ => None,
+        }
+    }
+
+    /// Lets time pass; when it wants to be called again at the latest.
+    pub fn tend(&mut self, now_ns: u64) -> Option<u64> {
+        self.advance(now_ns);
+        let silence = self.registers.patience().filter(|_| self.enabled && self.powered);
+        let mut due_ns = None;
+        if let Some(patience) = silence {
+            let patience_ns = u64::try_from(patience.as_nanos()).unwrap_or(u64::MAX);
+            let give_up_ns = self.heard_ns.saturating_add(patience_ns);
+            if now_ns >= give_up_ns {
+                self.tell("motor_timeout", json!({"after_ns": patience_ns, "last_heard_ns": self.heard_ns}));
+                self.latch(COMMUNICATION_LOST);
+            } else {
+                due_ns = Some(give_up_ns);
+            }
+        }
+        if let Some(run) = self.run {
+            let ends_ns = run.last_ns + RUN_ENDS_NS;
+            if now_ns >= ends_ns {
+                self.run = None;
+                self.tell("commands_end", run.summary());
+            } else {
+                due_ns = Some(due_ns.map_or(ends_ns, |due_ns: u64| due_ns.min(ends_ns)));
+            }
+        }
+        due_ns
+    }
+
+    /// What befalls it.
+    pub fn befall(&mut self, order: Order, now_ns: u64) {
+        self.tend(now_ns);
+        match order {
+            Order::Fault(0) => self.fault = 0,
+            Order::Fault(code) => self.latch(code),
+            Order::Mute(muted) => self.muted = muted,
+            Order::Hot(degrees) => {
+                self.degrees = degrees;
+                if degrees >= TOO_HOT {
+                    self.latch(COIL_TOO_HOT);
+                }
+            }
+            Order::Power(powered) => {
+                self.powered = powered;
+                self.registers = self.saved;
+                self.fault = 0;
+                self.stop();
+            }
+            Order::Ask => {
+                let state = json!({
+                    "enabled": self.enabled, "err": self.err(), "position": self.position, "velocity": self.velocity,
+                    "degrees": self.degrees, "mode": self.registers.mode, "timeout": self.registers.timeout,
+                });
+                self.tell("motor_state", state);
+            }
+            Order::Flood(_) | Order::BusOff(_) | Order::Link(_) => {}
+        }
+    }
+
+    fn switch(&mut self, word: u8) {
+        match word {
+            0xfb => {
+                self.fault = 0;
+                self.tell("motor_cleared", json!({}));
+            }
+            // A latched fault wants to be cleared first.
+            0xfc if self.fault != 0 => self.tell("motor_enable_refused", json!({"err": self.err()})),
+            0xfc if !self.enabled => {
+                self.enabled = true;
+                self.tell("motor_enabled", json!({}));
+            }
+            0xfd => {
+                // Said each time: whoever stops a motor may say it more than once.
+                self.stop();
+                self.tell("motor_disabled", json!({}));
+            }
+            0xfe => {
+                self.position = 0.0;
+                self.goal = Goal::Rest;
+                self.tell("motor_zeroed", json!({}));
+            }
+            _ => {}
+        }
+    }
+
+    fn command(&mut self, bytes: [u8; 8], now_ns: u64) {
+        let limits = [self.registers.pmax, self.registers.vmax, self.registers.tmax].map(f64::from);
+        let [pmax, vmax, tmax] = limits;
+        let real = |at: usize| {
+            let value = f32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]);
+            if value.is_finite() { f64::from(value) } else { 0.0 }
+        };
+        let (goal, torque) = match self.registers.mode {
+            registers::MIT => {
+                let mit = Mit::decode(bytes, limits);
+                let torque =
+                    mit.kp * (mit.position - self.position) + mit.kd * (mit.velocity - self.velocity) + mit.torque;
+                let goal = if mit.kp > 0.0 {
+                    Goal::Reach { position: mit.position, fastest: vmax }
+                } else if mit.kd > 0.0 {
+                    Goal::Turn(mit.velocity)
+                } else {
+                    Goal::Rest
+                };
+                (goal, torque)
+            }
+            registers::POS_VEL => {
+                let fastest = real(4).abs().min(vmax);
+                (Goal::Reach { position: real(0).clamp(-pmax, pmax), fastest }, 0.0)
+            }
+            registers::VEL => (Goal::Turn(real(0).clamp(-vmax, vmax)), 0.0),
+            _ => (Goal::Rest, 0.0),
+        };
+        if self.enabled {
+            self.goal = goal;
+            self.torque = torque.clamp(-tmax, tmax);
+        }
+        let position = match goal {
+            Goal::Reach { position, .. } => Some(position),
+            Goal::Rest | Goal::Turn(_) => None,
+        };
+        let enabled = self.enabled;
+        let Some(run) = &mut self.run else {
+            self.run = Some(Run { count: 1, last_ns: now_ns, longest_gap_ns: 0, largest_step: 0.0, position, enabled });
+            self.tell("commands_begin", json!({"enabled": enabled, "position": position}));
+            return;
+        };
+        run.count += 1;
+        run.longest_gap_ns = run.longest_gap_ns.max(now_ns - run.last_ns);
+        if let (Some(last), Some(position)) = (run.position, position) {
+            run.largest_step = run.largest_step.max((position - last).abs());
+        }
+        run.position = position.or(run.position);
+        run.enabled |= enabled;
+        run.last_ns = now_ns;
+    }
+
+    fn parameter(&mut self, bytes: [u8; 8]) -> Option<Frame> {
+        let [id_low, id_high, word, rid, value @ ..] = bytes;
+        let master = self.master();
+        let answer = |word, rid, value: [u8; 4]| {
+            let [a, b, c, d] = value;
+            Some(Frame::data(master, [id_low, id_high, word, rid, a, b, c, d]))
+        };
+        match word {
+            0x33 => answer(word, rid, self.registers.read(rid)?),
+            0x55 => {
+                if self.registers.write(rid, value) {
+                    self.tell("motor_written", json!({"rid": rid, "bytes": value}));
+                }
+                answer(word, rid, self.registers.read(rid)?)
+            }
+            // It writes its flash only at rest.
+            0xaa if !self.enabled => {
+                self.saved = self.registers;
+                self.tell("motor_saved", json!({}));
+                answer(word, 1, [0; 4])
+            }
+            0xcc => Some(self.feedback()),
+            _ => None,
+        }
+    }
+
+    /// What it says of itself.
+    fn feedback(&self) -> Frame {
+        let [pmax, vmax, tmax] = [self.registers.pmax, self.registers.vmax, self.registers.tmax].map(f64::from);
+        let [p_high, p_low] = (to_unsigned(self.position, pmax, 16) as u16).to_be_bytes();
+        let [v_high, v_low] = (to_unsigned(self.velocity, vmax, 12) as u16).to_be_bytes();
+        let [t_high, t_low] = (to_unsigned(self.torque, tmax, 12) as u16).to_be_bytes();
+        let [id, ..] = self.registers.slave.to_le_bytes();
+        Frame::data(
+            self.master(),
+            [
+                self.err() << 4 | id & 0x0f,
+                p_high,
+                p_low,
+                v_high << 4 | v_low >> 4,
+                v_low << 4 | t_high,
+                t_low,
+                self.degrees,
+                self.degrees,
+            ],
+        )
+    }
+
+    fn master(&self) -> u16 {
+        u16::try_from(self.registers.master).unwrap_or_default()
+    }
+
+    fn err(&self) -> u8 {
+        if self.fault != 0 { self.fault } else { u8::from(self.enabled) }
+    }
+
+    fn latch(&mut self, code: u8) {
+        self.fault = code;
+        self.tell("motor_fault", json!({"err": code, "was_enabled": self.enabled}));
+        self.stop();
+    }
+
+    fn stop(&mut self) {
+        self.enabled = false;
+        self.goal = Goal::Rest;
+        self.velocity = 0.0;
+        self.torque = 0.0;
+    }
+
+    fn advance(&mut self, now_ns: u64) {
+        let seconds = now_ns.saturating_sub(self.moved_ns) as f64 / 1e9;
+        self.moved_ns = self.moved_ns.max(now_ns);
+        match self.goal {
+            Goal::Rest => self.velocity = 0.0,
+            Goal::Reach { position, fastest } => {
+                (self.position, self.velocity) = reach(self.position, position, fastest, seconds);
+            }
+            Goal::Turn(velocity) => {
+                let (moved, reached) = turn(self.velocity, velocity, seconds);
+                self.position += moved;
+                self.velocity = reached;
+            }
+        }
+    }
+
+    fn tell(&mut self, action: &'static str, mut fields: Value) {
+        fields["motor"] = json!(self.registers.slave);
+        self.told.push(Told::new(action, fields));
+    }
+}
+
+impl Run {
+    fn summary(&self) -> Value {
+        json!({
+            "count": self.count, "last_mono_ns": self.last_ns, "longest_gap_ns": self.longest_gap_ns,
+            "largest_step": self.largest_step, "position": self.position, "enabled": self.enabled,
+        })
+    }
+}
+
+#[cfg(test)]
+#[path = "motor_tests.rs"]
+mod tests;

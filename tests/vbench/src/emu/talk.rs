@@ -1,0 +1,86 @@
+//! Devices that are spoken with: what they have to say is sent as soon as the host asks for it, and what they do of their own
+//! is done in time, plugged or not.
+//!
+//! Invariant: `attend` follows whatever changes such a device, so nothing it has to say or tell waits for the next beat.
+
+use std::time::Duration;
+
+use super::attachment::{Shared, State};
+use super::log::Moment;
+use super::order::Order;
+use super::wire::{self, HEADER_LEN, Status};
+use crate::clock;
+
+/// The thread looks at least this often.
+const LONGEST: Duration = Duration::from_secs(1);
+
+impl Shared {
+    /// Keeps the device's own time until the emulator has no more use for it.
+    pub(super) fn talk(&self) {
+        let mut state = self.lock();
+        while !state.ended {
+            self.attend(&mut state, Moment::now());
+            let rest = clock::until(state.due_ns).min(LONGEST);
+            state = self.wait(state, rest);
+        }
+    }
+
+    /// Something happens to the device; false: not to such a one.
+    pub(super) fn befall(&self, motor: Option<u16>, order: Order) -> bool {
+        let now = Moment::now();
+        let mut state = self.lock();
+        let done = state.function.talker().is_some_and(|talker| talker.befall(motor, order, now.mono_ns));
+        self.attend(&mut state, now);
+        done
+    }
+
+    /// Lets the device do what is due, sends what the host asks for, logs what it tells.
+    pub(super) fn attend(&self, state: &mut State, now: Moment) {
+        let Some(talker) = state.function.talker() else { return };
+        let due_ns = talker.tend(now.mono_ns).unwrap_or(u64::MAX);
+        let mut told = Vec::new();
+        talker.told(&mut told);
+        for told in told {
+            let mut fields = told.fields;
+            fields["device"] = self.index.into();
+            self.log.say(told.action, now, fields);
+        }
+        state.deliver(now.mono_ns);
+        let sooner = due_ns < state.due_ns;
+        state.due_ns = due_ns;
+        if sooner {
+            self.changed.notify_all();
+        }
+    }
+}
+
+impl State {
+    /// Answers waiting transfers as long as there is something for them, all in one go.
+    fn deliver(&mut self, now_ns: u64) {
+        let Some(talker) = self.function.talker() else { return };
+        if self.silent {
+            talker.discard();
+            return;
+        }
+        let mut replies = std::mem::take(&mut self.scratch);
+        replies.clear();
+        for (endpoint, queue) in (0..).zip(&mut self.waiting).skip(1) {
+            while let Some(transfer) = queue.front() {
+                let at = replies.len();
+                replies.resize(at + HEADER_LEN, 0);
+                if !talker.take(endpoint, transfer.room, now_ns, &mut replies) {
+                    replies.truncate(at);
+                    break;
+                }
+                let length = replies.len() - at - HEADER_LEN;
+                replies[at..at + HEADER_LEN].copy_from_slice(&wire::submit_reply(transfer.seq, Status::Ok, length));
+                queue.pop_front();
+                self.sent += 1;
+            }
+        }
+        if !replies.is_empty() {
+            self.write(&replies);
+        }
+        self.scratch = replies;
+    }
+}
