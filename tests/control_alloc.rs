@@ -81,7 +81,7 @@ fn a_bus_of_motors_allocates_nothing() {
                 50 => bus.arm(now),
                 450 => bus.disarm(now),
                 at @ 100..400 if at % 20 == 0 => {
-                    bus.target(&[1.0, -1.0, 9.0, 0.0, 0.0, 0.0, at as f64], now, now);
+                    bus.target(&[1.0, -1.0, 9.0, 0.0, 0.0, 0.0, 0.5], now, now);
                 }
                 at @ 400..440 => {
                     bus.target(&[f64::NAN; MOTORS as usize], now, now.after(Duration::from_millis(at)));

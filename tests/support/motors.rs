@@ -69,11 +69,16 @@ impl Adapter {
         self.told().iter().filter(|told| **told == action).count()
     }
 
-    /// Waits until the motors have told this so often.
-    pub(crate) fn wait_for(&self, action: &str, count: usize) {
+    /// Waits until each of `count` motors was turned off after the last time that one was enabled.
+    pub(crate) fn wait_until_off(&self, count: usize) {
         let begun = Instant::now();
-        while self.count(action) < count {
-            assert!(begun.elapsed() < PATIENCE, "no {count} {action}: {:?}", self.told());
+        loop {
+            let told = self.told();
+            let enabled = told.iter().rposition(|told| *told == "motor_enabled").unwrap_or(0);
+            if told[enabled..].iter().filter(|told| **told == "motor_disabled").count() >= count {
+                return;
+            }
+            assert!(begun.elapsed() < PATIENCE, "not turned off: {told:?}");
             std::thread::sleep(Duration::from_millis(2));
         }
     }

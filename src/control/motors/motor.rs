@@ -117,7 +117,6 @@ impl Motor {
     /// Turns it off, from the next frame on.
     pub(super) const fn turn_off(&mut self) {
         self.phase = Phase::Off { told: false };
-        self.status = None;
     }
 
     /// It was told to turn off, and said since that it is not enabled.
@@ -325,8 +324,12 @@ impl Motor {
         }
         match self.phase {
             Phase::Off { .. } if self.is_off() && !is_silent => send(parameter::refresh(slave)),
-            Phase::Off { .. } => {
+            Phase::Off { told } => {
                 send(Order::Disable.frame(slave));
+                if !told {
+                    // What it said before is no answer to this.
+                    self.status = None;
+                }
                 self.phase = Phase::Off { told: true };
             }
             Phase::Asked { at, setting } => {

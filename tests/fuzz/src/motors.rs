@@ -197,7 +197,9 @@ mod tests {
                     bus.step(now, |_| {});
                 }
                 ARM => bus.arm(now),
-                _ => drop(bus.target(&[1.0, 0.5], now.before(Duration::from_millis(1)), now)),
+                _ => {
+                    bus.target(&[1.0, 0.5], now.before(Duration::from_millis(1)), now);
+                }
             }
             states.push(bus.state());
         }

@@ -209,6 +209,36 @@ fn a_disarm_ends_an_arm_at_any_moment() {
 }
 
 #[test]
+fn a_motor_is_off_when_it_says_so_after_it_was_told() {
+    let enabling = || {
+        let mut world = World::ready();
+        world.sims[0].deaf = Some(Order::Enable);
+        world.arm();
+        while !world.sent.contains(&Order::Enable.frame(1)) {
+            world.cycle();
+        }
+        world
+    };
+    // What it said before is no answer to the order, which is sent all the same.
+    let mut world = enabling();
+    world.disarm();
+    let before = world.sims[0].feedback().unwrap();
+    world.bus.feed(&before, world.now);
+    world.cycle();
+    assert!(world.sent.contains(&Order::Disable.frame(1)));
+    // Nor is silence one.
+    let mut world = enabling();
+    world.cycle();
+    world.disarm();
+    world.sims[0].silent = true;
+    world.latency = 0;
+    world.run(1);
+    world.disarm();
+    assert_eq!(world.run_to_fault(), Fault::Silent { motor: 0 });
+    assert_eq!(world.told(Notice::Disabled(Reason::Asked)), 0);
+}
+
+#[test]
 fn an_arm_while_motors_are_disabled_waits_for_that() {
     let mut world = World::armed();
     world.disarm();

@@ -178,9 +178,10 @@ fn the_rate_of_actions_before_a_disarm_is_forgotten() {
         world.run(2);
     }
     world.disarm();
+    world.run(100);
     world.arm();
     world.run_until(BusState::Holding);
-    world.run(40);
+    world.run(150);
     assert!(world.target(&[0.5, 0.5]));
     world.run(39);
     assert_eq!(world.bus.state(), BusState::Following, "two actions 10 ms apart say nothing of these");
