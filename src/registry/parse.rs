@@ -15,6 +15,7 @@ mod hooks;
 mod lan;
 mod module;
 mod motors;
+mod name;
 mod node;
 mod process;
 mod program;
@@ -33,8 +34,8 @@ use program::Programs;
 use verdict::Whose;
 
 pub(super) use device::is_port;
-pub use device::{like_a_name, name_problem};
 pub use file::read_file;
+pub use name::{like_a_name, name_problem};
 
 /// The registry used when there is no file: the rig `rapid --sim` simulates.
 pub const BUILTIN: &str = include_str!("../../devices.toml");
