@@ -59,7 +59,7 @@ async fn motors_move_after_an_arm_and_are_turned_off_at_the_end() {
     let mut motors = open(&adapter);
     // Samples come without an arm, and actions move nothing.
     let begun = Instant::now();
-    until(&mut motors, Some([0.5, -0.5]), |values, _| begun.elapsed() > Duration::from_secs(1)).await;
+    until(&mut motors, Some([0.5, -0.5]), |_, _| begun.elapsed() > Duration::from_secs(1)).await;
     assert_eq!((adapter.count("motor_enabled"), adapter.count("commands_begin")), (0, 0), "{:?}", adapter.told());
 
     motors.order(Asked::Arm).expect("it listens");

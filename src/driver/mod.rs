@@ -154,6 +154,10 @@ impl Driver {
     pub fn order(&mut self, order: Order) -> Result<(), DriverError> {
         match self {
             Self::Motors(driver) => driver.order(order),
+            Self::Sim(driver) => {
+                driver.order(order);
+                Ok(())
+            }
             _ => Ok(()),
         }
     }
@@ -162,6 +166,7 @@ impl Driver {
     pub fn take_notice(&mut self) -> Option<ActuatorNotice> {
         match self {
             Self::Motors(driver) => driver.take_notice(),
+            Self::Sim(driver) => driver.take_notice(),
             _ => None,
         }
     }
@@ -173,10 +178,14 @@ impl Driver {
     /// # Errors
     /// When the device cannot do it, for people; it is read on.
     pub fn record(&mut self, episode: Option<&Arc<Episode>>) -> Result<(), DriverError> {
-        if let Self::Sim(driver) = self {
-            driver.record(episode.is_some());
+        match self {
+            Self::Lan(driver) => driver.record(episode.map(|episode| episode.file.clone())),
+            Self::Sim(driver) => {
+                driver.record(episode.is_some());
+                Ok(())
+            }
+            _ => Ok(()),
         }
-        Ok(())
     }
 
     /// Ends in order what the device does by itself: the run ends, or the device was unplugged. Is given
@@ -185,6 +194,7 @@ impl Driver {
         match self {
             Self::Motors(driver) => driver.close().await,
             Self::Sim(mut driver) => driver.record(false),
+            Self::Lan(driver) => driver.close().await,
             _ => {}
         }
     }

@@ -40,16 +40,18 @@
 //! Invariant: in a scenario that was accepted a device is only plugged while unplugged and the
 //! reverse, at every repetition.
 
+mod standing;
+
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Duration;
 
-use super::attachment::{LanIdentity, UsbIdentity};
 use super::diagnostic::{RegistryErrors, did_you_mean};
 use super::parse::{is_port, read_file};
 use super::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, SimFaults, SimSource};
 use super::section::{Problems, Section, file_label, read};
-use super::spec::{DeviceSpec, LanPicture, NodeSpec, Registry};
+use super::spec::{NodeSpec, Registry};
+use standing::{invent_ports, standing_for};
 
 const DEVICE_KEYS: [&str; 14] = [
     "name",
@@ -69,8 +71,6 @@ const DEVICE_KEYS: [&str; 14] = [
 ];
 const ACTIONS: [&str; 4] = ["plug", "unplug", "silence", "resume"];
 const EVENT_KEYS: [&str; 6] = ["at", "plug", "unplug", "silence", "resume", "port"];
-/// Rate of a simulated serial line, Hz: that of a usual motor controller's state.
-const SERIAL_HZ: u32 = 100;
 /// What a simulated camera adds to each picture, at the most: its name.
 const PICTURE_NAME_BYTES: usize = 64;
 const LONGEST: Duration = Duration::from_hours(7 * 24);
@@ -135,54 +135,6 @@ fn every_entry(registry: &Registry) -> Vec<ScenarioDevice> {
     let mut devices: Vec<_> = registry.devices.iter().map(|spec| standing_for(spec, &spec.name)).collect();
     invent_ports(&mut devices);
     devices
-}
-
-/// A simulated device with an entry's identity and format; its port may still be empty.
-fn standing_for(spec: &DeviceSpec, name: &str) -> ScenarioDevice {
-    let seed = u64::from(spec.id.bit());
-    let source = match &spec.node {
-        NodeSpec::Camera(camera) => {
-            SimSource::Camera { width: camera.width, height: camera.height, fps: camera.fps, seed, bytes: 0 }
-        }
-        // Raw lines have no channels; something must be sent all the same.
-        NodeSpec::Serial(serial) => SimSource::Serial { channels: serial.channels.max(1), hz: SERIAL_HZ, seed },
-        NodeSpec::Process(_) => SimSource::Process,
-        NodeSpec::Can(can) => SimSource::Serial { channels: can.channels().max(1), hz: SERIAL_HZ, seed },
-        NodeSpec::Lan(lan) => match (lan.picture(), lan.shape().as_slice()) {
-            (Some(LanPicture { width, height, fps }), [_, _]) => {
-                SimSource::Camera { width, height, fps, seed, bytes: 0 }
-            }
-            (_, [channels]) => SimSource::Serial { channels: *channels as usize, hz: SERIAL_HZ, seed },
-            // What sends bytes has no numbers; something must be sent all the same.
-            _ => SimSource::Serial { channels: 1, hz: SERIAL_HZ, seed },
-        },
-    };
-    let wished = spec.identity.usb();
-    let lan = wished.is_none().then(|| LanIdentity {
-        entry: spec.name.clone(),
-        address: format!("sim:{name}"),
-        instance: None,
-    });
-    let usb = UsbIdentity {
-        vid: wished.map_or(0, |wished| wished.vid),
-        pid: wished.map_or(0, |wished| wished.pid),
-        serial: Some(spec.identity.serial().map_or_else(|| format!("SIM-{name}"), str::to_owned)),
-        port: wished.and_then(|wished| wished.port.clone()).unwrap_or_default(),
-        product: Some(format!("simulated {}", spec.name)),
-        manufacturer: Some("rapid".to_owned()),
-        firmware: Some("1.00".to_owned()),
-    };
-    ScenarioDevice { name: name.to_owned(), usb, lan, source, plugged: true, faults: SimFaults::default() }
-}
-
-/// Ports of a bus no rig has, for devices whose port nothing says.
-fn invent_ports(devices: &mut [ScenarioDevice]) {
-    let mut taken: Vec<String> = devices.iter().map(|device| device.usb.port.clone()).collect();
-    for device in devices.iter_mut().filter(|device| device.usb.port.is_empty()) {
-        let port = (1..=taken.len() + 1).map(|number| format!("9-{number}")).find(|port| !taken.contains(port));
-        device.usb.port = port.unwrap_or_default();
-        taken.push(device.usb.port.clone());
-    }
 }
 
 fn devices(root: &Section<'_>, registry: &Registry, problems: &mut Problems<'_>) -> Vec<ScenarioDevice> {
