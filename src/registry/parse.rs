@@ -16,6 +16,7 @@ mod identity;
 mod lan;
 mod module;
 mod motors;
+mod name;
 mod node;
 mod process;
 mod program;
@@ -33,9 +34,9 @@ use device::Draft;
 use program::Programs;
 use verdict::Whose;
 
-pub use device::{like_a_name, name_problem};
 pub use file::read_file;
 pub(super) use identity::is_port;
+pub use name::{like_a_name, name_problem};
 
 /// The registry used when there is no file: the rig `rapid --sim` simulates.
 pub const BUILTIN: &str = include_str!("../../devices.toml");
