@@ -96,6 +96,7 @@ fn registry(count: u8) -> Registry {
             disk_reserve: None,
         },
         devices: (0..count).filter_map(device).collect(),
+        modules: Vec::new(),
         path: None,
         text: String::new(),
     }
@@ -111,6 +112,7 @@ async fn pretend(board: Arc<Board>, count: u8, mut commands: mpsc::Receiver<Comm
         tokio::select! {
             () = shutdown.cancelled() => return,
             Some(command) = commands.recv() => match command {
+                Command::Order(_) => say(&board, Level::Info, "there is no actuator".to_owned()),
                 Command::Quit => shutdown.cancel(),
                 Command::ToggleRecording => match episode.take() {
                     Some((_, file, _)) => {
