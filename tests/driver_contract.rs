@@ -17,8 +17,8 @@ use rapid::driver::{Driver, DriverError, sim};
 use rapid::modality::ModalityId;
 use rapid::registry::scenario::{SimDevice, SimSource};
 use rapid::registry::{
-    CameraSpec, DeviceNode, DeviceSpec, Framing, IdentitySpec, NodeSpec, Parse, PixelFormat, SerialSpec, UsbSpec,
-    WhenStale,
+    CameraSpec, DeviceNode, DeviceSpec, Framing, Heard, IdentitySpec, LanFind, LanProtocol, LanSpec, NodeSpec, Parse,
+    PixelFormat, Probe, SerialSpec, UsbSpec, WhenStale,
 };
 use rapid::sample::Encoding;
 use rapid::time::Stamp;
@@ -276,6 +276,59 @@ async fn a_serial_reading_allocates_nothing() {
             assert!(count == 0 || round < 200, "{count} allocations in round {round}");
         }
     }
+}
+
+/// A driver that hears packets, and a sender.
+async fn open_udp() -> (Driver, std::net::UdpSocket) {
+    let free = std::net::UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+    let find = LanFind::Host { host: free.ip(), probe: Probe::Udp, port: free.port() };
+    let protocol = LanProtocol::Udp { port: free.port() };
+    let lan = spec(NodeSpec::Lan(LanSpec { protocol, find, lease: Duration::from_secs(3) }));
+    let driver = Driver::open(&lan, &DeviceNode::Lan { address: free, heard: Heard::default() }).await.unwrap();
+    let sender = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+    sender.connect(free).unwrap();
+    (driver, sender)
+}
+
+#[tokio::test]
+async fn a_packet_allocates_nothing_and_has_the_kernels_time() {
+    let (mut driver, sender) = open_udp().await;
+    for round in 0..1_200_u32 {
+        let sent = Stamp::now();
+        sender.send(&round.to_le_bytes()).unwrap();
+        let (count, reading) = allocations(driver.read()).await;
+        let reading = reading.unwrap();
+        assert_eq!((reading.bytes, reading.encoding), (&round.to_le_bytes()[..], Encoding::Bytes));
+        assert_eq!(reading.flags, rapid::sample::FLAG_DEVICE_TIME);
+        // The wall clock is read a moment apart from ours, and may be slewed.
+        assert!(reading.captured.after(Duration::from_millis(1)) >= sent && reading.captured <= Stamp::now());
+        // As of a serial line.
+        assert!(count == 0 || round < 200, "{count} allocations in round {round}");
+    }
+}
+
+#[tokio::test]
+async fn packets_lose_nothing_when_reads_are_dropped_and_what_the_kernel_drops_is_counted() {
+    let (mut driver, sender) = open_udp().await;
+    for number in 0..200_u32 {
+        sender.send(&number.to_le_bytes()).unwrap();
+    }
+    let read = read_interrupted(&mut driver, 200).await;
+    assert!(read.iter().zip(0_u32..).all(|(packet, number)| *packet == number.to_le_bytes()));
+    // More than the kernel keeps: what is dropped is told with the packets after it.
+    let large = [7; 1024];
+    for _ in 0..40_000 {
+        sender.send(&large).unwrap();
+    }
+    let (mut read, mut lost) = (0, 0);
+    while let Ok(reading) = tokio::time::timeout(Duration::from_millis(200), driver.read()).await {
+        lost += reading.unwrap().lost;
+        read += 1;
+    }
+    sender.send(&large).unwrap();
+    lost += driver.read().await.unwrap().lost;
+    assert_eq!(read + lost, 40_000, "{read} read, {lost} lost");
+    assert!(lost > 0, "the kernel keeps 40 MB");
 }
 
 #[tokio::test]

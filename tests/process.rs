@@ -175,6 +175,10 @@ fn a_program_that_crashes_again_and_again_fails() {
     assert_eq!(failed["detail"], "its process ended with code 1");
     assert_eq!(failed["mask"], "0x00");
     assert_eq!(logged(&told, "crashes after 3 samples").len(), 6, "what it said is in the log");
+    let kept = place.logbook("counter");
+    for words in ["started as process", "crashes after 3 samples", "its process ended with code 1"] {
+        assert_eq!(kept.matches(words).count(), 6, "{words:?} in {kept}");
+    }
 }
 
 #[test]
@@ -189,6 +193,9 @@ fn a_program_that_floods_its_output_is_thinned_and_its_samples_are_whole() {
     let lines = logged(&told, "counter: flood ").len() as u64;
     assert!(lines <= 100 + 20 * seconds, "{lines} lines in {seconds} s");
     assert!(!logged(&told, "lines are left out").is_empty());
+    let kept = place.logbook("counter");
+    assert_eq!(kept.lines().filter(|line| line.contains(" flood ")).count() as u64, lines, "the file has no more");
+    assert!(kept.contains("prints too much: "));
     let episode = Episode::read(&place.path("out").join(&place.files("out")[0]));
     let sequences: Vec<u32> = episode.topic(TOPIC).map(|message| message.sequence).collect();
     assert!(sequences.len() > 100, "{} samples in 7 s at 100 Hz", sequences.len());
@@ -246,6 +253,20 @@ fn a_killed_rapid_takes_its_programs_along() {
     running.signal(Signal::KILL);
     running.end();
     until("the program outlived rapid", || !pids.iter().any(|pid| is_alive(*pid)));
+}
+
+#[test]
+fn the_file_of_a_device_goes_on_over_runs() {
+    let place = Place::new();
+    registry(&place, "", "");
+    for run in 1..=2 {
+        let running = place.start(&sim(&place, ""), "\"streaming\"");
+        running.signal(Signal::INT);
+        assert_eq!(running.end().0, Some(0));
+        let kept = place.logbook("counter");
+        assert_eq!(kept.matches("its process was ended by SIGTERM").count(), run, "{kept}");
+        assert!(kept.lines().all(|line| line.starts_with("20") && line.contains("Z ")), "{kept}");
+    }
 }
 
 #[test]

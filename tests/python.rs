@@ -7,8 +7,10 @@
 #![cfg(target_arch = "x86_64")]
 #![expect(clippy::expect_used, reason = "a test ends where what it needs is missing")]
 
+mod support;
+
 use std::io::{BufRead, BufReader, Read};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Child, ChildStdout, Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -19,25 +21,10 @@ use rapid::bus::{Bus, TopicId};
 use rapid::mask::{MaskRecord, PhysicalMask};
 use rapid::registry::Registry;
 use rapid::sample::{Encoding, SampleHeader};
+use support::python;
 
 /// What the simulated wrist camera would send.
 const PAYLOAD: &[u8] = b"\xff\xd8\xff\xe0 a picture";
-
-/// The Python of `make setup`.
-fn python() -> PathBuf {
-    let python = std::env::var_os("RAPID_PYTHON").map_or_else(
-        || {
-            let cache = std::env::var_os("XDG_CACHE_HOME").map_or_else(
-                || PathBuf::from(std::env::var_os("HOME").expect("a home directory")).join(".cache"),
-                PathBuf::from,
-            );
-            cache.join("rapid/venv/bin/python")
-        },
-        PathBuf::from,
-    );
-    assert!(python.exists(), "no Python environment at {}: run `make setup`", python.display());
-    python
-}
 
 /// The Python example of the README with this text in it.
 fn readme_example(containing: &str) -> String {

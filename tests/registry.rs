@@ -10,8 +10,8 @@ use proptest::prelude::*;
 use rapid::modality::ModalityKind;
 use rapid::registry::scenario::Scenario;
 use rapid::registry::{
-    BUILTIN, CanAdapter, CanProtocol, DeviceSpec, Framing, Hook, Loaded, MotorKind, MotorMode, NodeSpec, Opens,
-    POOL_SPARE, Parse, Registry, VerdictSpec,
+    BUILTIN, CanAdapter, CanProtocol, DeviceSpec, Framing, Hook, LanFind, LanPicture, LanProtocol, Loaded, MotorKind,
+    MotorMode, NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream, Probe, Registry, VerdictSpec,
 };
 
 fn files(folder: &str) -> Vec<PathBuf> {
@@ -77,6 +77,22 @@ fn defaults_are_those_of_the_documentation() {
 }
 
 #[test]
+fn modules_arrive_and_are_mounted_by_name() {
+    let modules = valid("modules").registry.modules;
+    let [get, soft, pinch] = modules.as_slice() else { panic!("three modules") };
+    assert_eq!((get.mount.to_string().as_str(), get.devices.as_slice()), ("tip", &["tactile_tip".to_owned()][..]));
+    assert_eq!(soft.tags[1], ("material".to_owned(), "tpu".to_owned()));
+    assert_eq!((pinch.devices.len(), pinch.tags.len()), (0, 0));
+    let mounted = |names: &[&str]| {
+        let names: Vec<String> = names.iter().map(|name| (*name).to_owned()).collect();
+        rapid::registry::mounted(&modules, &names).map(|found| found.len()).map_err(|error| error.to_string())
+    };
+    assert_eq!(mounted(&["soft_tip", "pinch", "pinch"]), Ok(2));
+    assert!(mounted(&["soft_tpi"]).unwrap_err().contains("did you mean \"soft_tip\"?"));
+    assert!(mounted(&["soft_tip", "get"]).unwrap_err().contains("both sit in the slot tip"));
+}
+
+#[test]
 fn a_program_and_its_settings_arrive() {
     let Loaded { registry, warnings } = valid("process");
     assert_eq!(warnings, []);
@@ -112,6 +128,39 @@ fn hooks_arrive_and_one_of_them_may_be_the_node() {
     assert_eq!(said(imu), [("on_detach", "/bin/sh []".to_owned())]);
     let NodeSpec::Process(process) = &imu.node else { panic!("a program") };
     assert_eq!((process.program.to_str(), process.args.join(" ")), (Some("/bin/sh"), "-c exit".to_owned()));
+}
+
+#[test]
+fn devices_on_the_network_arrive() {
+    let Loaded { registry, warnings } = valid("lan");
+    assert_eq!(warnings, []);
+    let lan = |name: &str| match &registry.named(name).unwrap().node {
+        NodeSpec::Lan(lan) => lan.clone(),
+        node => panic!("{node:?}"),
+    };
+    let picture = |width, height, fps| LanPicture { width, height, fps };
+    let host = |text: &str| text.parse().unwrap();
+    let fixed = |text: &str, probe, port| LanFind::Host { host: host(text), probe, port };
+    assert_eq!(lan("cam_lan").find, fixed("192.168.1.7", Probe::Tcp, 8081));
+    let path = "/video?size=1".to_owned();
+    let protocol = LanProtocol::Mjpeg { port: Some(8081), path, picture: picture(1280, 720, 25) };
+    assert_eq!(lan("cam_lan").protocol, protocol);
+    assert_eq!(lan("lidar").find, fixed("192.168.1.201", Probe::Udp, 2368));
+    assert_eq!((lan("lidar").lease.as_secs(), lan("gopro").lease.as_secs()), (1, 3));
+    assert_eq!(lan("lidar_asked").find, fixed("fd00::7", Probe::Http, 80));
+    assert_eq!(lan("gopro").protocol, LanProtocol::Gopro { port: 8080, download: true });
+    assert_eq!(lan("gopro").find, LanFind::Adapter { host: None });
+    assert_eq!(lan("cam_behind_adapter").find, LanFind::Adapter { host: Some(host("10.0.0.2")) });
+    let instance = Some("iPhone 15-iPhoneVIO".to_owned());
+    assert_eq!(lan("phone").find, LanFind::Mdns { service: "_iphonevio._tcp".to_owned(), instance });
+    let protocol = LanProtocol::Iphone { port: 5556, stream: PhoneStream::Pose, picture: picture(1920, 1440, 30) };
+    assert_eq!(lan("phone_pose").protocol, protocol);
+    let modality = |name: &str| registry.named(name).unwrap().modality();
+    assert_eq!((modality("phone").kind, modality("phone").shape), (ModalityKind::Image, vec![1440, 1920]));
+    assert_eq!((modality("phone_pose").kind, modality("phone_pose").shape), (ModalityKind::Scalars, vec![16]));
+    assert_eq!((modality("lidar").kind, modality("gopro").kind), (ModalityKind::Bytes, ModalityKind::Bytes));
+    let stall = |name: &str| registry.named(name).unwrap().stall_after.as_millis();
+    assert_eq!((stall("cam_lan"), stall("lidar"), stall("gopro")), (500, 500, 10_000));
 }
 
 #[test]

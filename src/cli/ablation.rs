@@ -5,15 +5,15 @@ use std::path::PathBuf;
 use clap::{Args, ValueEnum, ValueHint};
 
 pub(super) const ABLATION: &str = "\
-An episode belongs to a configuration by its tag finger=... (or that of a module) and by the sensors that
-were present when it began. A word of --modality is an entry, a module with sensors, a part of the names of
+An episode belongs to a configuration by its tag finger=... (or that of a module) and by the sensors that \
+were present when it began. A word of --modality is an entry, a module with sensors, a part of the names of \
 entries (tactile for tactile_tip), or vision: cameras that do not sit in a fingertip.
 
 Examples:
   rapid ablation --finger rigid,soft --modality vision,vision+tactile --episodes 20
   rapid ablation plan.toml --in /data/episodes --json
 
-A file has: episodes = 20, fingers = [\"rigid\"], modalities = [\"vision\"], and if needed task = \"...\",
+A file has: episodes = 20, fingers = [\"rigid\"], modalities = [\"vision\"], and if needed task = \"...\", \
 tag = \"finger\" and [words] vision = [\"cam_wrist\"].";
 
 /// Which configurations, and where their episodes are.

@@ -7,7 +7,7 @@ use clap::{Args, ValueHint};
 use super::SimArgs;
 
 pub(super) const REGISTER: &str = "\
-On a terminal it asks for what is not given. Without --serial and --port an entry means the unit that is
+On a terminal it asks for what is not given. Without --serial and --port an entry means the unit that is \
 plugged in by its serial number, or by its port if it has none of its own and is not the only one.
 
 Examples:
@@ -32,7 +32,7 @@ pub struct RegisterArgs {
     /// Port instead, as 1-2.3
     #[arg(long, value_name = "PORT")]
     pub port: Option<String>,
-    /// Name of the entry, such as cam_left
+    /// Name of the entry, such as gripper
     #[arg(long)]
     pub name: Option<String>,
     /// camera, serial, can, lan or the name of a program [default: by the nodes it offers]
@@ -56,11 +56,11 @@ pub struct RegisterArgs {
     /// Show what would be written, and write nothing
     #[arg(long)]
     pub dry_run: bool,
-    /// Take over the devices of a registry.toml of rapid_driver
-    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, conflicts_with_all = ["vid", "pid", "serial", "port", "name", "bit", "slot", "set"])]
+    /// Take over the devices of a registry.toml of `rapid_driver`
+    #[arg(long, help = "Take over the devices of a registry.toml of rapid_driver", value_name = "FILE", value_hint = ValueHint::FilePath, conflicts_with_all = ["vid", "pid", "serial", "port", "name", "bit", "slot", "set"])]
     pub import: Option<PathBuf>,
-    /// Its mask_layout.toml, for the bits
-    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, requires = "import")]
+    /// Its `mask_layout.toml`, for the bits
+    #[arg(long, help = "Its mask_layout.toml, for the bits", value_name = "FILE", value_hint = ValueHint::FilePath, requires = "import")]
     pub layout: Option<PathBuf>,
     /// Where devices come from.
     #[command(flatten)]

@@ -6,7 +6,7 @@ use std::path::Path;
 use serde::Serialize;
 
 use super::{Format, Outcome};
-use crate::registry::{DeviceSpec, Diagnostic, IdentitySpec, Loaded, Mount, Registry, UsbSpec};
+use crate::registry::{DeviceSpec, Diagnostic, IdentitySpec, Loaded, ModuleSpec, Mount, Registry, UsbSpec};
 use crate::text;
 
 /// Reads the registry at `path` and writes its entries, or every problem, to `out`.
@@ -17,6 +17,9 @@ pub fn check(path: &Path, format: Format, out: &mut dyn Write) -> io::Result<Out
     match (Registry::load(path), format) {
         (Ok(loaded), Format::Text) => {
             table(&loaded, out)?;
+            for module in &loaded.registry.modules {
+                writeln!(out, "{}", module_line(module))?;
+            }
             let count = loaded.registry.devices.len();
             let devices = if count == 1 { "device" } else { "devices" };
             writeln!(out, "{}: {count} {devices}, ok", text::plain(&path.display().to_string()))?;
@@ -25,6 +28,9 @@ pub fn check(path: &Path, format: Format, out: &mut dyn Write) -> io::Result<Out
         (Ok(loaded), Format::Json) => {
             for device in &loaded.registry.devices {
                 line(out, &Line::Device(row(device)))?;
+            }
+            for module in &loaded.registry.modules {
+                line(out, &Line::Module(module))?;
             }
             for warning in &loaded.warnings {
                 line(out, &Line::Warning(warning))?;
@@ -56,6 +62,7 @@ pub fn check(path: &Path, format: Format, out: &mut dyn Write) -> io::Result<Out
 #[serde(tag = "kind", rename_all = "lowercase")]
 enum Line<'a> {
     Device(Row<'a>),
+    Module(&'a ModuleSpec),
     Warning(&'a Diagnostic),
     Error(&'a Diagnostic),
 }
@@ -95,6 +102,17 @@ fn unit(usb: &UsbSpec) -> String {
         (None, None) => " any unit".to_owned(),
     };
     format!("{:04x}:{:04x}{place}", usb.vid, usb.pid)
+}
+
+fn module_line(module: &ModuleSpec) -> String {
+    let tags: Vec<String> = module.tags.iter().map(|(key, value)| format!("{key}={value}")).collect();
+    let mut line = format!("module {} in slot {}", module.name, module.mount);
+    for (what, words) in [("sensors", &module.devices), ("tags", &tags)] {
+        if !words.is_empty() {
+            line += &[", ", what, " ", &words.join(" ")].concat();
+        }
+    }
+    text::plain(&line).into_owned()
 }
 
 fn line(out: &mut dyn Write, line: &Line<'_>) -> io::Result<()> {

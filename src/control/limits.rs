@@ -62,13 +62,15 @@ impl Limits {
         Some(Clamped { value, is_news })
     }
 
-    /// From the command before towards `wanted`, as far as the time that passed allows.
+    /// From the command before towards `wanted`, as far as the time that passed allows. Beyond the range
+    /// it stays or comes back.
     #[must_use]
     pub fn slew(&self, before: f64, wanted: f64, passed: Duration) -> f64 {
         let most = self.slew * passed.as_secs_f64();
         let change = wanted - before;
         // `wanted` itself where it is in reach: no rounding keeps the command from arriving.
-        if change.abs() <= most { wanted } else { before + most.copysign(change) }
+        let next = if change.abs() <= most { wanted } else { before + most.copysign(change) };
+        next.clamp(self.low.min(before), self.high.max(before))
     }
 
     /// Of a commanded velocity, what lets the joint come to rest at the ends of `positions`, braking as

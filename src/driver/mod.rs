@@ -154,6 +154,10 @@ impl Driver {
     pub fn order(&mut self, order: Order) -> Result<(), DriverError> {
         match self {
             Self::Motors(driver) => driver.order(order),
+            Self::Sim(driver) => {
+                driver.joints.order(order);
+                Ok(())
+            }
             _ => Ok(()),
         }
     }
@@ -162,6 +166,7 @@ impl Driver {
     pub fn take_notice(&mut self) -> Option<ActuatorNotice> {
         match self {
             Self::Motors(driver) => driver.take_notice(),
+            Self::Sim(driver) => driver.joints.take_notice(),
             _ => None,
         }
     }
@@ -173,8 +178,14 @@ impl Driver {
     /// # Errors
     /// When the device cannot do it, for people; it is read on.
     pub fn record(&mut self, episode: Option<&Arc<Episode>>) -> Result<(), DriverError> {
-        let _ = episode;
-        Ok(())
+        match self {
+            Self::Lan(driver) => driver.record(episode.map(|episode| episode.file.clone())),
+            Self::Sim(driver) => {
+                driver.record(episode.is_some());
+                Ok(())
+            }
+            _ => Ok(()),
+        }
     }
 
     /// Ends in order what the device does by itself: the run ends, or the device was unplugged. Is given
@@ -182,6 +193,8 @@ impl Driver {
     pub async fn close(self) {
         match self {
             Self::Motors(driver) => driver.close().await,
+            Self::Sim(mut driver) => driver.record(false),
+            Self::Lan(driver) => driver.close().await,
             _ => {}
         }
     }

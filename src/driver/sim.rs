@@ -6,6 +6,7 @@
 //!
 //! Invariant: the sequence goes on over a replug; a number that is skipped is told in `lost`.
 
+mod joints;
 mod pictures;
 pub mod task;
 
@@ -17,6 +18,7 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
+use self::joints::Joints;
 use self::pictures::{PICTURES, Pictures, Scene, encode, fill, write_picture};
 use super::{DriverError, Reading, unblock};
 use crate::provenance::{Format, Negotiated};
@@ -47,9 +49,10 @@ pub struct Sim {
     /// The sample in `payload` is to be sent once more, with this stamp.
     again: Option<Stamp>,
     controls: BTreeMap<String, i64>,
-    /// Of simulated motors: where each was last told to go, once they were told.
-    motors: Vec<f64>,
-    moved: bool,
+    /// Its motors, if it has some.
+    pub(super) joints: Joints,
+    /// It was told to record.
+    records: bool,
 }
 
 #[derive(Debug)]
@@ -100,8 +103,8 @@ impl Sim {
             owed: 0,
             again: None,
             controls,
-            motors: Vec::new(),
-            moved: false,
+            joints: Joints::default(),
+            records: false,
         })
     }
 
@@ -113,7 +116,7 @@ impl Sim {
             self.controls = camera.controls.iter().cloned().collect();
         }
         if let NodeSpec::Can(can) = spec {
-            self.motors = vec![0.0; can.channels() / MOTOR_CHANNELS];
+            self.joints = Joints::new(can.channels() / MOTOR_CHANNELS);
         }
         self
     }
@@ -123,9 +126,7 @@ impl Sim {
     /// # Errors
     /// When the device is no actuator, or takes another count of numbers.
     pub(super) fn command(&mut self, target: &[f64]) -> Result<(), DriverError> {
-        if !self.motors.is_empty() && self.motors.len() == target.len() {
-            self.motors.copy_from_slice(target);
-            self.moved = true;
+        if self.joints.command(target) {
             return Ok(());
         }
         match (&self.content, target.try_into()) {
@@ -137,6 +138,14 @@ impl Sim {
             _ => return Err(DriverError::Fatal(format!("{} is no actuator", self.device.name))),
         }
         Ok(())
+    }
+
+    /// Tells the device to record, or to end that.
+    pub(super) fn record(&mut self, record: bool) {
+        if self.records != record {
+            self.records = record;
+            self.device.record(record);
+        }
     }
 
     /// The next sample.
@@ -172,9 +181,7 @@ impl Sim {
                 }
                 Content::Values { channels, seed } => {
                     write_values(*channels, *seed, sequence, &mut self.payload);
-                    if self.moved {
-                        write_positions(&self.motors, &mut self.payload);
-                    }
+                    self.joints.write(&mut self.payload);
                 }
                 Content::Task { part, trial } => {
                     let mut trial = trial.trial();
@@ -341,15 +348,6 @@ fn write_values(channels: usize, seed: u64, sequence: u32, payload: &mut Vec<u8>
             (TAU * (f64::from(sequence % 100_000) / 100.0 + phase)).sin()
         };
         payload.extend_from_slice(&value.to_le_bytes());
-    }
-}
-
-/// Puts the positions of motors in front of what else a sample says of each.
-fn write_positions(positions: &[f64], payload: &mut [u8]) {
-    for (motor, position) in payload.chunks_exact_mut(8 * MOTOR_CHANNELS).zip(positions) {
-        if let Some((place, _)) = motor.split_first_chunk_mut() {
-            *place = position.to_le_bytes();
-        }
     }
 }
 

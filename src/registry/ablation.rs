@@ -68,8 +68,8 @@ impl AblationPlan {
         problems.check()?;
         let root = Section::new(document.get_ref(), 0, String::new());
         root.allow(&mut problems, &["task", "episodes", "tag", "fingers", "modalities", "words"]);
-        let mut plan = Self::default();
-        plan.task = root.text(&mut problems, "task").map(|task| task.value.to_owned());
+        let task = root.text(&mut problems, "task").map(|task| task.value.to_owned());
+        let mut plan = Self { task, ..Self::default() };
         if let Some(episodes) = root.integer(&mut problems, "episodes", 1..=1_000_000) {
             plan.episodes = usize::try_from(episodes.value).unwrap_or(plan.episodes);
         }

@@ -98,10 +98,10 @@ pub fn written(entry: &NewEntry) -> Result<String, EditError> {
     let mut document = DocumentMut::new();
     document.insert("device", Item::Table(devices));
     let table = document.to_string();
-    let mut lines: Vec<String> = entry.comments.iter().map(|comment| commented(&one_line(comment))).collect();
+    let mut lines: Vec<String> = entry.comments.iter().map(|comment| commented(one_line(comment))).collect();
     match &entry.held_back {
         Some(reason) => {
-            lines.push(commented(&format!("Not in use: {}", one_line(reason))));
+            lines.push(commented(format!("Not in use: {}", one_line(reason))));
             lines.extend(table.trim_matches('\n').lines().map(commented));
         }
         None => lines.extend(table.trim_matches('\n').lines().map(str::to_owned)),
@@ -170,10 +170,10 @@ pub fn remove(text: &str, name: &str) -> Result<String, EditError> {
     Ok(new)
 }
 
-/// Does `text` hold any entry?
+/// Does `text` name no device yet? False of a text that is no TOML.
 #[must_use]
-pub fn has_entries(text: &str) -> bool {
-    Document::parse(text).is_ok_and(|document| document.as_table().contains_key("device"))
+pub fn has_no_entries(text: &str) -> bool {
+    Document::parse(text).is_ok_and(|document| !document.as_table().contains_key("device"))
 }
 
 /// A table under a header of its own.
@@ -188,7 +188,7 @@ fn collect(table: &Table, path: &mut Vec<String>, found: &mut Vec<Placed>) {
     if let Some(header) = table.span().filter(|_| !table.is_implicit() && !table.is_dotted() && !path.is_empty()) {
         found.push(Placed { path: path.clone(), end: end_of_values(table).unwrap_or(header.end), header });
     }
-    for (key, item) in table.iter() {
+    for (key, item) in table {
         path.push(key.to_owned());
         match item {
             Item::Table(table) => collect(table, path, found),

@@ -1,4 +1,4 @@
-//! Reading the registry and the mask layout of rapid_driver, for their devices to be taken over.
+//! Reading the registry and the mask layout of `rapid_driver`, for their devices to be taken over.
 //!
 //! `registry.toml` is a list of `[[device]]` with `name`, `backend` (`usb`, the default, or `mdns`),
 //! `vid`, `pid`, `serial`, `service_type` and shell commands; every value is text and may be empty.
@@ -12,10 +12,10 @@ use std::path::Path;
 use super::diagnostic::RegistryErrors;
 use super::section::{Problems, Section, file_label, read};
 
-/// Commands that rapid_driver would run, by their keys.
+/// Commands that `rapid_driver` would run, by their keys.
 const COMMANDS: [&str; 4] = ["on_attach", "on_detach", "on_record_start", "on_record_stop"];
 
-/// A `[[device]]` of rapid_driver.
+/// A `[[device]]` of `rapid_driver`.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Foreign {
     /// Its name, which may be none of ours.

@@ -16,6 +16,7 @@ mod identity;
 mod lan;
 mod module;
 mod motors;
+mod name;
 mod node;
 mod process;
 mod program;
@@ -33,9 +34,9 @@ use device::Draft;
 use program::Programs;
 use verdict::Whose;
 
-pub use device::{like_a_name, name_problem};
 pub use file::read_file;
 pub(super) use identity::is_port;
+pub use name::{like_a_name, name_problem};
 
 /// The registry used when there is no file: the rig `rapid --sim` simulates.
 pub const BUILTIN: &str = include_str!("../../devices.toml");
@@ -95,6 +96,7 @@ impl Registry {
         check_identities(&drafts, &mut problems);
         check_topics(&drafts, &mut problems);
         check_actuators(&drafts, &mut problems);
+        lan::check_ports(&drafts, &mut problems);
         let mut warnings = assign_bits(&mut drafts, &mut problems);
         warnings.extend(unused_ports(&drafts, &problems));
         warnings.extend(drafts.iter().flat_map(|draft| program::distrusted(draft, &problems)));

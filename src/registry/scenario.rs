@@ -180,6 +180,8 @@ pub struct SimDevice {
     pub begun: Stamp,
     unplugged: AtomicBool,
     silent: AtomicBool,
+    /// Episodes it was told to record by itself, and of how many of them it was told the end.
+    episodes: (AtomicU32, AtomicU32),
     /// Next sequence number; it goes on over a replug, as a device with its own counter would.
     pub sequence: AtomicU32,
     /// What a camera looks at.
@@ -226,6 +228,7 @@ impl SimDevice {
             begun,
             unplugged: AtomicBool::new(false),
             silent: AtomicBool::new(false),
+            episodes: (AtomicU32::new(0), AtomicU32::new(0)),
             sequence: AtomicU32::new(0),
             light: SimLight::default(),
         }
@@ -257,6 +260,19 @@ impl SimDevice {
     #[must_use]
     pub fn is_silent(&self) -> bool {
         self.silent.load(Ordering::Acquire)
+    }
+
+    /// Tells it to record by itself, or to end that.
+    pub fn record(&self, record: bool) {
+        let (begun, over) = &self.episodes;
+        if record { begun } else { over }.fetch_add(1, Ordering::AcqRel);
+    }
+
+    /// How often it was told to record, and how often to end that.
+    #[must_use]
+    pub fn recordings(&self) -> (u32, u32) {
+        let (begun, over) = &self.episodes;
+        (begun.load(Ordering::Acquire), over.load(Ordering::Acquire))
     }
 }
 

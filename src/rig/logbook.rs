@@ -201,7 +201,7 @@ mod tests {
         let names = ["cam.log.3", "cam.log.2", "cam.log.1", "cam.log"];
         assert_eq!(
             names.map(|name| read(&folder, name)),
-            ["three\nfour\n", "five\nsix\n", "seven\neight\n", "nine\nten\neleven\n"].map(str::to_owned)
+            ["five\nsix\n", "seven\neight\n", "nine\nten\n", "eleven\n"].map(str::to_owned)
         );
         assert_eq!(read(&folder, "imu.log"), "apart\n");
         assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 5);

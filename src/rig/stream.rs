@@ -32,9 +32,9 @@ const OPEN_LIMIT: Duration = Duration::from_secs(10);
 /// A device that is open and has sent nothing for this long is said to be silent, once an epoch. It
 /// stays Opening: what sends only when something happens may do so at any time.
 const SILENT_AFTER: Duration = Duration::from_secs(2);
-/// A camera always sends: one that has sent nothing for this long is opened again. Six of these and the
-/// delays between them fit into the minute in which five restarts are allowed.
-const CAMERA_LIMIT: Duration = Duration::from_secs(5);
+/// Cameras and programs always send: one that has sent nothing for this long since it was opened is opened
+/// again. Six of these and the delays between them fit into the minute in which five restarts are allowed.
+const START_LIMIT: Duration = Duration::from_secs(5);
 /// How long a device may take to be closed in order.
 const CLOSE_LIMIT: Duration = Duration::from_secs(2);
 /// How often the actuator is asked whether it was told something.
@@ -199,7 +199,9 @@ impl Stream {
                         stall.as_mut().reset(due);
                         continue;
                     }
-                    if patience.is_some_and(|patience| newest.elapsed() >= patience) {
+                    // To begin takes longer than to go on: an interpreter has its libraries to load.
+                    let least = if pulse == Pulse::Silent { START_LIMIT } else { Duration::ZERO };
+                    if patience.is_some_and(|patience| newest.elapsed() >= patience.max(least)) {
                         return (End::Retry, format!("nothing came for {:?}", newest.elapsed()));
                     }
                     if pulse == Pulse::Beating {
@@ -234,7 +236,7 @@ impl Stream {
         if !matches!(self.spec.node, NodeSpec::Camera(_)) || self.attachment.node.is_recording() {
             return std::future::pending().await;
         }
-        let limit = CAMERA_LIMIT.max(2 * say);
+        let limit = START_LIMIT.max(2 * say);
         sleep_until(opened + limit).await;
         format!("open, but sent nothing for {} s", limit.as_secs())
     }

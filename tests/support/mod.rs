@@ -23,6 +23,22 @@ pub(crate) fn until(what: &str, mut holds: impl FnMut() -> bool) {
     }
 }
 
+/// The Python of `make setup`.
+pub(crate) fn python() -> PathBuf {
+    let python = std::env::var_os("RAPID_PYTHON").map_or_else(
+        || {
+            let cache = std::env::var_os("XDG_CACHE_HOME").map_or_else(
+                || PathBuf::from(std::env::var_os("HOME").expect("a home directory")).join(".cache"),
+                PathBuf::from,
+            );
+            cache.join("rapid/venv/bin/python")
+        },
+        PathBuf::from,
+    );
+    assert!(python.exists(), "no Python environment at {}: run `make setup`", python.display());
+    python
+}
+
 /// A folder and an instance name of a test's own.
 pub(crate) struct Place {
     pub(crate) folder: tempfile::TempDir,
@@ -81,6 +97,8 @@ impl Place {
             .env_remove("RAPID_LOG")
             .env("HOME", self.folder.path())
             .env_remove("XDG_CONFIG_HOME")
+            .env_remove("XDG_STATE_HOME")
+            .env_remove("STATE_DIRECTORY")
             .args(["--instance", &self.instance])
             .args(arguments)
             .stdin(Stdio::null())
@@ -101,6 +119,12 @@ impl Place {
         let mut running = Running { child: Some(child), log };
         running.wait_for(word);
         running
+    }
+
+    /// What the programs of a device printed, over all runs in this place.
+    pub(crate) fn logbook(&self, device: &str) -> String {
+        let folder = self.path(".local/state/rapid/logs").join(&self.instance);
+        std::fs::read_to_string(folder.join(format!("{device}.log"))).unwrap_or_default()
     }
 
     /// Files in `folder` of this place, by name.

@@ -96,7 +96,7 @@ fn meant(modalities: &str, plan: &AblationPlan, registry: &Registry) -> Result<B
 
 /// 1. What the plan says it means; 2. the entry of that name; 3. the sensors of the module of that name;
 /// 4. the entries with that word in their names, as `tactile` in `tactile_tip`; 5. `vision`: the cameras that
-/// do not sit in a fingertip.
+///    do not sit in a fingertip.
 fn word_means(word: &str, plan: &AblationPlan, registry: &Registry) -> Vec<String> {
     let names = |is_meant: &dyn Fn(&DeviceSpec) -> bool| -> Vec<String> {
         registry.devices.iter().filter(|device| is_meant(device)).map(|device| device.name.clone()).collect()

@@ -15,7 +15,7 @@ use crate::registry::{CameraSpec, PixelFormat};
 const HIGH_SPEED: f64 = 0.8 * 60e6 * 1024.0 / 1062.0;
 /// Of one endpoint: three transactions of 1024 bytes in each of 8000 microframes (5.6.3).
 const ONE_ENDPOINT: f64 = 3.0 * 1024.0 * 8000.0;
-/// Of a full-speed bus: 90 % of 12 Mbit/s; of one endpoint 1023 bytes a millisecond (5.6.3).
+/// Of a full-speed bus, and of one endpoint: 1023 bytes a millisecond (5.6.3).
 const FULL_SPEED: f64 = 1023.0 * 1000.0;
 /// Of a bus of 5 Gbit/s: 500 MB/s remain of its coding, 80 % of them for payload.
 const SUPER_SPEED: f64 = 0.8 * 500e6;
@@ -62,21 +62,20 @@ impl Wish {
 
     /// The next lower rate, or where it is low already the next smaller size.
     fn lower(&mut self) -> bool {
-        let CameraSpec { width, height, fps, .. } = self.camera;
         /// Below, a smaller picture serves better than a slower one.
         const SLOW: u32 = 15;
+        let CameraSpec { width, height, fps, .. } = self.camera;
         let slower = RATES.into_iter().find(|rate| *rate < fps && *rate >= SLOW);
         let pixels = |(width, height): (u32, u32)| u64::from(width) * u64::from(height);
         let smaller = SIZES.into_iter().find(|size| pixels(*size) < pixels((width, height)));
         let slowest = RATES.into_iter().find(|rate| *rate < fps);
         match (slower, smaller, slowest) {
-            (Some(rate), ..) => self.camera.fps = rate,
+            (Some(rate), ..) | (None, None, Some(rate)) => self.camera.fps = rate,
             (None, Some(size), _) => {
                 self.max_bytes = usize::try_from(self.max_bytes as u64 * pixels(size) / pixels((width, height)).max(1))
                     .unwrap_or(self.max_bytes);
                 (self.camera.width, self.camera.height) = size;
             }
-            (None, None, Some(rate)) => self.camera.fps = rate,
             (None, None, None) => return false,
         }
         true
@@ -154,7 +153,11 @@ mod tests {
         for (wishes, mbit, expected) in [
             (vec![wish(640, 480, 30, Yuyv)], 480.0, ""),
             (vec![wish(640, 480, 30, Yuyv); 2], 480.0, ""),
-            (vec![wish(640, 480, 30, Yuyv); 3], 480.0, "[device.cam] 640x480@20 YUYV"),
+            (
+                vec![wish(640, 480, 30, Yuyv), wish(640, 480, 50, Grey), wish(640, 480, 60, Grey)],
+                480.0,
+                "[device.cam] 640x480@30 GREY",
+            ),
             // More than one endpoint carries, though the bus would.
             (vec![wish(1280, 720, 30, Yuyv)], 480.0, "[device.cam] 800x600@15 YUYV"),
             (vec![wish(1280, 720, 30, Grey)], 480.0, "[device.cam] 1280x720@25 GREY"),

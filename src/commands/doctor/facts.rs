@@ -7,6 +7,8 @@ use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
+use crate::driver::can::netlink;
+
 use super::usb::{UsbDevice, devices};
 
 /// See the module's comment. Whatever cannot be read is `None` or missing.
@@ -84,6 +86,10 @@ pub(super) struct Interface {
     pub(super) name: String,
     /// `up`, `down` or `unknown`
     pub(super) state: String,
+    /// Bits a second; not in sysfs, see [`ask_can`].
+    pub(super) bitrate: Option<u32>,
+    /// It left the bus after too many errors.
+    pub(super) bus_off: bool,
     /// Frames that wait in the kernel at most.
     pub(super) queue: Option<u64>,
     /// The USB device, by its port.
@@ -195,6 +201,15 @@ fn limits(root: &Path) -> (Option<u64>, Option<u64>) {
     (soft("Max realtime priority"), soft("Max locked memory"))
 }
 
+/// Asks the kernel for what sysfs does not say of CAN interfaces.
+pub(super) fn ask_can(interfaces: &mut [Interface]) {
+    for interface in interfaces {
+        if let Ok(seen) = netlink::look(&interface.name) {
+            (interface.bitrate, interface.bus_off) = (seen.bitrate, seen.bus_off);
+        }
+    }
+}
+
 fn interfaces(root: &Path, usb: &[UsbDevice]) -> Vec<Interface> {
     /// `ARPHRD_CAN` of `linux/if_arp.h`.
     const CAN: &str = "280";
@@ -204,6 +219,8 @@ fn interfaces(root: &Path, usb: &[UsbDevice]) -> Vec<Interface> {
         (word(&folder.join("type")).as_deref() == Some(CAN)).then(|| Interface {
             name: name.clone(),
             state: word(&folder.join("operstate")).unwrap_or_else(|| "unknown".to_owned()),
+            bitrate: None,
+            bus_off: false,
             queue: word(&folder.join("tx_queue_len")).and_then(|frames| frames.parse().ok()),
             port: port_of(&folder, usb),
         })

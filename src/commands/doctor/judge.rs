@@ -6,9 +6,12 @@ use serde::Serialize;
 
 use super::bandwidth::{self, Wish};
 use super::facts::{Facts, Node};
+use super::machine;
 use super::usb::UsbDevice;
 use crate::registry::{DeviceSpec, NodeSpec, Opens, Registry};
-use crate::text;
+
+/// A camera that runs slower than this, Mbit/s, is in the wrong port or on a bad cable.
+const SLOWEST: f64 = 480.0;
 
 /// How bad it is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
@@ -37,15 +40,15 @@ pub(super) struct Finding {
 }
 
 impl Finding {
-    fn ok(about: &'static str, what: impl Into<String>) -> Self {
+    pub(super) fn ok(about: &'static str, what: impl Into<String>) -> Self {
         Self { level: Level::Ok, about, what: what.into(), fix: None }
     }
 
-    fn warn(about: &'static str, what: impl Into<String>, fix: impl Into<String>) -> Self {
+    pub(super) fn warn(about: &'static str, what: impl Into<String>, fix: impl Into<String>) -> Self {
         Self { level: Level::Warn, about, what: what.into(), fix: Some(fix.into()) }
     }
 
-    fn bad(about: &'static str, what: impl Into<String>, fix: impl Into<String>) -> Self {
+    pub(super) fn bad(about: &'static str, what: impl Into<String>, fix: impl Into<String>) -> Self {
         Self { level: Level::Bad, about, what: what.into(), fix: Some(fix.into()) }
     }
 }
@@ -60,11 +63,11 @@ pub(super) fn judge(facts: &Facts, registry: Option<&Registry>, rules: Option<&s
     found.extend(speeds(&plugged));
     found.extend(serials(&facts.usb, entries));
     found.extend(nodes(facts, entries, &plugged));
-    found.extend(udev(facts, rules));
+    found.extend(machine::udev(facts, rules));
     found.extend(suspending(&plugged));
-    found.extend(can(facts, entries, &plugged));
-    found.extend(limits(facts, registry));
-    found.extend(disk(facts, registry));
+    found.extend(machine::can(facts, entries, &plugged));
+    found.extend(machine::limits(facts, registry));
+    found.extend(machine::disk(facts, registry));
     found
 }
 
@@ -109,7 +112,8 @@ const fn subsystem(entry: &DeviceSpec) -> Option<(&'static str, &'static str)> {
     }
 }
 
-fn mb(bytes: f64) -> String {
+/// A rate, for people.
+pub(super) fn megabytes(bytes: f64) -> String {
     format!("{:.1} MB/s", bytes / 1e6)
 }
 
@@ -118,21 +122,19 @@ fn buses(facts: &Facts, plugged: &[(&DeviceSpec, &UsbDevice)]) -> Vec<Finding> {
     let mut found = Vec::new();
     let roots = facts.usb.iter().filter(|device| device.is_root());
     for root in roots {
-        let wishes: Vec<(Wish, &UsbDevice)> = plugged
+        // What runs slower has a finding of its own, and takes next to nothing behind its hub.
+        let of_the_bus = |device: &UsbDevice| device.bus == root.bus && device.mbit >= SLOWEST;
+        let wishes: Vec<Wish> = plugged
             .iter()
-            .filter(|(_, device)| device.bus == root.bus)
-            .filter_map(|(entry, device)| {
+            .filter(|(_, device)| of_the_bus(device))
+            .filter_map(|(entry, _)| {
                 let NodeSpec::Camera(camera) = &entry.node else { return None };
-                let wish = Wish { name: entry.name.clone(), camera: camera.clone(), max_bytes: entry.max_bytes };
-                Some((wish, *device))
+                Some(Wish { name: entry.name.clone(), camera: camera.clone(), max_bytes: entry.max_bytes })
             })
             .collect();
-        if wishes.is_empty() {
-            continue;
+        if !wishes.is_empty() {
+            found.push(bus(root.bus, root.mbit, &wishes));
         }
-        let slow = wishes.iter().map(|(_, device)| device.mbit).fold(root.mbit, f64::min);
-        let wishes: Vec<Wish> = wishes.into_iter().map(|(wish, _)| wish).collect();
-        found.push(bus(root.bus, slow, &wishes));
     }
     found
 }
@@ -142,7 +144,7 @@ fn bus(bus: u32, mbit: f64, wishes: &[Wish]) -> Finding {
     let estimated = wishes.iter().any(Wish::is_estimated);
     let most = if estimated { "at most (estimated: the largest pictures that MJPG may give) " } else { "" };
     let (taken, budget) = (bandwidth::taken(wishes, mbit), bandwidth::budget(mbit));
-    let what = format!("bus {bus} carries {names}: {most}{} of {}", mb(taken), mb(budget));
+    let what = format!("bus {bus} carries {names}: {most}{} of {}", megabytes(taken), megabytes(budget));
     let lower = bandwidth::fitting(wishes, mbit);
     let fix = match &lower {
         Some(lower) if lower.is_empty() => return Finding::ok("bandwidth", what),
@@ -159,7 +161,7 @@ fn bus(bus: u32, mbit: f64, wishes: &[Wish]) -> Finding {
 /// Cameras that run slower than cameras do.
 fn speeds(plugged: &[(&DeviceSpec, &UsbDevice)]) -> Vec<Finding> {
     let slow =
-        plugged.iter().filter(|(entry, device)| matches!(entry.node, NodeSpec::Camera(_)) && device.mbit < 480.0);
+        plugged.iter().filter(|(entry, device)| matches!(entry.node, NodeSpec::Camera(_)) && device.mbit < SLOWEST);
     let say = |(entry, device): &(&DeviceSpec, &UsbDevice)| {
         let what = format!("[device.{}] runs at {} Mbit/s, too slow for pictures", entry.name, device.mbit);
         Finding::bad("speed", what, format!("another cable, port or hub: it is at port {}", device.port))
@@ -267,27 +269,6 @@ fn nodes(facts: &Facts, entries: &[DeviceSpec], plugged: &[(&DeviceSpec, &UsbDev
     found
 }
 
-fn udev(facts: &Facts, rules: Option<&str>) -> Vec<Finding> {
-    const INSTALL: &str = "sudo rapid artifacts --install";
-    let mut found = Vec::new();
-    if !facts.udev_runs {
-        let what = "no udev daemon runs: plugged devices are not seen";
-        found.push(Finding::bad("udev", what, "sudo systemctl start systemd-udevd"));
-    }
-    match (&facts.rules, rules) {
-        (_, None) => {}
-        (None, Some(_)) => {
-            let what = "the udev rules are not installed: no stable names /dev/rapid/NAME";
-            found.push(Finding::warn("udev", what, INSTALL));
-        }
-        (Some(installed), Some(rules)) if installed != rules => {
-            found.push(Finding::warn("udev", "the installed udev rules are not those of this registry", INSTALL));
-        }
-        (Some(_), Some(_)) => found.push(Finding::ok("udev", "the udev rules are those of this registry")),
-    }
-    found
-}
-
 fn suspending(plugged: &[(&DeviceSpec, &UsbDevice)]) -> Vec<Finding> {
     let mut seen = Vec::new();
     let mut found = Vec::new();
@@ -302,150 +283,4 @@ fn suspending(plugged: &[(&DeviceSpec, &UsbDevice)]) -> Vec<Finding> {
         found.push(Finding::warn("suspend", what, fix));
     }
     found
-}
-
-/// CAN interfaces: up, and with a queue that takes a burst.
-fn can(facts: &Facts, entries: &[DeviceSpec], plugged: &[(&DeviceSpec, &UsbDevice)]) -> Vec<Finding> {
-    /// A burst of commands to a whole arm; the kernel's default of 10 loses some of it (ENOBUFS).
-    const LEAST_QUEUE: u64 = 64;
-    let mut found = Vec::new();
-    for interface in &facts.can {
-        let entry =
-            plugged.iter().find(|(_, device)| Some(&device.port) == interface.port.as_ref()).map(|(entry, _)| entry);
-        let bitrate =
-            entry.and_then(|entry| if let NodeSpec::Can(can) = &entry.node { Some(can.bitrate) } else { None });
-        let name = &interface.name;
-        if entry.is_none() && !entries.is_empty() {
-            continue;
-        }
-        if interface.state == "down" {
-            let fix = format!("sudo ip link set {name} up type can bitrate {}", bitrate.unwrap_or(1_000_000));
-            found.push(Finding::warn(
-                "can",
-                format!("{name} is down; rapid brings it up only if it is permitted to"),
-                fix,
-            ));
-        } else {
-            found.push(Finding::ok("can", format!("{name} is up")));
-        }
-        if let Some(queue) = interface.queue.filter(|queue| *queue < LEAST_QUEUE) {
-            let what = format!("{name} queues {queue} frames at most: a burst of commands does not fit");
-            found.push(Finding::warn("can", what, format!("sudo ip link set {name} txqueuelen 256")));
-        }
-    }
-    found
-}
-
-fn limits(facts: &Facts, registry: Option<&Registry>) -> Vec<Finding> {
-    /// libusb programs with cameras need more than the kernel's default of 16 MB.
-    const USBFS_MB: u64 = 64;
-    /// Of the sources that x86 and ARM machines have, those that are read without a trap into the kernel.
-    const FAST_CLOCKS: [&str; 4] = ["tsc", "arch_sys_counter", "kvm-clock", "hyperv_clocksource_tsc_page"];
-    let mut found = Vec::new();
-    match facts.realtime {
-        Some(0) if !facts.user.is_root => {
-            let what = "real-time priority is not permitted: under load the mask's beat of 2 ms becomes uneven";
-            let fix = "echo \"$USER - rtprio 80\" | sudo tee /etc/security/limits.d/rapid.conf, and log in again";
-            found.push(Finding::warn("limits", what, fix));
-        }
-        Some(_) => found.push(Finding::ok("limits", "real-time priority is permitted")),
-        None => {}
-    }
-    if let Some(locked) = facts.locked_memory {
-        let shown = if locked == u64::MAX { "no limit".to_owned() } else { text::size(locked) };
-        found.push(Finding::ok("limits", format!("memory that may be locked: {shown}; rapid locks none")));
-    }
-    if let (Some((size, free)), Some(registry)) = (facts.shared_memory, registry) {
-        let wanted = registry.rig.memory_budget;
-        let what = format!(
-            "/dev/shm has {} free of {}, and memory_budget is {}",
-            text::size(free),
-            text::size(size),
-            text::size(wanted)
-        );
-        found.push(if free < wanted {
-            let size = (wanted + (size - free.min(size))).div_ceil(1 << 20) + 64;
-            Finding::bad(
-                "memory",
-                what,
-                format!("sudo mount -o remount,size={size}M /dev/shm; or lower memory_budget under [rig]"),
-            )
-        } else {
-            Finding::ok("memory", what)
-        });
-    }
-    if let Some(clock) = &facts.clock {
-        found.push(if FAST_CLOCKS.contains(&clock.as_str()) {
-            Finding::ok("clock", format!("the kernel's clock source is {clock}"))
-        } else {
-            let what = format!("the kernel's clock source is {clock}, slow to read");
-            Finding::warn("clock", what, "see `journalctl -k -b | grep -i clocksource` for why it is not tsc")
-        });
-    }
-    let programs = registry.is_some_and(|registry| {
-        registry
-            .devices
-            .iter()
-            .any(|entry| matches!(&entry.node, NodeSpec::Process(process) if process.opens == Opens::Usb))
-    });
-    if let Some(mb) = facts.usbfs_mb.filter(|mb| programs && *mb != 0 && *mb < USBFS_MB) {
-        let what = format!("programs that read USB devices themselves share {mb} MB for transfers");
-        let fix = "echo 256 | sudo tee /sys/module/usbcore/parameters/usbfs_memory_mb";
-        found.push(Finding::warn("usbfs", what, fix));
-    }
-    found
-}
-
-/// Does the disk take what the devices may send?
-fn disk(facts: &Facts, registry: Option<&Registry>) -> Vec<Finding> {
-    /// Shorter than a session.
-    const SHORT: f64 = 1800.0;
-    let Some(disk) = &facts.disk else { return Vec::new() };
-    let folder = text::plain(&disk.folder.display().to_string()).into_owned();
-    let mut found = Vec::new();
-    let wanted: f64 = registry.map(|registry| registry.devices.iter().map(most).sum()).unwrap_or_default();
-    match &disk.rate {
-        Err(error) => {
-            found.push(Finding::bad(
-                "disk",
-                format!("{folder} cannot be written to: {error}"),
-                "choose another folder with --out",
-            ));
-        }
-        Ok(rate) => {
-            let what = format!("{folder} took {}; the devices send at most {} (estimated)", mb(*rate), mb(wanted));
-            found.push(if *rate < wanted {
-                Finding::warn("disk", what, "record on a faster disk: --out DIR")
-            } else {
-                Finding::ok("disk", what)
-            });
-        }
-    }
-    let usual = (1_u64 << 30).min(disk.size / 20);
-    let reserve = registry.and_then(|registry| registry.rig.disk_reserve).unwrap_or(usual);
-    let room = disk.free.saturating_sub(reserve);
-    let seconds = if wanted > 0.0 { room as f64 / wanted } else { f64::INFINITY };
-    let lasts =
-        if seconds.is_finite() { format!(", {:.0} min of everything at most", seconds / 60.0) } else { String::new() };
-    let what = format!("{} free besides the reserve of {}{lasts}", text::size(room), text::size(reserve));
-    found.push(if room == 0 {
-        Finding::bad("disk", what, "remove or move recordings, or choose another folder with --out")
-    } else if seconds < SHORT {
-        Finding::warn("disk", what, "remove or move recordings, or choose another folder with --out")
-    } else {
-        Finding::ok("disk", what)
-    });
-    found
-}
-
-/// Bytes a second that a device sends at the most.
-fn most(entry: &DeviceSpec) -> f64 {
-    match &entry.node {
-        NodeSpec::Camera(camera) => {
-            Wish { name: String::new(), camera: camera.clone(), max_bytes: entry.max_bytes }.bytes_per_second()
-        }
-        NodeSpec::Serial(serial) => f64::from(serial.baud) / 10.0,
-        NodeSpec::Can(can) => f64::from(can.bitrate) / 8.0,
-        _ => 0.0,
-    }
 }

@@ -5,6 +5,7 @@
 mod bandwidth;
 mod facts;
 mod judge;
+mod machine;
 mod usb;
 
 use std::io::{self, Write};
@@ -33,6 +34,7 @@ pub fn doctor(
     out: &mut dyn Write,
 ) -> io::Result<bool> {
     let mut facts = facts::collect(Path::new("/"));
+    facts::ask_can(&mut facts.can);
     facts.disk = disk(episodes);
     report(&facts, registry, format, out)
 }
@@ -110,7 +112,7 @@ fn tree_line(device: &UsbDevice, entries: &[&str]) -> String {
         line.push_str("  hub");
     }
     for entry in entries {
-        line.push_str(&format!("  [device.{entry}]"));
+        line += &["  [device.", entry, "]"].concat();
     }
     if let Some(product) = &device.product {
         line.push_str("  ");
@@ -181,3 +183,6 @@ fn write_rate(folder: &Path) -> io::Result<f64> {
     file.sync_data()?;
     Ok(written as f64 / begun.elapsed().as_secs_f64().max(1e-6))
 }
+
+#[cfg(test)]
+mod tests;

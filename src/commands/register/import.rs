@@ -1,4 +1,4 @@
-//! Taking over the devices of rapid_driver.
+//! Taking over the devices of `rapid_driver`.
 //!
 //! Its registry says no more of a device than how it is found and what to run. How it is read is seen
 //! at the device, if it is plugged in, or said by `--node`; an entry for which neither tells is written
@@ -14,6 +14,10 @@ use crate::registry::edit::{NewEntry, Setting};
 use crate::registry::import::{Foreign, devices, layout};
 use crate::registry::{Attachment, DeviceNode, RegistryErrors, UsbIdentity, like_a_name, name_problem, read_file};
 use crate::text;
+
+/// What announces itself by a service type, and what it speaks (`aod321/iPhoneVIO`; OpenGoPro,
+/// "mDNS").
+const PROTOCOLS: [(&str, &str); 2] = [("_iphonevio._tcp", "iphone"), ("_gopro-web._tcp", "gopro")];
 
 /// Why nothing is imported.
 #[derive(Debug, thiserror::Error)]
@@ -67,7 +71,16 @@ impl Reader {
     /// Otherwise why that is not known.
     fn of(device: &Foreign, node: Option<&str>, attached: &[Attachment]) -> Result<Self, String> {
         if let Some(service) = &device.service {
-            return Err(format!("it is found by mDNS ({service}), for which the settings are to be written by hand"));
+            let Some((_, protocol)) = PROTOCOLS.iter().find(|(known, _)| known == service) else {
+                return Err(format!("it is found by mDNS ({service}), and what it speaks is not known"));
+            };
+            let text = |key: &str, value: &str| (format!("lan.{key}"), Setting::Text(value.to_owned()));
+            // Its pictures are large and few: by their pixels they would be given most of the shared memory.
+            let size = (*protocol == "iphone").then(|| ("max_bytes".to_owned(), Setting::Text("2MiB".to_owned())));
+            return Ok(Self {
+                node: "lan".to_owned(),
+                settings: vec![text("protocol", protocol), text("mdns", service)].into_iter().chain(size).collect(),
+            });
         }
         let is_it = |attachment: &&Attachment| {
             let is_unit = |usb: &UsbIdentity| {

@@ -16,7 +16,7 @@ use std::path::PathBuf;
 use serde::Serialize;
 
 use self::units::unregistered;
-use self::wish::{choose, comments, free_bit, identity, name, node, settings, slot};
+use self::wish::{Meant, choose, comments, free_bit, identity, name, node, settings, slot};
 use super::Format;
 use super::artifacts::ArtifactsError;
 use crate::cli::{RegisterArgs, UnregisterArgs};
@@ -42,7 +42,7 @@ pub enum RegisterError {
     #[error("{} must be given: this is no terminal where it could be asked", .0.join(", "))]
     Missing(Vec<&'static str>),
     /// Several units are meant.
-    #[error("several units that are plugged in are meant: name one with --serial or --port{}", .0.iter().map(|unit| format!("\n  {unit}")).collect::<String>())]
+    #[error("several units that are plugged in are meant: name one with --serial or --port{}", .0.iter().flat_map(|unit| ["\n  ", unit]).collect::<String>())]
     Several(Vec<String>),
     /// The answers ended.
     #[error("no answer: nothing was written")]
@@ -120,8 +120,12 @@ pub async fn register(
         let entries = import::read(file, args.layout.as_deref(), args.node.as_deref(), attached, target)?;
         return commit(target, &entries, talk.as_mut(), manner, out);
     }
-    let Some(unit) = choose(&units, args, talk.as_mut(), format, out)? else { return Ok(()) };
-    let unit = unit.as_ref();
+    let unit = match choose(&units, args, talk.as_mut(), format, out)? {
+        Meant::Nothing => return Ok(()),
+        Meant::NotPlugged => None,
+        Meant::Unit(unit) => Some(unit),
+    };
+    let unit = unit.as_deref();
     let name = name(target.registry.as_ref(), unit, args, talk.as_mut())?;
     let node = node(unit, args, talk.as_mut())?;
     let mut entry = NewEntry { name, comments: comments(unit), keys: Vec::new(), held_back: None };
@@ -265,3 +269,6 @@ struct Registered<'a> {
     entry: &'a str,
     dry_run: bool,
 }
+
+#[cfg(test)]
+mod tests;

@@ -213,3 +213,6 @@ pub fn lines_look_like(lines: &[Vec<u8>]) -> Option<Vec<(String, Setting)>> {
     }
     channels(same(&json)).map(|channels| serial_settings("json", channels))
 }
+
+#[cfg(test)]
+mod tests;

@@ -22,14 +22,24 @@ struct Listed<'a> {
     node: Option<&'static str>,
 }
 
-/// The unit that is meant. `Some(None)`: none that is plugged in; `None`: there is nothing to do.
+/// What is to be registered.
+pub(super) enum Meant {
+    /// This unit.
+    Unit(Box<Candidate>),
+    /// A device that is described, and not plugged in.
+    NotPlugged,
+    /// There is nothing, and that has been said.
+    Nothing,
+}
+
+/// The unit that is meant.
 pub(super) fn choose(
     units: &[Candidate],
     args: &RegisterArgs,
     talk: Option<&mut Dialogue<'_>>,
     format: Format,
     out: &mut dyn Write,
-) -> Result<Option<Option<Candidate>>, RegisterError> {
+) -> Result<Meant, RegisterError> {
     let fits = |unit: &&Candidate| {
         args.vid.is_none_or(|vid| vid == unit.usb.vid)
             && args.pid.is_none_or(|pid| pid == unit.usb.pid)
@@ -39,15 +49,15 @@ pub(super) fn choose(
     let fitting: Vec<&Candidate> = units.iter().filter(fits).collect();
     let says_which = args.vid.is_some() || args.pid.is_some() || args.serial.is_some() || args.port.is_some();
     match (fitting.as_slice(), talk) {
-        ([unit], _) if says_which => Ok(Some(Some((*unit).clone()))),
-        ([], _) if args.vid.is_some() && args.pid.is_some() => Ok(Some(None)),
+        ([unit], _) if says_which => Ok(Meant::Unit(Box::new((*unit).clone()))),
+        ([], _) if args.vid.is_some() && args.pid.is_some() => Ok(Meant::NotPlugged),
         ([], Some(talk)) => {
             talk.say(if says_which {
                 "No such device is plugged in, or it is registered already. `rapid devices` lists what is."
             } else {
                 "Everything that is plugged in is registered, or nothing is plugged in. `rapid devices` lists it."
             })?;
-            Ok(None)
+            Ok(Meant::Nothing)
         }
         (units, Some(talk)) => {
             talk.say("Plugged in and not registered:\n")?;
@@ -60,7 +70,7 @@ pub(super) fn choose(
                 let number = answer.parse::<usize>().ok().and_then(|number| number.checked_sub(1));
                 number.filter(|number| *number < most).ok_or_else(|| format!("a number from 1 to {most}"))
             })?;
-            Ok(Some(units.get(which).map(|unit| (*unit).clone())))
+            Ok(units.get(which).map_or(Meant::Nothing, |unit| Meant::Unit(Box::new((*unit).clone()))))
         }
         (units, None) if says_which && !units.is_empty() => {
             Err(RegisterError::Several(units.iter().map(|unit| line(unit)).collect()))
@@ -75,7 +85,7 @@ pub(super) fn choose(
                 }
             }
             if format == Format::Json && args.name.is_none() {
-                return Ok(None);
+                return Ok(Meant::Nothing);
             }
             Err(RegisterError::Missing(vec!["--vid", "--pid", "--name"]))
         }
@@ -167,7 +177,7 @@ pub(super) fn identity(
     match &unit.own_serial {
         Some(_) if !unit.has_twin => return Ok(usual.into_iter().collect()),
         Some(_) => {
-            talk.say("There is another unit of this model: it is told apart by its serial number or by its port.")?
+            talk.say("There is another unit of this model: it is told apart by its serial number or by its port.")?;
         }
         None if unit.usb.serial.is_some() => {
             talk.say("Its serial number is not its own or cannot be written: it is told apart by its port.")?;

@@ -40,9 +40,9 @@ impl Target {
         let text = read_file(&path, "name another with --config FILE")?;
         let registry = match Registry::parse(&text, Some(&path)) {
             Ok(loaded) => Some(loaded.registry),
-            Err(wrong) if edit::has_entries(&text) => return Err(wrong),
-            // It says what holds for all devices, and names none yet; or is no TOML, which is said later.
-            Err(_) => None,
+            // It says what holds for all devices, and names none yet.
+            Err(_) if edit::has_no_entries(&text) => None,
+            Err(wrong) => return Err(wrong),
         };
         Ok(Self { path, text, registry })
     }

@@ -35,6 +35,16 @@ fn limits_that_are_none_allow_nothing() {
 }
 
 #[test]
+fn who_is_beyond_the_range_stays_or_comes_back() {
+    let limits = Limits::new(-1.0, 2.0, 1.0);
+    for (before, wanted, next) in
+        [(3.0, 4.0, 3.0), (3.0, 0.0, 2.5), (-2.0, -3.0, -2.0), (2.0, 3.0, 2.0), (0.0, 9.0, 0.5)]
+    {
+        assert_eq!(limits.slew(before, wanted, Duration::from_millis(500)), next);
+    }
+}
+
+#[test]
 fn a_velocity_is_braked_at_the_ends_of_the_positions() {
     let limits = Limits::new(-5.0, 5.0, 2.0);
     let braked = |velocity, position| limits.brake(velocity, position, [-1.0, 1.0]);

@@ -6,7 +6,6 @@ use super::MotorBus;
 use super::motor::{Motor, Phase};
 use super::notice::{BusState, Fault, Notice, Reason};
 use crate::control::deadman::Verdict;
-use crate::control::limits;
 use crate::registry::MotorMode;
 use crate::time::Stamp;
 
@@ -123,13 +122,7 @@ impl MotorBus {
     fn follow(&mut self, now: Stamp, passed: Duration) {
         let axes = self.motors.iter().zip(&self.limits).zip(&mut self.commands);
         for (axis, ((motor, limits), command)) in axes.enumerate() {
-            let Some(feedback) = motor.feedback else { continue };
-            let next = limits.slew(*command, self.line.at(axis, now), passed);
-            *command = match motor.spec.mode {
-                MotorMode::Mit { kp, .. } => limits::within_torque(next, feedback.q, motor.spec.torque, kp),
-                MotorMode::PositionVelocity => next,
-                MotorMode::Velocity => limits.brake(next, feedback.q, motor.spec.position),
-            };
+            *command = motor.bound(limits.slew(*command, self.line.at(axis, now), passed), limits);
         }
     }
 

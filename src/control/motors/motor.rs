@@ -19,7 +19,7 @@ use crate::control::can::CanFrame;
 use crate::control::damiao::codec::{self, Feedback, Mit, MotorStatus, Order, Ranges};
 use crate::control::damiao::model;
 use crate::control::damiao::parameter::{self, ControlMode, Parameter, Reply, TIMEOUT_UNIT_US, Value};
-use crate::control::limits::Limits;
+use crate::control::limits::{Limits, within_torque};
 use crate::registry::{MotorMode, MotorSpec};
 use crate::time::Stamp;
 
@@ -117,7 +117,6 @@ impl Motor {
     /// Turns it off, from the next frame on.
     pub(super) const fn turn_off(&mut self) {
         self.phase = Phase::Off { told: false };
-        self.status = None;
     }
 
     /// It was told to turn off, and said since that it is not enabled.
@@ -285,6 +284,19 @@ impl Motor {
             if status == MotorStatus::Enabled {
                 self.phase = Phase::On;
             }
+        } else if self.phase == Phase::On {
+            // It waits for the others, and somebody may lean on it.
+            *command = self.bound(*command, limits);
+        }
+    }
+
+    /// The command next to `command` that where the joint is allows.
+    pub(super) fn bound(&self, command: f64, limits: &Limits) -> f64 {
+        let Some(Feedback { q, .. }) = self.feedback else { return command };
+        match self.spec.mode {
+            MotorMode::Mit { kp, .. } => within_torque(command, q, self.spec.torque, kp),
+            MotorMode::PositionVelocity => command,
+            MotorMode::Velocity => limits.brake(command, q, self.spec.position),
         }
     }
 
@@ -312,8 +324,12 @@ impl Motor {
         }
         match self.phase {
             Phase::Off { .. } if self.is_off() && !is_silent => send(parameter::refresh(slave)),
-            Phase::Off { .. } => {
+            Phase::Off { told } => {
                 send(Order::Disable.frame(slave));
+                if !told {
+                    // What it said before is no answer to this.
+                    self.status = None;
+                }
                 self.phase = Phase::Off { told: true };
             }
             Phase::Asked { at, setting } => {

@@ -41,6 +41,8 @@ pub(super) struct Packets {
     /// What the kernel dropped so far.
     dropped: Option<u32>,
     lost: u64,
+    /// Time of the newest packet.
+    last: Stamp,
 }
 
 /// A packet as the kernel gives it.
@@ -62,7 +64,15 @@ impl Packets {
         // SAFETY: the descriptor is owned by what is registered.
         let socket = unsafe { AsyncFd::register_with_interest(socket, Interest::READABLE) }
             .map_err(|error| DriverError::Retry(format!("port {port}: {}", io::Error::from(error))))?;
-        Ok(Self { socket, place, packet: vec![0; max_bytes], filled: 0, dropped: None, lost: 0 })
+        Ok(Self {
+            socket,
+            place,
+            packet: vec![0; max_bytes],
+            filled: 0,
+            dropped: None,
+            lost: 0,
+            last: Stamp::default(),
+        })
     }
 
     pub(super) async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
@@ -120,7 +130,10 @@ impl Packets {
             return None;
         }
         self.filled = received.length;
-        Some(stamp(received.stamp, Stamp::now(), realtime_ns()))
+        let (stamp, flags) = stamp(received.stamp, Stamp::now(), realtime_ns());
+        // The two clocks are read one after the other, which is not always equally quick.
+        self.last = self.last.max(stamp);
+        Some((self.last, flags))
     }
 }
 

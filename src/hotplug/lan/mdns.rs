@@ -3,7 +3,9 @@
 //! The library keeps what was announced until it expires, which by default is after two minutes. So a
 //! device that its driver does not hear is asked again once a lease (RFC 6762, 10.4), and what does not
 //! answer by the end of the next is told as removed. A goodbye is told one second after it came: the
-//! library keeps to RFC 6762, 10.1, in which that is the time for somebody else to object.
+//! library keeps to RFC 6762, 10.1, in which that is the time for somebody else to object. mdns-sd 0.21
+//! cannot ask again for an instance with a dot in its name: that one is gone when it says so, when its
+//! driver hears nothing more, or after two minutes.
 //!
 //! Invariant: of an announcement only the names and numbers are taken, each bounded.
 
@@ -22,10 +24,14 @@ use crate::time::Stamp;
 
 /// More devices of one service than a rig has.
 const MOST_INSTANCES: usize = 64;
+/// Addresses of an instance that are looked at.
+const MOST_ADDRESSES: usize = 8;
 /// A name of an instance has 63 bytes (RFC 6763, 4.1.1).
 const LONGEST_NAME: usize = 63;
-/// The library tells of an expired answer a little later or, by its own clock, earlier.
-const MARGIN: Duration = Duration::from_millis(200);
+/// The library tells of an answer that did not come at the end of the lease, give or take this.
+const MARGIN: Duration = Duration::from_millis(100);
+/// From the end of a lease to the next question, so that what is told of the one is not taken for the other.
+const PAUSE: Duration = Duration::from_millis(200);
 /// What the app on the phone looks for, to know where to connect to.
 const VIO_SERVER: &str = "_vioserver._tcp.local.";
 
@@ -59,7 +65,8 @@ pub(super) struct Wanted {
 struct Found {
     /// Its own name, without that of the service.
     name: String,
-    address: SocketAddr,
+    /// The best first, at least one.
+    addresses: Vec<SocketAddr>,
 }
 
 impl Browser {
@@ -87,7 +94,7 @@ impl Browser {
         async move {
             let Some(daemon) = daemon else { return };
             match daemon.browse(&domain) {
-                Ok(events) => Service { daemon, domain, wanted, known: BTreeMap::new() }.run(events).await,
+                Ok(events) => Service { domain, wanted, known: BTreeMap::new() }.run(&daemon, events).await,
                 Err(error) => tracing::error!(%error, service = domain, "devices of this service are not found"),
             }
         }
@@ -109,8 +116,8 @@ impl Wanted {
     }
 }
 
+/// The entries of one service, and what is announced of it.
 struct Service {
-    daemon: ServiceDaemon,
     domain: String,
     wanted: Vec<Wanted>,
     /// What is announced, by full name.
@@ -118,7 +125,7 @@ struct Service {
 }
 
 impl Service {
-    async fn run(mut self, events: Receiver<ServiceEvent>) {
+    async fn run(mut self, daemon: &ServiceDaemon, events: Receiver<ServiceEvent>) {
         let mut look = interval(LOOK_EVERY);
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
@@ -136,7 +143,10 @@ impl Service {
                         return;
                     }
                 },
-                _ = look.tick() => self.look(Stamp::now()).await,
+                _ = look.tick() => for (full, limit) in self.look(Stamp::now()).await {
+                    // Refused only while the library is busy: asked again a lease later.
+                    let _ = daemon.verify(full, limit);
+                },
             }
         }
     }
@@ -160,11 +170,15 @@ impl Service {
                 self.known.iter().filter(|(_, found)| fits(found)).map(|(full, _)| full).find(is_free).cloned()
             });
             let Some(found) = full.as_ref().and_then(|full| self.known.get(full)) else { continue };
+            let at = |address: &SocketAddr| {
+                let mut address = *address;
+                address.set_port(wanted.port.unwrap_or(address.port()));
+                address
+            };
+            let kept = wanted.watch.address().filter(|kept| found.addresses.iter().any(|found| at(found) == *kept));
+            // Announcements come in parts: an address that is good enough stays.
+            let Some(address) = kept.or_else(|| found.addresses.first().map(at)) else { continue };
             let Some(wanted) = self.wanted.get_mut(index) else { continue };
-            let mut address = found.address;
-            if let Some(port) = wanted.port {
-                address.set_port(port);
-            }
             (wanted.current, wanted.asked) = (full, None);
             wanted.watch.found(address, Some(&found.name), now).await;
         }
@@ -186,19 +200,19 @@ impl Service {
         self.assign(now).await;
     }
 
-    async fn look(&mut self, now: Stamp) {
+    /// Looks at leases and links; says which instances are to be asked again, and how long they have.
+    async fn look(&mut self, now: Stamp) -> Vec<(String, Duration)> {
+        let mut questions = Vec::new();
         for wanted in &mut self.wanted {
-            let (length, is_known) =
-                (wanted.watch.length(), wanted.current.as_ref().is_some_and(|full| self.known.contains_key(full)));
-            if is_known && wanted.watch.is_there() {
-                let is_due = wanted.asked.is_none_or(|asked| now.since(asked) >= length + MARGIN);
-                if is_due && !wanted.watch.is_sending(length, now) {
-                    // What does not answer by the end of the lease is removed.
-                    if let Some(full) = &wanted.current
-                        && self.daemon.verify(full.clone(), length).is_ok()
-                    {
-                        wanted.asked = Some(now);
-                    }
+            let length = wanted.watch.length();
+            let announced = wanted.current.as_ref().and_then(|full| self.known.get_key_value(full));
+            if let (Some((full, found)), true) = (announced, wanted.watch.is_there()) {
+                let is_due = wanted.asked.is_none_or(|asked| now.since(asked) >= length + PAUSE);
+                // See the module's comment.
+                let can_be_asked = !found.name.contains(['.', '\\']);
+                if is_due && can_be_asked && !wanted.watch.is_sending(length, now) {
+                    questions.push((full.clone(), length));
+                    wanted.asked = Some(now);
                 }
                 wanted.watch.renew(now);
             }
@@ -207,6 +221,7 @@ impl Service {
                 wanted.current = None;
             }
         }
+        questions
     }
 }
 
@@ -214,7 +229,7 @@ impl Wanted {
     /// Who says that its device is gone: an answer that did not come, or a goodbye.
     fn witness(&self, now: Stamp) -> Witness {
         match self.asked {
-            Some(asked) if now.since(asked) + MARGIN >= self.watch.length() => Witness::Lease,
+            Some(asked) if now.since(asked).abs_diff(self.watch.length()) <= MARGIN => Witness::Lease,
             _ => Witness::Goodbye,
         }
     }
@@ -222,27 +237,37 @@ impl Wanted {
 
 fn found(service: &ResolvedService, domain: &str) -> Option<(String, Found)> {
     let name = service.fullname.strip_suffix(domain)?.strip_suffix('.')?;
-    let address = best(service.addresses.iter().map(socket_ip), service.port)?;
-    Some((service.fullname.clone(), Found { name: unescaped(name), address }))
+    let addresses = ordered(service.addresses.iter().filter_map(scoped), service.port);
+    (!addresses.is_empty()).then(|| (service.fullname.clone(), Found { name: unescaped(name), addresses }))
 }
 
-/// An address with the scope that a link-local one needs.
-fn socket_ip(ip: &ScopedIp) -> (IpAddr, u32) {
-    match ip {
+/// An address with the scope that a link-local one needs. Of this computer's own only what was announced
+/// on it: nobody else has a device there.
+fn scoped(ip: &ScopedIp) -> Option<(IpAddr, u32)> {
+    let is_own = match ip {
+        ScopedIp::V4(v4) => v4.interface_ids().iter().any(|interface| interface.name == "lo"),
+        ScopedIp::V6(v6) => v6.scope_id().name == "lo",
+        _ => false,
+    };
+    if ip.is_loopback() && !is_own {
+        return None;
+    }
+    Some(match ip {
         ScopedIp::V6(v6) if v6.addr().is_unicast_link_local() => ((*v6.addr()).into(), v6.scope_id().index),
         ip => (ip.to_ip_addr(), 0),
-    }
+    })
 }
 
-/// IPv4 first, then what needs no scope, then the rest; the lowest of them, so that it is the same one
-/// each time.
-fn best(addresses: impl Iterator<Item = (IpAddr, u32)>, port: u16) -> Option<SocketAddr> {
-    let usable = addresses.filter(|(ip, _)| !ip.is_unspecified() && !ip.is_multicast());
-    let (ip, scope) = usable.min_by_key(|(ip, scope)| (ip.is_ipv6(), *scope, *ip))?;
-    Some(match ip {
+/// Of others before our own, IPv4 first, then what needs no scope, then the rest; in the order of numbers,
+/// so that it is the same one each time.
+fn ordered(addresses: impl Iterator<Item = (IpAddr, u32)>, port: u16) -> Vec<SocketAddr> {
+    let mut usable: Vec<_> = addresses.filter(|(ip, _)| !ip.is_unspecified() && !ip.is_multicast()).collect();
+    usable.sort_by_key(|(ip, scope)| (ip.is_loopback(), ip.is_ipv6(), *scope, *ip));
+    let socket = |(ip, scope)| match ip {
         IpAddr::V4(ip) => (ip, port).into(),
         IpAddr::V6(ip) => SocketAddrV6::new(ip, port, 0, scope).into(),
-    })
+    };
+    usable.into_iter().take(MOST_ADDRESSES).map(socket).collect()
 }
 
 /// A label as it is written in DNS: `\.` is a dot, `\065` a byte.

@@ -14,7 +14,7 @@ use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
 
 use super::super::Witness;
 use super::watch::{LOOK_EVERY, Watch};
-use crate::registry::Probe;
+use crate::registry::{Heard, Probe};
 use crate::time::Stamp;
 
 /// From one question to the next; also how long an answer may take.
@@ -44,7 +44,8 @@ pub(super) async fn watch(mut watch: Watch, server: SocketAddr, asked: SocketAdd
                     Answer::Nobody => watch.gone(Witness::Lease, Stamp::now()).await,
                     Answer::Silence => {}
                 }
-                answer = Box::pin(next(&watch, probe, asked));
+                let driver_has_port = probe == Probe::Udp && watch.is_there();
+                answer = Box::pin(next(watch.heard(), driver_has_port, probe, asked));
             }
             _ = look.tick() => watch.look(Stamp::now()).await,
         }
@@ -52,12 +53,10 @@ pub(super) async fn watch(mut watch: Watch, server: SocketAddr, asked: SocketAdd
 }
 
 /// The next question, or none if the device's driver hears it, or has the port it would be heard at.
-fn next(watch: &Watch, probe: Probe, asked: SocketAddr) -> impl Future<Output = Answer> + use<> {
-    let is_heard = watch.is_sending(EVERY, Stamp::now()) || (probe == Probe::Udp && watch.is_there());
-    async move {
-        sleep(EVERY).await;
-        if is_heard { Answer::Silence } else { ask(probe, asked).await }
-    }
+async fn next(heard: Heard, driver_has_port: bool, probe: Probe, asked: SocketAddr) -> Answer {
+    sleep(EVERY).await;
+    let is_heard = Stamp::now().since(heard.at()) < EVERY;
+    if is_heard || driver_has_port { Answer::Silence } else { ask(probe, asked).await }
 }
 
 async fn ask(probe: Probe, asked: SocketAddr) -> Answer {

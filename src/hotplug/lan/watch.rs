@@ -50,8 +50,18 @@ impl Watch {
         self.length
     }
 
+    /// Where it is, while it is there.
+    pub(super) const fn address(&self) -> Option<SocketAddr> {
+        self.address
+    }
+
     pub(super) const fn is_there(&self) -> bool {
         self.lease.is_there()
+    }
+
+    /// What its driver hears.
+    pub(super) fn heard(&self) -> Heard {
+        self.heard.clone()
     }
 
     /// Has the driver heard of it within this time?

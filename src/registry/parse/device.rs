@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use toml::de::DeValue;
 
+use super::name::name_problem;
 use super::program::{For, Programs};
 use super::verdict::{VerdictTable, Whose};
 use super::{action, can, hooks, identity, lan, motors, node, process, verdict};
@@ -12,8 +13,8 @@ use crate::modality::ModalityId;
 use crate::registry::diagnostic::did_you_mean;
 use crate::registry::section::{At, Problems, Section};
 use crate::registry::spec::{
-    ActionSpec, CanAdapter, CanProtocol, CanSpec, DeviceSpec, Hook, Hooks, IdentitySpec, Mount, NodeSpec, Opens,
-    WhenStale,
+    ActionSpec, CanAdapter, CanProtocol, CanSpec, DeviceSpec, Hook, Hooks, IdentitySpec, LanSpec, Mount, NodeSpec,
+    Opens, WhenStale,
 };
 
 /// Kinds of node this version has a driver for.
@@ -47,9 +48,6 @@ const KEYS: [&str; 24] = [
     "on_record_start",
     "on_record_stop",
 ];
-
-/// In bytes.
-const LONGEST_NAME: usize = 64;
 
 /// The mask is 64 bits wide.
 const HIGHEST_BIT: i64 = 63;
@@ -148,6 +146,14 @@ impl Draft<'_> {
         node.into_iter().chain(self.hooks.all().map(|(key, hook)| (key, hook.program.as_path())))
     }
 
+    /// Its settings, if it is on the network.
+    pub(super) fn lan(&self) -> Option<&LanSpec> {
+        match self.node.as_ref()? {
+            NodeSpec::Lan(lan) => Some(lan),
+            _ => None,
+        }
+    }
+
     pub(super) fn is_camera(&self) -> bool {
         self.kind == Some(Kind::Camera)
     }
@@ -229,36 +235,6 @@ fn check_name(name: &str, section: &Section<'_>, problems: &mut Problems<'_>) {
     if let Some((message, fix)) = name_problem(name) {
         problems.report(section.at, &section.entry, message, fix);
     }
-}
-
-/// Why `name` cannot be a modality's name, and what to do about it; `None` if it can.
-#[must_use]
-pub fn name_problem(name: &str) -> Option<(String, String)> {
-    let begins = name.starts_with(|c: char| c.is_ascii_lowercase());
-    if begins && name.len() <= LONGEST_NAME && name.chars().all(in_a_name) {
-        return None;
-    }
-    let fix = match like_a_name(name) {
-        Some(better) => {
-            format!("use lower-case letters, digits and `_`, at most {LONGEST_NAME}, for example [device.{better}]")
-        }
-        None => {
-            format!("begin with a lower-case letter; then lower-case letters, digits and `_`, at most {LONGEST_NAME}")
-        }
-    };
-    Some((format!("{name:?} cannot be a modality's name"), fix))
-}
-
-/// The name that is nearest to any text, if one is near.
-#[must_use]
-pub fn like_a_name(text: &str) -> Option<String> {
-    let better: String =
-        text.to_lowercase().chars().map(|c| if in_a_name(c) { c } else { '_' }).take(LONGEST_NAME).collect();
-    better.starts_with(|c: char| c.is_ascii_lowercase()).then_some(better)
-}
-
-const fn in_a_name(c: char) -> bool {
-    c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_'
 }
 
 fn check_keys(section: &Section<'_>, problems: &mut Problems<'_>) {

@@ -1,10 +1,9 @@
-//! Which device an entry means: ids, serial number, port.
+//! Which device an entry means: the keys `vid`, `pid`, `serial` and `port`.
 
 use super::device::Kind;
 use crate::registry::section::{Problems, Section};
 use crate::registry::spec::{IdentitySpec, UsbSpec};
 
-/// Reads the keys that say it; `None` if a problem with them was reported.
 pub(super) fn identity(kind: Option<Kind>, section: &Section<'_>, problems: &mut Problems<'_>) -> Option<IdentitySpec> {
     // A device on the network has none; one behind a USB adapter of its own has that adapter's.
     if kind == Some(Kind::Lan) && !["vid", "pid", "serial", "serial_number", "port"].iter().any(|key| section.has(key))

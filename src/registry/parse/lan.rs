@@ -3,6 +3,7 @@
 use std::net::IpAddr;
 use std::time::Duration;
 
+use super::device::Draft;
 use crate::registry::section::{Problems, Section};
 use crate::registry::spec::{LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, Probe};
 
@@ -138,6 +139,23 @@ fn picture(table: &Section<'_>, default: LanPicture, problems: &mut Problems<'_>
         width: integer("width", 8192, default.width),
         height: integer("height", 8192, default.height),
         fps: integer("fps", 1000, default.fps),
+    }
+}
+
+/// Two entries cannot have one port of this computer, unless each has it on an adapter of its own.
+pub(super) fn check_ports(drafts: &[Draft<'_>], problems: &mut Problems<'_>) {
+    for (index, draft) in drafts.iter().enumerate() {
+        let Some((port, own)) = draft.lan().and_then(|lan| Some((lan.own_port()?, lan))) else { continue };
+        let same = |earlier: &&Draft<'_>| {
+            earlier.lan().is_some_and(|other| {
+                other.own_port() == Some(port) && !(own.find.is_adapter() && other.find.is_adapter())
+            })
+        };
+        let Some(earlier) = drafts.iter().take(index).find(same) else { continue };
+        let (_, number) = port;
+        let message = format!("port {number} of this computer is already that of [{}]", earlier.section.entry);
+        let fix = "write another port here, and set the device to send to it";
+        draft.section.report(problems, "lan", message, fix);
     }
 }
 

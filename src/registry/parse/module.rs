@@ -1,6 +1,7 @@
 //! `[module.NAME]`.
 
-use super::device::{Draft, name_problem};
+use super::device::Draft;
+use super::name::name_problem;
 use crate::registry::diagnostic::did_you_mean;
 use crate::registry::section::{Problems, Section};
 use crate::registry::spec::{ModuleSpec, Mount};

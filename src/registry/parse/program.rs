@@ -195,20 +195,27 @@ mod tests {
         allow(dir.path(), 0o755);
         let (file, program) = (dir.path().join("devices.toml"), dir.path().join("p"));
         write(&program, "").unwrap();
-        let text = "[device.a]\nvid = \"1\"\npid = \"2\"\nbit = 0\nnode = \"p\"\n";
-        let told = |mode| {
+        let entry = "[device.a]\nvid = \"1\"\npid = \"2\"\nbit = 0\n";
+        let told = |mode, keys: &str| {
+            let text = format!("{entry}{keys}\n");
             allow(&program, mode);
-            match Registry::parse(text, Some(&file)) {
+            match Registry::parse(&text, Some(&file)) {
                 Ok(loaded) => (loaded.warnings, false),
                 Err(errors) => (errors.diagnostics, true),
             }
         };
-        assert_eq!(told(0o755), (Vec::new(), false));
-        let (diagnostics, refused) = told(0o777);
-        assert_eq!(refused, rustix::process::geteuid().is_root());
-        assert_eq!(diagnostics.len(), 1, "{diagnostics:?}");
-        assert!(diagnostics[0].message.ends_with("p: other users may write to it (mode 0777)"), "{diagnostics:?}");
-        assert_eq!((diagnostics[0].entry.as_deref(), diagnostics[0].line), (Some("device.a"), 5));
+        for keys in [
+            "node = \"p\"",
+            "on_record_stop = [\"p\", \"x\"]\nnode = \"camera\"",
+            "on_attach = [\"p\"]\nnode = \"process\"",
+        ] {
+            assert_eq!(told(0o755, keys), (Vec::new(), false));
+            let (diagnostics, refused) = told(0o777, keys);
+            assert_eq!(refused, rustix::process::geteuid().is_root());
+            assert_eq!(diagnostics.len(), 1, "{diagnostics:?}");
+            assert!(diagnostics[0].message.ends_with("p: other users may write to it (mode 0777)"), "{diagnostics:?}");
+            assert_eq!((diagnostics[0].entry.as_deref(), diagnostics[0].line), (Some("device.a"), 5));
+        }
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! What stands for an entry of the registry in a simulated rig.
+//! What stands for an entry of the registry in a simulation.
 
 use crate::registry::attachment::{LanIdentity, UsbIdentity};
 use crate::registry::scenario::{ScenarioDevice, SimFaults, SimSource};

@@ -113,6 +113,14 @@ const HTTP_PORT: u16 = 80;
 /// The pose of a phone's camera is a matrix of 4 by 4.
 const POSE: u32 = 16;
 
+impl LanFind {
+    /// Is the device a network adapter, or behind one?
+    #[must_use]
+    pub const fn is_adapter(&self) -> bool {
+        matches!(self, Self::Adapter { .. })
+    }
+}
+
 impl LanPicture {
     /// What a phone sends unless the entry says otherwise.
     pub(in crate::registry) const OF_A_PHONE: Self = Self { width: 1920, height: 1440, fps: 30 };
@@ -173,7 +181,12 @@ impl LanSpec {
         match (self.modality_kind(), self.picture()) {
             (ModalityKind::Image, Some(picture)) => {
                 let pixels = u64::from(picture.width) * u64::from(picture.height);
-                ((2 * pixels).max(SMALLEST_JPEG), 1024)
+                let most = match &self.protocol {
+                    // It compresses to some fifth of a byte a pixel (quality 0.7), and its pictures are large.
+                    LanProtocol::Iphone { .. } => pixels / 2,
+                    _ => 2 * pixels,
+                };
+                (most.max(SMALLEST_JPEG), 4096)
             }
             (ModalityKind::Scalars, _) => (8 * u64::from(POSE), 8 * u64::from(POSE)),
             // What an Ethernet frame carries is under 1500.
@@ -215,6 +228,16 @@ impl LanSpec {
     #[must_use]
     pub fn server(&self, host: IpAddr) -> SocketAddr {
         SocketAddr::new(host, self.port().unwrap_or(HTTP_PORT))
+    }
+
+    /// The port of this computer that it needs: of UDP or not, and its number.
+    #[must_use]
+    pub const fn own_port(&self) -> Option<(bool, u16)> {
+        match &self.protocol {
+            LanProtocol::Udp { port } => Some((true, *port)),
+            LanProtocol::Iphone { port, .. } => Some((false, *port)),
+            LanProtocol::Mjpeg { .. } | LanProtocol::Gopro { .. } => None,
+        }
     }
 
     /// The port of ours that a phone connects to.

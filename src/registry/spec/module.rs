@@ -1,14 +1,17 @@
 //! `[module.NAME]`: something that is mounted on the gripper.
 
+use serde::Serialize;
+
 use super::Mount;
 
 /// A module, of those that bear sensors and those that are mechanics alone (paper, section "Module
 /// Catalog").
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct ModuleSpec {
     /// Its name, as a modality's.
     pub name: String,
     /// Where it sits.
+    #[serde(rename = "slot")]
     pub mount: Mount,
     /// What an episode with it is tagged with: keys and values.
     pub tags: Vec<(String, String)>,

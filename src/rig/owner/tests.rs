@@ -283,6 +283,64 @@ async fn the_first_witness_wins_and_no_replug_is_lost() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn devices_are_told_of_the_episode_in_progress() {
+    let name = format!("ownere{}", std::process::id());
+    let path = PathBuf::from(format!("/dev/shm/rapid_test_mask_{name}"));
+    let registry = registry(Duration::from_millis(100), Duration::from_millis(150));
+    let board = Arc::new(Board::new(&registry));
+    let bus = Bus::open(&registry, Some(&name)).expect("bus");
+    let claim = Claim::new(&path, 2).expect("claim");
+    let presence = Presence::start(claim, bus.writer(TopicId::Mask).expect("mask"), Arc::clone(&board)).expect("mask");
+    let (hotplug, plugged) = unbounded();
+    let (commands, asked) = mpsc::channel(4);
+    let (tell, episode) = watch::channel(None);
+    let stop = CancellationToken::new();
+    let mut rig = Rig::new(&registry, &bus, presence, Arc::clone(&board)).following(episode);
+    let mut bench = Bench { hotplug, commands, events: board.events(), units: HashMap::new(), path, told: Vec::new() };
+    let running = tokio::spawn({
+        let stop = stop.clone();
+        async move { rig.run(Box::pin(plugged), asked, stop).await }
+    });
+    let come_to = async |unit: &Arc<SimDevice>, told: (u32, u32)| {
+        let begun = Instant::now();
+        while unit.recordings() != told {
+            assert!(begun.elapsed() < PATIENCE, "{:?} instead of {told:?}", unit.recordings());
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+    };
+    let begin = |number: u8| {
+        let file = PathBuf::from(format!("/episodes/{number}.mcap"));
+        tell.send_replace(Some(Arc::new(crate::status::Episode::new(&file))));
+    };
+
+    for step in [Plug("1", CHANNELS), Until("a streaming")] {
+        bench.step(&step).await;
+    }
+    let first = Arc::clone(&bench.units["1"]);
+    assert_eq!(first.recordings(), (0, 0), "there is no episode");
+    begin(1);
+    come_to(&first, (1, 0)).await;
+    // One that is silent is told as well.
+    first.set_silent(true);
+    bench.step(&Until("a stalled")).await;
+    tell.send_replace(None);
+    come_to(&first, (1, 1)).await;
+    begin(2);
+    come_to(&first, (2, 1)).await;
+    // One that comes during the episode, while another is pulled.
+    for step in [Plug("2", CHANNELS), Until("b streaming"), Removed("1", Witness::Kernel), Until("a absent")] {
+        bench.step(&step).await;
+    }
+    let second = Arc::clone(&bench.units["2"]);
+    come_to(&second, (1, 0)).await;
+    come_to(&first, (2, 2)).await;
+    // The run ends before its episode does.
+    stop.cancel();
+    running.await.expect("no panic").expect("no error");
+    come_to(&second, (1, 1)).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_failed_device_is_started_again_by_hand() {
     // It sends three numbers and the entry wants two.
     let steps = [Plug("1", 3), Until("a failed"), Mask(0), Restart(0), Until("a failed"), Restart(1)];

@@ -7,6 +7,8 @@
 //!
 //! Invariant: a target depends on its input alone, so that an input that broke it breaks it again.
 
+pub mod lan;
+pub mod motors;
 pub mod mutate;
 pub mod policy;
 pub mod rules;
@@ -31,6 +33,10 @@ pub const TARGETS: &[Target] = &[
     Target { name: "serial", run: targets::serial, seeds: seeds::serial },
     Target { name: "slcan", run: targets::slcan, seeds: seeds::slcan },
     Target { name: "damiao_serial", run: targets::damiao_serial, seeds: seeds::damiao_serial },
+    Target { name: "multipart", run: lan::multipart, seeds: lan::multiparts },
+    Target { name: "phone", run: lan::phone, seeds: lan::phones },
+    Target { name: "http_answer", run: lan::answer, seeds: lan::answers },
+    Target { name: "mdns_name", run: lan::label, seeds: lan::labels },
     Target { name: "message", run: targets::message, seeds: seeds::messages },
     Target { name: "inspect", run: targets::inspect, seeds: seeds::episodes },
     Target { name: "recover", run: targets::recover, seeds: seeds::episodes },
@@ -41,6 +47,7 @@ pub const TARGETS: &[Target] = &[
     Target { name: "text", run: targets::text, seeds: seeds::strings },
     Target { name: "bundle", run: policy::bundle, seeds: policy::bundles },
     Target { name: "picture", run: policy::picture, seeds: policy::pictures },
+    Target { name: "motors", run: motors::motors, seeds: motors::sessions },
 ];
 
 /// The target of this name.

@@ -85,12 +85,31 @@ is() { local value=$1; shift; [ "$("$@")" = "$value" ]; }
 # can_up NAME: brings a CAN interface up at the bus's rate.
 can_up() { ip link set "$1" up type can bitrate 1000000 || fail "$1 does not come up"; }
 
-# lan_rule ADDRESS/BITS: every network adapter that is plugged from now on gets this address, as a DHCP client would see to.
+# lan_rule N ADDRESS/BITS: the interface of network adapter N gets this address at each plug, as a DHCP client would see to.
 lan_rule() {
-  echo "ACTION==\"add\", SUBSYSTEM==\"net\", ENV{ID_NET_DRIVER}==\"cdc_ether\", RUN+=\"/sbin/ip addr add $1 dev \$name\", RUN+=\"/sbin/ip link set \$name up\"" \
-    >/etc/udev/rules.d/90-bench-lan.rules
+  local mac name='$name'
+  printf -v mac '00:00:5e:00:53:%02x' "$1"
+  echo "ACTION==\"add\", SUBSYSTEM==\"net\", ATTR{address}==\"$mac\", RUN+=\"/sbin/ip addr add $2 dev $name\", RUN+=\"/sbin/ip link set $name up\"" \
+    >>/etc/udev/rules.d/90-bench-lan.rules
   udevadm control --reload
 }
+
+# mark WORD: the emulator's log says the word; what is told from now on is told after it.
+mark() {
+  emu "say $1"
+  wait_for 20 said "$out/emu.jsonl" "\"word\":\"$1\"" || fail "the emulator does not say $1"
+  marked=$(wc -l <"$out/emu.jsonl")
+}
+
+# told ACTION [FRAGMENT...]: since the last mark the emulator's log has a line of this action with all fragments.
+told() {
+  local lines fragment
+  lines=$(tail -n "+$((${marked:-0} + 1))" "$out/emu.jsonl" | grep -F "\"action\":\"$1\"") || return 1; shift
+  for fragment in "$@"; do lines=$(grep -F -- "$fragment" <<<"$lines") || return 1; done
+}
+
+# states N DEVICE STATE: rapid has reported this state of the device N times at least.
+states() { [ "$(grep -F '"event":"state"' $out/rapid.jsonl | grep -F "\"device\":\"$2\"" | grep -cF "\"state\":\"$3\"")" -ge "$1" ]; }
 
 # held fd|task: descriptors or threads rapid has.
 held() { ls "/proc/$rapid_pid/$1" | wc -l; }

@@ -1,7 +1,7 @@
-//! Two devices read by programs, one of which ignores SIGTERM, are unplugged one after the other while a sampler reads the mask.
+//! Devices read by programs that behave badly, while a sampler reads the mask: two are unplugged one after the other, and the
+//! program of the second ignores SIGTERM; of two that are plugged later, one program crashes again and again, one floods its stderr.
 //!
-//! Invariant: three spans of equal length are compared, of one guest: nothing happens, a program that ends promptly loses
-//! its device, a deaf one does.
+//! Invariant: spans of equal length are compared, of one guest: nothing happens, or one of the above.
 
 use serde_json::Value;
 
@@ -14,8 +14,11 @@ pub const SPAN_MS: u64 = 7_000;
 const IDLE_MS: u64 = 2_000;
 const PROMPT_MS: u64 = 10_000;
 const DEAF_MS: u64 = 18_000;
+const CRASH_MS: u64 = 26_000;
+const FLOOD_MS: u64 = 34_000;
 /// The timeline begins some seconds after the recording.
-const SECONDS: u32 = 40;
+/// The last of five restarts comes 15.5 s after the first crash.
+const SECONDS: u32 = 65;
 const REGISTRY: &str = r#"
 [rig]
 name = "vbench"
@@ -41,6 +44,28 @@ bit = 1
 args = ["--ignore-sigterm"]
 kind = "scalars"
 channels = 2
+
+[device.crashing]
+vid = "0x2e8a"
+pid = "0x000a"
+serial = "C1"
+node = "process_node"
+bit = 2
+[device.crashing.process]
+args = ["--crash-after", "3"]
+kind = "scalars"
+channels = 2
+
+[device.flooding]
+vid = "0x2e8a"
+pid = "0x000a"
+serial = "F1"
+node = "process_node"
+bit = 3
+[device.flooding.process]
+args = ["--flood-stderr"]
+kind = "scalars"
+channels = 2
 "#;
 
 /// What happens in a span.
@@ -52,6 +77,10 @@ pub enum Span {
     Prompt,
     /// The device of the program that does not.
     Deaf,
+    /// A device is plugged at its beginning whose program crashes after three samples, each time.
+    Crashing,
+    /// One whose program writes to its stderr as fast as it can.
+    Flooding,
 }
 
 /// How the mask beat in a span.
@@ -72,12 +101,16 @@ pub fn scenario() -> Scenario {
     Scenario::new("deaf")
         .device(DeviceSpec::acm(0x2e8a, 0x000a, 100.0).serial("P1"))
         .device(DeviceSpec::acm(0x2e8a, 0x000a, 100.0).serial("D1"))
+        .spare(DeviceSpec::acm(0x2e8a, 0x000a, 100.0).serial("C1"))
+        .spare(DeviceSpec::acm(0x2e8a, 0x000a, 100.0).serial("F1"))
         .registry(REGISTRY)
         .node_program()
         .record(SECONDS, &["prompt", "deaf"])
         .watch_mask()
         .at(PROMPT_MS, "unplug 0")
         .at(DEAF_MS, "unplug 1")
+        .at(CRASH_MS, "plug 2")
+        .at(FLOOD_MS, "plug 3")
 }
 
 /// The mask's rhythm in a span; `None` when the sampler saw nothing of it.
@@ -88,6 +121,8 @@ pub fn rhythm(outcome: &Outcome, span: Span) -> Option<Rhythm> {
         Span::Idle => IDLE_MS,
         Span::Prompt => PROMPT_MS,
         Span::Deaf => DEAF_MS,
+        Span::Crashing => CRASH_MS,
+        Span::Flooding => FLOOD_MS,
     };
     let from = outcome.origins().first()?.mono_ns + offset * 1_000_000;
     let until = from + SPAN_MS * 1_000_000;

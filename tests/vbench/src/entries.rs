@@ -24,3 +24,21 @@ pub fn scalars(name: &str, topic: &str, bit: u32, model: &str, serial: &str) -> 
          [device.{name}.serial]\nbaud = 115200\nframing = \"line\"\nparse = \"csv\"\nchannels = 4\n"
     )
 }
+
+/// A network device behind a USB adapter of the model `vid:pid`; `lan` is what its table says.
+pub fn lan(name: &str, topic: &str, bit: u32, model: &str, serial: &str, lan: &str) -> String {
+    usb(name, topic, bit, model, serial, "lan", lan)
+}
+
+/// A CAN adapter of the model `vid:pid`; `can` is what its table says.
+pub fn can(name: &str, topic: &str, bit: u32, model: &str, serial: &str, can: &str) -> String {
+    usb(name, topic, bit, model, serial, "can", can)
+}
+
+fn usb(name: &str, topic: &str, bit: u32, model: &str, serial: &str, node: &str, table: &str) -> String {
+    let (vid, pid) = model.split_once(':').unwrap_or((model, ""));
+    format!(
+        "[device.{name}]\nvid = \"0x{vid}\"\npid = \"0x{pid}\"\nserial_number = \"{serial}\"\nnode = \"{node}\"\n\
+         topic = \"{topic}\"\nbit = {bit}\n[device.{name}.{node}]\n{table}\n"
+    )
+}

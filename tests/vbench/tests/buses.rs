@@ -148,7 +148,7 @@ lan_up() {
   wait_for 60 test -e /sys/class/net/$net || { ip link; fail 'no interface'; }
   wait_for 10 eval 'ip -4 addr show up dev $net | grep -q 172.23.145.50/24' || { ip addr; fail 'no address'; }
 }
-lan_rule 172.23.145.50/24
+lan_rule 0 172.23.145.50/24
 get() {
   exec 6<>/dev/tcp/172.23.145.51/8080 || return 1
   printf 'GET %s HTTP/1.1\r\nHost: camera\r\n\r\n' "$1" >&6

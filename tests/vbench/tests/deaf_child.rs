@@ -1,15 +1,15 @@
-//! A program that ignores SIGTERM loses its device: the mask goes on as if nothing were.
+//! Programs that ignore SIGTERM, crash or flood their stderr: the mask goes on as if nothing were.
 
 use vbench::deaf::{Span, rhythm, scenario};
 use vbench::recording::falls;
 
 #[test]
-fn a_deaf_program_does_not_hold_up_the_mask() {
+fn programs_that_behave_badly_do_not_hold_up_the_mask() {
     let outcome = scenario().run().unwrap_or_else(|error| panic!("{error}"));
     assert_eq!((outcome.code, outcome.rapid_code), (0, Some(0)));
     assert!(outcome.emulator_errors().is_empty(), "{:?}", outcome.emulator_errors());
 
-    for span in [Span::Idle, Span::Prompt, Span::Deaf] {
+    for span in [Span::Idle, Span::Prompt, Span::Deaf, Span::Crashing, Span::Flooding] {
         let rhythm = rhythm(&outcome, span).expect("the sampler saw it");
         println!("{span:?}: {rhythm:?}");
         assert_eq!(rhythm.silent_tenths, 0, "{span:?}: {rhythm:?}");
@@ -34,4 +34,15 @@ fn a_deaf_program_does_not_hold_up_the_mask() {
     let stamp = |line: Option<&serde_json::Value>| line.and_then(|line| line["stamp"].as_u64()).expect("a stamp");
     let (absent, killed) = (stamp(outcome.rapid.iter().find(absent)), stamp(outcome.rapid.iter().find(killed)));
     assert!(killed >= absent + 5_000_000_000, "the bit goes at once, the program after its 5 s");
+
+    let states = |device: &str| {
+        let of_it = |line: &&serde_json::Value| line["device"] == device && line["event"] == "state";
+        let states = outcome.rapid.iter().filter(of_it).filter_map(|line| line["state"].as_str());
+        states.map(str::to_owned).collect::<Vec<_>>()
+    };
+    let round = ["opening", "streaming", "backoff"];
+    assert_eq!(states("crashing"), [&round.repeat(5)[..], &["opening", "streaming", "failed"]].concat());
+    assert_eq!(says("crashing: Error: \"crashes after 3 samples"), 6);
+    assert_eq!(states("flooding"), ["opening", "streaming"], "it goes on");
+    assert!(says("flooding: prints too much") > 0);
 }

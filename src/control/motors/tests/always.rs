@@ -80,7 +80,7 @@ impl Happening {
             // A stranger's: one of a motor would be the motor's word.
             Self::Frame(id, data) => {
                 if !world.sims.iter().any(|sim| u32::from(sim.master) == id) {
-                    world.feed(&CanFrame { id, len: 8, data, ..CanFrame::default() });
+                    world.feed(&CanFrame { id, len: 8, data, ..CanFrame::default() }, world.now);
                 }
             }
         }
@@ -88,7 +88,7 @@ impl Happening {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 400, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig::with_cases(ProptestConfig::default().cases / 2))]
 
     #[test]
     fn motors_move_only_as_they_may(

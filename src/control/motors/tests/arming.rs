@@ -118,6 +118,20 @@ fn every_fault_of_a_motor_that_moves_disables_all() {
 }
 
 #[test]
+fn a_fault_between_two_cycles_is_not_covered_up_by_what_follows() {
+    for (status, hot) in [(MotorStatus::Disabled, 30), (MotorStatus::Overload, 30), (MotorStatus::Enabled, 90)] {
+        let mut world = World::armed();
+        world.run(2);
+        let well = world.sims[0].feedback().unwrap();
+        let ill = Sim { status, mos: hot, ..world.sims[0].clone() }.feedback().unwrap();
+        for frame in [well, ill, well] {
+            world.bus.feed(&frame, world.now);
+        }
+        assert!(matches!(world.bus.state(), BusState::Faulted(_)), "{status}");
+    }
+}
+
+#[test]
 fn a_motor_that_gets_hot_is_told_of_and_then_disables_all() {
     let mut world = World::armed();
     let warm = |celsius| Notice::Warm { motor: 0, part: Part::Mos, celsius, limit: 80.0 };
@@ -159,6 +173,26 @@ fn a_motor_that_does_not_do_as_it_is_told_is_a_fault() {
 }
 
 #[test]
+fn who_waits_for_the_others_yields_when_leant_on() {
+    let mut stiff = spec(vec![motor(1, 0x11, MIT), motor(2, 0x12, MIT)]);
+    stiff.motors[0].torque = 2.0;
+    let mut world = World::new(stiff);
+    world.run_until(BusState::Disarmed);
+    world.sims[0].stuck = true;
+    world.sims[1].deaf = Some(Order::Enable);
+    world.arm();
+    while world.sims[0].command.is_none() {
+        world.cycle();
+    }
+    world.run(5);
+    world.sims[0].q = 1.0;
+    world.run(3);
+    assert_eq!(world.bus.state(), BusState::Arming);
+    let command = world.sims[0].command.unwrap().1;
+    assert!((command - 0.8).abs() < 1e-3, "{command}: 2 Nm at 10 Nm/rad are 0.2 rad");
+}
+
+#[test]
 fn a_disarm_ends_an_arm_at_any_moment() {
     for cycles in 0..30 {
         let mut world = World::ready();
@@ -172,6 +206,36 @@ fn a_disarm_ends_an_arm_at_any_moment() {
         world.arm();
         world.run_until(BusState::Holding);
     }
+}
+
+#[test]
+fn a_motor_is_off_when_it_says_so_after_it_was_told() {
+    let enabling = || {
+        let mut world = World::ready();
+        world.sims[0].deaf = Some(Order::Enable);
+        world.arm();
+        while !world.sent.contains(&Order::Enable.frame(1)) {
+            world.cycle();
+        }
+        world
+    };
+    // What it said before is no answer to the order, which is sent all the same.
+    let mut world = enabling();
+    world.disarm();
+    let before = world.sims[0].feedback().unwrap();
+    world.bus.feed(&before, world.now);
+    world.cycle();
+    assert!(world.sent.contains(&Order::Disable.frame(1)));
+    // Nor is silence one.
+    let mut world = enabling();
+    world.cycle();
+    world.disarm();
+    world.sims[0].silent = true;
+    world.latency = 0;
+    world.run(1);
+    world.disarm();
+    assert_eq!(world.run_to_fault(), Fault::Silent { motor: 0 });
+    assert_eq!(world.told(Notice::Disabled(Reason::Asked)), 0);
 }
 
 #[test]

@@ -159,6 +159,35 @@ fn without_actions_motors_hold_and_are_then_disabled() {
 }
 
 #[test]
+fn an_action_that_was_long_on_its_way_is_held_the_sooner() {
+    let mut world = World::armed();
+    world.run(40);
+    let tick = world.now.before(Duration::from_millis(150));
+    assert!(world.bus.target(&[0.5, 0.5], tick, world.now));
+    world.run(9);
+    assert_eq!(world.bus.state(), BusState::Following);
+    world.cycle();
+    assert_eq!(world.bus.state(), BusState::Holding, "200 ms after its tick");
+}
+
+#[test]
+fn the_rate_of_actions_before_a_disarm_is_forgotten() {
+    let mut world = World::armed();
+    for _ in 0..5 {
+        assert!(world.target(&[0.5, 0.5]));
+        world.run(2);
+    }
+    world.disarm();
+    world.run(100);
+    world.arm();
+    world.run_until(BusState::Holding);
+    world.run(150);
+    assert!(world.target(&[0.5, 0.5]));
+    world.run(39);
+    assert_eq!(world.bus.state(), BusState::Following, "two actions 10 ms apart say nothing of these");
+}
+
+#[test]
 fn an_arm_without_an_action_does_not_last() {
     let mut world = World::armed();
     world.run(199);

@@ -189,7 +189,8 @@ pub(super) struct World {
     pub(super) latency: usize,
     /// The frames of the last cycle.
     pub(super) sent: Vec<CanFrame>,
-    answers: VecDeque<Vec<CanFrame>>,
+    /// What motors sent, and when.
+    answers: VecDeque<(Stamp, Vec<CanFrame>)>,
     judge: Judge,
 }
 
@@ -206,11 +207,15 @@ struct Judge {
 struct Axis {
     /// What the machine was told last.
     reported: Option<f64>,
-    /// It was told that the motor is enabled.
+    /// It told the motor to turn on.
+    told: bool,
+    /// It was told since that the motor is enabled.
     is_on: bool,
     /// The last command to a motor that is on, and when.
     command: Option<(f64, Stamp)>,
     unanswered: Option<Stamp>,
+    /// When it was last told to turn off.
+    off: Stamp,
 }
 
 impl World {
@@ -247,6 +252,10 @@ impl World {
 
     pub(super) fn arm(&mut self) {
         self.bus.arm(self.now);
+        if !self.judge.may_move {
+            // What motors said before is of the past.
+            self.judge.axes.iter_mut().for_each(|axis| (axis.told, axis.is_on) = (false, false));
+        }
         self.judge.may_move = true;
     }
 
@@ -265,7 +274,7 @@ impl World {
     }
 
     /// A frame reaches the machine.
-    pub(super) fn feed(&mut self, frame: &CanFrame) {
+    pub(super) fn feed(&mut self, frame: &CanFrame, sent: Stamp) {
         self.bus.feed(frame, self.now);
         if Reply::decode(frame).is_some() {
             return;
@@ -278,20 +287,25 @@ impl World {
             let [p, v, t] = sim.ranges;
             let said = Feedback::decode(frame, &Ranges::new(p, v, t).unwrap()).unwrap();
             axis.unanswered = None;
+            axis.reported = Some(said.q);
+            // What it said before it was told to turn off is of the past.
+            if sent < axis.off {
+                continue;
+            }
             // Once armed, and once it was on, whatever is not on ends it all.
             let was_on = axis.is_on;
-            axis.is_on = said.status == MotorStatus::Enabled;
+            axis.is_on = axis.told && said.status == MotorStatus::Enabled;
             let too_hot = f64::from(said.mos) >= motor.max_mos || f64::from(said.rotor) >= motor.max_rotor;
             self.judge.may_move &= !(was_on && (!axis.is_on || too_hot));
-            axis.reported = Some(said.q);
         }
     }
 
     pub(super) fn cycle(&mut self) {
         self.now = self.now.after(CYCLE);
         if self.answers.len() > self.latency {
-            for frame in self.answers.pop_front().unwrap_or_default() {
-                self.feed(&frame);
+            let (sent, frames) = self.answers.pop_front().unwrap_or_default();
+            for frame in frames {
+                self.feed(&frame, sent);
             }
         }
         let mut sent = Vec::new();
@@ -302,7 +316,7 @@ impl World {
             self.look(frame);
             answers.extend(self.sims.iter_mut().filter_map(|sim| sim.answer(frame)));
         }
-        self.answers.push_back(answers);
+        self.answers.push_back((self.now, answers));
         self.sent = sent;
         while let Some(notice) = self.bus.take_notice() {
             assert!(!notice.words(self.bus.names()).to_string().is_empty());
@@ -323,11 +337,10 @@ impl World {
             }
             let unanswered = axis.unanswered.map_or(Duration::ZERO, |since| self.now.since(since));
             if is_order && frame.data[7] == 0xfd {
-                // Told to turn off: what it says until then is of the past.
-                *axis = Axis { is_on: false, command: None, ..axis.clone() };
+                *axis = Axis { told: false, is_on: false, command: None, off: self.now, ..axis.clone() };
             }
             if is_order && frame.data[7] == 0xfc {
-                axis.command = None;
+                (axis.told, axis.command) = (true, None);
                 assert!(self.judge.may_move, "a motor was enabled without an arm");
             }
             if is_order || ![slave, slave + 0x100, slave + 0x200].contains(&frame.id) {

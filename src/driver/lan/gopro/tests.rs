@@ -1,4 +1,78 @@
+use std::net::Ipv4Addr as Address;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::TcpListener;
+
 use super::*;
+use crate::registry::{DeviceNode, Heard};
+
+/// A camera that has a clip, and breaks off in its middle so many times; who is asked how often.
+async fn camera(clip: Vec<u8>, breaks: usize) -> (Server, Arc<AtomicUsize>) {
+    let listener = TcpListener::bind((Address::LOCALHOST, 0)).await.expect("a port");
+    let address = listener.local_addr().expect("an address");
+    let asked = Arc::new(AtomicUsize::new(0));
+    let count = Arc::clone(&asked);
+    tokio::spawn(async move {
+        while let Ok((mut stream, _)) = listener.accept().await {
+            let mut request = vec![0; 4096];
+            let length = stream.read(&mut request).await.unwrap_or(0);
+            let request = String::from_utf8_lossy(&request[..length]).to_lowercase();
+            let from = request.split("range: bytes=").nth(1).and_then(|rest| rest.split('-').next()?.parse().ok());
+            let rest = &clip[from.unwrap_or(0).min(clip.len())..];
+            let status = if from.is_some() { "206 Partial Content" } else { "200 OK" };
+            let head = format!("HTTP/1.1 {status}\r\nContent-Length: {}\r\n\r\n", rest.len());
+            let is_broken = count.fetch_add(1, Ordering::Relaxed) < breaks;
+            let sent = if is_broken { &rest[..rest.len() / 2] } else { rest };
+            let _ = stream.write_all(head.as_bytes()).await;
+            let _ = stream.write_all(sent).await;
+        }
+    });
+    let place = Place::new(&DeviceNode::Lan { address, heard: Heard::default() }, None).expect("a place");
+    (place.server(address.port()).expect("a server"), asked)
+}
+
+fn clip_in(folder: &std::path::Path) -> Clip {
+    let answer = br#"{"folder":"100GOPRO","file":"GX010001.MP4"}"#;
+    Clip::new(answer, folder.join("ep_001.mcap"), "gopro").expect("a clip")
+}
+
+#[tokio::test]
+async fn a_clip_is_fetched_on_from_where_it_broke_off() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let bytes: Vec<u8> = (0..3_u32 << 20).map(|index| index.to_le_bytes()[1]).collect();
+    let (server, asked) = camera(bytes.clone(), 2).await;
+    let clip = clip_in(folder.path());
+    clip::fetch(clip.clone(), server.clone()).await.expect("fetched");
+    assert!(std::fs::read(clip.target()).expect("the clip") == bytes, "the clip is another");
+    assert_eq!(asked.load(Ordering::Relaxed), 3);
+    let files: Vec<_> =
+        std::fs::read_dir(folder.path()).expect("a folder").flatten().map(|file| file.file_name()).collect();
+    assert_eq!(files, ["ep_001.gopro.GX010001.MP4"], "nothing is left over");
+    // What is there is not asked for again.
+    clip::fetch(clip, server).await.expect("there");
+    assert_eq!(asked.load(Ordering::Relaxed), 3);
+}
+
+#[tokio::test]
+async fn a_camera_that_always_breaks_off_is_given_up_and_what_came_is_kept() {
+    let (server, _) = camera(vec![7], usize::MAX).await;
+    let folder = tempfile::tempdir().expect("a folder");
+    let failed = clip::fetch(clip_in(folder.path()), server).await.expect_err("half of one byte never comes");
+    assert!(!failed.is_empty());
+    assert!(folder.path().join("ep_001.gopro.GX010001.MP4.partial").exists());
+    assert!(!folder.path().join("ep_001.gopro.GX010001.MP4").exists());
+}
+
+#[test]
+fn a_note_says_where_the_clip_is() {
+    let folder = tempfile::tempdir().expect("a folder");
+    clip_in(folder.path()).note("http://172.24.106.51:8080/videos/DCIM/100GOPRO/GX010001.MP4").expect("written");
+    let note = std::fs::read_to_string(folder.path().join("ep_001.gopro.clip.json")).expect("a note");
+    let note: serde_json::Value = serde_json::from_str(&note).expect("JSON");
+    assert_eq!((note["file"].as_str(), note["size"].as_u64()), (Some("GX010001.MP4"), None));
+}
 
 #[test]
 fn the_camera_is_in_the_network_of_its_host() {

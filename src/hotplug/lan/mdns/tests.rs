@@ -1,1 +1,175 @@
+use tokio::sync::mpsc;
 
+use super::super::super::HotplugEvent;
+use super::*;
+use crate::registry::{DeviceNode, Unit};
+
+const LEASE: Duration = Duration::from_secs(3);
+
+/// Entries of a service, and what they tell.
+struct Bench {
+    service: Service,
+    told: mpsc::Receiver<HotplugEvent>,
+    now: Stamp,
+}
+
+impl Bench {
+    fn new(entries: &[(&str, Option<&str>)]) -> Self {
+        let (tell, told) = mpsc::channel(64);
+        let wanted = entries.iter().map(|(entry, instance)| Wanted {
+            watch: Watch::new(entry, LEASE, tell.clone()),
+            instance: instance.map(str::to_owned),
+            port: None,
+            current: None,
+            asked: None,
+        });
+        let service = Service { domain: "_s._tcp.local.".into(), wanted: wanted.collect(), known: BTreeMap::new() };
+        Self { service, told, now: Stamp(1_000_000_000_000) }
+    }
+
+    async fn announced(&mut self, name: &str, addresses: &[&str]) -> Vec<String> {
+        let addresses = addresses.iter().map(|address| address.parse().expect("an address")).collect();
+        let found = Found { name: name.into(), addresses };
+        self.service.announced(format!("{name}._s._tcp.local."), found, self.now).await;
+        self.told()
+    }
+
+    async fn removed(&mut self, name: &str) -> Vec<String> {
+        self.service.removed(&format!("{name}._s._tcp.local."), self.now).await;
+        self.told()
+    }
+
+    /// Looks every 100 ms for so long; what is to be asked again, and what is told.
+    async fn pass(&mut self, ms: u64) -> (usize, Vec<String>) {
+        let mut questions = 0;
+        for _ in 0..ms / 100 {
+            self.now = self.now.after(LOOK_EVERY);
+            questions += self.service.look(self.now).await.len();
+        }
+        (questions, self.told())
+    }
+
+    fn told(&mut self) -> Vec<String> {
+        let mut told = Vec::new();
+        while let Ok(event) = self.told.try_recv() {
+            told.push(match event {
+                HotplugEvent::Added(attachment) => {
+                    let (Unit::Lan(lan), DeviceNode::Lan { address, .. }) = (&attachment.unit, &attachment.node) else {
+                        panic!("not on the network: {attachment:?}")
+                    };
+                    assert_eq!(lan.address, address.to_string());
+                    format!("+{} {} {address}", lan.entry, lan.instance.as_deref().unwrap_or_default())
+                }
+                HotplugEvent::Removed { syspath, witness, .. } => format!("-{} {}", syspath.display(), witness.word()),
+            });
+        }
+        told
+    }
+}
+
+#[tokio::test]
+async fn an_instance_is_told_once_and_its_goodbye_at_once() {
+    let mut bench = Bench::new(&[("phone", None)]);
+    assert_eq!(bench.announced("a", &["127.0.0.1:5"]).await, ["+phone a 127.0.0.1:5"]);
+    // More of the same announcement.
+    assert!(bench.announced("a", &["127.0.0.2:5", "127.0.0.1:5"]).await.is_empty());
+    bench.pass(1000).await;
+    assert_eq!(bench.removed("a").await, ["-/lan/phone goodbye"]);
+    assert!(bench.removed("a").await.is_empty());
+    assert_eq!(bench.announced("a", &["127.0.0.1:5"]).await, ["+phone a 127.0.0.1:5"]);
+    // Its address is another.
+    assert_eq!(bench.announced("a", &["127.0.0.9:5"]).await, ["+phone a 127.0.0.9:5"]);
+}
+
+#[tokio::test]
+async fn what_is_announced_is_asked_again_and_its_silence_is_the_end_of_the_lease() {
+    let mut bench = Bench::new(&[("phone", None)]);
+    bench.announced("a", &["127.0.0.1:5"]).await;
+    assert_eq!(bench.pass(3000).await, (1, vec![]));
+    assert_eq!(bench.pass(9000).await.0, 3, "once a lease and a pause");
+    // 12 s: asked at 0.1, 3.3, 6.5, 9.7; the last is over at 12.7.
+    bench.pass(700).await;
+    assert_eq!(bench.removed("a").await, ["-/lan/phone lease"]);
+    // An instance the library cannot ask for is not.
+    bench.announced("b.c", &["127.0.0.1:5"]).await;
+    assert_eq!(bench.pass(9000).await, (0, vec![]));
+}
+
+#[tokio::test]
+async fn what_its_driver_hears_outlasts_a_lost_announcement_and_not_a_goodbye() {
+    for goodbye in [false, true] {
+        let mut bench = Bench::new(&[("phone", None)]);
+        bench.now = Stamp::now().before(Duration::from_secs(10));
+        let found = Found { name: "a".into(), addresses: vec![([127, 0, 0, 1], 5).into()] };
+        bench.service.announced("a._s._tcp.local.".into(), found, bench.now).await;
+        let Ok(HotplugEvent::Added(attachment)) = bench.told.try_recv() else { panic!("not told") };
+        let DeviceNode::Lan { heard, .. } = attachment.node else { panic!("not on the network") };
+        bench.service.wanted[0].asked = Some(bench.now);
+        bench.now = bench.now.after(if goodbye { LEASE / 2 } else { LEASE });
+        heard.now();
+        if goodbye {
+            assert_eq!(bench.removed("a").await, ["-/lan/phone goodbye"]);
+            continue;
+        }
+        assert!(bench.removed("a").await.is_empty());
+        assert_eq!(bench.pass(5000).await, (0, vec![]), "nobody is there to be asked");
+        assert_eq!(bench.pass(12_000).await.1, ["-/lan/phone lease"]);
+    }
+}
+
+#[tokio::test]
+async fn each_instance_is_one_entry_and_a_named_one_the_one_of_its_name() {
+    let mut bench = Bench::new(&[("left", None), ("named", Some("B")), ("right", None)]);
+    assert_eq!(bench.announced("b", &["127.0.0.1:2"]).await, ["+left b 127.0.0.1:2"], "the first free one");
+    assert_eq!(bench.removed("b").await, ["-/lan/left goodbye"]);
+    let mut bench = Bench::new(&[("named", Some("B")), ("left", None), ("right", None)]);
+    assert_eq!(bench.announced("a", &["127.0.0.1:1"]).await, ["+left a 127.0.0.1:1"]);
+    assert_eq!(bench.announced("b", &["127.0.0.1:2"]).await, ["+named b 127.0.0.1:2"]);
+    assert_eq!(bench.announced("c", &["127.0.0.1:3"]).await, ["+right c 127.0.0.1:3"]);
+    assert!(bench.announced("d", &["127.0.0.1:4"]).await.is_empty());
+    // Whoever waits takes the place of one that left.
+    assert_eq!(bench.removed("a").await, ["-/lan/left goodbye", "+left d 127.0.0.1:4"]);
+}
+
+#[tokio::test]
+async fn a_flood_of_names_is_bounded() {
+    let mut bench = Bench::new(&[("phone", Some("never"))]);
+    for number in 0..1000 {
+        bench.announced(&format!("n{number}"), &["127.0.0.1:1"]).await;
+    }
+    assert_eq!(bench.service.known.len(), MOST_INSTANCES);
+}
+
+#[test]
+fn names_are_read_as_dns_writes_them() {
+    for (label, name) in [
+        ("iPhone-iPhoneVIO", "iPhone-iPhoneVIO"),
+        (r"one\. two", "one. two"),
+        (r"a\\b", r"a\b"),
+        (r"tab\009end", "tab\tend"),
+        (r"odd\", "odd"),
+        (r"\999", "999"),
+        (r"\195\164", "ä"),
+        (r"\255", "\u{fffd}"),
+    ] {
+        assert_eq!(unescaped(label), name, "{label}");
+    }
+    assert_eq!(unescaped(&"x".repeat(500)).len(), LONGEST_NAME);
+}
+
+#[test]
+fn the_best_address_is_the_same_each_time() {
+    let ip = |text: &str| text.parse::<IpAddr>().expect("an address");
+    let all = [
+        ("fe80::1", 3),
+        ("127.0.0.1", 0),
+        ("fd00::2", 0),
+        ("192.168.1.9", 0),
+        ("192.168.1.7", 0),
+        ("0.0.0.0", 0),
+        ("224.0.0.1", 0),
+    ];
+    let found = ordered(all.iter().map(|(text, scope)| (ip(text), *scope)), 80);
+    let shown: Vec<_> = found.iter().map(ToString::to_string).collect();
+    assert_eq!(shown, ["192.168.1.7:80", "192.168.1.9:80", "[fd00::2]:80", "[fe80::1%3]:80", "127.0.0.1:80"]);
+}

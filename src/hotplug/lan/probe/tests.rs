@@ -1,1 +1,110 @@
+use std::net::IpAddr;
 
+use tokio::net::TcpListener;
+use tokio::sync::mpsc;
+
+use super::super::super::HotplugEvent;
+use super::*;
+use crate::registry::DeviceNode;
+
+const LOCAL: IpAddr = IpAddr::V4(std::net::Ipv4Addr::LOCALHOST);
+
+/// A server that does this with each connection; its address.
+async fn server<F: Future<Output = ()> + Send>(answer: impl Fn(TcpStream) -> F + Send + 'static) -> SocketAddr {
+    let listener = TcpListener::bind((LOCAL, 0)).await.expect("a port");
+    let address = listener.local_addr().expect("an address");
+    tokio::spawn(async move {
+        while let Ok((stream, _)) = listener.accept().await {
+            answer(stream).await;
+        }
+    });
+    address
+}
+
+/// A port that nobody is at.
+fn nobody() -> SocketAddr {
+    let listener = std::net::TcpListener::bind((LOCAL, 0)).expect("a port");
+    listener.local_addr().expect("an address")
+}
+
+#[tokio::test]
+async fn an_answer_is_told_from_none() {
+    let greeting = |text: &'static [u8]| {
+        server(move |mut stream| async move {
+            let _ = stream.read(&mut [0; 1024]).await;
+            let _ = stream.write_all(text).await;
+        })
+    };
+    let web = greeting(b"HTTP/1.0 404 Not Found\r\n\r\n").await;
+    let ssh = greeting(b"SSH-2.0-OpenSSH\r\n").await;
+    let silent = server(|stream| async move {
+        tokio::spawn(async move {
+            sleep(Duration::from_mins(1)).await;
+            drop(stream);
+        });
+    })
+    .await;
+    for (probe, address, expected) in [
+        (Probe::Tcp, web, Answer::Here),
+        (Probe::Tcp, ssh, Answer::Here),
+        (Probe::Tcp, silent, Answer::Here),
+        (Probe::Tcp, nobody(), Answer::Nobody),
+        (Probe::Http, web, Answer::Here),
+        (Probe::Http, ssh, Answer::Silence),
+        (Probe::Http, silent, Answer::Silence),
+        (Probe::Http, nobody(), Answer::Nobody),
+        (Probe::Udp, nobody(), Answer::Silence),
+    ] {
+        assert_eq!(ask(probe, address).await, expected, "{probe:?} {address}");
+    }
+}
+
+#[tokio::test]
+async fn packets_of_the_device_are_heard_and_the_port_is_given_back() {
+    let port = nobody();
+    let sender = UdpSocket::bind((LOCAL, 0)).await.expect("a port");
+    let mut heard = Box::pin(ask(Probe::Udp, port));
+    let answer = loop {
+        tokio::select! {
+            answer = &mut heard => break answer,
+            () = sleep(Duration::from_millis(5)) => { let _ = sender.send_to(b"x", port).await; }
+        }
+    };
+    assert_eq!(answer, Answer::Here);
+    drop(heard);
+    UdpSocket::bind(port).await.expect("the port is free for the driver");
+    // Of somebody else they say nothing.
+    let elsewhere = SocketAddr::from(([127, 0, 0, 9], nobody().port()));
+    let mut heard = Box::pin(ask(Probe::Udp, elsewhere));
+    let answer = loop {
+        tokio::select! {
+            answer = &mut heard => break answer,
+            () = sleep(Duration::from_millis(5)) => {
+                let _ = sender.send_to(b"x", (LOCAL, elsewhere.port())).await;
+            }
+        }
+    };
+    assert_eq!(answer, Answer::Silence);
+}
+
+#[tokio::test]
+async fn a_device_comes_and_goes_and_one_that_sends_is_not_asked() {
+    let listener = TcpListener::bind((LOCAL, 0)).await.expect("a port");
+    let address = listener.local_addr().expect("an address");
+    let (tell, mut told) = mpsc::channel(8);
+    tokio::spawn(watch(Watch::new("cam", EVERY * 3, tell), address, address, Probe::Tcp));
+    let Some(HotplugEvent::Added(attachment)) = told.recv().await else { panic!("not found") };
+    let DeviceNode::Lan { heard, .. } = attachment.node else { panic!("not on the network") };
+    drop(listener.accept().await);
+    // While its driver hears it, nobody connects.
+    for _ in 0..30 {
+        heard.now();
+        let asked = timeout(Duration::from_millis(100), listener.accept()).await;
+        assert!(asked.is_err(), "asked although it sends");
+    }
+    drop(listener);
+    let Some(HotplugEvent::Removed { witness, .. }) = told.recv().await else { panic!("not gone") };
+    assert_eq!(witness, Witness::Lease);
+    let _listener = TcpListener::bind(address).await.expect("the port again");
+    assert!(matches!(told.recv().await, Some(HotplugEvent::Added(_))), "found again");
+}

@@ -1,5 +1,6 @@
 //! `vbench-deaf [--json]`: the longest silence of the mask while nothing happens, while a program that ends promptly loses its
-//! device, and while a deaf one does. A benchmark: it prints figures and asserts nothing about them.
+//! device, while a deaf one
+//! does, and beside programs that crash and that flood their stderr. A benchmark: it prints figures and asserts nothing about them.
 
 use std::process::ExitCode;
 
@@ -34,6 +35,8 @@ fn run() -> Result<(), Box<dyn std::error::Error>> {
         (Span::Idle, "mask_silence_idle", "longest silence of the mask in 7 s in which nothing happens"),
         (Span::Prompt, "mask_silence_prompt_child", "in the 7 s after an unplug whose program ends on SIGTERM"),
         (Span::Deaf, "mask_silence_deaf_child", "in the 7 s after an unplug whose program ignores SIGTERM"),
+        (Span::Crashing, "mask_silence_crashing_child", "in 7 s in which a program crashes again and again"),
+        (Span::Flooding, "mask_silence_flooding_child", "in 7 s in which a program floods its stderr"),
     ] {
         let rhythm = deaf::rhythm(&outcome, span);
         let own = rhythm

@@ -1,0 +1,48 @@
+/* A program that reads a device for `rapid`, in C. publisher.c is one.
+ *
+ * Build:  cargo build --release -p rapid-node
+ *         cc publisher.c -I examples/c target/release/librapid_node.a -lpthread -ldl -lm -o publisher
+ *
+ * Everything is called from one thread. */
+#ifndef RAPID_NODE_H
+#define RAPID_NODE_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* What a payload holds. RAPID_F64 is little-endian 64-bit floats, which is what kind = "scalars" means. */
+enum rapid_encoding { RAPID_BYTES = 0, RAPID_MJPEG = 1, RAPID_YUYV = 2, RAPID_GREY = 3, RAPID_F64 = 4 };
+
+struct rapid_sample {
+    const void *bytes;
+    size_t length;
+    uint64_t capture_ns; /* CLOCK_MONOTONIC; 0 if it is not known */
+    uint64_t lost;       /* samples the device lost since the one before */
+    uint32_t encoding;   /* enum rapid_encoding */
+    uint32_t width;      /* of a picture, pixels */
+    uint32_t height;
+};
+
+typedef struct rapid_node rapid_node;
+
+/* Joins the bus of the `rapid` that started this program, to publish samples of at most max_bytes.
+ * NULL if that cannot be; rapid_node_error() says why. */
+rapid_node *rapid_node_open(size_t max_bytes);
+
+/* Publishes a sample, whose bytes are copied. 0, or -1 with a rapid_node_error(). */
+int rapid_node_publish(rapid_node *node, const struct rapid_sample *sample);
+
+/* Leaves the bus. */
+void rapid_node_close(rapid_node *node);
+
+/* What went wrong last in this thread; valid until the next call of this library. */
+const char *rapid_node_error(void);
+
+#ifdef __cplusplus
+}
+#endif
+#endif

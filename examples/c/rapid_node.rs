@@ -1,0 +1,154 @@
+//! `librapid_node.a`: what `rapid_node.h` declares.
+//!
+//! iceoryx2's own binding for C is no package of any registry in the version that `rapid` has. A program
+//! that builds that binding from its sources can do without this library: topic, types and header are
+//! those of the README.
+
+use std::cell::RefCell;
+use std::error::Error;
+use std::ffi::{CString, c_char, c_int};
+
+use iceoryx2::port::notifier::Notifier;
+use iceoryx2::port::publisher::Publisher;
+use iceoryx2::prelude::*;
+
+/// Stands beside every payload; `rapid::sample::SampleHeader`.
+#[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
+#[type_name("RapidSampleHeader")]
+#[repr(C)]
+struct SampleHeader {
+    seq: u64,
+    lost: u64,
+    capture_ns: u64,
+    recv_ns: u64,
+    id: u32,
+    epoch: u32,
+    encoding: u32,
+    flags: u32,
+    width: u32,
+    height: u32,
+}
+
+/// `struct rapid_sample`.
+#[repr(C)]
+pub struct RapidSample {
+    bytes: *const u8,
+    length: usize,
+    capture_ns: u64,
+    lost: u64,
+    encoding: u32,
+    width: u32,
+    height: u32,
+}
+
+/// `rapid_node`.
+pub struct RapidNode {
+    publisher: Publisher<ipc::Service, [u8], SampleHeader>,
+    wake: Notifier<ipc::Service>,
+    /// What all headers have in common, and the sequence number of the next.
+    header: SampleHeader,
+    _node: Node<ipc::Service>,
+}
+
+thread_local! {
+    static ERROR: RefCell<CString> = RefCell::default();
+}
+
+/// See `rapid_node.h`.
+#[unsafe(no_mangle)]
+pub extern "C" fn rapid_node_open(max_bytes: usize) -> *mut RapidNode {
+    match open(max_bytes) {
+        Ok(node) => Box::into_raw(Box::new(node)),
+        Err(error) => {
+            say(&*error);
+            std::ptr::null_mut()
+        }
+    }
+}
+
+/// See `rapid_node.h`.
+///
+/// # Safety
+/// `node` comes from [`rapid_node_open`] and was not closed; `sample` and its bytes can be read.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rapid_node_publish(node: *mut RapidNode, sample: *const RapidSample) -> c_int {
+    // SAFETY: the caller keeps to the header: both are null or valid, and nobody else uses the node meanwhile.
+    let (Some(node), Some(sample)) = (unsafe { node.as_mut() }, unsafe { sample.as_ref() }) else {
+        say(&*Box::<dyn Error>::from("no node or no sample"));
+        return -1;
+    };
+    let bytes = if sample.length == 0 || sample.bytes.is_null() {
+        &[]
+    } else {
+        // SAFETY: the caller says that there are so many bytes; they are only read, before this returns.
+        unsafe { std::slice::from_raw_parts(sample.bytes, sample.length) }
+    };
+    match publish(node, sample, bytes) {
+        Ok(()) => 0,
+        Err(error) => {
+            say(&*error);
+            -1
+        }
+    }
+}
+
+/// See `rapid_node.h`.
+///
+/// # Safety
+/// `node` comes from [`rapid_node_open`] and is not used any more.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rapid_node_close(node: *mut RapidNode) {
+    if !node.is_null() {
+        // SAFETY: it was made by `Box::into_raw`, and the caller gives it back.
+        drop(unsafe { Box::from_raw(node) });
+    }
+}
+
+/// See `rapid_node.h`.
+#[unsafe(no_mangle)]
+pub extern "C" fn rapid_node_error() -> *const c_char {
+    ERROR.with_borrow(|error| error.as_ptr())
+}
+
+fn say(error: &dyn Error) {
+    ERROR.set(CString::new(error.to_string().replace('\0', "")).unwrap_or_default());
+}
+
+fn open(max_bytes: usize) -> Result<RapidNode, Box<dyn Error>> {
+    set_log_level(LogLevel::Error);
+    let topic = variable("RAPID_TOPIC")?;
+    let mut config = Config::global_config().clone();
+    config.global.prefix = FileName::new(variable("RAPID_BUS_PREFIX")?.as_bytes())?;
+    let node = NodeBuilder::new()
+        .config(&config)
+        // SIGTERM ends this program as it ends any other.
+        .signal_handling_mode(SignalHandlingMode::Disabled)
+        .create::<ipc::Service>()?;
+    let name = ServiceName::new(&topic)?;
+    let samples = node.service_builder(&name).publish_subscribe::<[u8]>().user_header::<SampleHeader>().open()?;
+    let publisher = samples.publisher_builder().initial_max_slice_len(max_bytes).create()?;
+    let wake = node.service_builder(&name).event().open()?.notifier_builder().create()?;
+    let header = SampleHeader {
+        id: variable("RAPID_BIT")?.parse()?,
+        epoch: variable("RAPID_EPOCH")?.parse()?,
+        ..SampleHeader::default()
+    };
+    Ok(RapidNode { publisher, wake, header, _node: node })
+}
+
+fn variable(name: &str) -> Result<String, Box<dyn Error>> {
+    std::env::var(name).map_err(|_| format!("{name} is not set: rapid starts this program, see its README").into())
+}
+
+fn publish(node: &mut RapidNode, said: &RapidSample, bytes: &[u8]) -> Result<(), Box<dyn Error>> {
+    let mut sample = node.publisher.loan_slice_uninit(bytes.len())?;
+    let RapidSample { capture_ns, encoding, width, height, lost, .. } = *said;
+    // What the device lost leaves a hole.
+    node.header.seq += lost;
+    *sample.user_header_mut() = SampleHeader { capture_ns, encoding, width, height, ..node.header };
+    sample.write_from_slice(bytes).send()?;
+    node.header.seq += 1;
+    // Without a notification a sample is found a little later.
+    node.wake.notify()?;
+    Ok(())
+}

@@ -1,0 +1,118 @@
+"""What a program of `rapid` needs in Python: the header of a sample, and ways to publish and to receive.
+
+Needs the package `iceoryx2` of the version that `rapid` has, 0.10. Copy this file beside your program.
+"""
+
+import ctypes
+import os
+import struct
+import time
+
+import iceoryx2 as iox2
+
+# What a payload holds.
+BYTES, MJPEG, YUYV, GREY, F64 = range(5)
+# What every actuator is told, little-endian 64-bit floats, one an axis.
+ACTIONS = "/action"
+# As many axes as an action may have.
+MOST_AXES = 64
+
+
+class SampleHeader(ctypes.Structure):
+    """Stands beside every payload."""
+
+    _fields_ = [
+        ("seq", ctypes.c_uint64),
+        ("lost", ctypes.c_uint64),
+        ("capture_ns", ctypes.c_uint64),
+        ("recv_ns", ctypes.c_uint64),
+        ("id", ctypes.c_uint32),
+        ("epoch", ctypes.c_uint32),
+        ("encoding", ctypes.c_uint32),
+        ("flags", ctypes.c_uint32),
+        ("width", ctypes.c_uint32),
+        ("height", ctypes.c_uint32),
+    ]
+
+    @staticmethod
+    def type_name():
+        """The name under which `rapid` knows it."""
+        return "RapidSampleHeader"
+
+
+class Bus:
+    """The bus of the `rapid` that started this program, or of the one whose prefix is given."""
+
+    def __init__(self, prefix=None):
+        iox2.set_log_level(iox2.LogLevel.Error)
+        config = iox2.config.default()
+        prefix = prefix or os.environ.get("RAPID_BUS_PREFIX")
+        if prefix:
+            config.global_cfg.prefix = iox2.FileName.new(prefix)
+        # SIGTERM ends this program as it ends any other.
+        builder = iox2.NodeBuilder.new().config(config).signal_handling_mode(iox2.SignalHandlingMode.Disabled)
+        self._node = builder.create(iox2.ServiceType.Ipc)
+
+    def _topic(self, topic):
+        builder = self._node.service_builder(iox2.ServiceName.new(topic))
+        return builder.publish_subscribe(iox2.Slice[ctypes.c_uint8]).user_header(SampleHeader).open()
+
+    def publisher(self, topic, max_bytes):
+        """Publishes payloads of at most this many bytes."""
+        ports = self._topic(topic).publisher_builder().initial_max_slice_len(max_bytes).create()
+        return Publisher(ports)
+
+    def node(self, max_bytes):
+        """Publishes the samples of the device this program was started for."""
+        topic = os.environ["RAPID_TOPIC"]
+        publisher = self.publisher(topic, max_bytes)
+        wake = self._node.service_builder(iox2.ServiceName.new(topic)).event().open()
+        publisher._wake = wake.notifier_builder().create()
+        publisher._header = {"id": int(os.environ["RAPID_BIT"]), "epoch": int(os.environ["RAPID_EPOCH"])}
+        return publisher
+
+    def actions(self):
+        """Receives what the actuator is told."""
+        return Actions(self._topic(ACTIONS).subscriber_builder().create())
+
+
+class Publisher:
+    """Publishes on one topic."""
+
+    def __init__(self, port):
+        self._port = port
+        self._wake = None
+        self._header = {}
+        self._seq = 0
+
+    def send(self, payload, encoding, capture_ns=None, **header):
+        """Publishes a payload, captured at a moment of `time.monotonic_ns()`, by default now."""
+        sample = self._port.loan_slice_uninit(len(payload))
+        fields = {"capture_ns": capture_ns or time.monotonic_ns(), "encoding": encoding, **self._header, **header}
+        sample.user_header()[0] = SampleHeader(seq=self._seq, **fields)
+        ctypes.memmove(sample.payload().as_ptr(), payload, len(payload))
+        sample.assume_init().send()
+        self._seq += 1
+        # Without a notification a sample is found a little later.
+        if self._wake:
+            self._wake.notify()
+
+    def send_numbers(self, numbers, **header):
+        """Publishes numbers, which is what `kind = "scalars"` means."""
+        self.send(struct.pack(f"<{len(numbers)}d", *numbers), F64, **header)
+
+
+class Actions:
+    """The actions of the run."""
+
+    def __init__(self, port):
+        self._port = port
+
+    def newest(self):
+        """The newest action that came since the last call, a list of numbers; None if none did."""
+        newest = None
+        while (sample := self._port.receive()) is not None:
+            payload = bytes(sample.payload().as_memory_view())
+            if sample.user_header().contents.encoding == F64 and 0 < len(payload) <= 8 * MOST_AXES:
+                newest = [number for (number,) in struct.iter_unpack("<d", payload)]
+        return newest

@@ -1,0 +1,127 @@
+//! Which units could be registered, and what their entries would say.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use super::*;
+use crate::driver::camera::Mode;
+use crate::registry::scenario::SimDevice;
+use crate::registry::{BUILTIN, Unit};
+
+fn usb(ids: (u16, u16), serial: Option<&str>, port: &str) -> UsbIdentity {
+    UsbIdentity {
+        vid: ids.0,
+        pid: ids.1,
+        serial: serial.map(str::to_owned),
+        port: port.into(),
+        ..UsbIdentity::default()
+    }
+}
+
+fn node(usb: &UsbIdentity, node: DeviceNode) -> Attachment {
+    let syspath = PathBuf::from("/sys/none").join(&usb.port).join(node.label().replace('/', "_"));
+    Attachment { syspath, node, unit: Unit::Usb(usb.clone()), driver: None }
+}
+
+fn video(usb: &UsbIdentity, path: &str) -> Attachment {
+    node(usb, DeviceNode::Video(path.into()))
+}
+
+#[test]
+fn what_an_entry_reads_is_no_news_and_the_rest_of_its_device_may_be() {
+    let registry = Registry::parse(BUILTIN, None).unwrap().registry;
+    let known = usb((0x046d, 0x0825), Some("CAM00A1"), "1-1");
+    let new = usb((0x046d, 0x0825), Some("OTHER"), "1-2");
+    let bare = usb((0x1209, 1), None, "1-3");
+    let attached = [
+        node(&bare, DeviceNode::Usb("/dev/bus/usb/001/009".into())),
+        video(&known, "/dev/video0"),
+        video(&known, "/dev/video1"),
+        node(&known, DeviceNode::Usb("/dev/bus/usb/001/002".into())),
+        node(&known, DeviceNode::Tty("/dev/ttyACM0".into())),
+        video(&new, "/dev/video2"),
+        node(&new, DeviceNode::Usb("/dev/bus/usb/001/003".into())),
+    ];
+    let found = unregistered(Some(&registry), &attached);
+    let said: Vec<String> = found
+        .iter()
+        .map(|unit| {
+            let nodes: Vec<String> = unit.nodes.iter().map(|node| node.node.label()).collect();
+            format!("{} {:?} {}", unit.usb.port, unit.guess(), nodes.join(" "))
+        })
+        .collect();
+    assert_eq!(
+        said,
+        [
+            "1-1 Some(\"serial\") /dev/ttyACM0",
+            "1-2 Some(\"camera\") /dev/video2 /dev/bus/usb/001/003",
+            "1-3 None /dev/bus/usb/001/009",
+        ]
+    );
+    assert!(found[1].has_twin);
+    assert_eq!(found[1].identity(), Some(("serial", "OTHER".to_owned())));
+    assert_eq!(found[2].identity(), None, "the only one of its model");
+    assert_eq!(unregistered(None, &attached).len(), 3);
+}
+
+#[test]
+fn units_that_a_serial_number_cannot_tell_apart_are_told_apart_by_their_ports() {
+    for (serials, expected) in [
+        ([Some("A"), Some("B")], [("serial", "A"), ("serial", "B")]),
+        ([Some("A"), Some("A")], [("port", "1-1"), ("port", "1-2")]),
+        ([None, None], [("port", "1-1"), ("port", "1-2")]),
+        ([None, Some("B")], [("port", "1-1"), ("serial", "B")]),
+        // What would not be one line is nothing to identify a device by.
+        ([Some("evil\nline"), Some("B")], [("port", "1-1"), ("serial", "B")]),
+    ] {
+        let units = [usb((1, 2), serials[0], "1-1"), usb((1, 2), serials[1], "1-2")];
+        let attached = [video(&units[0], "/dev/video0"), video(&units[1], "/dev/video1")];
+        let found: Vec<_> = unregistered(None, &attached).iter().filter_map(Candidate::identity).collect();
+        assert_eq!(found, expected.map(|(key, value)| (key, value.to_owned())), "{serials:?}");
+    }
+}
+
+#[test]
+fn a_camera_is_asked_for_what_it_offers() {
+    let mode = |fourcc: &str, width, height, rates: &[u32]| Mode {
+        fourcc: fourcc.into(),
+        size: Size::One { width, height },
+        rates: Rates::List(rates.iter().map(|frames| Rate { frames: *frames, seconds: 1 }).collect()),
+    };
+    for (modes, expected) in [
+        (vec![mode("YUYV", 640, 480, &[30]), mode("MJPG", 1280, 720, &[30, 60])], Some((1280, 720, 30, "MJPG"))),
+        (vec![mode("MJPG", 320, 240, &[30]), mode("MJPG", 640, 480, &[25, 60])], Some((640, 480, 25, "MJPG"))),
+        (vec![mode("GREY", 400, 400, &[])], Some((400, 400, 30, "GREY"))),
+        (vec![mode("H264", 640, 480, &[30])], None),
+        (Vec::new(), None),
+    ] {
+        let camera = CameraInfo {
+            path: PathBuf::new(),
+            name: String::new(),
+            driver: String::new(),
+            modes,
+            controls: Vec::new(),
+        };
+        assert_eq!(best(&camera), expected);
+    }
+    let range = Rates::Range { slowest: Rate { frames: 5, seconds: 1 }, fastest: Rate { frames: 15, seconds: 1 } };
+    assert_eq!(fps(&range), 15);
+    let sim = SimSource::Serial { channels: 4, hz: 10, seed: 1 };
+    let sim = DeviceNode::Sim(Arc::new(SimDevice::new("x", sim, crate::time::Stamp(0))));
+    assert_eq!(suggested(&sim, None), serial_settings("csv", 4));
+}
+
+#[test]
+fn lines_are_numbers_or_not() {
+    let look = |lines: &[&str]| {
+        let lines: Vec<Vec<u8>> = lines.iter().map(|line| line.as_bytes().to_vec()).collect();
+        lines_look_like(&lines)
+    };
+    assert_eq!(look(&["cut", "1, 2.5,-3", "4,5,6"]), Some(serial_settings("csv", 3)));
+    assert_eq!(look(&["", "[1,2]", "[3,4]"]), Some(serial_settings("json", 2)));
+    assert_eq!(look(&["", "{\"a\":1,\"b\":\"x\"}"]), Some(serial_settings("json", 1)));
+    for lines in [&["1,2"][..], &["", "hello"], &["", "1,2", "1,2,3"], &["", "{}"], &[]] {
+        assert_eq!(look(lines), None, "{lines:?}");
+    }
+    assert_eq!(lines_look_like(&[vec![], vec![0xff, 0xfe]]), None);
+}

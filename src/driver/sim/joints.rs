@@ -1,0 +1,85 @@
+//! Simulated motors: once armed, each is where it was last told to be.
+
+use crate::action::{ActuatorNotice, Arming, Order};
+use crate::registry::MOTOR_CHANNELS;
+
+/// See the module's comment.
+#[derive(Debug, Default)]
+pub(in crate::driver) struct Joints {
+    positions: Vec<f64>,
+    is_armed: bool,
+    has_moved: bool,
+    notice: Option<ActuatorNotice>,
+}
+
+impl Joints {
+    /// So many motors, disarmed.
+    pub(super) fn new(count: usize) -> Self {
+        Self { positions: vec![0.0; count], ..Self::default() }
+    }
+
+    /// Takes an action; false if it is not theirs.
+    pub(super) fn command(&mut self, target: &[f64]) -> bool {
+        if self.positions.is_empty() || self.positions.len() != target.len() {
+            return false;
+        }
+        if self.is_armed {
+            self.positions.copy_from_slice(target);
+            self.has_moved = true;
+        }
+        true
+    }
+
+    pub(in crate::driver) fn order(&mut self, order: Order) {
+        if self.positions.is_empty() {
+            return;
+        }
+        self.is_armed = order == Order::Arm;
+        let (arming, text) = if self.is_armed {
+            (Arming::Armed, "simulated motors follow actions")
+        } else {
+            (Arming::Disarmed, "simulated motors are disabled")
+        };
+        self.notice = Some(ActuatorNotice { arming, text: text.to_owned(), is_problem: false });
+    }
+
+    pub(in crate::driver) fn take_notice(&mut self) -> Option<ActuatorNotice> {
+        self.notice.take()
+    }
+
+    /// Puts their positions in front of what else a sample says of each, once they were told any.
+    pub(super) fn write(&self, payload: &mut [u8]) {
+        if !self.has_moved {
+            return;
+        }
+        for (motor, position) in payload.chunks_exact_mut(8 * MOTOR_CHANNELS).zip(&self.positions) {
+            if let Some((place, _)) = motor.split_first_chunk_mut() {
+                *place = position.to_le_bytes();
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn they_move_when_they_are_armed() {
+        let mut joints = Joints::new(2);
+        let mut payload = [0; 2 * 8 * MOTOR_CHANNELS];
+        let first = |payload: &[u8]| f64::from_le_bytes(payload[..8].try_into().expect("8 bytes"));
+        assert!(joints.command(&[1.0, 2.0]) && !joints.command(&[1.0]));
+        joints.write(&mut payload);
+        assert!(first(&payload).abs() < f64::EPSILON, "not armed");
+        joints.order(Order::Arm);
+        assert_eq!(joints.take_notice().map(|notice| notice.arming), Some(Arming::Armed));
+        assert!(joints.command(&[1.0, 2.0]));
+        joints.write(&mut payload);
+        assert!((first(&payload) - 1.0).abs() < f64::EPSILON);
+        joints.order(Order::Disarm);
+        assert!(joints.command(&[3.0, 2.0]));
+        joints.write(&mut payload);
+        assert!((first(&payload) - 1.0).abs() < f64::EPSILON, "disarmed");
+    }
+}

@@ -1,0 +1,89 @@
+//! Devices on the network: what their servers, packets and announcements hold.
+
+use rapid::driver::lan::fuzzing;
+use rapid::hotplug::lan::fuzz_label;
+
+/// Of the smallest entry.
+const LARGEST: usize = 1024;
+
+/// The stream in pieces whose lengths the first byte says.
+fn pieces(bytes: &[u8]) -> impl Iterator<Item = &[u8]> {
+    let (size, stream) = bytes.split_first().map_or((0, bytes), |(size, stream)| (*size, stream));
+    stream.chunks(usize::from(size) + 1)
+}
+
+/// Pictures over HTTP: none is larger than permitted, and how the bytes come in pieces does not matter.
+pub fn multipart(bytes: &[u8]) {
+    let Some((line, stream)) = bytes.iter().position(|byte| *byte == b'\n').map(|at| bytes.split_at(at)) else {
+        return;
+    };
+    let Ok(content_type) = std::str::from_utf8(line) else { return };
+    let (parts, malformed) = fuzzing::multipart(content_type, LARGEST, pieces(stream));
+    assert!(parts.iter().all(|part| part.len() <= LARGEST));
+    let whole = stream.get(1..).unwrap_or_default();
+    assert_eq!((parts, malformed), fuzzing::multipart(content_type, LARGEST, [whole]));
+}
+
+/// A phone's messages, likewise.
+pub fn phone(bytes: &[u8]) {
+    let (payloads, malformed) = fuzzing::phone(LARGEST, pieces(bytes));
+    // A session has a bound of its own.
+    assert!(payloads.iter().all(|payload| payload.len() <= 64 << 10));
+    assert_eq!((payloads, malformed), fuzzing::phone(LARGEST, [bytes.get(1..).unwrap_or_default()]));
+}
+
+/// What is looked at in the answers of a server: no path leaves its folder.
+pub fn answer(bytes: &[u8]) {
+    fuzzing::answer(bytes);
+}
+
+/// The name of an announced instance.
+pub fn label(bytes: &[u8]) {
+    if let Ok(label) = std::str::from_utf8(bytes) {
+        fuzz_label(label);
+    }
+}
+
+/// Streams of cameras as they are.
+pub fn multiparts() -> Vec<Vec<u8>> {
+    let stream = |head: &str, size: u8, body: &[u8]| [head.as_bytes(), &[b'\n', size], body].concat();
+    let kind = "multipart/x-mixed-replace; boundary=--f";
+    vec![
+        stream(kind, 9, b"--f\r\nContent-Length: 3\r\n\r\nabc\r\n--f\r\nContent-Length: 2\r\n\r\nde\r\n--f--\r\n"),
+        stream(kind, 3, b"----f\n\nabc\n--f\n\n\r\n--g\r\nd\n--f\nContent-Length: 4000000000\n\nx\n--f\n\ne\n--f\n"),
+        stream("multipart/mixed;boundary=\"a b\"", 200, b"--a b\r\nX: y\r\n\r\n\r\n--a b--\r\n"),
+        stream(kind, 50, &[b"--f\r\n\r\n", &[b'x'; 2000][..], b"\r\n--f\r\nContent-Length: 1\r\n\r\na"].concat()),
+    ]
+}
+
+/// Connections of phones.
+pub fn phones() -> Vec<Vec<u8>> {
+    let message = |kind: u8, payload: &[u8]| {
+        let length = u32::try_from(payload.len()).unwrap_or(0).to_le_bytes();
+        [&length[..], &[kind, 0, 0, 0], payload].concat()
+    };
+    let frame = |picture: &[u8]| {
+        let length = u32::try_from(picture.len()).unwrap_or(0).to_le_bytes();
+        message(1, &[&length[..], &[0; 80], picture].concat())
+    };
+    vec![
+        [&[7][..], &message(0, b"{\"sessionId\":\"a\"}"), &frame(b"one"), &message(3, b"{}"), &frame(b"")].concat(),
+        [&[255][..], &frame(&[9; 1024]), &frame(&[9; 1025]), &message(1, b"short"), &frame(b"two")].concat(),
+    ]
+}
+
+/// Answers of a GoPro, and a picture's beginning.
+pub fn answers() -> Vec<Vec<u8>> {
+    vec![
+        br#"{"status":{"8":0,"10":1,"35":3600,"54":1000,"70":87},"settings":{}}"#.to_vec(),
+        br#"{"folder":"100GOPRO","file":"GX010001.MP4"}"#.to_vec(),
+        br#"{"folder":"..","file":"../../etc/passwd"}"#.to_vec(),
+        br#"{"info":{"model_name":"HERO11 Black","firmware_version":"H22.01"},"s":"1234"}"#.to_vec(),
+        vec![0xff, 0xd8, 0xff, 0xfe, 0, 4, 1, 2, 0xff, 0xff, 0xc0, 0, 11, 8, 0, 120, 0, 160, 1, 1, 0x11, 0],
+    ]
+}
+
+/// Names of instances as DNS writes them.
+pub fn labels() -> Vec<Vec<u8>> {
+    [r"iPhone-iPhoneVIO", r"one\. two", r"tab\009end", r"\195\164", r"odd\"].map(|text| text.as_bytes().to_vec()).into()
+}

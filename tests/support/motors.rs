@@ -1,0 +1,154 @@
+//! Motors on a serial line: the simulated motors of the virtual bench behind Damiao's adapter, on a
+//! pseudo-terminal.
+
+use std::fs::File;
+use std::io::{Read, Write};
+use std::os::fd::{AsFd, OwnedFd};
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use rapid::registry::{DamiaoSpec, MotorKind, MotorMode, MotorSpec};
+use rapid::time::Stamp;
+use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+use vbench::emu::can::bus::{self, Bus};
+use vbench::emu::can::damiao::{self, Damiao};
+use vbench::emu::order::Order;
+use vbench::emu::told::Told;
+
+/// The longest that something is waited for.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
+
+/// An adapter with motors behind it. Dropped, it is pulled out.
+pub(crate) struct Adapter {
+    /// The line it is on.
+    pub(crate) path: PathBuf,
+    shared: Arc<Mutex<Shared>>,
+    pulled: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+struct Shared {
+    bus: Bus,
+    told: Vec<Told>,
+}
+
+impl Adapter {
+    /// With `count` motors, which listen to 1, 2, ... and answer with 0x11, 0x12, ...
+    pub(crate) fn plug(count: u16) -> Self {
+        let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).expect("terminal");
+        grantpt(&master).expect("terminal");
+        unlockpt(&master).expect("terminal");
+        let path = PathBuf::from(ptsname(&master, Vec::new()).expect("its name").into_string().expect("text"));
+        let motors: Vec<_> = (1..=count)
+            .map(|id| bus::MotorSpec::parse(&format!("{id:x}/{:x}/DM4310", id + 0x10)).expect("a motor"))
+            .collect();
+        let shared = Arc::new(Mutex::new(Shared { bus: Bus::new(&motors), told: Vec::new() }));
+        let pulled = Arc::new(AtomicBool::new(false));
+        let thread = std::thread::spawn({
+            let (shared, pulled) = (Arc::clone(&shared), Arc::clone(&pulled));
+            move || serve(master, &shared, &pulled)
+        });
+        Self { path, shared, pulled, thread: Some(thread) }
+    }
+
+    /// Something befalls a motor.
+    pub(crate) fn befall(&self, motor: u16, order: Order) {
+        self.shared.lock().expect("whole").bus.befall(Some(motor), order, Stamp::now().0);
+    }
+
+    /// What the motors have told so far, oldest first.
+    pub(crate) fn told(&self) -> Vec<&'static str> {
+        self.shared.lock().expect("whole").told.iter().map(|told| told.action).collect()
+    }
+
+    /// How often the motors told this.
+    pub(crate) fn count(&self, action: &str) -> usize {
+        self.told().iter().filter(|told| **told == action).count()
+    }
+
+    /// Waits until each of `count` motors was turned off after the last time that one was enabled.
+    pub(crate) fn wait_until_off(&self, count: usize) {
+        let begun = Instant::now();
+        loop {
+            let told = self.told();
+            let enabled = told.iter().rposition(|told| *told == "motor_enabled").unwrap_or(0);
+            if told[enabled..].iter().filter(|told| **told == "motor_disabled").count() >= count {
+                return;
+            }
+            assert!(begun.elapsed() < PATIENCE, "not turned off: {told:?}");
+            std::thread::sleep(Duration::from_millis(2));
+        }
+    }
+}
+
+impl Drop for Adapter {
+    fn drop(&mut self) {
+        self.pulled.store(true, Ordering::Release);
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+fn serve(master: OwnedFd, shared: &Mutex<Shared>, pulled: &AtomicBool) {
+    use rustix::event::{PollFd, PollFlags, Timespec, poll};
+    let mut line = File::from(master);
+    let (mut damiao, mut piece) = (Damiao::default(), [0; 4096]);
+    while !pulled.load(Ordering::Acquire) {
+        let waits = Timespec { tv_sec: 0, tv_nsec: 1_000_000 };
+        let ready = {
+            let mut fds = [PollFd::from_borrowed_fd(line.as_fd(), PollFlags::IN)];
+            poll(&mut fds, Some(&waits)).expect("poll");
+            fds[0].revents()
+        };
+        let mut answers = Vec::new();
+        {
+            let mut shared = shared.lock().expect("whole");
+            if ready.contains(PollFlags::IN) {
+                let count = line.read(&mut piece).unwrap_or(0);
+                let mut frames = Vec::new();
+                damiao.hear(&piece[..count], &mut answers, |frame| frames.push(frame));
+                for frame in frames {
+                    shared.bus.send(&frame, Stamp::now().0, |answer| damiao::tell(&answer, &mut answers));
+                }
+            } else if ready.contains(PollFlags::HUP) {
+                // Nobody has it open: it may be opened again.
+                std::thread::sleep(Duration::from_millis(1));
+            }
+            shared.bus.tend(Stamp::now().0);
+            let told: Vec<_> = shared.bus.told().collect();
+            shared.told.extend(told);
+        }
+        // A reader that does not read is its own loss.
+        let _ = line.write_all(&answers);
+    }
+}
+
+/// The entry of `count` motors, position driven, at 200 Hz.
+pub(crate) fn spec(count: u16) -> DamiaoSpec {
+    let motor = |id: u16| MotorSpec {
+        name: format!("joint{id}"),
+        slave: id,
+        master: id + 0x10,
+        kind: MotorKind::Dm4310,
+        mode: MotorMode::Mit { kp: 20.0, kd: 1.0 },
+        position: [-1.0, 1.0],
+        velocity: 5.0,
+        torque: 8.0,
+        slew: 4.0,
+        max_mos: 80.0,
+        max_rotor: 80.0,
+    };
+    DamiaoSpec {
+        motors: (1..=count).map(motor).collect(),
+        hz: 200,
+        deadman: None,
+        disable_after: Duration::from_millis(500),
+        timeout: Duration::from_millis(400),
+        // The terminals of a busy machine are slower than a bus.
+        silent_after: Duration::from_millis(400),
+    }
+}

@@ -1,0 +1,98 @@
+//! `rapid` with devices behind USB network adapters: a GoPro that records by itself, a LiDAR whose packets are recorded.
+
+use serde_json::Value;
+use vbench::check::{episode, ms, only, play, rises_after};
+use vbench::emu::lan::lidar;
+use vbench::emu::spec::DeviceSpec;
+use vbench::entries::{lan, registry};
+use vbench::outcome::Outcome;
+use vbench::proto;
+use vbench::recording::{Recording, falls, holes};
+use vbench::scenario::Scenario;
+
+const GOPRO: &str = "/rapid/gopro";
+const LIDAR: &str = "/rapid/lidar";
+
+const SCRIPT: &str = r#"
+lan_rule 0 172.23.145.50/24
+lan_rule 1 192.168.1.100/24
+rapid_start --headless --record --out $out/rec --config /tmp/bench/devices.toml --json
+await_rapid 60 '"event":"recording"' || fail 'not recording'
+emu plug 0 1
+wait_for 60 states 1 lidar streaming || fail 'the lidar does not stream'
+wait_for 60 states 1 gopro streaming || fail 'the camera does not stream'
+wait_for 30 told http shutter/start || fail 'the shutter was not started'
+sleep 4
+emu unplug 1
+wait_for 30 states 1 lidar absent
+emu plug 1
+wait_for 60 states 2 lidar streaming || fail 'the lidar does not stream again'
+sleep 2
+rapid_stop
+ls $out/rec >$out/files
+emu_quit
+exit 0
+"#;
+
+#[test]
+fn a_camera_records_by_itself_and_a_lidar_is_recorded_whole() {
+    let outcome = play(
+        Scenario::new("net")
+            .device(DeviceSpec::ecm().serial("C3441325012345").names("GoPro", "HERO12 Black").gopro(2))
+            .device(DeviceSpec::ecm().serial("VLP16").lidar(200.0))
+            .registry(&registry(&[
+                lan("gopro", GOPRO, 0, "2672:0059", "C3441325012345", "protocol = \"gopro\""),
+                lan("lidar", LIDAR, 1, "2672:0059", "VLP16", "protocol = \"udp\"\nport = 2368"),
+            ]))
+            .script(SCRIPT),
+    );
+    assert_eq!((outcome.code, outcome.rapid_code), (0, Some(0)), "{}", outcome.log);
+    assert!(outcome.emulator_errors().is_empty(), "{:?}", outcome.emulator_errors());
+    let episode = episode(&outcome);
+    camera(&outcome);
+    packets(&outcome, &episode);
+}
+
+/// The camera was set up, recorded as long as the episode, and told which clip belongs to it.
+fn camera(outcome: &Outcome) {
+    let asked: Vec<&str> = outcome.emu.iter().filter_map(|line| line["target"].as_str()).collect();
+    let places = |end: &str| -> Vec<usize> {
+        (0..).zip(&asked).filter(|(_, target)| target.contains(end)).map(|(place, _)| place).collect()
+    };
+    let first = |end: &str| *places(end).first().unwrap_or_else(|| panic!("no {end} in {asked:?}"));
+    assert_eq!(asked[0], "/gopro/camera/control/wired_usb?p=1");
+    assert!(first("set_date_time?date=20") < first("shutter/start"), "{asked:?}");
+    assert_eq!((places("shutter/start").len(), places("shutter/stop").len()), (1, 1), "{asked:?}");
+    let kept_alive = places("keep_alive").len();
+    assert!(kept_alive >= 2, "{kept_alive} keep-alives in {asked:?}");
+    assert!(first("shutter/stop") < first("last_captured"), "{asked:?}");
+
+    let files = outcome.file("files");
+    let note = files.lines().find(|name| name.ends_with(".gopro.clip.json")).unwrap_or_else(|| panic!("{files}"));
+    let note: Value = serde_json::from_str(&outcome.file(&format!("rec/{note}"))).expect("a note in JSON");
+    assert_eq!((&note["file"], &note["size"]), (&"GX010001.MP4".into(), &2_000_000.into()), "{note}");
+    println!("the camera was asked {} times: {note}", asked.len());
+}
+
+/// Every packet sent between the first and the last that were recorded is there; the bit follows the adapter.
+fn packets(outcome: &Outcome, episode: &Recording) {
+    let mut numbers: Vec<u64> = Vec::new();
+    for message in episode.topic(LIDAR) {
+        let packet = proto::bytes(&message.data, 2);
+        numbers.push(lidar::number(packet).unwrap_or_else(|| panic!("{} bytes are no packet", packet.len())).into());
+    }
+    numbers.sort_unstable();
+    println!("{} packets", numbers.len());
+    assert!(numbers.len() > 800, "{} packets", numbers.len());
+    let edges = episode.mask_edges();
+    let fell = only(&falls(&edges, 1));
+    let pulled = outcome.actions("unplug", 1)[0].real_ns;
+    println!("the bit fell {} ms after the adapter was pulled", ms(fell, pulled));
+    assert!(fell >= pulled, "it fell before the pull");
+    assert_eq!(rises_after(&edges, 1, fell).len(), 1, "it rose with the return");
+    assert_eq!(falls(&edges, 0), Vec::<u64>::new(), "the camera's bit");
+
+    // What the adapter sends between the kernel's taking of it and the socket's opening is nobody's: one hole, at the replug.
+    let found = holes(numbers);
+    assert!(found.len() <= 1, "{found:?}");
+}
