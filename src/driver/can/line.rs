@@ -207,8 +207,8 @@ impl Line {
     fn decode(&mut self) -> Decoded {
         let bytes = self.inbox.get(self.taken..self.filled).unwrap_or_default();
         let (taken, decoded) = match &mut self.codec {
-            Codec::Slcan(decoder) => {
-                let (taken, event) = decoder.feed(bytes);
+            Codec::Slcan(codec) => {
+                let (taken, event) = codec.feed(bytes);
                 let decoded = match event {
                     Some(slcan::Event::Frame(frame, _)) => Decoded::Frame(frame),
                     Some(slcan::Event::Done) => Decoded::Answer { refused: false },
@@ -217,9 +217,9 @@ impl Line {
                 };
                 (taken, decoded)
             }
-            Codec::Damiao(decoder) => {
+            Codec::Damiao(codec) => {
                 use damiao_serial::Kind;
-                let (taken, message) = decoder.feed(bytes);
+                let (taken, message) = codec.feed(bytes);
                 let decoded = match message.map(|message| (message.kind, message.frame)) {
                     Some((Kind::Received, frame)) => Decoded::Frame(frame),
                     Some((Kind::SendFailed, _)) => Decoded::Answer { refused: true },

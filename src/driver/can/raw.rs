@@ -93,7 +93,9 @@ impl Raw {
         let lost = link.take_lost();
         let first = frames.first().map(|received| received.arrival).unwrap_or_default();
         self.payload.clear();
-        frames.iter().for_each(|received| write(received, &mut self.payload));
+        for received in frames {
+            write(received, &mut self.payload);
+        }
         Ok(Reading {
             bytes: &self.payload,
             encoding: Encoding::Bytes,

@@ -1,4 +1,4 @@
-//! CAN adapters that are network interfaces (Linux SocketCAN).
+//! CAN adapters that are network interfaces (Linux `SocketCAN`).
 //!
 //! Sources: linux/can.h, linux/can/error.h, Documentation/networking/can.rst and timestamping.rst of the
 //! kernel. Its stamps are on the wall clock and are put on the monotonic one as they are read.
@@ -24,7 +24,7 @@ const OLDEST: Duration = Duration::from_secs(10);
 /// A bound socket.
 #[derive(Debug)]
 pub struct Socket {
-    socket: CanSocket,
+    bound: CanSocket,
     name: String,
     index: u32,
     restarts: bool,
@@ -43,7 +43,7 @@ impl Socket {
 
     fn of(socket: CanSocket, name: &str, ready: Ready, description: String) -> Self {
         let Ready { index, restarts } = ready;
-        Self { socket, name: name.to_owned(), index, restarts, dropped: 0, lost: 0, description }
+        Self { bound: socket, name: name.to_owned(), index, restarts, dropped: 0, lost: 0, description }
     }
 
     pub(super) fn send(&mut self, frame: &CanFrame) -> Result<(), LinkError> {
@@ -54,7 +54,7 @@ impl Socket {
         // SAFETY: `raw` is a whole can_frame that outlives the call.
         let written = unsafe {
             libc::send(
-                self.socket.as_raw_fd(),
+                self.bound.as_raw_fd(),
                 (&raw const raw).cast(),
                 size_of::<libc::can_frame>(),
                 libc::MSG_DONTWAIT,
@@ -68,7 +68,7 @@ impl Socket {
 
     pub(super) fn try_recv(&mut self, frame: &mut CanFrame) -> Result<Option<Arrival>, LinkError> {
         let message = loop {
-            match receive(&self.socket) {
+            match receive(&self.bound) {
                 Ok(Some(message)) => break message,
                 // Something else than a classical frame.
                 Ok(None) => {}
@@ -111,7 +111,7 @@ impl Socket {
 
 impl AsFd for Socket {
     fn as_fd(&self) -> BorrowedFd<'_> {
-        self.socket.as_fd()
+        self.bound.as_fd()
     }
 }
 

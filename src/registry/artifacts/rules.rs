@@ -15,7 +15,7 @@ use std::fmt::Write as _;
 use super::HEADER;
 use crate::registry::spec::{CAN_RESTART_MS, CanAdapter, DeviceSpec, NodeSpec, Opens, Registry, UsbSpec};
 
-/// What linux/if_arp.h calls a CAN interface (`ARPHRD_CAN`).
+/// What `linux/if_arp.h` calls a CAN interface (`ARPHRD_CAN`).
 const ARPHRD_CAN: u32 = 280;
 
 /// The rules of a whole registry.

@@ -237,7 +237,7 @@ fn check_pairs(motors: &[(Section<'_>, Option<MotorSpec>)], problems: &mut Probl
             if earlier.slave == motor.slave {
                 let message = format!("slave = {:#x} is that of {} already", motor.slave, earlier.name);
                 refuse("slave", message, "give each motor its own id, with its maker's program");
-            } else if earlier.master == motor.master && (earlier.slave ^ motor.slave) & 0xf == 0 {
+            } else if earlier.master == motor.master && earlier.slave & 0xf == motor.slave & 0xf {
                 let message = format!(
                     "{} answers with master = {:#x} too, and cannot be told from it",
                     earlier.name, motor.master

@@ -36,13 +36,12 @@ fn slcan_adapter(mut line: File, answer: &'static [u8]) -> JoinHandle<(File, Str
 }
 
 fn slcan_link() -> (Link, File) {
-    let (line, path) = terminal();
-    // Held open, so that the adapter's end does not hang up before the host has opened.
-    let adapter = slcan_adapter(line, b"\r");
+    let (terminal, path) = terminal();
+    let adapter = slcan_adapter(terminal, b"\r");
     let link = Link::open_slcan(&path, 500_000).unwrap();
-    let (line, orders) = adapter.join().unwrap();
+    let (terminal, orders) = adapter.join().unwrap();
     assert_eq!(orders, "C\rS6\rO\r");
-    (link, line)
+    (link, terminal)
 }
 
 pub(in crate::driver::can) fn damiao_link() -> (Link, File) {

@@ -85,7 +85,7 @@ fn frames_that_found_the_queue_full_are_counted() {
     const SENT: u64 = 2_000;
     let (mut link, bus) = bus();
     let Link::Socket(socket) = &link else { panic!("a socket") };
-    socket.socket.set_socket_option_int(libc::SOL_SOCKET, libc::SO_RCVBUF, 16 << 10).unwrap();
+    socket.bound.set_socket_option_int(libc::SOL_SOCKET, libc::SO_RCVBUF, 16 << 10).unwrap();
     let mut frame = CanFrame::standard(1, [0; 8]);
     for _ in 0..SENT {
         bus.send(&bytes(&frame)).unwrap();
