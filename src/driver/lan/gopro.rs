@@ -39,8 +39,9 @@ const LARGEST_ANSWER: usize = 256 << 10;
 /// The host asks the camera for its address (DHCP), which takes a moment after the plug.
 const ADDRESS_LIMIT: Duration = Duration::from_secs(8);
 const LOOK_FOR_ADDRESS: Duration = Duration::from_millis(200);
-/// The clip is in the camera's list a moment after it was stopped.
-const CLIP_IS_LISTED_AFTER: Duration = Duration::from_millis(1500);
+/// The clip is in the camera's list a moment after it was stopped, usually within 1.5 s.
+const CLIP_IS_LISTED_WITHIN: Duration = Duration::from_secs(4);
+const LOOK_FOR_CLIP: Duration = Duration::from_millis(100);
 /// An answer that did not come is asked for again.
 const TRIES: u32 = 2;
 
@@ -85,12 +86,14 @@ impl Gopro {
         if let Err(error) = ask(&server, &clock()).await {
             tracing::warn!(device = name, %error, "the camera's clock is not set");
         }
+        let newest = newest(&server).await.ok();
         let (tell, states) = mpsc::channel(4);
         let (orders, asked) = mpsc::channel(4);
         let camera = Camera {
             name: name.to_owned(),
             server,
             download,
+            newest,
             states: tell,
             episode: None,
             pending: VecDeque::new(),
@@ -128,7 +131,8 @@ impl Gopro {
         let Self { orders, task, states, .. } = self;
         let _ = orders.send(Order::Stop).await;
         drop((orders, states));
-        let _ = task.await;
+        // Who gives this up leaves the task its time: the camera is not to record on.
+        let _ = task.detach().await;
     }
 
     pub(super) fn card(&self) -> Option<String> {
@@ -142,6 +146,8 @@ struct Camera {
     name: String,
     server: Server,
     download: bool,
+    /// The newest clip, as far as is known: folder and file.
+    newest: Option<(String, String)>,
     states: mpsc::Sender<Result<State, DriverError>>,
     /// The episode in progress, for which the shutter was started.
     episode: Option<PathBuf>,
@@ -195,9 +201,14 @@ impl Camera {
     async fn start(&mut self, episode: PathBuf) {
         // The camera reads one card: the clip in progress comes first.
         self.fetching = None;
-        match ask(&self.server, "/gopro/camera/shutter/start").await {
-            Ok(_) => self.episode = Some(episode),
-            Err(error) => tracing::error!(device = self.name, %error, "the camera does not record this episode"),
+        let started = ask(&self.server, "/gopro/camera/shutter/start").await;
+        // It may record already: its connection was lost in the middle of the episode.
+        let records = started.is_ok() || self.look().await.is_ok_and(|state| state.recording);
+        if records {
+            self.episode = Some(episode);
+        } else if let Err(error) = started {
+            tracing::error!(device = self.name, %error, "the camera does not record this episode");
+            self.fetch();
         }
     }
 
@@ -207,9 +218,9 @@ impl Camera {
             tracing::error!(device = self.name, %error, "the camera may record on: stop it by hand");
             return;
         }
-        sleep(CLIP_IS_LISTED_AFTER).await;
         match self.note(episode).await {
             Ok(clip) => {
+                self.newest = Some((clip.folder.clone(), clip.file.clone()));
                 tracing::info!(
                     device = self.name,
                     clip = clip.file,
@@ -230,15 +241,28 @@ impl Camera {
 
     /// Writes beside the episode which clip belongs to it.
     async fn note(&self, episode: PathBuf) -> Result<Clip, String> {
-        let told = |error: DriverError| error.to_string();
-        let answer = ask(&self.server, "/gopro/media/last_captured").await.map_err(told)?;
-        let mut clip = Clip::new(&answer, episode, &self.name)?;
+        let (folder, file) = self.made().await?;
+        let mut clip = Clip::new(folder, file, episode, &self.name);
         let info = ask(&self.server, &format!("/gopro/media/info?path={}/{}", clip.folder, clip.file)).await;
         clip.size = info.ok().and_then(|info| clip::size(&info));
         let (noted, url) = (clip.clone(), clip.url(&self.server));
         let written = tokio::task::spawn_blocking(move || noted.note(&url)).await;
         written.map_err(|error| error.to_string())?.map_err(|error| error.to_string())?;
         Ok(clip)
+    }
+
+    /// The clip that was just made: another than was the newest before.
+    async fn made(&self) -> Result<(String, String), String> {
+        let looks = CLIP_IS_LISTED_WITHIN.as_millis() / LOOK_FOR_CLIP.as_millis();
+        for _ in 0..looks {
+            match newest(&self.server).await {
+                Ok(clip) if self.newest.as_ref() != Some(&clip) => return Ok(clip),
+                Ok(_) => {}
+                Err(reason) => tracing::debug!(device = self.name, %reason, "the newest clip is not known yet"),
+            }
+            sleep(LOOK_FOR_CLIP).await;
+        }
+        Err(format!("it names no new clip within {} s", CLIP_IS_LISTED_WITHIN.as_secs()))
     }
 
     /// Goes on with the clips that are to be fetched.
@@ -268,6 +292,12 @@ async fn ask(server: &Server, path: &str) -> Result<Vec<u8>, DriverError> {
             outcome => return outcome,
         }
     }
+}
+
+/// Folder and file of the newest clip on the card.
+async fn newest(server: &Server) -> Result<(String, String), String> {
+    let answer = ask(server, "/gopro/media/last_captured").await.map_err(|error| error.to_string())?;
+    clip::named(&answer)
 }
 
 /// The camera's address, once the host has one in its network.
@@ -353,7 +383,8 @@ fn state(answer: &[u8], asked: Stamp) -> Option<State> {
 #[doc(hidden)]
 pub(super) fn fuzz(answer: &[u8]) {
     let _ = (state(answer, Stamp::default()), model(answer), clip::size(answer));
-    if let Ok(clip) = Clip::new(answer, PathBuf::from("/a/b.mcap"), "gopro") {
+    if let Ok((folder, file)) = clip::named(answer) {
+        let clip = Clip::new(folder, file, PathBuf::from("/a/b.mcap"), "gopro");
         assert_eq!(clip.target().parent(), Some(std::path::Path::new("/a")), "a clip leaves its folder");
         assert!(clip.folder.bytes().chain(clip.file.bytes()).all(|byte| byte.is_ascii_graphic() && byte != b'/'));
     }

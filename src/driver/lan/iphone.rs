@@ -33,6 +33,10 @@ use crate::time::Stamp;
 
 /// Bytes taken from the kernel at once.
 const INBOX: usize = 64 << 10;
+/// A picture that is not the sample has room for this much, or a byte a pixel.
+const LARGEST_UNSEEN: usize = 64 << 10;
+/// Of what a phone says of its session, so much is logged.
+const LONGEST_SESSION: usize = 500;
 /// The comment at its longest: 18 numbers, the longest of which take 330 digits.
 const COMMENT: usize = 2 << 10;
 
@@ -144,7 +148,8 @@ impl Phone {
                 Cut::Open => {}
                 Cut::Frame(frame) => return Some((frame, connection.arrived)),
                 Cut::Session => {
-                    let text = String::from_utf8_lossy(connection.packets.payload());
+                    let text = connection.packets.payload();
+                    let text = String::from_utf8_lossy(text.get(..LONGEST_SESSION).unwrap_or(text));
                     tracing::info!(
                         device = self.name,
                         session = crate::text::plain(&text).as_ref(),
@@ -201,7 +206,11 @@ impl Phone {
             return Ok(());
         }
         self.place.heard();
-        let largest = self.max_bytes.saturating_sub(COMMENT);
+        let largest = match self.stream {
+            PhoneStream::Image => self.max_bytes.saturating_sub(COMMENT),
+            // The picture is let go, but comes before that.
+            PhoneStream::Pose => LARGEST_UNSEEN.max((self.picture.width * self.picture.height) as usize),
+        };
         self.connection = Some(Connection {
             stream,
             packets: Packets::new(largest),

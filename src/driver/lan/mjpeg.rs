@@ -128,6 +128,8 @@ pub(super) fn check_size(name: &str, (width, height): (u32, u32), wished: LanPic
 /// The parser of an answer that is a stream of pictures.
 fn accept(name: &str, path: &str, reply: &Reply, max_bytes: usize) -> Result<Multipart, DriverError> {
     let content = reply.header(CONTENT_TYPE).unwrap_or_default();
+    // A boundary has 70 characters; what is longer is shown in part.
+    let content = content.get(..200).unwrap_or(content);
     let fatal = |text: String| Err(DriverError::Fatal(text));
     match reply.status {
         status if status.is_success() => {}

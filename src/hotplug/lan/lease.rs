@@ -40,7 +40,7 @@ impl Lease {
     /// Something of it was heard at `when`.
     pub(super) fn heard(&mut self, when: Stamp) -> Option<Change> {
         let came = self.heard.is_none();
-        if came && when <= self.gone {
+        if came && when < self.gone {
             return None;
         }
         self.heard = self.heard.max(Some(when));

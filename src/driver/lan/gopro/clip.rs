@@ -39,14 +39,8 @@ pub(super) struct Clip {
 }
 
 impl Clip {
-    /// From the camera's answer to `last_captured`.
-    pub(super) fn new(answer: &[u8], episode: PathBuf, device: &str) -> Result<Self, String> {
-        let answer: serde_json::Value = serde_json::from_slice(answer).map_err(|error| error.to_string())?;
-        let name = |key: &str| {
-            let name = answer.get(key).and_then(serde_json::Value::as_str).unwrap_or_default();
-            if is_plain(name) { Ok(name.to_owned()) } else { Err(format!("{key} {name:?} is no plain name")) }
-        };
-        Ok(Self { folder: name("folder")?, file: name("file")?, size: None, episode, device: device.to_owned() })
+    pub(super) fn new(folder: String, file: String, episode: PathBuf, device: &str) -> Self {
+        Self { folder, file, size: None, episode, device: device.to_owned() }
     }
 
     fn path(&self) -> String {
@@ -74,6 +68,16 @@ impl Clip {
         });
         std::fs::write(self.beside("clip.json"), format!("{note:#}\n"))
     }
+}
+
+/// Folder and file, from the camera's answer to `last_captured`.
+pub(super) fn named(answer: &[u8]) -> Result<(String, String), String> {
+    let answer: serde_json::Value = serde_json::from_slice(answer).map_err(|error| error.to_string())?;
+    let name = |key: &str| {
+        let name = answer.get(key).and_then(serde_json::Value::as_str).unwrap_or_default();
+        if is_plain(name) { Ok(name.to_owned()) } else { Err(format!("{key} {name:?} is no plain name")) }
+    };
+    Ok((name("folder")?, name("file")?))
 }
 
 /// The size that the camera tells of a clip, as text or number.

@@ -34,8 +34,7 @@ async fn camera(clip: Vec<u8>, breaks: usize) -> (Server, Arc<AtomicUsize>) {
 }
 
 fn clip_in(folder: &std::path::Path) -> Clip {
-    let answer = br#"{"folder":"100GOPRO","file":"GX010001.MP4"}"#;
-    Clip::new(answer, folder.join("ep_001.mcap"), "gopro").expect("a clip")
+    Clip::new("100GOPRO".into(), "GX010001.MP4".into(), folder.join("ep_001.mcap"), "gopro")
 }
 
 #[tokio::test]
@@ -119,9 +118,10 @@ fn the_clock_is_set_to_the_second() {
 
 #[test]
 fn a_clip_is_named_by_plain_words_alone() {
-    let clip = |answer: &str| Clip::new(answer.as_bytes(), PathBuf::from("/out/ep_001.mcap"), "gopro");
+    let clip = |answer: &str| clip::named(answer.as_bytes());
     let good = clip(r#"{"folder":"100GOPRO","file":"GX010001.MP4"}"#).expect("a clip");
-    assert_eq!(good.target(), PathBuf::from("/out/ep_001.gopro.GX010001.MP4"));
+    assert_eq!(good, ("100GOPRO".to_owned(), "GX010001.MP4".to_owned()));
+    assert_eq!(clip_in(std::path::Path::new("/out")).target(), PathBuf::from("/out/ep_001.gopro.GX010001.MP4"));
     for answer in [
         r#"{"folder":"100GOPRO","file":"../../etc/passwd"}"#,
         r#"{"folder":"..","file":"GX010001.MP4"}"#,

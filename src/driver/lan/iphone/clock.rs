@@ -79,7 +79,7 @@ mod tests {
         let delays: Vec<u64> = (0..1800).map(|frame| 5 + (frame * 7) % 30).collect();
         for ppm in [-100, 100] {
             let errors = errors(&delays, ppm);
-            assert!(errors.iter().skip(30).all(|error| (4_000_000..8_000_000).contains(error)), "{ppm}: {errors:?}");
+            assert!(errors.iter().skip(30).all(|error| (3_500_000..8_000_000).contains(error)), "{ppm}: {errors:?}");
         }
     }
 
