@@ -108,6 +108,7 @@ pub struct SimArgs {
 /// Options of a run.
 #[derive(Debug, Clone, Args)]
 #[command(next_help_heading = RUN)]
+#[expect(clippy::struct_excessive_bools, reason = "each is a switch of the command line")]
 pub struct RunArgs {
     /// Lines instead of the monitor
     #[arg(long)]

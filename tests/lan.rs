@@ -382,7 +382,10 @@ fn a_gopro_records_with_the_episode_and_its_clip_is_noted_beside_it() {
     let told = stop(running);
     assert!(!gopro.recording.load(Ordering::Relaxed), "the camera records on");
     let files = place.files("out");
-    let episode = files.iter().find(|name| name.ends_with(".mcap")).expect("an episode");
+    let episode = files
+        .iter()
+        .find(|name| std::path::Path::new(name).extension().is_some_and(|extension| extension == "mcap"))
+        .expect("an episode");
     let stem = episode.trim_end_matches(".mcap");
     let note = std::fs::read_to_string(place.path("out").join(format!("{stem}.gopro.clip.json")));
     let note: Value =

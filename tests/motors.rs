@@ -1,5 +1,7 @@
 //! Thread `control` with simulated motors behind it: what they are told, and that they are turned off.
 
+#![expect(clippy::expect_used, reason = "helpers of tests")]
+
 #[path = "support/motors.rs"]
 mod motors;
 

@@ -32,6 +32,7 @@ impl Actions {
     }
 
     /// The oldest order that another program gave and nobody took.
+    #[must_use]
     pub fn order(&self) -> Option<Order> {
         self.orders.next()
     }

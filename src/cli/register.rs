@@ -18,7 +18,6 @@ Examples:
 
 /// What to register.
 #[derive(Debug, Clone, Args)]
-#[expect(clippy::struct_excessive_bools, reason = "each is a switch of the command line")]
 pub struct RegisterArgs {
     /// USB vendor id
     #[arg(long, value_name = "HEX", value_parser = usb_id)]

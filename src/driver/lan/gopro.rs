@@ -233,7 +233,7 @@ impl Camera {
                 }
             }
             Err(reason) => {
-                tracing::error!(device = self.name, %reason, "which clip belongs to the episode is not known")
+                tracing::error!(device = self.name, %reason, "which clip belongs to the episode is not known");
             }
         }
         self.fetch();

@@ -158,13 +158,14 @@ fn bind(place: &Place, port: u16) -> io::Result<OwnedFd> {
     }
     // SAFETY: just opened, and ours alone.
     let socket = unsafe { OwnedFd::from_raw_fd(descriptor) };
-    set(&socket, libc::SO_TIMESTAMPNS, &1_i32)?;
-    set(&socket, libc::SO_RXQ_OVFL, &1_i32)?;
-    set(&socket, libc::SO_RCVBUF, &BACKLOG)?;
+    set(&socket, libc::SO_TIMESTAMPNS, 1)?;
+    set(&socket, libc::SO_RXQ_OVFL, 1)?;
+    set(&socket, libc::SO_RCVBUF, BACKLOG)?;
     if let Some(interface) = place.interface() {
         set_bytes(&socket, libc::SO_BINDTODEVICE, interface.as_bytes())?;
     }
     let port = port.to_be();
+    #[expect(clippy::cast_possible_truncation, reason = "2 and 10")]
     let (family_v4, family_v6) = (libc::AF_INET as libc::sa_family_t, libc::AF_INET6 as libc::sa_family_t);
     let result = if is_v6 {
         // SAFETY: all zeroes are a valid address.
@@ -186,7 +187,7 @@ fn length_of<T>() -> libc::socklen_t {
     libc::socklen_t::try_from(size_of::<T>()).unwrap_or(0)
 }
 
-fn set(socket: &OwnedFd, option: libc::c_int, value: &libc::c_int) -> io::Result<()> {
+fn set(socket: &OwnedFd, option: libc::c_int, value: libc::c_int) -> io::Result<()> {
     set_bytes(socket, option, &value.to_ne_bytes())
 }
 

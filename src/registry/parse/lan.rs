@@ -247,7 +247,7 @@ fn fixed(
         return None;
     }
     let asked = if table.has("probe_port") { self::port(table, "probe_port", problems) } else { own };
-    if asked.is_none() && !table.has("probe_port") && table.has("port") | (word == Word::Iphone) {
+    if asked.is_none() && !table.has("probe_port") && (table.has("port") || word == Word::Iphone) {
         let fix = "write probe_port = a port of the device that takes connections; `port` is one of this computer";
         table.missing(problems, "probe_port", fix);
     }
