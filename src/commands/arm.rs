@@ -12,7 +12,7 @@ pub enum OrderError {
     #[error(transparent)]
     Bus(#[from] BusError),
     /// Nobody listens.
-    #[error("no rapid with an actuator runs here: start it, or name it with --instance")]
+    #[error("no rapid here has an actuator that is plugged in: start it, plug it in, or name it with --instance")]
     Nobody,
     /// The output.
     #[error(transparent)]
