@@ -17,8 +17,8 @@ const DEAF_MS: u64 = 18_000;
 const CRASH_MS: u64 = 26_000;
 const FLOOD_MS: u64 = 34_000;
 /// The timeline begins some seconds after the recording.
-/// The last of five restarts comes 15.5 s after the first crash.
-const SECONDS: u32 = 65;
+/// Between the first crash and the fifth are 7.5 s of waiting and four starts, which take seconds in the guest.
+const SECONDS: u32 = 75;
 const REGISTRY: &str = r#"
 [rig]
 name = "vbench"
@@ -52,7 +52,7 @@ serial = "C1"
 node = "process_node"
 bit = 2
 [device.crashing.process]
-args = ["--crash-after", "3"]
+args = ["--crash-after", "50"]
 kind = "scalars"
 channels = 2
 
@@ -77,7 +77,7 @@ pub enum Span {
     Prompt,
     /// The device of the program that does not.
     Deaf,
-    /// A device is plugged at its beginning whose program crashes after three samples, each time.
+    /// A device is plugged at its beginning whose program crashes after half a second, each time.
     Crashing,
     /// One whose program writes to its stderr as fast as it can.
     Flooding,
