@@ -31,7 +31,7 @@ use crate::time::Stamp;
 /// The JSON file is written this often, and at every change.
 const JSON_PERIOD: Duration = Duration::from_secs(1);
 /// At the end, streams have this long to close their devices before they are abandoned.
-const STOP_LIMIT: Duration = Duration::from_millis(500);
+const STOP_LIMIT: Duration = Duration::from_millis(4500);
 /// Reports that may wait; streams report a few times in their life.
 const REPORT_DEPTH: usize = 1024;
 

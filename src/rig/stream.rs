@@ -36,7 +36,7 @@ const SILENT_AFTER: Duration = Duration::from_secs(2);
 /// again. Six of these and the delays between them fit into the minute in which five restarts are allowed.
 const START_LIMIT: Duration = Duration::from_secs(5);
 /// How long a device may take to be closed in order.
-const CLOSE_LIMIT: Duration = Duration::from_secs(2);
+const CLOSE_LIMIT: Duration = Duration::from_secs(4);
 /// How often the actuator is asked whether it was told something.
 const ACTIONS_EVERY: Duration = Duration::from_millis(2);
 

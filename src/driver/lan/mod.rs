@@ -10,6 +10,7 @@
 //! Invariant: what a server sends is bounded: headers, bodies, pictures, packets, and the time they take.
 //! Invariant: only the device the entry means is listened to.
 
+mod carrier;
 mod gopro;
 mod http;
 mod iphone;
@@ -24,6 +25,7 @@ use std::time::Duration;
 use super::{DriverError, Reading};
 use crate::provenance::{Format, Negotiated};
 use crate::registry::{DeviceNode, DeviceSpec, LanFind, LanPicture, LanProtocol, LanSpec};
+use carrier::Carrier;
 use place::Place;
 
 /// A camera or a phone that sends nothing whole for this long is connected to anew. Six of these and the
@@ -34,6 +36,7 @@ const PATIENCE: Duration = Duration::from_secs(5);
 #[derive(Debug)]
 pub struct Lan {
     protocol: Protocol,
+    carrier: Carrier,
     description: String,
     negotiated: Negotiated,
 }
@@ -73,20 +76,28 @@ impl Lan {
         };
         let (description, format) = describe(lan, &at);
         let negotiated = Negotiated { card: protocol.card(), bus: Some(at), format, ..Negotiated::default() };
-        Ok(Self { protocol, description, negotiated })
+        Ok(Self { protocol, carrier: Carrier::of(node), description, negotiated })
     }
 
     /// The next sample.
     ///
     /// # Errors
-    /// [`DriverError::Gone`] when the network adapter was unplugged, [`DriverError::Retry`] when the device
-    /// ended its stream or fell silent.
+    /// [`DriverError::Gone`] when the network adapter was unplugged, [`DriverError::Retry`] when its link went
+    /// down, or the device ended its stream or fell silent.
     pub async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
-        match &mut self.protocol {
-            Protocol::Mjpeg(camera) => camera.read().await,
-            Protocol::Udp(packets) => packets.read().await,
-            Protocol::Gopro(gopro) => gopro.read().await,
-            Protocol::Iphone(phone) => phone.read().await,
+        let Self { protocol, carrier, .. } = self;
+        let read = async {
+            match protocol {
+                Protocol::Mjpeg(camera) => camera.read().await,
+                Protocol::Udp(packets) => packets.read().await,
+                Protocol::Gopro(gopro) => gopro.read().await,
+                Protocol::Iphone(phone) => phone.read().await,
+            }
+        };
+        tokio::select! {
+            biased;
+            reading = read => reading,
+            () = carrier.lost() => Err(DriverError::Retry("the network link is down".to_owned())),
         }
     }
 

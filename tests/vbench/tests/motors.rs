@@ -126,8 +126,9 @@ fn motors_move_after_an_arm_and_at_no_other_time() {
     assert!(commands > 400, "{commands} commands");
     for run in moving {
         println!("motor {}: {run}", run["motor"]);
-        // 2 rad/s at 100 Hz are 0.02 rad; a busy guest loses some frames on their way to the adapter.
-        assert!(run["largest_step"].as_f64().unwrap() < 0.25, "{run}");
+        // 2 rad/s at 100 Hz, after a late cycle twice as much, and after a frame that the adapter had no room for again;
+        // an action that is not slewed is 0.15 from the one before.
+        assert!(run["largest_step"].as_f64().unwrap() < 0.1, "{run}");
         let last = run["last_mono_ns"].as_u64().unwrap();
         assert!(last < pulled.mono_ns + 500_000_000, "commands {} ms after the pull", ms(last, pulled.mono_ns));
     }
