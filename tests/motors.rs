@@ -44,7 +44,6 @@ async fn until(motors: &mut Motors, target: Option<[f64; 2]>, mut done: impl FnM
                 }
             }
             while let Some(notice) = motors.take_notice() {
-                eprintln!("{:?}: {}", notice.arming, notice.text);
                 arming = Some(notice.arming);
             }
             if !values.is_empty() && done(&values, arming) {
@@ -121,7 +120,6 @@ async fn one_motor_that_fails_stops_all() {
                 ticks.tick().await;
                 let _ = motors.command(&[0.1, 0.1], Stamp::now());
                 while let Some(notice) = motors.take_notice() {
-                    eprintln!("{:?}: {}", notice.arming, notice.text);
                     if notice.arming == Arming::Faulted {
                         return;
                     }
