@@ -21,6 +21,7 @@ use crate::provenance::{Format, Negotiated};
 use crate::registry::{CanSpec, DamiaoSpec, DeviceNode, MAX_MOTORS};
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
 use crate::time::Stamp;
+pub use beat::Punctuality;
 use beat::{Beat, Ending, Request, Sample, Target};
 
 /// Samples that may wait to be read, a second of them at 200 Hz.
@@ -133,6 +134,14 @@ impl Motors {
             Ok(())
         })
         .await;
+    }
+
+    /// Turns the motors off, waits for that, and says how well they were driven; `None` if the thread
+    /// panicked. Blocks as dropping does.
+    #[must_use]
+    pub fn finish(mut self) -> Option<Punctuality> {
+        self.stop();
+        self.ending.punctuality.get().cloned()
     }
 
     /// What was opened, for people.

@@ -17,6 +17,7 @@ mod heap;
 mod infer;
 mod load;
 mod mask;
+mod motors;
 mod others;
 mod picture;
 mod policy;
@@ -87,6 +88,7 @@ enum Section {
     Picture,
     Infer,
     Control,
+    Motors,
     Eval,
     Unplug,
     Cycles,
@@ -95,13 +97,14 @@ enum Section {
 
 impl Section {
     /// In this order: what must not be disturbed comes before what leaves dirty pages behind.
-    const ALL: [Self; 15] = [
+    const ALL: [Self; 16] = [
         Self::Start,
         Self::Infer,
         Self::Sync,
         Self::Picture,
         Self::Policy,
         Self::Control,
+        Self::Motors,
         Self::Eval,
         Self::Frame,
         Self::Replug,
@@ -126,6 +129,7 @@ impl Section {
             Self::Picture => "picture",
             Self::Infer => "infer",
             Self::Control => "control",
+            Self::Motors => "motors",
             Self::Eval => "eval",
             Self::Unplug => "unplug",
             Self::Cycles => "cycles",
@@ -151,6 +155,7 @@ impl Section {
             Self::Picture => picture::measure(bench),
             Self::Infer => infer::measure(bench),
             Self::Control => control::measure(bench),
+            Self::Motors => motors::measure(bench),
             Self::Eval => eval::measure(bench),
             Self::Unplug => others::unplug(bench),
             Self::Cycles => others::cycles(bench),

@@ -9,6 +9,7 @@
 //! Invariant: however the thread ends, a panic included, [`Powered`] tells every motor to turn off. A
 //! process that is killed sends nothing: then the motors' own time limit does it.
 
+use std::fmt;
 use std::sync::Arc;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -72,11 +73,37 @@ pub(super) enum Request {
     Order(Order),
 }
 
+/// How well the thread kept its beat.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Punctuality {
+    /// Cycles that were counted.
+    pub cycles: u64,
+    /// How late they began, ms: the median, all but one in a thousand, all.
+    pub late_ms: [f64; 3],
+    /// Actions that commands followed.
+    pub actions: u64,
+    /// From their tick to the first command after it, ms: the median, all but one in a hundred.
+    pub wire_ms: [f64; 2],
+}
+
+impl fmt::Display for Punctuality {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let [p50, p999, max] = self.late_ms;
+        write!(f, "{} cycles of thread `control`: late by p50 {p50:.3} p99.9 {p999:.3} max {max:.3} ms", self.cycles)?;
+        let [p50, p99] = self.wire_ms;
+        match self.actions {
+            0 => Ok(()),
+            actions => write!(f, "; {actions} actions on the wire p50 {p50:.1} p99 {p99:.1} ms after their tick"),
+        }
+    }
+}
+
 /// How the thread is told to end, and why it ended.
 #[derive(Debug, Default)]
 pub(super) struct Ending {
     asked: AtomicBool,
     reason: OnceLock<LinkError>,
+    pub(super) punctuality: OnceLock<Punctuality>,
 }
 
 impl Ending {
@@ -173,7 +200,9 @@ impl Beat {
         if let Err(error) = &end {
             let _ = self.ending.reason.set(error.clone());
         }
-        tracing::info!("{}", self.summary());
+        let punctuality = self.punctuality();
+        tracing::info!("{punctuality}");
+        let _ = self.ending.punctuality.set(punctuality);
         // Before the channels close: who sees that they did may exit.
         let Self { powered, samples, notices, .. } = self;
         drop(powered);
@@ -286,27 +315,14 @@ impl Beat {
         }
     }
 
-    fn summary(&self) -> String {
+    fn punctuality(&self) -> Punctuality {
         let ms = |histogram: &Histogram<u64>, quantile| histogram.value_at_quantile(quantile) as f64 / 1e6;
-        let (late, delay) = (&self.lateness, &self.latency);
-        let mut text = format!(
-            "{} cycles of thread `control`: late by p50 {:.3} p99.9 {:.3} max {:.3} ms",
-            late.len(),
-            ms(late, 0.5),
-            ms(late, 0.999),
-            ms(late, 1.0)
-        );
-        if !delay.is_empty() {
-            use std::fmt::Write as _;
-            let _ = write!(
-                text,
-                "; {} actions on the wire p50 {:.1} p99 {:.1} ms after their tick",
-                delay.len(),
-                ms(delay, 0.5),
-                ms(delay, 0.99)
-            );
+        Punctuality {
+            cycles: self.lateness.len(),
+            late_ms: [0.5, 0.999, 1.0].map(|quantile| ms(&self.lateness, quantile)),
+            actions: self.latency.len(),
+            wire_ms: [0.5, 0.99].map(|quantile| ms(&self.latency, quantile)),
         }
-        text
     }
 }
 

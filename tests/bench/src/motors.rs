@@ -1,0 +1,114 @@
+//! How well thread `control` keeps its beat, what an answer of a motor costs, and what a full bus does.
+//!
+//! The motors are those of the virtual bench, behind Damiao's adapter on a pseudo-terminal.
+
+#[path = "../../support/motors.rs"]
+mod adapter;
+
+use std::hint::black_box;
+use std::time::{Duration, Instant};
+
+use rapid::action::Order;
+use rapid::control::can::CanFrame;
+use rapid::control::motors::MotorBus;
+use rapid::driver::can::link::Link;
+use rapid::driver::can::motors::{Motors, Punctuality};
+use rapid::time::Stamp;
+
+use self::adapter::{Adapter, spec};
+use crate::beat::sleep_until;
+use crate::figure::Figure;
+use crate::stats::{Sorted, median};
+use crate::{Bench, Failure};
+
+const AXES: u16 = 6;
+const CYCLE: Duration = Duration::from_millis(5);
+/// An arm needs a few cycles.
+const ARMED_WITHIN: Duration = Duration::from_secs(5);
+
+pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
+    let length = bench.choose(Duration::from_secs(20), Duration::from_secs(4));
+    let (mut runs, mut bare) = (Vec::new(), Vec::new());
+    for run in 0..bench.runs {
+        bench.progress(&format!("motors: run {} of {}, {} s each", run + 1, bench.runs, length.as_secs()));
+        bare.push(beat(length));
+        runs.push(drive(length)?);
+    }
+    let of = |value: &dyn Fn(&Punctuality) -> f64| median(&runs.iter().map(value).collect::<Vec<_>>());
+    let bare = |share| median(&bare.iter().filter_map(|run: &Sorted| run.quantile(share)).collect::<Vec<_>>());
+    let cycles: u64 = runs.iter().map(|run| run.cycles).sum();
+    let note = format!(
+        "{cycles} cycles at 200 Hz, {AXES} simulated motors that follow actions at 10 Hz. Baseline: a thread that sleeps to \
+         the same grid, right before"
+    );
+    let note_wire =
+        "from the tick of an action to the first command after it was handed to the adapter: a cycle at the most";
+    Ok(vec![
+        Figure::new("motors/cycle late, p50", "ms", of(&|run| run.late_ms[0])).baseline(bare(0.5)).note(note),
+        Figure::new("motors/cycle late, p99.9", "ms", of(&|run| run.late_ms[1])).baseline(bare(0.999)).target("< 1"),
+        Figure::new("motors/cycle late, max", "ms", of(&|run| run.late_ms[2])).baseline(bare(1.0)),
+        Figure::new("motors/action to wire, p50", "ms", of(&|run| run.wire_ms[0])).note(note_wire),
+        Figure::new("motors/action to wire, p99", "ms", of(&|run| run.wire_ms[1])),
+        feedback(bench.choose(1_000_000, 100_000)),
+    ])
+}
+
+/// A bare thread on the same grid: how late it wakes, ms.
+fn beat(length: Duration) -> Sorted {
+    let begun = Stamp::now();
+    let mut due = begun;
+    let mut late = Vec::new();
+    while due.since(begun) < length {
+        due = due.after(CYCLE);
+        sleep_until(due);
+        late.push(Stamp::now().since(due).as_secs_f64() * 1e3);
+    }
+    Sorted::new(late)
+}
+
+/// Drives motors for so long.
+fn drive(length: Duration) -> Result<Punctuality, Failure> {
+    let adapter = Adapter::plug(AXES);
+    let link = Link::open_damiao(&adapter.path)?;
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    let mut motors = Motors::start(link, &spec(AXES))?;
+    runtime.block_on(async {
+        let begun = Instant::now();
+        let mut ticks = tokio::time::interval(Duration::from_millis(100));
+        motors.order(Order::Arm)?;
+        while begun.elapsed() < length + ARMED_WITHIN {
+            tokio::select! {
+                reading = motors.read() => drop(black_box(reading?.bytes.len())),
+                _ = ticks.tick() => {
+                    let angle = begun.elapsed().as_secs_f64().sin() * 0.5;
+                    motors.command(&[angle; AXES as usize], Stamp::now())?;
+                }
+            }
+            if begun.elapsed() >= length && adapter.count("motor_enabled") > 0 {
+                break;
+            }
+        }
+        Ok::<(), Failure>(())
+    })?;
+    let enabled = adapter.count("motor_enabled");
+    let punctuality = motors.finish().ok_or("thread `control` panicked")?;
+    if enabled < usize::from(AXES) || punctuality.actions == 0 {
+        return Err(format!("{enabled} of {AXES} motors were armed, {} actions sent", punctuality.actions).into());
+    }
+    Ok(punctuality)
+}
+
+/// What an answer of a motor costs, from frame to state.
+fn feedback(count: u32) -> Figure {
+    let mut bus = MotorBus::new(&spec(AXES), Stamp::now());
+    let mut frame =
+        CanFrame { id: 0x11, len: 8, data: [0x01, 0x7f, 0xff, 0x7f, 0xf7, 0xff, 30, 30], ..CanFrame::default() };
+    let begun = Instant::now();
+    for number in 0..count {
+        frame.data[2] = u8::try_from(number & 0xff).unwrap_or_default();
+        bus.feed(black_box(&frame), Stamp(u64::from(number)));
+    }
+    let each = begun.elapsed().as_secs_f64() * 1e6 / f64::from(count);
+    black_box(bus.counts());
+    Figure::new("motors/feedback", "us", Some(each)).target("< 1").note(format!("{count} answers, decoded and judged"))
+}
