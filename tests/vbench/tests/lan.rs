@@ -65,7 +65,8 @@ fn camera(outcome: &Outcome) {
     assert_eq!((places("shutter/start").len(), places("shutter/stop").len()), (1, 1), "{asked:?}");
     let kept_alive = places("keep_alive").len();
     assert!(kept_alive >= 2, "{kept_alive} keep-alives in {asked:?}");
-    assert!(first("shutter/stop") < first("last_captured"), "{asked:?}");
+    let looked = places("last_captured");
+    assert!(looked.iter().any(|place| *place > first("shutter/stop")), "{asked:?}");
 
     let files = outcome.file("files");
     let note = files.lines().find(|name| name.ends_with(".gopro.clip.json")).unwrap_or_else(|| panic!("{files}"));
