@@ -81,7 +81,9 @@
 //!
 //! * A bit is set exactly while its device is attached and has sent a sample in this epoch. Late data
 //!   does not clear it; the slot says `Stalled`.
-//! * Only [`rig`] decides the mask, and nothing it does may hold up its publication.
+//! * Only [`rig`] decides the mask, and nothing it does may hold up its publication. [`lockstep`] applies the
+//!   same slots on its virtual clock.
+//! * Motors move only after an arm, and are turned off on every way out.
 //! * A writer never waits for a reader: who falls behind loses the oldest, and sees a hole in `seq`.
 //!   What is lost is counted and said.
 //! * Nothing downstream is re-wired on plug and unplug: topics live as long as the run.

@@ -4,8 +4,8 @@
 //! ([`Source`]), `session` decides what belongs to the episode and which frame it belongs to,
 //! `file` writes it. `inspect` reads such a file back.
 //!
-//! Invariant: only the `writer` thread touches a file of an episode, and nothing waits for it but
-//! who asks it to start or to stop.
+//! Invariant: only the `writer` thread touches a file of an episode of a run, and nothing waits for it but
+//! who asks it to start or to stop. On a virtual clock there is no thread: `stepped` writes when it is told.
 //! Invariant: a file without `.partial` at its end is finished; one that exists is never replaced.
 //! Invariant: what could not be recorded is counted and said.
 

@@ -46,8 +46,6 @@ pub(super) struct Control {
     acting: bool,
     complained: Option<Stamp>,
     reported: Stamp,
-    /// Answers that failed.
-    failures: u64,
 }
 
 impl Control {
@@ -77,7 +75,6 @@ impl Control {
             acting: false,
             complained: None,
             reported: Stamp(0),
-            failures: 0,
             options,
         }
     }
@@ -193,7 +190,6 @@ impl Control {
                 }
             }
             Err(reason) => {
-                self.failures += 1;
                 self.pilot.failed(request.tick);
                 let text = format!("policy: no answer: {reason}");
                 self.complain(&text);
