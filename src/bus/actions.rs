@@ -37,6 +37,12 @@ impl Actions {
         self.orders.next()
     }
 
+    /// Forgets orders and actions that were meant for a device before this one.
+    pub fn discard(&self) {
+        self.orders.discard();
+        let _ = self.newest(&mut [0.0; MAX_ACTION]);
+    }
+
     /// Writes the newest action that waits into `action` and forgets the older ones; gives it with the tick it
     /// is the action of, or `None` if none waits. What is no list of at most [`MAX_ACTION`] finite numbers is no action, whoever published it.
     pub fn newest<'a>(&self, action: &'a mut [f64; MAX_ACTION]) -> Option<(&'a [f64], Stamp)> {

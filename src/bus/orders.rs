@@ -43,11 +43,17 @@ impl Orders {
                 1 => Order::Arm,
                 _ => continue,
             };
-            // Who does not wait for the answer any more has been told that nobody took the order.
-            if request.send_copy(*request).is_ok() {
+            // Who does not wait for the answer any more has been told that nobody took the order. To stop is
+            // right all the same.
+            if request.send_copy(*request).is_ok() || order == Order::Disarm {
                 return Some(order);
             }
         }
+    }
+
+    /// Forgets what waits, unanswered.
+    pub(super) fn discard(&self) {
+        while let Ok(Some(_)) = self.server.receive() {}
     }
 }
 

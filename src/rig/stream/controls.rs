@@ -34,8 +34,7 @@ impl Controls {
     /// When it cannot be armed.
     pub(super) fn begin(&mut self, source: &mut Source) -> Result<(), DriverError> {
         self.orders.mark_unchanged();
-        while self.actions.order().is_some() {}
-        let _ = self.actions.newest(&mut self.action);
+        self.actions.discard();
         if self.arm { source.order(Order::Arm) } else { Ok(()) }
     }
 
