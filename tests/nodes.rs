@@ -1,8 +1,6 @@
 //! Programs in other languages that read devices for `rapid`: those of `examples/python`, with the wheels
 //! `make setup` installs, and of `examples/c`, with the machine's C compiler.
 
-#![expect(clippy::expect_used, reason = "a test ends where what it needs is missing")]
-
 mod support;
 
 use std::path::{Path, PathBuf};
