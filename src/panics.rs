@@ -15,6 +15,10 @@ use std::sync::{Mutex, MutexGuard, Once, PoisonError};
 /// The target of the log lines made here.
 pub const TARGET: &str = "rapid::panics";
 
+/// Name of the thread that moves motors. Its panics have no backtrace: that is made before anything is
+/// unwound, takes a good part of a second, and so long the motors would go on.
+pub const CONTROL_THREAD: &str = "control";
+
 /// Where messages go.
 #[derive(Debug)]
 enum Goes {
@@ -66,7 +70,7 @@ fn tell(info: &PanicHookInfo<'_>) {
     let message = format!("thread '{}' {info}", thread.name().unwrap_or("unnamed"));
     tracing::error!(target: TARGET, "{message}");
     // Only if RUST_BACKTRACE asks for it; a line of the log is no place for all of it.
-    let backtrace = Backtrace::capture();
+    let backtrace = if thread.name() == Some(CONTROL_THREAD) { Backtrace::disabled() } else { Backtrace::capture() };
     if backtrace.status() == BacktraceStatus::Captured {
         for line in backtrace.to_string().lines() {
             tracing::error!(target: TARGET, "{line}");

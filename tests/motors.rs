@@ -156,3 +156,42 @@ async fn a_pulled_adapter_ends_the_driver() {
     assert!(matches!(error, DriverError::Gone), "{error}");
     assert!(motors.command(&[0.0, 0.0], Stamp::now()).is_err());
 }
+
+/// The fault is ordered by the environment, which belongs to a process: this test runs itself in one of its own.
+#[test]
+fn a_panic_of_thread_control_turns_motors_off() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let order = folder.path().join("now");
+    let status = std::process::Command::new(std::env::current_exe().expect("this program"))
+        .args(["--exact", "in_a_process_that_panics", "--ignored"])
+        .env("RAPID_FAULT", format!("control:{}", order.display()))
+        // A backtrace is made before anything is dropped, and would take longer than the motors wait.
+        .env("RUST_BACKTRACE", "1")
+        .env("MOTORS_PANIC_AT", &order)
+        .status()
+        .expect("it runs");
+    assert!(status.success(), "{status}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "run by a_panic_of_thread_control_turns_motors_off"]
+async fn in_a_process_that_panics() {
+    rapid::panics::to_log();
+    let order = std::env::var_os("MOTORS_PANIC_AT").expect("the file at which thread `control` panics");
+    let adapter = Adapter::plug(AXES);
+    let mut motors = open(&adapter);
+    motors.order(Asked::Arm).expect("it listens");
+    until(&mut motors, Some([0.1, 0.1]), |_, arming| arming == Some(Arming::Armed)).await;
+    std::fs::write(order, "").expect("the order");
+    adapter.wait_until_off(2);
+    assert_eq!(adapter.count("motor_timeout"), 0, "they were told, and did not find out by themselves");
+    let ended = async {
+        loop {
+            if let Err(error) = motors.read().await {
+                return error;
+            }
+        }
+    };
+    let error = timeout(PATIENCE, ended).await.expect("it ends");
+    assert!(error.to_string().contains("panicked"), "{error}");
+}

@@ -17,6 +17,7 @@ use super::link::Link;
 use crate::action::{ActuatorNotice, Order};
 use crate::control::motors::SAMPLE_VALUES;
 use crate::driver::{DriverError, Reading, unblock};
+use crate::panics::CONTROL_THREAD;
 use crate::provenance::{Format, Negotiated};
 use crate::registry::{CanSpec, DamiaoSpec, DeviceNode, MAX_MOTORS};
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
@@ -67,7 +68,7 @@ impl Motors {
         let (requests, asked) = sync_channel(REQUESTS);
         let ending = Arc::<Ending>::default();
         let beat = Beat::new(link, spec, asked, told, tell, Arc::clone(&ending));
-        let thread = std::thread::Builder::new().name("control".to_owned()).spawn(move || beat.run());
+        let thread = std::thread::Builder::new().name(CONTROL_THREAD.to_owned()).spawn(move || beat.run());
         let thread = thread.map_err(|error| DriverError::Retry(format!("no thread for the motors: {error}")))?;
         Ok(Self {
             description,
