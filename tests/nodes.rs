@@ -30,7 +30,7 @@ fn example(path: &str) -> PathBuf {
 }
 
 /// Records a program that counts and is replugged: what it publishes arrives, in order and on the clock of `rapid`.
-/// Each time it has some 10 s to begin: Python takes seconds on a busy machine.
+/// Each time it has 9 s or more to begin: Python takes seconds on a busy machine.
 fn check_counter(place: &Place) {
     place.write(
         "sim.toml",
