@@ -22,8 +22,8 @@ const SLACK: Duration = Duration::from_secs(60);
 const KINDS: [&str; 4] = [
     "node = \"camera\"\n[device.NAME.camera]\nwidth = 640\nheight = 480\nfps = 30\n",
     "node = \"serial\"\n[device.NAME.serial]\nbaud = 115200\nparse = \"csv\"\nchannels = 6\n",
-    "node = \"can\"\n[device.NAME.can]\nprotocol = \"damiao\"\nmotors = [{ name = \"grip\", slave = 1, type = \"DM4310\" }]\n",
-    "node = \"lan\"\n[device.NAME.lan]\nprotocol = \"iphone\"\nstream = \"pose\"\nhost = \"192.0.2.HOST\"\nport = 5555\n",
+    "node = \"can\"\n[device.NAME.can]\nprotocol = \"damiao\"\nmotors = [{ name = \"grip\", slave = 1, type = \"DM4310\", mode = \"position\", position = [-1, 1] }]\n",
+    "node = \"lan\"\n[device.NAME.lan]\nprotocol = \"iphone\"\nstream = \"pose\"\nhost = \"192.0.2.HOST\"\nprobe_port = 5555\n",
 ];
 
 /// One run.
