@@ -8,8 +8,7 @@ use std::process::Command;
 
 use rapid::sample::Encoding;
 use rustix::process::Signal;
-use serde_json::Value;
-use support::{Episode, Place, events};
+use support::{Episode, Place, events, logged};
 
 const SIM: [&str; 6] = ["--sim", "sim.toml", "--config", "devices.toml", "--headless", "--json"];
 /// Samples a second.
@@ -30,18 +29,14 @@ fn example(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("examples").join(path)
 }
 
-/// Texts of the log that hold `words`.
-fn logged<'a>(events: &'a [Value], words: &str) -> Vec<&'a str> {
-    events.iter().filter_map(|event| event["text"].as_str()).filter(|text| text.contains(words)).collect()
-}
-
 /// Records a program that counts and is replugged: what it publishes arrives, in order and on the clock of `rapid`.
+/// Each time it has some 10 s to begin: Python takes seconds on a busy machine.
 fn check_counter(place: &Place) {
     place.write(
         "sim.toml",
-        "[[event]]\nat = \"4s\"\nunplug = \"counter\"\n[[event]]\nat = \"5s\"\nplug = \"counter\"\n",
+        "[[event]]\nat = \"10s\"\nunplug = \"counter\"\n[[event]]\nat = \"11s\"\nplug = \"counter\"\n",
     );
-    let output = place.run(&[&SIM[..], &["--record", "--out", "out", "--duration", "8s"]].concat());
+    let output = place.run(&[&SIM[..], &["--record", "--out", "out", "--duration", "20s"]].concat());
     assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
     let told = events(&String::from_utf8_lossy(&output.stdout));
     let states: Vec<&str> = told.iter().filter_map(|event| event["state"].as_str()).collect();
@@ -114,10 +109,6 @@ fn an_actuator_in_python_goes_where_another_program_tells_it() {
 
 #[test]
 fn a_program_in_c_reads_a_device() {
-    if Command::new("cc").arg("--version").output().is_err() {
-        println!("NOT CHECKED: there is no C compiler `cc`");
-        return;
-    }
     // Beside the binary, in the profile that it was built in.
     let built = Path::new(env!("CARGO_BIN_EXE_rapid")).parent().expect("a folder");
     let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
