@@ -106,3 +106,6 @@ pub fn give(instance: Option<&str>, order: Order) -> Result<bool, BusError> {
         std::thread::sleep(LOOK);
     }
 }
+
+#[cfg(test)]
+mod tests;
