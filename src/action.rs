@@ -4,6 +4,8 @@
 //! order of the actuator's `[device.NAME.action]` table, in its units. Its capture time is the tick of
 //! the control grid it is the action of.
 
+use std::sync::atomic::{AtomicU8, Ordering};
+
 use serde::Serialize;
 
 /// Topic of actions, on the bus and in recordings.
@@ -50,6 +52,32 @@ pub enum Order {
     Disarm,
 }
 
+/// Orders on their way to whoever carries them out.
+///
+/// Invariant: a disarm is never lost, and nothing is left of what was said before it.
+#[derive(Debug, Default)]
+pub struct OrderSlot(AtomicU8);
+
+impl OrderSlot {
+    const DISARM: u8 = 1;
+    const ARM: u8 = 2;
+
+    /// Leaves an order there.
+    pub fn give(&self, order: Order) {
+        match order {
+            Order::Disarm => self.0.store(Self::DISARM, Ordering::Release),
+            Order::Arm => drop(self.0.fetch_or(Self::ARM, Ordering::Release)),
+        }
+    }
+
+    /// Takes what is there, in the order in which it is to be carried out.
+    pub fn take(&self) -> impl Iterator<Item = Order> + use<> {
+        let given = self.0.swap(0, Ordering::Acquire);
+        let orders = [(Self::DISARM, Order::Disarm), (Self::ARM, Order::Arm)].into_iter();
+        orders.filter(move |(bit, _)| given & bit != 0).map(|(_, order)| order)
+    }
+}
+
 /// What an actuator tells of itself beside its samples.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ActuatorNotice {
@@ -59,4 +87,28 @@ pub struct ActuatorNotice {
     pub text: String,
     /// Somebody should look after it.
     pub is_problem: bool,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_disarm_is_never_lost_and_ends_what_was_said_before() {
+        use Order::{Arm, Disarm};
+        let slot = OrderSlot::default();
+        for (given, taken) in [
+            (&[][..], &[][..]),
+            (&[Arm], &[Arm]),
+            (&[Disarm], &[Disarm]),
+            (&[Arm, Disarm], &[Disarm]),
+            (&[Disarm, Arm], &[Disarm, Arm]),
+            (&[Arm, Disarm, Arm, Arm], &[Disarm, Arm]),
+            (&[Disarm, Arm, Disarm], &[Disarm]),
+        ] {
+            given.iter().for_each(|order| slot.give(*order));
+            assert_eq!(slot.take().collect::<Vec<_>>(), taken, "{given:?}");
+            assert_eq!(slot.take().count(), 0);
+        }
+    }
 }

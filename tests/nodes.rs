@@ -107,19 +107,29 @@ fn an_actuator_in_python_goes_where_another_program_tells_it() {
     assert!(fastest < 0.005 + 1e-9, "{fastest} m a step");
 }
 
+/// `librapid_node.a`, built with all that the tests of the workspace need: where those were built before, there is nothing to
+/// do. In the profile of this test.
+fn c_library() -> PathBuf {
+    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+    let mut build = Command::new(cargo);
+    build.args(["test", "--locked", "--workspace", "--no-run", "--test", "library", "--message-format", "json"]);
+    if Path::new(env!("CARGO_BIN_EXE_rapid")).parent().is_some_and(|folder| folder.ends_with("release")) {
+        build.arg("--release");
+    }
+    let built = build.current_dir(env!("CARGO_MANIFEST_DIR")).output().expect("cargo");
+    assert!(built.status.success(), "{}", String::from_utf8_lossy(&built.stderr));
+    let files = events(&String::from_utf8_lossy(&built.stdout));
+    let files = files
+        .iter()
+        .filter(|line| line["target"]["name"] == "rapid_node")
+        .filter_map(|line| line["filenames"].as_array());
+    let archive = files.flatten().filter_map(serde_json::Value::as_str).find(|file| file.ends_with(".a"));
+    archive.expect("cargo says where the archive is").into()
+}
+
 #[test]
 fn a_program_in_c_reads_a_device() {
-    // Beside the binary, in the profile that it was built in.
-    let built = Path::new(env!("CARGO_BIN_EXE_rapid")).parent().expect("a folder");
-    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-    let mut library = Command::new(cargo);
-    library.args(["build", "--locked", "--package", "rapid-node"]).current_dir(env!("CARGO_MANIFEST_DIR"));
-    if built.ends_with("release") {
-        library.arg("--release");
-    }
-    let library = library.output().expect("cargo");
-    assert!(library.status.success(), "{}", String::from_utf8_lossy(&library.stderr));
-
+    let archive = c_library();
     let place = place("node = \"publisher\"", &format!("channels = 2\nargs = [{RATE:?}]"));
     let compiled = Command::new("cc")
         .args(["-std=c11", "-D_POSIX_C_SOURCE=200809L", "-Wall", "-Wextra", "-Werror", "-O1", "-o"])
@@ -127,7 +137,7 @@ fn a_program_in_c_reads_a_device() {
         .arg(example("c/publisher.c"))
         .arg("-I")
         .arg(example("c"))
-        .arg(built.join("librapid_node.a"))
+        .arg(archive)
         .args(["-lpthread", "-ldl", "-lm"])
         .output()
         .expect("cc");

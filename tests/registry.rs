@@ -183,27 +183,27 @@ fn a_bus_and_its_motors_arrive() {
     assert_eq!((bus.modality().kind, bus.modality().shape, bus.max_bytes), (ModalityKind::Bytes, vec![], 128 * 24));
     assert_eq!((bus.topic.as_str(), bus.action.as_ref()), ("/rapid/can/bus", None));
 
-    assert_eq!((hand.modality().kind, hand.modality().shape, hand.max_bytes), (ModalityKind::Scalars, vec![18], 144));
+    assert_eq!((hand.modality().kind, hand.modality().shape, hand.max_bytes), (ModalityKind::Scalars, vec![24], 192));
     let CanProtocol::Damiao(damiao) = &motors.protocol else { panic!("motors") };
     let ms = std::time::Duration::from_millis;
     assert_eq!((damiao.hz, damiao.deadman), (500, Some(ms(80))));
     assert_eq!((damiao.disable_after, damiao.timeout, damiao.silent_after), (ms(2000), ms(200), ms(20)));
-    let [gripper, roll, wheel] = damiao.motors.as_slice() else { panic!("three motors") };
+    let [gripper, roll, wheel, thumb] = damiao.motors.as_slice() else { panic!("four motors") };
     assert_eq!((gripper.slave, gripper.master, gripper.kind), (5, 0x15, MotorKind::Dmh3510));
     assert_eq!((gripper.mode, gripper.position), (MotorMode::Mit { kp: 0.8, kd: 0.05 }, [-1.5, 0.25]));
     // What is not written is a tenth of the motor's torque, and slow.
     assert_eq!((gripper.velocity, gripper.torque, gripper.slew), (2.0, 0.1, 2.0));
     assert_eq!((gripper.max_mos, gripper.max_rotor), (80.0, 80.0));
     assert_eq!((roll.slave, roll.master, roll.mode), (6, 0, MotorMode::PositionVelocity));
-    assert_eq!((roll.velocity, roll.torque, roll.slew), (10.0, 5.0, 4.0));
+    assert_eq!((roll.velocity, roll.slew, thumb.torque), (10.0, 4.0, 3.0));
     assert_eq!((roll.max_mos, roll.max_rotor), (70.0, 90.0));
     assert_eq!((wheel.master, wheel.mode, wheel.slew), (0x7fe, MotorMode::Velocity, 20.0));
     let axes = hand.action.as_ref().unwrap();
     assert_eq!(
         (axes.names.join(" "), axes.units.join(" ")),
-        ("gripper wrist.roll wheel".into(), "rad rad rad/s".into())
+        ("gripper wrist.roll wheel thumb".into(), "rad rad rad/s rad".into())
     );
-    assert_eq!((axes.min.as_slice(), axes.max.as_slice()), (&[-1.5, -3.0, -2.0][..], &[0.25, 3.0, 2.0][..]));
+    assert_eq!((axes.min.as_slice(), axes.max.as_slice()), (&[-1.5, -3.0, -2.0, 0.0][..], &[0.25, 3.0, 2.0, 1.0][..]));
 }
 
 #[test]

@@ -1,8 +1,7 @@
 //! `librapid_node.a`: what `rapid_node.h` declares.
 //!
-//! iceoryx2's own binding for C is no package of any registry in the version that `rapid` has. A program
-//! that builds that binding from its sources can do without this library: topic, types and header are
-//! those of the README.
+//! It is no binding of iceoryx2. A program that has one can do without this library: topic, types and header
+//! are those of the README.
 
 use std::cell::RefCell;
 use std::error::Error;

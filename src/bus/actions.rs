@@ -31,16 +31,20 @@ impl Actions {
         Ok(Self { topic: spec.name.clone(), depth: spec.depth, subscriber, orders: Orders::open(node)? })
     }
 
-    /// The oldest order that another program gave and nobody took.
-    #[must_use]
-    pub fn order(&self) -> Option<Order> {
-        self.orders.next()
+    /// Hands the orders of other programs to `take`, oldest first. One that it takes is answered, and counts as
+    /// given.
+    ///
+    /// # Errors
+    /// The first of `take`.
+    pub fn orders<E>(&self, take: &mut dyn FnMut(Order) -> Result<(), E>) -> Result<(), E> {
+        self.orders.hand_over(take)
     }
 
-    /// Forgets orders and actions that were meant for a device before this one.
-    pub fn discard(&self) {
-        self.orders.discard();
+    /// Forgets orders and actions that were meant for a device before this one; says whether there was an
+    /// order.
+    pub fn discard(&self) -> bool {
         let _ = self.newest(&mut [0.0; MAX_ACTION]);
+        self.orders.discard()
     }
 
     /// Writes the newest action that waits into `action` and forgets the older ones; gives it with the tick it

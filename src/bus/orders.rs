@@ -4,7 +4,9 @@
 //! A sample would not do: its publisher ends with the program that gives the order, and a subscriber that looks
 //! a moment later finds neither.
 //!
-//! Invariant: an order counts as given only when the actuator's stream has taken it.
+//! Invariant: an order counts as given only when the actuator has taken it.
+//! Invariant: an arm is carried out only while who gave it waits for the answer: later it has been told that
+//! nobody took it. To disarm is right all the same.
 
 use std::time::{Duration, Instant};
 
@@ -19,6 +21,8 @@ use crate::action::Order;
 const TOPIC: &str = "/rapid/arm";
 /// Programs that give orders at a time.
 const CLIENTS: usize = 8;
+/// Orders that are taken at a time: who floods the service must not keep the actuator from its actions.
+const AT_A_TIME: usize = 4 * CLIENTS;
 /// Whoever reads an actuator looks for orders many times a second.
 const ANSWER_LIMIT: Duration = Duration::from_secs(2);
 const LOOK: Duration = Duration::from_millis(5);
@@ -34,26 +38,38 @@ impl Orders {
         Ok(Self { server: server.map_err(|error| topic_error(TOPIC, &error))? })
     }
 
-    /// The oldest that waits. What is neither order is none.
-    pub(super) fn next(&self) -> Option<Order> {
-        loop {
-            let request = self.server.receive().ok()??;
-            let order = match *request {
-                0 => Order::Disarm,
-                1 => Order::Arm,
-                _ => continue,
+    /// Hands what waits to `take`, oldest first, and answers what it took. What is neither order is none.
+    ///
+    /// # Errors
+    /// The first of `take`, whose order is not answered.
+    pub(super) fn hand_over<E>(&self, take: &mut dyn FnMut(Order) -> Result<(), E>) -> Result<(), E> {
+        for _ in 0..AT_A_TIME {
+            let Ok(Some(request)) = self.server.receive() else { break };
+            let Some(order) = order(*request).filter(|order| *order == Order::Disarm || request.is_connected()) else {
+                continue;
             };
-            // Who does not wait for the answer any more has been told that nobody took the order. To stop is
-            // right all the same.
-            if request.send_copy(*request).is_ok() || order == Order::Disarm {
-                return Some(order);
-            }
+            take(order)?;
+            // Who is gone needs no answer.
+            let _ = request.send_copy(*request);
         }
+        Ok(())
     }
 
-    /// Forgets what waits, unanswered.
-    pub(super) fn discard(&self) {
-        while let Ok(Some(_)) = self.server.receive() {}
+    /// Forgets what waits, unanswered; says whether an order was among it.
+    pub(super) fn discard(&self) -> bool {
+        let mut found = false;
+        while let Ok(Some(request)) = self.server.receive() {
+            found |= order(*request).is_some();
+        }
+        found
+    }
+}
+
+const fn order(request: u8) -> Option<Order> {
+    match request {
+        0 => Some(Order::Disarm),
+        1 => Some(Order::Arm),
+        _ => None,
     }
 }
 
@@ -90,3 +106,6 @@ pub fn give(instance: Option<&str>, order: Order) -> Result<bool, BusError> {
         std::thread::sleep(LOOK);
     }
 }
+
+#[cfg(test)]
+mod tests;

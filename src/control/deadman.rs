@@ -2,7 +2,8 @@
 //!
 //! Without a fresh action for two periods of actions, or as long as is configured, motors hold; after
 //! holding for a while longer they are to be disabled. An action that comes while they hold moves them
-//! again.
+//! again. Two periods are never taken for less than two cycles of commands and the time that an action is
+//! on its way.
 //!
 //! Invariant: after being armed, and without an action, it says `Hold` and then `Disable`, never
 //! `Follow`.
@@ -13,11 +14,17 @@ use crate::time::Stamp;
 
 /// Periods of actions that may pass without one.
 const PERIODS: u32 = 2;
+/// Cycles of commands that may pass without an action, however quickly the last two came...
+const CYCLES: u32 = 2;
+/// ...and how long an action may have been on its way when it is looked at.
+const WAY: Duration = Duration::from_millis(20);
 
 /// See the module's comment.
 #[derive(Debug, Clone, Copy)]
 pub struct Deadman {
     hold_after: Option<Duration>,
+    /// Patience that nobody configured is no shorter.
+    least: Duration,
     disable_after: Duration,
     /// Of the newest action, if any came since arming.
     fresh: Option<Stamp>,
@@ -36,10 +43,11 @@ pub enum Verdict {
 }
 
 impl Deadman {
-    /// `hold_after` of `None` is two periods.
+    /// `hold_after` of `None` is two periods. `cycle` is the time between two commands.
     #[must_use]
-    pub const fn new(hold_after: Option<Duration>, disable_after: Duration) -> Self {
-        Self { hold_after, disable_after, fresh: None, armed: Stamp(0) }
+    pub fn new(hold_after: Option<Duration>, disable_after: Duration, cycle: Duration) -> Self {
+        let least = cycle.saturating_mul(CYCLES).saturating_add(WAY);
+        Self { hold_after, least, disable_after, fresh: None, armed: Stamp(0) }
     }
 
     /// The motors were armed at `now`, and there is no action yet.
@@ -56,7 +64,7 @@ impl Deadman {
     /// How old an action may be, with so long between actions.
     #[must_use]
     pub fn patience(&self, period: Duration) -> Duration {
-        self.hold_after.unwrap_or(period * PERIODS)
+        self.hold_after.unwrap_or_else(|| period.saturating_mul(PERIODS).max(self.least))
     }
 
     /// What to do at `now`, with so long between actions.

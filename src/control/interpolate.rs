@@ -1,7 +1,8 @@
 //! From targets, ten a second or so, to the commands between them, hundreds a second.
 //!
-//! A target is reached on a straight line from the command at its arrival, in the time between the last
-//! two targets: then the next one is due. After that the target is held.
+//! A target is reached on a straight line from the command at its arrival, in the time between two
+//! targets: then the next one is due. After that the target is held. The time between two targets is the
+//! shorter one of the last two: a pause is none, and who is slow is known by the second.
 //!
 //! Invariant: what is between two targets lies between them, on every axis.
 
@@ -24,6 +25,8 @@ pub struct Interpolator {
     begin: Stamp,
     takes: Duration,
     tick: Option<Stamp>,
+    /// Between the last two targets.
+    gap: Duration,
     period: Duration,
 }
 
@@ -37,6 +40,7 @@ impl Interpolator {
             begin: Stamp(0),
             takes: Duration::ZERO,
             tick: None,
+            gap: FIRST_PERIOD,
             period: FIRST_PERIOD,
         }
     }
@@ -45,7 +49,7 @@ impl Interpolator {
     pub fn restart(&mut self, command: &[f64]) {
         self.hold(command);
         self.tick = None;
-        self.period = FIRST_PERIOD;
+        (self.gap, self.period) = (FIRST_PERIOD, FIRST_PERIOD);
     }
 
     /// Holds `command` from now on.
@@ -60,7 +64,9 @@ impl Interpolator {
     /// Heads for `target`, the one of `tick`, from `command`, the one of now.
     pub fn head_for(&mut self, target: &[f64], tick: Stamp, command: &[f64], now: Stamp) {
         if let Some(apart) = self.tick.map(|last| tick.since(last)).filter(|apart| *apart <= LONGEST) {
-            self.period = apart.max(SHORTEST);
+            let gap = apart.max(SHORTEST);
+            self.period = gap.min(self.gap);
+            self.gap = gap;
         }
         self.tick = Some(tick);
         for ((from, to), (command, target)) in self.from.iter_mut().zip(&mut self.to).zip(command.iter().zip(target)) {
@@ -84,7 +90,7 @@ impl Interpolator {
         (from + (to - from) * share).clamp(from.min(*to), from.max(*to))
     }
 
-    /// The time between the last two targets, or [`FIRST_PERIOD`].
+    /// The time between two targets: the shorter one of the last two, [`FIRST_PERIOD`] where there were fewer.
     #[must_use]
     pub const fn period(&self) -> Duration {
         self.period

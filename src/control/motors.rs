@@ -9,7 +9,7 @@
 //! | Holding   | stay                           | Following; Disabling, after a while              |
 //! | Disabling | told to turn off               | Disarmed, when all have said so                  |
 //! | Faulted   | told to turn off, until they do | Arming, when asked                              |
-//! | Stopped   | nothing is sent                |                                                  |
+//! | Stopped   | told to turn off, by the caller |                                                 |
 //!
 //! A cycle is: [`MotorBus::feed`] every frame that came, [`MotorBus::target`] the newest action,
 //! [`MotorBus::step`], and send what that gives. Who polls motors knows their positions without
@@ -29,6 +29,8 @@
 //! Invariant: an action is followed only if its tick is after the arm, after those of all before it, and
 //! no older than the deadman allows.
 //! Invariant: a sample holds an answer of every motor, each newer than those of the sample before.
+//! Invariant: a motor that answers is in samples sooner or later, whatever befell the bus before its ranges
+//! were read, unless they cannot be used.
 
 mod due;
 mod motor;
@@ -78,6 +80,8 @@ pub struct MotorBus {
     stepped: Option<Stamp>,
     armed: Stamp,
     refusing: Option<Refusal>,
+    /// The motor whose frames are sent first: where there is no room for all, each has its turn.
+    first: usize,
     notices: Notices,
     counts: Counts,
 }
@@ -113,7 +117,7 @@ impl MotorBus {
             commands: vec![0.0; axes],
             targets: vec![0.0; axes],
             line: Interpolator::new(axes),
-            deadman: Deadman::new(spec.deadman, spec.disable_after),
+            deadman: Deadman::new(spec.deadman, spec.disable_after, cycle),
             state: BusState::Probing,
             since: now,
             reason: Reason::Asked,
@@ -122,6 +126,7 @@ impl MotorBus {
             stepped: None,
             armed: now,
             refusing: None,
+            first: 0,
             notices: Notices::new(),
             counts: Counts::default(),
         }
@@ -165,7 +170,7 @@ impl MotorBus {
 
     /// A frame came from the bus.
     pub fn feed(&mut self, frame: &CanFrame, now: Stamp) {
-        if self.state == BusState::Stopped || codec::data_of(frame).is_none() {
+        if codec::data_of(frame).is_none() {
             return;
         }
         let reply = Reply::decode(frame);
@@ -181,7 +186,9 @@ impl MotorBus {
             Ok(())
         };
         // At once: what a motor says next must not cover it up.
-        if let Some(fault) = taken.err().or_else(|| self.judge(index)) {
+        if self.state != BusState::Stopped
+            && let Some(fault) = taken.err().or_else(|| self.judge(index))
+        {
             self.fail(fault, now);
         }
     }
@@ -250,10 +257,20 @@ impl MotorBus {
         }
     }
 
-    /// The frames that disable every motor, for any way out. Nothing is sent after them.
+    /// The frames that disable every motor, for any way out. Nothing else is sent after them; they may be
+    /// had again.
     pub fn stop_frames(&mut self) -> impl Iterator<Item = CanFrame> + '_ {
         self.state = BusState::Stopped;
-        self.motors.iter().map(|motor| Order::Disable.frame(motor.spec.slave))
+        self.motors.iter_mut().map(|motor| {
+            motor.stop();
+            Order::Disable.frame(motor.spec.slave)
+        })
+    }
+
+    /// Names of the motors that were told to turn on, or said that they are on, and have not said since they
+    /// were told to turn off that they are off.
+    pub fn still_on(&self) -> impl Iterator<Item = &str> {
+        self.motors.iter().filter(|motor| motor.may_be_on).map(|motor| motor.spec.name.as_str())
     }
 
     /// Fills `out` with [`SAMPLE_VALUES`] numbers a motor, if every motor has answered since the last
@@ -288,10 +305,15 @@ impl MotorBus {
         self.stepped = Some(now);
         self.listen(now);
         self.advance(now, passed);
-        for (motor, command) in self.motors.iter_mut().zip(&self.commands) {
+        let count = self.motors.len().max(1);
+        for at in self.first..self.first + count {
+            let (Some(motor), Some(command)) = (self.motors.get_mut(at % count), self.commands.get(at % count)) else {
+                continue;
+            };
             let is_silent = motor.unanswered(now) >= self.silent_after;
             motor.step(*command, now, is_silent, &mut send);
         }
+        self.first = (self.first + 1) % count;
     }
 }
 

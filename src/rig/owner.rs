@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use futures::StreamExt;
-use tokio::sync::{mpsc, watch};
+use tokio::sync::mpsc;
 use tokio::task::{Id, JoinError, JoinSet};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep, timeout};
 use tokio_util::sync::CancellationToken;
@@ -18,7 +18,7 @@ use super::slot::{Effects, End, Input, Slot};
 use super::stream::{Controls, Numbers, Reported, Stream};
 use super::worker::Seat;
 use super::{RigCommand, RigError};
-use crate::action::Order;
+use crate::action::{Arming, OrderSlot};
 use crate::bus::{Bus, TopicId, Writer};
 use crate::hotplug::{HotplugEvent, HotplugStream, Witness};
 use crate::mask::PhysicalMask;
@@ -54,7 +54,7 @@ pub struct Rig {
     /// The episode in progress.
     episode: EpisodeWatch,
     /// To the actuator.
-    orders: watch::Sender<Option<Order>>,
+    orders: Arc<OrderSlot>,
 }
 
 /// A slot and what belongs to it.
@@ -74,6 +74,8 @@ struct Modality {
     post: Option<Post>,
     /// What it is told, if it is the actuator and no program reads it.
     controls: Option<Controls>,
+    /// What the actuator said last in this epoch.
+    arming: Option<Arming>,
     /// What was agreed with the device, or why it does not run.
     detail: String,
 }
@@ -84,7 +86,7 @@ impl Rig {
     pub fn new(registry: &Registry, bus: &Bus, presence: Presence, board: Arc<Board>) -> Self {
         let programs = Programs::new(registry, bus, &board);
         let prefix = bus.membership().prefix();
-        let orders = watch::Sender::new(None);
+        let orders = Arc::<OrderSlot>::default();
         let modality = |spec: &DeviceSpec| {
             let writer = bus.writer(TopicId::Modality(spec.id))?;
             let spec = Arc::new(spec.clone());
@@ -99,10 +101,12 @@ impl Rig {
                 attached: Stamp::default(),
                 stop: CancellationToken::new(),
                 // A program that moves its device listens itself.
-                controls: spec.action.as_ref().filter(|_| seat.is_none()).and_then(|_| {
-                    let orders = orders.subscribe();
-                    Some(Controls::new(bus.actions()?, orders, false))
-                }),
+                controls: spec
+                    .action
+                    .as_ref()
+                    .filter(|_| seat.is_none())
+                    .and_then(|_| Some(Controls::new(bus.actions()?, Arc::clone(&orders)))),
+                arming: None,
                 seat,
                 post,
                 spec,
@@ -121,7 +125,7 @@ impl Rig {
             tasks: HashMap::new(),
             reports: mpsc::channel(1).0,
             programs,
-            episode: watch::channel(None).1,
+            episode: tokio::sync::watch::channel(None).1,
             orders,
         }
     }
@@ -147,7 +151,10 @@ impl Rig {
                 // Shutdown first, then the earliest witnesses of an unplug, then the rest.
                 biased;
                 () = shutdown.cancelled() => break Ok(()),
-                Some(ended) = self.streams.join_next_with_id(), if !self.streams.is_empty() => self.stream_ended(ended),
+                Some(ended) = self.streams.join_next_with_id(), if !self.streams.is_empty() => {
+                    self.reports_so_far(&mut reported);
+                    self.stream_ended(ended);
+                }
                 event = hotplug.next() => match event {
                     Some(Ok(event)) => self.hotplug(event),
                     Some(Err(error)) => break Err(error.into()),
@@ -157,7 +164,7 @@ impl Rig {
                 Some(command) = commands.recv() => match command {
                     RigCommand::Restart(id) => self.apply(id, Input::Restart),
                     // Without an actuator nobody listens.
-                    RigCommand::Order(order) => drop(self.orders.send(Some(order))),
+                    RigCommand::Order(order) => self.orders.give(order),
                 },
                 () = sleep(deadline.since(Stamp::now())) => self.deadlines_passed(),
                 _ = json.tick() => self.json_is_stale = true,
@@ -166,7 +173,11 @@ impl Rig {
                 self.write_json();
             }
         };
+        self.reports_so_far(&mut reported);
         self.stop_streams().await;
+        for id in self.modalities.iter().map(|modality| modality.spec.id).collect::<Vec<_>>() {
+            self.lay_down(id, false);
+        }
         result
     }
 
@@ -267,7 +278,8 @@ impl Rig {
     fn apply(&mut self, id: ModalityId, input: Input<Attachment>) {
         let now = Stamp::now();
         let Some(modality) = self.modality(id) else { return };
-        let before = modality.slot.state();
+        let (before, epoch) = (modality.slot.state(), modality.slot.epoch());
+        let ran = modality.slot.is_current(epoch);
         let Effects { stop, start } = modality.slot.apply(input, now);
         let (state, present) = (modality.slot.state(), modality.slot.is_present());
         // The mask comes before everything else that an unplug brings with it.
@@ -280,6 +292,10 @@ impl Rig {
         if stop.is_some() {
             modality.stop.cancel();
         }
+        if ran && !modality.slot.is_current(epoch) {
+            self.lay_down(id, true);
+        }
+        let Some(modality) = self.modality(id) else { return };
         let changed = state != before || start.is_some();
         if changed
             && state == SlotState::Backoff

@@ -56,7 +56,7 @@ pub(super) enum Report {
     Stalled,
     /// Samples come again.
     Resumed,
-    /// Samples or actions are lost, and why; told once an epoch.
+    /// Samples or actions are lost, and why, told once an epoch each; or an order.
     Refused(String),
     /// What an actuator has to tell.
     Actuator(ActuatorNotice),
@@ -122,7 +122,11 @@ impl Stream {
         tokio::select! {
             biased;
             () = self.stop.cancelled() => {}
-            end = self.read(&mut source) => return end,
+            end = self.read(&mut source) => {
+                // What it said last, before it ended.
+                self.pass_on_notices(&mut source).await;
+                return end;
+            }
         }
         source.close().await;
         stopped()
@@ -132,7 +136,7 @@ impl Stream {
         self.report(Report::Opened(source.description(), Box::new(self.provenance(source)))).await;
         let patience = source.patience(self.spec.stall_after);
         let mut pulse = Pulse::Silent;
-        let mut refused = false;
+        let (mut refused, mut unmoved) = (false, false);
         let stall = sleep_until(Instant::now() + self.spec.stall_after);
         tokio::pin!(stall);
         let silent = self.silence();
@@ -177,16 +181,17 @@ impl Stream {
                     self.tell(source, &mut episode).await;
                 }
                 _ = told.tick(), if controls.is_some() => {
-                    if let Some(controls) = &mut controls
-                        && let Err(error) = controls.pass_on(source)
-                        && !refused
-                    {
-                        refused = true;
-                        self.report(Report::Refused(format!("it does not move: {error}"))).await;
+                    if let Some(controls) = &mut controls {
+                        if let Err(error) = controls.pass_on_orders(source) {
+                            self.report(Report::Refused(format!("an order is not carried out: {error}"))).await;
+                        }
+                        if let Err(error) = controls.pass_on_action(source)
+                            && !std::mem::replace(&mut unmoved, true)
+                        {
+                            self.report(Report::Refused(format!("it does not move: {error}"))).await;
+                        }
                     }
-                    while let Some(notice) = source.take_notice() {
-                        self.report(Report::Actuator(notice)).await;
-                    }
+                    self.pass_on_notices(source).await;
                 }
                 () = &mut news => {
                     self.tell(source, &mut episode).await;
@@ -223,6 +228,13 @@ impl Stream {
         if let Err(error) = source.record(now.as_ref()) {
             let verb = if now.is_some() { "start" } else { "stop" };
             self.report(Report::Refused(format!("it does not {verb} recording: {error}"))).await;
+        }
+    }
+
+    /// Reports what the actuator has to tell.
+    async fn pass_on_notices(&self, source: &mut Source) {
+        while let Some(notice) = source.take_notice() {
+            self.report(Report::Actuator(notice)).await;
         }
     }
 

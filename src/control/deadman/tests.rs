@@ -1,6 +1,7 @@
 use super::*;
 
 const MS: u64 = 1_000_000;
+const CYCLE: Duration = Duration::from_millis(5);
 
 fn at(ms: u64) -> Stamp {
     Stamp(ms * MS)
@@ -10,7 +11,7 @@ fn at(ms: u64) -> Stamp {
 fn actions_that_stop_are_held_and_then_disabled() {
     let period = Duration::from_millis(100);
     for (configured, hold_ms) in [(None, 200), (Some(Duration::from_millis(50)), 50)] {
-        let mut deadman = Deadman::new(configured, Duration::from_secs(1));
+        let mut deadman = Deadman::new(configured, Duration::from_secs(1), CYCLE);
         deadman.arm(at(0));
         deadman.feed(at(500));
         // One that is older than what is known changes nothing.
@@ -31,10 +32,25 @@ fn actions_that_stop_are_held_and_then_disabled() {
 
 #[test]
 fn an_armed_motor_without_an_action_holds_and_is_disabled() {
-    let mut deadman = Deadman::new(None, Duration::from_secs(1));
+    let mut deadman = Deadman::new(None, Duration::from_secs(1), CYCLE);
     deadman.feed(at(9));
     deadman.arm(at(10));
     for (ms, verdict) in [(10, Verdict::Hold), (1009, Verdict::Hold), (1010, Verdict::Disable)] {
         assert_eq!(deadman.look(at(ms), Duration::from_millis(100)), verdict);
     }
+}
+
+#[test]
+fn actions_that_come_quicker_than_commands_are_waited_for_all_the_same() {
+    let mut deadman = Deadman::new(None, Duration::from_secs(1), CYCLE);
+    let period = Duration::from_millis(1);
+    assert_eq!(deadman.patience(period), Duration::from_millis(30), "two cycles, and 20 ms on its way");
+    deadman.arm(at(0));
+    deadman.feed(at(100));
+    for (ms, verdict) in [(129, Verdict::Follow), (130, Verdict::Hold)] {
+        assert_eq!(deadman.look(at(ms), period), verdict);
+    }
+    // What is configured is as it is.
+    let deadman = Deadman::new(Some(Duration::from_millis(12)), Duration::from_secs(1), CYCLE);
+    assert_eq!(deadman.patience(period), Duration::from_millis(12));
 }

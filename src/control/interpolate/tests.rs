@@ -40,6 +40,12 @@ fn a_pause_says_nothing_of_the_rate_and_a_hold_ends_the_line() {
     assert_eq!((line.period(), line.tick()), (Duration::from_millis(50), Some(at(5000))));
     line.restart(&[0.5]);
     assert_eq!((line.period(), line.tick()), (FIRST_PERIOD, None));
+    // Nor does a shorter one; two of them are a rate, and the first quick one is another.
+    for (tick, period) in [(5000, 100), (5900, 100), (6000, 100), (6900, 100), (7800, 900), (8100, 300), (8400, 300)] {
+        line.head_for(&[1.0], at(tick), &[0.0], at(tick));
+        assert_eq!(line.period(), Duration::from_millis(period), "{tick}");
+    }
+    line.restart(&[0.5]);
     // Two at once.
     line.head_for(&[1.0], at(5000), &[0.0], at(5000));
     line.head_for(&[1.0], at(5000), &[0.0], at(5000));

@@ -61,7 +61,23 @@ impl MotorBus {
                 Some(motor) if waited >= DISABLE_WITHIN => self.fail(Fault::NotDisabled { motor }, now),
                 Some(_) => {}
             },
-            BusState::Disarmed | BusState::Faulted(_) | BusState::Stopped => {}
+            // It says the same again.
+            BusState::Faulted(Fault::Unusable { .. }) | BusState::Stopped => {}
+            BusState::Disarmed | BusState::Faulted(_) => self.ask_late(now),
+        }
+    }
+
+    /// Asks motors whose ranges are not known, though the bus is past its probing: they had no power then, or
+    /// an arm came between.
+    fn ask_late(&mut self, now: Stamp) {
+        for motor in &mut self.motors {
+            let is_silent = motor.unanswered(now) >= self.silent_after;
+            match motor.phase {
+                Phase::Off { .. } if motor.ranges.is_none() && motor.is_off() && !is_silent => motor.probe(),
+                // It may hear without being heard.
+                Phase::Asked { .. } | Phase::Probed if is_silent => motor.turn_off(),
+                _ => {}
+            }
         }
     }
 

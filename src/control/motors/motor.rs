@@ -60,6 +60,12 @@ pub(super) fn limits(spec: &MotorSpec) -> Limits {
     }
 }
 
+/// Positions within what a motor counts in, from `-range` to `range`: those beyond can be neither sent nor
+/// seen. The lower end is above the higher one if there are none.
+fn within([low, high]: [f64; 2], range: f64) -> [f64; 2] {
+    [low.max(-range), high.min(range)]
+}
+
 /// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Motor {
@@ -84,6 +90,9 @@ pub(super) struct Motor {
     differs: bool,
     /// That it does not answer was told.
     pub(super) missed: bool,
+    /// It was told to turn on, or said that it is on, and has not said since it was told to turn off that
+    /// it is not.
+    pub(super) may_be_on: bool,
 }
 
 impl Motor {
@@ -104,6 +113,7 @@ impl Motor {
             warm: [false; 2],
             differs: false,
             missed: false,
+            may_be_on: false,
         }
     }
 
@@ -117,6 +127,14 @@ impl Motor {
     /// Turns it off, from the next frame on.
     pub(super) const fn turn_off(&mut self) {
         self.phase = Phase::Off { told: false };
+    }
+
+    /// It is being told to turn off for the last time.
+    pub(super) const fn stop(&mut self) {
+        if !matches!(self.phase, Phase::Off { told: true }) {
+            self.phase = Phase::Off { told: true };
+            self.status = None;
+        }
     }
 
     /// It was told to turn off, and said since that it is not enabled.
@@ -176,6 +194,10 @@ impl Motor {
                 };
                 *slot = value;
                 Ranges::new(value, value, value).ok_or(unusable)?;
+                let [low, high] = within(self.spec.position, value);
+                if reply.parameter == Parameter::PMax && low > high {
+                    return Err(unusable);
+                }
             }
         }
         self.phase = if at + 1 < PROBE.len() { Phase::Asked { at: at + 1, setting: None } } else { Phase::Probed };
@@ -224,6 +246,7 @@ impl Motor {
         };
         self.asked = None;
         self.status = Some(feedback.status);
+        self.may_be_on = feedback.status == MotorStatus::Enabled || self.may_be_on && !self.is_off();
         if self.ranges.is_some() {
             self.feedback = Some(feedback);
             self.seen = now;
@@ -270,10 +293,9 @@ impl Motor {
         let (Some(ranges), Some(feedback), Some(status)) = (self.ranges, self.feedback, self.status) else { return };
         if self.phase == Phase::Probed {
             self.phase = Phase::Clearing;
-            let [low, high] = self.spec.position;
             if self.spec.mode != MotorMode::Velocity {
-                // Positions beyond what it counts in can be neither sent nor seen.
-                limits.set_range(low.max(-ranges.position()), high.min(ranges.position()));
+                let [low, high] = within(self.spec.position, ranges.position());
+                limits.set_range(low, high);
             }
         }
         if self.phase == Phase::Clearing && status == MotorStatus::Disabled {
@@ -292,11 +314,11 @@ impl Motor {
 
     /// The command next to `command` that where the joint is allows.
     pub(super) fn bound(&self, command: f64, limits: &Limits) -> f64 {
-        let Some(Feedback { q, .. }) = self.feedback else { return command };
+        let (Some(Feedback { q, .. }), Some(ranges)) = (self.feedback, &self.ranges) else { return command };
         match self.spec.mode {
             MotorMode::Mit { kp, .. } => within_torque(command, q, self.spec.torque, kp),
             MotorMode::PositionVelocity => command,
-            MotorMode::Velocity => limits.brake(command, q, self.spec.position),
+            MotorMode::Velocity => limits.brake(command, q, within(self.spec.position, ranges.position())),
         }
     }
 
@@ -319,7 +341,7 @@ impl Motor {
     /// Sends the frames of this cycle. `command` is the position or the velocity of now.
     pub(super) fn step(&mut self, command: f64, now: Stamp, is_silent: bool, send: &mut impl FnMut(CanFrame)) {
         let slave = self.spec.slave;
-        if self.phase == Phase::Probed && self.status == Some(MotorStatus::Enabled) {
+        if matches!(self.phase, Phase::Asked { .. } | Phase::Probed) && self.status == Some(MotorStatus::Enabled) {
             self.turn_off();
         }
         match self.phase {
@@ -347,6 +369,7 @@ impl Motor {
             }
             Phase::Enabling => {
                 send(Order::Enable.frame(slave));
+                self.may_be_on = true;
                 self.command(command, send);
             }
             Phase::On => self.command(command, send),

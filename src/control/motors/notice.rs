@@ -287,6 +287,11 @@ impl fmt::Display for Words<'_, Fault> {
             Fault::NotEnabled { motor } => write!(f, "motor {} does not become enabled", self.name(motor)),
             Fault::NotDisabled { motor } => write!(f, "motor {} does not become disabled", self.name(motor)),
             Fault::Unread { motor, parameter } => write!(f, "motor {} does not tell its {parameter}", self.name(motor)),
+            Fault::Unusable { motor, parameter: Parameter::PMax, value }
+                if value.number().is_finite() && value.number() > 0.0 =>
+            {
+                write!(f, "motor {} counts to {value} rad, and its `position` lies beyond that", self.name(motor))
+            }
             Fault::Unusable { motor, parameter, value } => {
                 write!(f, "{parameter} of motor {} is {value}, and cannot be used or changed", self.name(motor))
             }

@@ -85,6 +85,12 @@ impl Line {
         Ok(Self::new(fd, Codec::Damiao(damiao_serial::Decoder::default()), description))
     }
 
+    /// Any descriptor in the place of a line to an adapter of Damiao's.
+    #[cfg(test)]
+    pub(super) fn stand_in(fd: OwnedFd) -> Self {
+        Self::new(fd, Codec::Damiao(damiao_serial::Decoder::default()), String::new())
+    }
+
     fn new(fd: OwnedFd, codec: Codec, description: String) -> Self {
         Self {
             fd,

@@ -7,7 +7,7 @@
 //! Invariant: bytes from an adapter never make it panic.
 
 use std::io;
-use std::os::fd::{AsFd, AsRawFd, BorrowedFd, RawFd};
+use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd};
 use std::path::Path;
 use std::time::Duration;
 
@@ -115,6 +115,11 @@ impl Link {
         Socket::open(name, bitrate).map(Self::Socket)
     }
 
+    /// A socket of datagrams in the place of a network interface's.
+    pub(super) fn stand_in(socket: OwnedFd) -> Result<Self, LinkError> {
+        Socket::stand_in(socket).map(Self::Socket)
+    }
+
     /// Opens the serial line at `path`, and the bus behind it with `bitrate`. Waits for the adapter's
     /// answers, a few hundred ms at most: keep it off the runtime.
     ///
@@ -160,12 +165,12 @@ impl Link {
     /// # Errors
     /// [`LinkError::BusOff`] when the controller says so, after which the link may still be used; the
     /// others end the link.
-    pub fn recv_until(&mut self, deadline: Stamp, frame: &mut CanFrame) -> Result<Option<Stamp>, LinkError> {
+    pub fn recv_until(&mut self, deadline: Stamp, frame: &mut CanFrame) -> Result<Option<Arrival>, LinkError> {
         let mut hung_up = false;
         loop {
             while let Some(arrival) = self.try_recv(frame)? {
                 if !frame.error {
-                    return Ok(Some(arrival.at));
+                    return Ok(Some(arrival));
                 }
                 if is_bus_off(frame) {
                     return Err(LinkError::BusOff);
@@ -320,7 +325,12 @@ impl AsyncLink {
                 first.arrival = arrival?;
                 let [place, rest @ ..] = into else { return Ok(0) };
                 *place = first;
-                return Ok(1 + self.take_waiting(rest)?);
+                // The first one is there, whatever comes after it.
+                let others = self.take_waiting(rest).unwrap_or_else(|error| {
+                    self.ended = Some(error);
+                    0
+                });
+                return Ok(1 + others);
             }
         }
     }

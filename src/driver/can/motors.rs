@@ -6,6 +6,7 @@
 //! Invariant: whatever ends the driver, the motors are told to turn off: see `beat`.
 
 mod beat;
+mod tally;
 
 use std::sync::Arc;
 use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
@@ -22,15 +23,15 @@ use crate::provenance::{Format, Negotiated};
 use crate::registry::{CanSpec, DamiaoSpec, DeviceNode, MAX_MOTORS};
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
 use crate::time::Stamp;
-pub use beat::Punctuality;
-use beat::{Beat, Ending, Request, Sample, Target};
+use beat::{Beat, Sample, Shared, Target};
+pub use tally::Punctuality;
 
 /// Samples that may wait to be read, a second of them at 200 Hz.
 const SAMPLES: usize = 256;
-/// Notices that may wait; they are read every few milliseconds.
+/// Notices that may wait, beside those that thread `control` keeps; they are read every few milliseconds.
 const NOTICES: usize = 64;
-/// Requests that may wait; they are taken every cycle.
-const REQUESTS: usize = 64;
+/// Actions that may wait; they are taken every cycle.
+const TARGETS: usize = 64;
 
 /// See the module's comment.
 #[derive(Debug)]
@@ -40,8 +41,8 @@ pub struct Motors {
     axes: usize,
     samples: mpsc::Receiver<Sample>,
     notices: mpsc::Receiver<ActuatorNotice>,
-    requests: SyncSender<Request>,
-    ending: Arc<Ending>,
+    targets: SyncSender<Target>,
+    shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
     payload: [u8; MAX_MOTORS * SAMPLE_VALUES * 8],
 }
@@ -65,9 +66,9 @@ impl Motors {
         let description = format!("{}, {} motors at {} Hz", link.description(), spec.motors.len(), spec.hz);
         let (told, samples) = mpsc::channel(SAMPLES);
         let (tell, notices) = mpsc::channel(NOTICES);
-        let (requests, asked) = sync_channel(REQUESTS);
-        let ending = Arc::<Ending>::default();
-        let beat = Beat::new(link, spec, asked, told, tell, Arc::clone(&ending));
+        let (targets, asked) = sync_channel(TARGETS);
+        let shared = Arc::<Shared>::default();
+        let beat = Beat::new(link, spec, asked, told, tell, Arc::clone(&shared));
         let thread = std::thread::Builder::new().name(CONTROL_THREAD.to_owned()).spawn(move || beat.run());
         let thread = thread.map_err(|error| DriverError::Retry(format!("no thread for the motors: {error}")))?;
         Ok(Self {
@@ -76,8 +77,8 @@ impl Motors {
             axes: spec.motors.len(),
             samples,
             notices,
-            requests,
-            ending,
+            targets,
+            shared,
             thread: Some(thread),
             payload: [0; MAX_MOTORS * SAMPLE_VALUES * 8],
         })
@@ -88,7 +89,7 @@ impl Motors {
     /// # Errors
     /// When the adapter is gone or cannot be used any more.
     pub async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
-        let Some(sample) = self.samples.recv().await else { return Err(self.ending.reason()) };
+        let Some(sample) = self.samples.recv().await else { return Err(self.shared.reason()) };
         let values = sample.values.get(..self.axes * SAMPLE_VALUES).unwrap_or_default();
         for (place, value) in self.payload.chunks_exact_mut(8).zip(values) {
             place.copy_from_slice(&value.to_le_bytes());
@@ -97,7 +98,7 @@ impl Motors {
             bytes: self.payload.get(..values.len() * 8).unwrap_or_default(),
             encoding: Encoding::F64,
             captured: sample.captured,
-            flags: FLAG_DEVICE_TIME,
+            flags: if sample.from_kernel { FLAG_DEVICE_TIME } else { 0 },
             width: u32::try_from(values.len()).unwrap_or(u32::MAX),
             height: 0,
             lost: sample.lost,
@@ -112,15 +113,23 @@ impl Motors {
         if target.len() != self.axes {
             return Err(DriverError::Retry(format!("it takes {} numbers, not {}", self.axes, target.len())));
         }
-        self.ask(Request::Target(Target::new(target, tick)))
+        self.targets.try_send(Target::new(target, tick)).map_err(|error| match error {
+            TrySendError::Full(_) => DriverError::Retry("thread `control` is behind".to_owned()),
+            TrySendError::Disconnected(_) => self.shared.reason(),
+        })
     }
 
-    /// Lets the motors move, or stops them.
+    /// Lets the motors move, or stops them, with the next cycle. There is room for it however many actions
+    /// wait.
     ///
     /// # Errors
-    /// When thread `control` does not take it.
+    /// When thread `control` has ended.
     pub fn order(&mut self, order: Order) -> Result<(), DriverError> {
-        self.ask(Request::Order(order))
+        if self.shared.has_ended() || self.samples.is_closed() {
+            return Err(self.shared.reason());
+        }
+        self.shared.orders.give(order);
+        Ok(())
     }
 
     /// What happened since the last call.
@@ -128,7 +137,7 @@ impl Motors {
         self.notices.try_recv().ok()
     }
 
-    /// Turns the motors off and waits for that.
+    /// Turns the motors off and waits until they say so, for a tenth of a second at most.
     pub async fn close(mut self) {
         let _ = unblock(move || {
             self.stop();
@@ -137,12 +146,12 @@ impl Motors {
         .await;
     }
 
-    /// Turns the motors off, waits for that, and says how well they were driven; `None` if the thread
+    /// Turns the motors off, waits as [`Self::close`] does, and says how well they were driven; `None` if the thread
     /// panicked. Blocks as dropping does.
     #[must_use]
     pub fn finish(mut self) -> Option<Punctuality> {
         self.stop();
-        self.ending.punctuality.get().cloned()
+        self.shared.punctuality.get().cloned()
     }
 
     /// What was opened, for people.
@@ -159,15 +168,8 @@ impl Motors {
         Negotiated { card: Some(self.description.clone()), format, ..Negotiated::default() }
     }
 
-    fn ask(&self, request: Request) -> Result<(), DriverError> {
-        self.requests.try_send(request).map_err(|error| match error {
-            TrySendError::Full(_) => DriverError::Retry("thread `control` is behind".to_owned()),
-            TrySendError::Disconnected(_) => self.ending.reason(),
-        })
-    }
-
     fn stop(&mut self) {
-        self.ending.ask();
+        self.shared.ask();
         if let Some(thread) = self.thread.take() {
             // Its panic has been told by the channel that it closed.
             let _ = thread.join();
@@ -176,8 +178,12 @@ impl Motors {
 }
 
 impl Drop for Motors {
-    /// Blocks for the cycle that is under way and for the frames that turn the motors off: some 20 ms.
+    /// Blocks for the cycle that is under way and until the motors say that they are off: some 20 ms, and a
+    /// tenth of a second more where one says nothing.
     fn drop(&mut self) {
         self.stop();
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -204,10 +204,12 @@ pub(super) fn read<'a>(
         .unwrap_or_else(|| node::default_stall(settings.as_ref()));
     let latency = section.duration(problems, "latency", Duration::ZERO..=LONGEST_LATENCY).unwrap_or_default();
     let max_bytes = node::max_bytes(&section, settings.as_ref(), problems);
-    let mut action = action::action(&section, problems);
-    if let Some(NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(damiao), .. })) = &settings {
-        action = motors::axes(damiao, action, &section, problems);
-    }
+    let action = match &settings {
+        Some(NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(damiao), .. })) => {
+            Some(motors::axes(damiao, &section, problems))
+        }
+        _ => action::action(&section, problems),
+    };
     let written = section.integer(problems, "depth", 2..=4096).and_then(|depth| u64::try_from(depth.value).ok());
     Draft {
         name: name.to_owned(),

@@ -23,6 +23,8 @@ const KEYS: [&str; 13] = [
 ];
 /// Six numbers a motor, and 64 in an action or a sample.
 const MOST: usize = 10;
+/// Motors that hold for want of an action must not do so between two commands.
+const DEADMAN_PERIODS: u32 = 2;
 /// A motor that stops by itself when it is told nothing must not do so between two commands.
 const TIMEOUT_PERIODS: u32 = 4;
 /// What a motor does that nobody has set limits for: slow enough to step aside.
@@ -43,6 +45,13 @@ pub(super) fn damiao(table: &Section<'_>, problems: &mut Problems<'_>) -> Option
     let (ms, second) = (Duration::from_millis, Duration::from_secs);
     let hz = table.integer(problems, "hz", 10..=1000).and_then(|hz| u32::try_from(hz.value).ok()).unwrap_or(200);
     let deadman = table.duration(problems, "deadman", ms(1)..=second(10));
+    let two = second(1) * DEADMAN_PERIODS / hz;
+    if let Some(short) = deadman.filter(|deadman| *deadman < two) {
+        let message = format!("deadman = {short:?} is less than {DEADMAN_PERIODS} commands at {hz} Hz take");
+        let least = two.as_micros().div_ceil(1000);
+        let fix = format!("write deadman = \"{least}ms\" or more, or remove it for twice the time between actions");
+        table.report(problems, "deadman", message, fix);
+    }
     let disable_after = table.duration(problems, "disable_after", ms(10)..=Duration::from_hours(1));
     let silent_after = table.duration(problems, "silent_after", ms(1)..=second(10));
     let least = second(1) * TIMEOUT_PERIODS / hz;
@@ -200,7 +209,8 @@ fn mode(entry: &Section<'_>, problems: &mut Problems<'_>) -> Option<MotorMode> {
     let mode = if entry.has("mode") { entry.choice(problems, "mode", &words)? } else { zero };
     let gains = [("kp", 500.0), ("kd", 5.0)];
     if mode != zero {
-        for (key, _) in gains.into_iter().filter(|(key, _)| entry.has(key)) {
+        // Frames of these modes have room for none of them.
+        for key in ["kp", "kd", "torque"].into_iter().filter(|key| entry.has(key)) {
             let message = format!("a motor that runs its own loop takes no {key}");
             entry.report(problems, key, message, format!("remove {key}, or write mode = \"mit\""));
         }
@@ -258,33 +268,17 @@ fn check_pairs(motors: &[(Section<'_>, Option<MotorSpec>)], problems: &mut Probl
     }
 }
 
-/// The axes of the entry's actions: those of its motors, or those it writes for them.
-pub(super) fn axes(
-    damiao: &DamiaoSpec,
-    written: Option<ActionSpec>,
-    section: &Section<'_>,
-    problems: &mut Problems<'_>,
-) -> Option<ActionSpec> {
-    let of_motors = of_motors(damiao);
-    let Some(written) = written else { return Some(of_motors) };
-    let Some(table) = section.table(problems, "action") else { return Some(of_motors) };
-    if written.names.len() != of_motors.names.len() {
-        let message = format!("axes: {}, motors: {}", written.names.len(), of_motors.names.len());
-        table.report(problems, "names", message, "remove the table: the axes follow from the motors");
-        return None;
+/// The axes of the entry's actions. They follow from its motors, whose limits are those that are kept: a
+/// table beside them would say what nobody heeds.
+pub(super) fn axes(damiao: &DamiaoSpec, section: &Section<'_>, problems: &mut Problems<'_>) -> ActionSpec {
+    if section.has("action") {
+        let message = format!("motors take no table [{}]: their axes follow from them", section.child("action"));
+        let fix = format!(
+            "remove the table, and write limits as position, velocity, torque and slew of each motor in [{}]",
+            section.child("can")
+        );
+        section.report(problems, "action", message, fix);
     }
-    for (at, name) in written.names.iter().enumerate() {
-        let inside = written.min.get(at) >= of_motors.min.get(at) && written.max.get(at) <= of_motors.max.get(at);
-        if !inside {
-            let message = format!("{name} goes beyond the limits of its motor");
-            table.report(problems, "max", message, "keep min and max within the motor's, or remove the table");
-            return None;
-        }
-    }
-    Some(written)
-}
-
-fn of_motors(damiao: &DamiaoSpec) -> ActionSpec {
     let range = |motor: &MotorSpec| match motor.mode {
         MotorMode::Velocity => ("rad/s", [-motor.velocity, motor.velocity]),
         MotorMode::Mit { .. } | MotorMode::PositionVelocity => ("rad", motor.position),

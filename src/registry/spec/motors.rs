@@ -15,7 +15,8 @@ pub struct DamiaoSpec {
     pub motors: Vec<MotorSpec>,
     /// Commands a second to each motor, `10..=1000`, default 200.
     pub hz: u32,
-    /// Without an action for this long the motors hold; `None` is twice the time between actions.
+    /// Without an action for this long the motors hold, two commands at least; `None` is twice the time
+    /// between actions.
     pub deadman: Option<Duration>,
     /// Holding for this long they are disabled.
     pub disable_after: Duration,
@@ -42,8 +43,8 @@ pub struct MotorSpec {
     pub position: [f64; 2],
     /// Highest speed, rad/s; above 0.
     pub velocity: f64,
-    /// Highest torque, Nm; above 0. Bounds what the position error asks for in [`MotorMode::Mit`]; the
-    /// other modes have no torque in their frames.
+    /// Highest torque, Nm; above 0. Bounds what the position error asks for in [`MotorMode::Mit`], and means
+    /// nothing in the other modes, whose frames have no torque.
     pub torque: f64,
     /// Highest change of the command: rad/s of a commanded position, rad/s² of a commanded velocity;
     /// above 0.

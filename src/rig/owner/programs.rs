@@ -15,11 +15,11 @@ impl Rig {
         self
     }
 
-    /// Arms the actuator as soon as it is there, once.
+    /// Arms the actuator as soon as it is there: once, and not after another order.
     #[must_use]
-    pub fn arming(mut self, arm: bool) -> Self {
-        for controls in self.modalities.iter_mut().filter_map(|modality| modality.controls.as_mut()) {
-            controls.arm = arm;
+    pub fn arming(self, arm: bool) -> Self {
+        for controls in self.modalities.iter().filter_map(|modality| modality.controls.as_ref()) {
+            controls.arm_once(arm);
         }
         self
     }

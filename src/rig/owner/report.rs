@@ -2,15 +2,25 @@
 
 use std::sync::Arc;
 
+use tokio::sync::mpsc;
+
 use super::Rig;
-use crate::action::ActuatorNotice;
+use crate::action::{ActuatorNotice, Arming};
 use crate::modality::ModalityId;
 use crate::rig::slot::Input;
-use crate::rig::stream::Report;
+use crate::rig::stream::{Report, Reported};
 use crate::sample::Epoch;
 use crate::status::{Level, What};
 
 impl Rig {
+    /// What streams reported by now: of one that has ended, all of it.
+    pub(super) fn reports_so_far(&mut self, reported: &mut mpsc::Receiver<Reported>) {
+        for _ in 0..reported.len() {
+            let Ok((id, epoch, report)) = reported.try_recv() else { return };
+            self.report(id, epoch, report);
+        }
+    }
+
     pub(super) fn report(&mut self, id: ModalityId, epoch: Epoch, report: Report) {
         // A report may arrive after the end of its stream, whose reason must stay.
         let Some(modality) = self.modality(id).filter(|modality| modality.slot.is_current(epoch)) else { return };
@@ -27,17 +37,12 @@ impl Rig {
                 self.show(id);
                 self.board.announce(What::Log { level: Level::Warn, text });
             }
-            Report::Started => {
-                // From now on it takes an order of its own.
-                if let Some(controls) = &mut modality.controls {
-                    controls.arm = false;
-                }
-                self.apply(id, Input::Started(epoch));
-            }
+            Report::Started => self.apply(id, Input::Started(epoch)),
             Report::Stalled => self.apply(id, Input::Stalled(epoch)),
             Report::Resumed => self.apply(id, Input::Resumed(epoch)),
             Report::Actuator(ActuatorNotice { arming, text, is_problem }) => {
                 modality.detail = format!("{}: {text}", arming.word());
+                modality.arming = Some(arming);
                 let device = modality.spec.name.clone();
                 self.show(id);
                 self.board.announce(What::Actuator { device, bit: id, arming, is_problem, text });
@@ -47,6 +52,18 @@ impl Rig {
                 self.board.announce(What::Log { level: Level::Error, text });
             }
         }
+    }
+
+    /// The stream of a modality has ended, or was told to. What its actuator said last is not so any more:
+    /// nobody hears of it, and nothing is sent to it until the next arm.
+    pub(super) fn lay_down(&mut self, id: ModalityId, is_problem: bool) {
+        let board = Arc::clone(&self.board);
+        let Some(modality) = self.modality(id) else { return };
+        if modality.arming.take().is_none_or(|last| matches!(last, Arming::Disarmed | Arming::Faulted)) {
+            return;
+        }
+        let (device, text) = (modality.spec.name.clone(), "it is commanded no more, until the next arm".to_owned());
+        board.announce(What::Actuator { device, bit: id, arming: Arming::Disarmed, is_problem, text });
     }
 
     pub(super) fn announce_state(&mut self, id: ModalityId) {

@@ -4,9 +4,10 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use futures::channel::mpsc::{UnboundedSender, unbounded};
-use tokio::sync::broadcast;
+use tokio::sync::{broadcast, watch};
 
 use super::*;
+use crate::action::Order;
 use crate::hotplug::HotplugError;
 use crate::registry::scenario::{SimDevice, SimSource};
 use crate::registry::{
@@ -14,6 +15,8 @@ use crate::registry::{
 };
 use crate::rig::presence::{Claim, read_mask};
 use crate::status::Event;
+
+mod actuator;
 
 const CHANNELS: usize = 2;
 /// How long a condition may take before a test gives up; no requirement.
@@ -58,6 +61,7 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
     }
 }
 
+#[derive(Clone, Copy)]
 enum Step {
     /// A unit of the model, which sends this many numbers, is told as attached at a port.
     Plug(&'static str, usize),
@@ -68,12 +72,14 @@ enum Step {
     Silence(&'static str),
     Resume(&'static str),
     Restart(u8),
+    /// The operator gives an order, and the rig has it.
+    Give(Order),
     /// Takes events until this one.
     Until(&'static str),
     /// The mask other processes read becomes this.
     Mask(u64),
 }
-use Step::{Mask, Plug, Pull, Removed, Restart, Resume, Silence, Until};
+use Step::{Give, Mask, Plug, Pull, Removed, Restart, Resume, Silence, Until};
 
 struct Bench {
     hotplug: UnboundedSender<Result<HotplugEvent, HotplugError>>,
@@ -111,6 +117,14 @@ impl Bench {
                 let id = ModalityId::new(*bit).expect("below 64");
                 self.commands.send(RigCommand::Restart(id)).await.expect("rig");
             }
+            Give(order) => {
+                self.commands.send(RigCommand::Order(*order)).await.expect("rig");
+                let begun = Instant::now();
+                while self.commands.capacity() < self.commands.max_capacity() {
+                    assert!(begun.elapsed() < PATIENCE, "nobody takes an order");
+                    tokio::time::sleep(Duration::from_millis(1)).await;
+                }
+            }
             Until(wanted) => loop {
                 let event = timeout(PATIENCE, self.events.recv()).await;
                 let event = event.unwrap_or_else(|_| panic!("no {wanted:?} after {:?}", self.told)).expect("event");
@@ -141,23 +155,28 @@ fn word(what: &What) -> Option<String> {
         What::Detach { device, witness, .. } => Some(format!("{device} gone {witness}")),
         What::State { device, state, .. } => Some(format!("{device} {}", state.word())),
         What::Unregistered { .. } => Some("unused".into()),
+        What::Actuator { device, arming, .. } => Some(format!("{device} {}", arming.word())),
         _ => None,
     }
 }
 
 async fn told(cooldown: Duration, stall_after: Duration, steps: &[Step]) -> Vec<String> {
+    told_of(&registry(cooldown, stall_after), false, steps).await
+}
+
+/// What was told after these steps and to the end of the run, by a rig that is to be armed at the start or not.
+async fn told_of(registry: &Registry, arm: bool, steps: &[Step]) -> Vec<String> {
     static NEXT: AtomicU32 = AtomicU32::new(0);
     let name = format!("owner{}x{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
     let path = PathBuf::from(format!("/dev/shm/rapid_test_mask_{name}"));
-    let registry = registry(cooldown, stall_after);
-    let board = Arc::new(Board::new(&registry));
-    let bus = Bus::open(&registry, Some(&name)).expect("bus");
+    let board = Arc::new(Board::new(registry));
+    let bus = Bus::open(registry, Some(&name)).expect("bus");
     let claim = Claim::new(&path, 2).expect("claim");
     let presence = Presence::start(claim, bus.writer(TopicId::Mask).expect("mask"), Arc::clone(&board)).expect("mask");
     let (hotplug, plugged) = unbounded();
     let (commands, asked) = mpsc::channel(4);
     let stop = CancellationToken::new();
-    let mut rig = Rig::new(&registry, &bus, presence, Arc::clone(&board));
+    let mut rig = Rig::new(registry, &bus, presence, Arc::clone(&board)).arming(arm);
     let mut bench = Bench { hotplug, commands, events: board.events(), units: HashMap::new(), path, told: Vec::new() };
     let running = tokio::spawn({
         let stop = stop.clone();

@@ -264,3 +264,105 @@ fn nothing_is_sent_after_a_stop() {
         assert_eq!(world.stop().len(), 2);
     }
 }
+
+#[test]
+fn motors_that_come_late_are_in_samples_after_a_fault_or_a_disarm() {
+    let mut sample = [0.0; 12];
+    // Armed before the second one had power: the arm fails.
+    let mut world = World::new(spec(vec![motor(1, 0x11, MIT), motor(2, 0x12, MIT)]));
+    world.sims[1].silent = true;
+    world.arm();
+    let fault = world.run_to_fault();
+    assert_eq!(fault, Fault::Silent { motor: 1 });
+    world.run(200);
+    assert_eq!(world.bus.sample(&mut sample), None);
+    // Off again while it is asked: it is told to turn off, as one that may hear.
+    world.sims[1].silent = false;
+    world.run(4);
+    world.sims[1].silent = true;
+    world.run(20);
+    assert!(world.sent.contains(&Order::Disable.frame(2)));
+    world.sims[1].silent = false;
+    world.run(30);
+    assert!(world.bus.sample(&mut sample).is_some());
+    assert!((sample[0] - 0.25).abs() < 1e-3 && (sample[6] - 0.25).abs() < 1e-3, "{sample:?}");
+    assert_eq!(world.bus.state(), BusState::Faulted(fault), "nothing brings it back but an arm");
+    world.arm();
+    world.run_until(BusState::Holding);
+
+    // Disarmed during its first arm, at any moment.
+    for cycles in 0..20 {
+        let mut world = World::new(spec(vec![motor(1, 0x11, MIT), motor(2, 0x12, MIT)]));
+        world.arm();
+        world.run(cycles);
+        world.disarm();
+        world.run_until(BusState::Disarmed);
+        world.run(40);
+        assert!(world.bus.sample(&mut sample).is_some(), "{cycles}");
+        assert!(!world.moved());
+    }
+}
+
+#[test]
+fn a_motor_whose_parameters_cannot_be_used_is_not_asked_for_ever() {
+    let mut world = World::new(spec(vec![motor(1, 0x11, MIT)]));
+    (world.sims[0].mode, world.sims[0].stubborn) = (2, true);
+    world.run_to_fault();
+    world.run(500);
+    assert_eq!(world.notices.iter().filter(|notice| matches!(notice, Notice::Fault(_))).count(), 1);
+}
+
+#[test]
+fn positions_that_the_motor_cannot_count_to_are_a_fault() {
+    for mode in [MIT, MotorMode::PositionVelocity, MotorMode::Velocity] {
+        for position in [[13.0, 14.0], [-20.0, -12.6]] {
+            let mut spec = spec(vec![motor(1, 0x11, mode)]);
+            spec.motors[0].position = position;
+            let mut world = World::new(spec);
+            world.arm();
+            let fault = world.run_to_fault();
+            let expected = Fault::Unusable { motor: 0, parameter: Parameter::PMax, value: Value::Float(12.5) };
+            assert_eq!(fault, expected, "{position:?}");
+            let text = fault.words(world.bus.names()).to_string();
+            assert_eq!(text, "motor joint_1 counts to 12.5 rad, and its `position` lies beyond that");
+        }
+    }
+}
+
+#[test]
+fn motors_that_may_be_on_are_known_after_a_stop() {
+    let still_on = |world: &World| world.bus.still_on().map(str::to_owned).collect::<Vec<_>>();
+    let mut world = World::armed();
+    assert_eq!(still_on(&world), ["joint_1", "joint_2"]);
+    // One of them has no power; what the other said before is no answer.
+    world.sims[1].silent = true;
+    let before = world.sims[0].feedback().unwrap();
+    let frames = world.stop();
+    world.feed(&before, world.now);
+    assert_eq!(still_on(&world), ["joint_1", "joint_2"]);
+    for _ in 0..2 {
+        for frame in &frames {
+            let answers: Vec<_> = world.sims.iter_mut().filter_map(|sim| sim.answer(frame)).collect();
+            answers.iter().for_each(|answer| world.bus.feed(answer, world.now));
+        }
+        // Asked for again, what was said stands.
+        assert_eq!((world.stop().len(), still_on(&world)), (2, vec!["joint_2".to_owned()]));
+    }
+    assert_eq!(world.bus.state(), BusState::Stopped);
+    let mut world = World::armed();
+    world.disarm();
+    world.run_until(BusState::Disarmed);
+    assert_eq!(still_on(&world), [""; 0]);
+}
+
+#[test]
+fn every_motor_has_its_turn_to_be_first() {
+    let mut world = World::ready();
+    let first: Vec<u8> = (0..4)
+        .map(|_| {
+            world.cycle();
+            world.sent[0].data[0]
+        })
+        .collect();
+    assert!(first == [1, 2, 1, 2] || first == [2, 1, 2, 1], "{first:?}");
+}

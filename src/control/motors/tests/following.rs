@@ -270,3 +270,62 @@ fn the_motors_own_modes_have_their_own_frames() {
     assert_eq!(world.bus.state(), BusState::Holding);
     assert_eq!(world.sims[1].command, Some((0x202, 0.0)));
 }
+
+#[test]
+fn one_pause_does_not_make_the_deadman_patient() {
+    let mut world = World::armed();
+    for _ in 0..5 {
+        assert!(world.target(&[0.5, 0.5]));
+        world.run(PERIOD);
+    }
+    // 0.9 s in all, within which it held.
+    world.run(8 * PERIOD);
+    assert_eq!(world.bus.state(), BusState::Holding);
+    assert!(world.target(&[1.0, 1.0]));
+    world.run(2 * PERIOD - 1);
+    assert_eq!(world.bus.state(), BusState::Following);
+    world.cycle();
+    assert_eq!(world.bus.state(), BusState::Holding, "200 ms after the last action");
+}
+
+#[test]
+fn who_is_slow_is_known_by_the_second_action() {
+    let mut world = World::armed();
+    for _ in 0..3 {
+        assert!(world.target(&[0.5, 0.5]));
+        world.run(5 * PERIOD);
+    }
+    assert!(world.target(&[0.5, 0.5]));
+    world.run(10 * PERIOD - 1);
+    assert_eq!(world.bus.state(), BusState::Following, "two actions a second are awaited for a second");
+}
+
+#[test]
+fn two_actions_at_once_do_not_end_the_following() {
+    let mut world = World::armed();
+    world.run(20);
+    let way = Duration::from_millis(12);
+    for ms in [1, 0] {
+        let tick = world.now.before(Duration::from_millis(ms));
+        assert!(world.bus.target(&[0.5, 0.5], tick, world.now));
+    }
+    for _ in 0..10 {
+        world.run(4);
+        let tick = world.now.before(way);
+        assert!(world.bus.target(&[0.5, 0.5], tick, world.now), "12 ms on its way is not too old");
+    }
+}
+
+#[test]
+fn a_velocity_comes_to_rest_where_the_motor_counts_no_further() {
+    let mut world = World::new(spec(vec![motor(1, 0x11, MotorMode::Velocity)]));
+    world.sims[0].ranges = [1.0, 30.0, 10.0];
+    world.run_until(BusState::Disarmed);
+    world.arm();
+    world.run_until(BusState::Holding);
+    for _ in 0..20 {
+        world.target(&[1.5]);
+        world.run(PERIOD);
+    }
+    assert!((world.sims[0].q - 1.0).abs() < 0.01, "{}", world.sims[0].q);
+}

@@ -68,9 +68,9 @@ fn slcan_carries_frames_both_ways() {
     adapter.write_all(b"z\rt0052AABB\r\x07T00000005").unwrap();
     let mut frame = CanFrame::default();
     let before = Stamp::now();
-    let at = link.recv_until(soon(), &mut frame).unwrap().unwrap();
+    let Arrival { at, from_kernel } = link.recv_until(soon(), &mut frame).unwrap().unwrap();
     assert_eq!((frame.id, frame.data()), (5, &[0xaa, 0xbb][..]));
-    assert!(at <= Stamp::now() && at >= before);
+    assert!(at <= Stamp::now() && at >= before && !from_kernel);
     assert_eq!(link.recv_until(Stamp::now(), &mut frame), Ok(None));
     assert_eq!((link.take_refused(), link.take_refused(), link.take_lost()), (1, 0, 0));
     adapter.write_all(b"0\r").unwrap();
@@ -206,6 +206,31 @@ async fn a_task_gets_all_that_waits_and_the_end_after_it() {
     drop(adapter);
     let ended = tokio::time::timeout(Duration::from_secs(10), link.recv(&mut into)).await.unwrap();
     assert_eq!(ended, Err(LinkError::Gone));
+}
+
+#[tokio::test]
+async fn a_task_gets_the_frame_that_came_with_the_end() {
+    let (ours, mut theirs) = std::os::unix::net::UnixStream::pair().unwrap();
+    ours.set_nonblocking(true).unwrap();
+    let mut link = AsyncLink::new(Link::Damiao(Line::stand_in(ours.into()))).unwrap();
+    let mut into = [Received::default(); 4];
+    let frame = CanFrame::standard(0x15, [1, 2, 3, 4, 5, 6, 7, 8]);
+    {
+        // It waits, and finds both at once.
+        let waiting = link.recv(&mut into);
+        tokio::pin!(waiting);
+        tokio::select! {
+            biased;
+            early = &mut waiting => panic!("{early:?}"),
+            () = std::future::ready(()) => {}
+        }
+        theirs.write_all(&received(&frame)).unwrap();
+        drop(theirs);
+        let found = tokio::time::timeout(Duration::from_secs(10), waiting).await.unwrap();
+        assert_eq!(found, Ok(1));
+    }
+    assert_eq!(into[0].frame, frame);
+    assert_eq!(link.recv(&mut into).await, Err(LinkError::Gone));
 }
 
 #[test]

@@ -4,22 +4,24 @@
 //! [`MotorBus`] decide, send. Deadlines are absolute: a late cycle does not shift those after it, and
 //! cycles that were missed are left out.
 //!
-//! Invariant: between two cycles nothing is allocated, locked or logged; a notice is made of text when
-//! something happened.
-//! Invariant: however the thread ends, a panic included, [`Powered`] tells every motor to turn off. A
-//! process that is killed sends nothing: then the motors' own time limit does it.
+//! Invariant: between two cycles nothing is allocated, locked or logged, but for two things: text is made of
+//! what happened, and a sample is handed over by tokio's channel, which allocates room for some dozens where
+//! none is free, and whose reader is woken under a lock of the runtime.
+//! Invariant: however the thread ends, a panic included, [`Powered`] tells every motor to turn off. But after
+//! a panic it waits until each has said that it is off, [`OFF_WITHIN`] at most. A process that is killed sends
+//! nothing: then the motors' own time limit does it.
 
-use std::fmt;
+use std::collections::VecDeque;
 use std::sync::Arc;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::Receiver;
 use std::time::Duration;
 
-use hdrhistogram::Histogram;
 use tokio::sync::mpsc;
 
-use crate::action::{ActuatorNotice, Arming, Order};
+use super::tally::{Punctuality, Tally};
+use crate::action::{ActuatorNotice, Arming, Order, OrderSlot};
 use crate::control::can::CanFrame;
 use crate::control::motors::{BusState, MotorBus, SAMPLE_VALUES};
 use crate::driver::DriverError;
@@ -29,20 +31,26 @@ use crate::realtime::{CONTROL_PRIORITY, use_fifo};
 use crate::registry::{DamiaoSpec, MAX_MOTORS};
 use crate::time::Stamp;
 
-/// Motors are told to turn off so often, at [`AGAIN`] from one another: a frame may be lost.
+/// Motors are told to turn off so often at least, at [`AGAIN`] from one another: a frame may be lost.
 const TURN_OFF: usize = 3;
+/// ...and for this long at most, while one that was on has not said that it is off.
+const OFF_WITHIN: Duration = Duration::from_millis(100);
 /// See [`TURN_OFF`].
 const AGAIN: Duration = Duration::from_millis(5);
 /// Frames taken after the deadline of a cycle: a flooded bus must not keep the motors from their commands.
 const LATE_FRAMES: usize = 64;
-/// Longest time the statistics tell apart, ns.
-const LONGEST: u64 = 10_000_000_000;
+/// Trouble with the bus is told anew when there was none for so long.
+const QUIET: Duration = Duration::from_secs(1);
+/// Texts of it that wait to be told.
+const TROUBLES: usize = 4;
 
 /// State of all motors.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Sample {
     pub(super) captured: Stamp,
-    /// Samples before this one for which there was no room, and frames the adapter lost.
+    /// The kernel stamped all frames that it is made of.
+    pub(super) from_kernel: bool,
+    /// Samples before this one for which there was no room.
     pub(super) lost: u64,
     pub(super) values: [f64; MAX_MOTORS * SAMPLE_VALUES],
 }
@@ -66,49 +74,24 @@ impl Target {
     }
 }
 
-/// What is asked of the thread.
-#[derive(Debug, Clone, Copy)]
-pub(super) enum Request {
-    Target(Target),
-    Order(Order),
-}
-
-/// How well the thread kept its beat.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Punctuality {
-    /// Cycles that were counted.
-    pub cycles: u64,
-    /// How late they began, ms: the median, all but one in a thousand, all.
-    pub late_ms: [f64; 3],
-    /// Actions that commands followed.
-    pub actions: u64,
-    /// From their tick to the first command after it, ms: the median, all but one in a hundred.
-    pub wire_ms: [f64; 2],
-}
-
-impl fmt::Display for Punctuality {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let [p50, p999, max] = self.late_ms;
-        write!(f, "{} cycles of thread `control`: late by p50 {p50:.3} p99.9 {p999:.3} max {max:.3} ms", self.cycles)?;
-        let [p50, p99] = self.wire_ms;
-        match self.actions {
-            0 => Ok(()),
-            actions => write!(f, "; {actions} actions on the wire p50 {p50:.1} p99 {p99:.1} ms after their tick"),
-        }
-    }
-}
-
-/// How the thread is told to end, and why it ended.
+/// What the thread shares with its owner: what it is told, and why it ended.
 #[derive(Debug, Default)]
-pub(super) struct Ending {
+pub(super) struct Shared {
     asked: AtomicBool,
+    pub(super) orders: OrderSlot,
     reason: OnceLock<LinkError>,
     pub(super) punctuality: OnceLock<Punctuality>,
 }
 
-impl Ending {
+impl Shared {
+    /// It is to end.
     pub(super) fn ask(&self) {
         self.asked.store(true, Ordering::Release);
+    }
+
+    /// It gave a reason to end.
+    pub(super) fn has_ended(&self) -> bool {
+        self.reason.get().is_some()
     }
 
     /// Why it ended: it gave a reason, or panicked.
@@ -127,20 +110,54 @@ struct Powered {
 
 impl Drop for Powered {
     fn drop(&mut self) {
+        // After a panic the bus may be half of what it was: it is asked for its frames, and fed no more.
+        let panics = std::thread::panicking();
+        let end = Stamp::now().after(OFF_WITHIN);
         let mut frame = CanFrame::default();
-        for _ in 0..TURN_OFF {
+        let (mut rounds, mut gone, mut off) = (0, false, panics);
+        while rounds < TURN_OFF || !(off || gone || Stamp::now() >= end) {
+            rounds += 1;
             for off in self.bus.stop_frames() {
                 // A bus that is gone has no motors to stop.
                 let _ = self.link.send(&off);
             }
             // Waiting also lets out what the adapter had no room for.
             let until = Stamp::now().after(AGAIN);
-            while let Ok(Some(_)) = self.link.recv_until(until, &mut frame) {
+            loop {
+                match self.link.recv_until(until, &mut frame) {
+                    Ok(Some(arrival)) if !panics => self.bus.feed(&frame, arrival.at),
+                    Ok(Some(_)) | Err(LinkError::BusOff | LinkError::Full) => {}
+                    Ok(None) => break,
+                    Err(_) => {
+                        gone = true;
+                        break;
+                    }
+                }
                 if Stamp::now() >= until {
                     break;
                 }
             }
+            off = panics || self.bus.still_on().next().is_none();
         }
+        if !off {
+            let motors = self.bus.still_on().collect::<Vec<_>>().join(", ");
+            tracing::warn!(
+                motors,
+                "motors were told to turn off and did not say that they are; without commands they stop by their own \
+                 time limit"
+            );
+        }
+    }
+}
+
+/// Something that goes on for a while, and is told when it begins.
+#[derive(Debug, Default)]
+struct Spell(Option<Stamp>);
+
+impl Spell {
+    /// It happens at `now`. Says whether that is news.
+    fn goes_on(&mut self, now: Stamp) -> bool {
+        self.0.replace(now).is_none_or(|last| now.since(last) >= QUIET)
     }
 }
 
@@ -149,42 +166,48 @@ impl Drop for Powered {
 pub(super) struct Beat {
     powered: Powered,
     cycle: Duration,
-    requests: Receiver<Request>,
+    targets: Receiver<Target>,
     samples: mpsc::Sender<Sample>,
     notices: mpsc::Sender<ActuatorNotice>,
-    ending: Arc<Ending>,
-    /// Not told yet.
+    shared: Arc<Shared>,
+    /// Samples for which there was no room, not told yet.
     lost: u64,
+    /// The kernel stamped all frames since the last sample.
+    from_kernel: bool,
     is_bus_off: bool,
+    full: Spell,
+    losing: Spell,
+    /// Trouble with the bus that is not told yet.
+    troubles: VecDeque<String>,
     /// An action that no frame was sent after.
     unsent: Option<Stamp>,
-    /// How late cycles began, ns.
-    lateness: Histogram<u64>,
-    /// From the tick of an action to the first command after it, ns.
-    latency: Histogram<u64>,
+    tally: Tally,
 }
 
 impl Beat {
     pub(super) fn new(
         link: Link,
         spec: &DamiaoSpec,
-        requests: Receiver<Request>,
+        targets: Receiver<Target>,
         samples: mpsc::Sender<Sample>,
         notices: mpsc::Sender<ActuatorNotice>,
-        ending: Arc<Ending>,
+        shared: Arc<Shared>,
     ) -> Self {
         Self {
             powered: Powered { link, bus: MotorBus::new(spec, Stamp::now()) },
             cycle: Duration::from_secs(1) / spec.hz.max(1),
-            requests,
+            targets,
             samples,
             notices,
-            ending,
+            shared,
             lost: 0,
+            from_kernel: true,
             is_bus_off: false,
+            full: Spell::default(),
+            losing: Spell::default(),
+            troubles: VecDeque::with_capacity(TROUBLES),
             unsent: None,
-            lateness: statistics(),
-            latency: statistics(),
+            tally: Tally::new(),
         }
     }
 
@@ -198,11 +221,16 @@ impl Beat {
         }
         let end = self.beat();
         if let Err(error) = &end {
-            let _ = self.ending.reason.set(error.clone());
+            let _ = self.shared.reason.set(error.clone());
         }
-        let punctuality = self.punctuality();
+        // What happened in the last cycle.
+        self.tell();
+        let punctuality = self.tally.punctuality();
         tracing::info!("{punctuality}");
-        let _ = self.ending.punctuality.set(punctuality);
+        if let Some(mishaps) = self.tally.mishaps(&self.powered.bus.counts()) {
+            tracing::info!("of thread `control`: {mishaps}");
+        }
+        let _ = self.shared.punctuality.set(punctuality);
         // Before the channels close: who sees that they did may exit.
         let Self { powered, samples, notices, .. } = self;
         drop(powered);
@@ -211,12 +239,12 @@ impl Beat {
 
     fn beat(&mut self) -> Result<(), LinkError> {
         let mut due = Stamp::now().after(self.cycle);
-        while !self.ending.asked.load(Ordering::Acquire) {
+        while !self.shared.asked.load(Ordering::Acquire) {
             fault::point("control");
             self.listen(due)?;
             let now = Stamp::now();
-            self.lateness.saturating_record(now.0.saturating_sub(due.0));
-            self.take_requests(now);
+            self.tally.late(now.0.saturating_sub(due.0));
+            self.take_orders(now);
             self.step(now)?;
             self.tell();
             due = due.after(self.cycle);
@@ -235,35 +263,42 @@ impl Beat {
         let mut late = 0;
         while late < LATE_FRAMES {
             match self.powered.link.recv_until(due, &mut frame) {
-                Ok(Some(at)) => {
+                Ok(Some(arrival)) => {
                     self.is_bus_off = false;
-                    self.powered.bus.feed(&frame, at);
+                    self.from_kernel &= arrival.from_kernel;
+                    self.powered.bus.feed(&frame, arrival.at);
                     self.sample();
                 }
                 Ok(None) => break,
-                Err(LinkError::BusOff) => self.bus_off(),
+                Err(LinkError::BusOff) => self.bus_off()?,
                 Err(error) => return Err(error),
             }
             if Stamp::now() >= due {
                 late += 1;
             }
         }
-        self.lost += self.powered.link.take_lost();
+        let link = &mut self.powered.link;
+        self.tally.unsent += link.take_refused();
+        let lost = link.take_lost();
+        self.tally.lost_frames += lost;
+        if lost > 0 && self.losing.goes_on(Stamp::now()) {
+            self.complain("frames of the bus are lost before they can be read".to_owned());
+        }
         Ok(())
     }
 
-    fn take_requests(&mut self, now: Stamp) {
+    fn take_orders(&mut self, now: Stamp) {
         let bus = &mut self.powered.bus;
-        while let Ok(request) = self.requests.try_recv() {
-            match request {
-                Request::Order(Order::Arm) => bus.arm(now),
-                Request::Order(Order::Disarm) => bus.disarm(now),
-                Request::Target(target) => {
-                    let values = target.values.get(..target.count).unwrap_or_default();
-                    if bus.target(values, target.tick, now) {
-                        self.unsent = Some(target.tick);
-                    }
-                }
+        for order in self.shared.orders.take() {
+            match order {
+                Order::Arm => bus.arm(now),
+                Order::Disarm => bus.disarm(now),
+            }
+        }
+        while let Ok(target) = self.targets.try_recv() {
+            let values = target.values.get(..target.count).unwrap_or_default();
+            if bus.target(values, target.tick, now) {
+                self.unsent = Some(target.tick);
             }
         }
     }
@@ -271,15 +306,19 @@ impl Beat {
     fn step(&mut self, now: Stamp) -> Result<(), LinkError> {
         let Powered { link, bus } = &mut self.powered;
         let mut end = None;
-        let mut sent = false;
+        let (mut sent, mut full) = (false, 0);
         bus.step(now, |frame| match link.send(&frame) {
             Ok(()) => sent = true,
             // The motor is not answered for, and is said to be silent if that lasts.
-            Err(LinkError::Full | LinkError::BusOff) => {}
+            Err(LinkError::Full | LinkError::BusOff) => full += 1,
             Err(error) => end = Some(error),
         });
         if sent && let Some(tick) = self.unsent.take() {
-            self.latency.saturating_record(Stamp::now().0.saturating_sub(tick.0));
+            self.tally.on_the_wire(Stamp::now().0.saturating_sub(tick.0));
+        }
+        self.tally.full += full;
+        if full > 0 && self.full.goes_on(now) {
+            self.complain(LinkError::Full.to_string());
         }
         end.map_or(Ok(()), Err)
     }
@@ -290,46 +329,43 @@ impl Beat {
         let mut values = [0.0; MAX_MOTORS * SAMPLE_VALUES];
         let count = bus.names().len() * SAMPLE_VALUES;
         let Some(captured) = values.get_mut(..count).and_then(|values| bus.sample(values)) else { return };
-        match self.samples.try_send(Sample { captured, lost: self.lost, values }) {
-            Ok(()) => self.lost = 0,
-            Err(_) => self.lost += 1,
+        let from_kernel = std::mem::replace(&mut self.from_kernel, true);
+        if self.samples.try_send(Sample { captured, from_kernel, lost: self.lost, values }).is_ok() {
+            self.lost = 0;
+        } else {
+            self.lost += 1;
+            self.tally.lost_samples += 1;
         }
     }
 
-    fn bus_off(&mut self) {
+    /// The adapter left the bus. One that does not return by itself has to be opened again.
+    fn bus_off(&mut self) -> Result<(), LinkError> {
         if !std::mem::replace(&mut self.is_bus_off, true) {
-            let arming = arming(self.powered.bus.state());
-            let notice = ActuatorNotice { arming, text: LinkError::BusOff.to_string(), is_problem: true };
-            let _ = self.notices.try_send(notice);
+            self.complain(LinkError::BusOff.to_string());
+        }
+        if self.powered.link.restarts() { Ok(()) } else { Err(LinkError::BusOff) }
+    }
+
+    fn complain(&mut self, text: String) {
+        if self.troubles.len() < TROUBLES {
+            self.troubles.push_back(text);
         }
     }
 
+    /// Tells what happened, as far as there is room; the rest waits.
     fn tell(&mut self) {
         let bus = &mut self.powered.bus;
-        while let Some(notice) = bus.take_notice() {
-            let text = notice.words(bus.names()).to_string();
-            let notice = ActuatorNotice { arming: arming(bus.state()), text, is_problem: notice.is_problem() };
-            if self.notices.try_send(notice).is_err() {
-                break;
-            }
+        while let Ok(place) = self.notices.try_reserve() {
+            let (text, is_problem) = if let Some(text) = self.troubles.pop_front() {
+                (text, true)
+            } else if let Some(notice) = bus.take_notice() {
+                (notice.words(bus.names()).to_string(), notice.is_problem())
+            } else {
+                return;
+            };
+            place.send(ActuatorNotice { arming: arming(bus.state()), text, is_problem });
         }
     }
-
-    fn punctuality(&self) -> Punctuality {
-        let ms = |histogram: &Histogram<u64>, quantile| histogram.value_at_quantile(quantile) as f64 / 1e6;
-        Punctuality {
-            cycles: self.lateness.len(),
-            late_ms: [0.5, 0.999, 1.0].map(|quantile| ms(&self.lateness, quantile)),
-            actions: self.latency.len(),
-            wire_ms: [0.5, 0.99].map(|quantile| ms(&self.latency, quantile)),
-        }
-    }
-}
-
-fn statistics() -> Histogram<u64> {
-    // Its bounds are in range: the highest is more than twice the lowest, the digits at most 5.
-    #[expect(clippy::expect_used, reason = "constants, checked by a test")]
-    Histogram::new_with_bounds(1, LONGEST, 2).expect("bounds of a histogram")
 }
 
 const fn arming(state: BusState) -> Arming {
@@ -339,17 +375,5 @@ const fn arming(state: BusState) -> Arming {
         BusState::Following => Arming::Armed,
         BusState::Holding => Arming::Holding,
         BusState::Faulted(_) => Arming::Faulted,
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_bounds_of_the_statistics_are_ones() {
-        let mut statistics = statistics();
-        statistics.saturating_record(u64::MAX);
-        assert_eq!(statistics.len(), 1);
     }
 }

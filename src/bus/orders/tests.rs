@@ -1,0 +1,95 @@
+//! Orders and what becomes of them, by clients that wait and clients that are gone.
+
+use iceoryx2::port::client::Client;
+
+use super::*;
+use Order::{Arm, Disarm};
+
+const PATIENCE: Duration = Duration::from_secs(30);
+
+fn open(test: &str) -> (String, Node<Service>, Orders) {
+    let instance = format!("orders{test}{}", std::process::id());
+    let node = NodeBuilder::new().config(&config(Some(&instance)).expect("config")).create::<Service>().expect("node");
+    let orders = Orders::open(&node).expect("orders");
+    (instance, node, orders)
+}
+
+fn client(node: &Node<Service>) -> Client<Service, u8, (), u8, ()> {
+    service(node).expect("service").client_builder().create().expect("client")
+}
+
+fn taken(orders: &Orders) -> Vec<Order> {
+    let mut taken = Vec::new();
+    orders
+        .hand_over(&mut |order| {
+            taken.push(order);
+            Ok::<(), ()>(())
+        })
+        .expect("they are taken");
+    taken
+}
+
+#[test]
+fn an_order_that_is_taken_is_answered() {
+    let (instance, _node, orders) = open("a");
+    for order in [Arm, Disarm] {
+        let given = std::thread::spawn({
+            let instance = instance.clone();
+            move || give(Some(&instance), order).expect("the bus")
+        });
+        let (begun, mut all) = (Instant::now(), Vec::new());
+        while all.is_empty() {
+            all.extend(taken(&orders));
+            assert!(begun.elapsed() < PATIENCE, "{order:?} does not arrive");
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        assert_eq!(all, [order]);
+        assert!(given.join().expect("no panic"), "{order:?} was taken, and its client is told so");
+    }
+}
+
+#[test]
+fn an_arm_whose_client_is_gone_is_not_carried_out_and_a_disarm_is() {
+    let (_, node, orders) = open("b");
+    let client = client(&node);
+    for (request, wanted) in [(1, &[][..]), (0, &[Disarm]), (7, &[])] {
+        drop(client.send_copy(request).expect("it is sent"));
+        assert_eq!(taken(&orders), wanted, "{request}");
+    }
+    // The whole program is gone.
+    let other = self::client(&node);
+    drop(other.send_copy(1).expect("it is sent"));
+    drop(other);
+    assert_eq!(taken(&orders), []);
+    // One that waits is heard after them.
+    let waiting = client.send_copy(1).expect("it is sent");
+    assert_eq!(taken(&orders), [Arm]);
+    assert_eq!(waiting.receive().expect("the bus").map(|answer| *answer), Some(1));
+}
+
+#[test]
+fn orders_of_before_the_device_was_there_are_not_for_it() {
+    let (_, node, orders) = open("c");
+    assert!(!orders.discard());
+    let client = client(&node);
+    for (request, is_order) in [(0, true), (1, true), (9, false)] {
+        let waiting = client.send_copy(request).expect("it is sent");
+        assert_eq!(orders.discard(), is_order, "{request}");
+        assert_eq!(taken(&orders), []);
+        assert!(waiting.receive().expect("the bus").is_none(), "{request} counts as given");
+    }
+    drop(client.send_copy(1).expect("it is sent"));
+    assert!(orders.discard(), "an order is one when its client is gone, too");
+}
+
+#[test]
+fn an_order_that_the_actuator_does_not_take_is_not_answered() {
+    let (_, node, orders) = open("d");
+    let client = client(&node);
+    let first = client.send_copy(1).expect("it is sent");
+    let second = client.send_copy(0).expect("it is sent");
+    assert_eq!(orders.hand_over(&mut |_| Err("no")), Err("no"));
+    assert_eq!(taken(&orders), [Disarm]);
+    assert!(first.receive().expect("the bus").is_none());
+    assert!(second.receive().expect("the bus").is_some());
+}

@@ -1,0 +1,124 @@
+//! What thread `control` counts: how well it kept its beat, and what went wrong.
+
+use std::fmt;
+
+use hdrhistogram::Histogram;
+
+use crate::control::motors::Counts;
+
+/// Longest time the statistics tell apart, ns.
+const LONGEST: u64 = 10_000_000_000;
+
+/// How well the thread kept its beat.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Punctuality {
+    /// Cycles that were counted.
+    pub cycles: u64,
+    /// How late they began, ms: the median, all but one in a thousand, all.
+    pub late_ms: [f64; 3],
+    /// Actions that commands followed.
+    pub actions: u64,
+    /// From their tick to the first command after it, ms: the median, all but one in a hundred.
+    pub wire_ms: [f64; 2],
+}
+
+impl fmt::Display for Punctuality {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let [p50, p999, max] = self.late_ms;
+        write!(f, "{} cycles of thread `control`: late by p50 {p50:.3} p99.9 {p999:.3} max {max:.3} ms", self.cycles)?;
+        let [p50, p99] = self.wire_ms;
+        match self.actions {
+            0 => Ok(()),
+            actions => write!(f, "; {actions} actions on the wire p50 {p50:.1} p99 {p99:.1} ms after their tick"),
+        }
+    }
+}
+
+/// See the module's comment.
+#[derive(Debug)]
+pub(super) struct Tally {
+    /// How late cycles began, ns.
+    lateness: Histogram<u64>,
+    /// From the tick of an action to the first command after it, ns.
+    latency: Histogram<u64>,
+    /// Frames that were lost before they could be read.
+    pub(super) lost_frames: u64,
+    /// Frames for which there was no room to the bus.
+    pub(super) full: u64,
+    /// Frames that the adapter took and said it did not send.
+    pub(super) unsent: u64,
+    /// Samples that nobody read in time.
+    pub(super) lost_samples: u64,
+}
+
+impl Tally {
+    pub(super) fn new() -> Self {
+        let (lateness, latency) = (statistics(), statistics());
+        Self { lateness, latency, lost_frames: 0, full: 0, unsent: 0, lost_samples: 0 }
+    }
+
+    /// A cycle began so late.
+    pub(super) fn late(&mut self, ns: u64) {
+        self.lateness.saturating_record(ns);
+    }
+
+    /// An action was so old when the first command after it was sent.
+    pub(super) fn on_the_wire(&mut self, ns: u64) {
+        self.latency.saturating_record(ns);
+    }
+
+    pub(super) fn punctuality(&self) -> Punctuality {
+        let ms = |histogram: &Histogram<u64>, quantile| histogram.value_at_quantile(quantile) as f64 / 1e6;
+        Punctuality {
+            cycles: self.lateness.len(),
+            late_ms: [0.5, 0.999, 1.0].map(|quantile| ms(&self.lateness, quantile)),
+            actions: self.latency.len(),
+            wire_ms: [0.5, 0.99].map(|quantile| ms(&self.latency, quantile)),
+        }
+    }
+
+    /// What went wrong, with what the motors' bus counted, for people; `None` if nothing did.
+    pub(super) fn mishaps(&self, bus: &Counts) -> Option<String> {
+        let all = [
+            (bus.faults, "faults"),
+            (bus.refused, "actions refused"),
+            (bus.clamped, "values beyond their limits"),
+            (self.full, "frames without room to the bus"),
+            (self.unsent, "frames that the adapter did not send"),
+            (self.lost_frames, "frames lost before they were read"),
+            (bus.strangers, "frames of no motor of the entry"),
+            (self.lost_samples, "samples that nobody read in time"),
+            (bus.lost_notices, "notices that nobody read in time"),
+        ];
+        let counted = all.iter().filter(|(count, _)| *count > 0).map(|(count, what)| format!("{count} {what}"));
+        let counted = counted.collect::<Vec<_>>().join(", ");
+        (!counted.is_empty()).then_some(counted)
+    }
+}
+
+fn statistics() -> Histogram<u64> {
+    // Its bounds are in range: the highest is more than twice the lowest, the digits at most 5.
+    #[expect(clippy::expect_used, reason = "constants, checked by a test")]
+    Histogram::new_with_bounds(1, LONGEST, 2).expect("bounds of a histogram")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_bounds_of_the_statistics_are_ones() {
+        let mut tally = Tally::new();
+        tally.late(u64::MAX);
+        assert_eq!(tally.punctuality().cycles, 1);
+    }
+
+    #[test]
+    fn what_did_not_happen_is_not_told() {
+        let mut tally = Tally::new();
+        assert_eq!(tally.mishaps(&Counts::default()), None);
+        tally.full = 3;
+        let bus = Counts { actions: 9, faults: 1, ..Counts::default() };
+        assert_eq!(tally.mishaps(&bus).as_deref(), Some("1 faults, 3 frames without room to the bus"));
+    }
+}

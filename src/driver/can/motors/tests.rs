@@ -1,0 +1,244 @@
+//! Thread `control` over a pair of UDP sockets that stands in for a bus, see `socket/tests.rs`, with motors
+//! that answer at the other end.
+
+use std::net::UdpSocket;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::thread;
+use std::time::Duration;
+
+use tokio::time::{Instant, interval, timeout};
+
+use super::*;
+use crate::action::Arming;
+use crate::control::can::CanFrame;
+use crate::control::damiao::codec::{self, Feedback, MotorStatus, Ranges};
+use crate::control::damiao::parameter::{Parameter, Reply, Value};
+use crate::driver::can::link::tests::damiao_link;
+use crate::driver::can::socket::tests::{bus, bytes};
+use crate::registry::{MotorKind, MotorMode, MotorSpec};
+
+/// The longest that a condition is waited for.
+const PATIENCE: Duration = Duration::from_secs(20);
+
+fn spec(count: u16, hz: u32) -> DamiaoSpec {
+    let motor = |slave: u16| MotorSpec {
+        name: format!("joint{slave}"),
+        slave,
+        master: 0x10 + slave,
+        kind: MotorKind::Dm4310,
+        mode: MotorMode::Mit { kp: 10.0, kd: 1.0 },
+        position: [-1.0, 1.0],
+        velocity: 5.0,
+        torque: 5.0,
+        slew: 5.0,
+        max_mos: 80.0,
+        max_rotor: 80.0,
+    };
+    DamiaoSpec {
+        motors: (1..=count).map(motor).collect(),
+        hz,
+        deadman: None,
+        disable_after: Duration::from_secs(60),
+        timeout: Duration::from_millis(400),
+        // A busy machine is slower than a bus.
+        silent_after: Duration::from_secs(2),
+    }
+}
+
+/// What befalls the motors.
+#[derive(Debug, Default)]
+struct Fate {
+    /// Orders to turn off that are lost.
+    deaf_to: AtomicU32,
+    is_on: AtomicBool,
+    ends: AtomicBool,
+}
+
+/// One motor that answers at `bus`; gives the bus back when it ends.
+fn motor(bus: UdpSocket) -> (Arc<Fate>, thread::JoinHandle<UdpSocket>) {
+    let fate = Arc::<Fate>::default();
+    bus.set_read_timeout(Some(Duration::from_millis(5))).unwrap();
+    let thread = thread::spawn({
+        let fate = Arc::clone(&fate);
+        move || {
+            while !fate.ends.load(Ordering::Acquire) {
+                let mut raw = [0; 17];
+                if !matches!(bus.recv(&mut raw), Ok(16)) {
+                    continue;
+                }
+                let id = u16::from_ne_bytes([raw[0], raw[1]]);
+                let frame = CanFrame::standard(id, raw[8..16].try_into().unwrap());
+                // Who is not there to hear it is the thread, which has ended.
+                let _ = bus.send(&bytes(&answer(&frame, &fate)));
+            }
+            bus
+        }
+    });
+    (fate, thread)
+}
+
+fn answer(frame: &CanFrame, fate: &Fate) -> CanFrame {
+    const SLAVE: u16 = 1;
+    if frame.id == 0x7ff && frame.data[2] != 0xcc {
+        let parameter = Parameter::from_rid(frame.data[3]).unwrap();
+        let value = match parameter {
+            Parameter::PMax => Value::Float(12.5),
+            Parameter::VMax => Value::Float(30.0),
+            Parameter::TMax => Value::Float(10.0),
+            Parameter::ControlMode => Value::Whole(1),
+            _ => Value::Whole(8000),
+        };
+        return Reply { slave: SLAVE, written: frame.data[2] == 0x55, parameter, value }.encode(0x11);
+    }
+    if *frame == codec::Order::Enable.frame(SLAVE) {
+        fate.is_on.store(true, Ordering::Release);
+    }
+    if *frame == codec::Order::Disable.frame(SLAVE)
+        && fate.deaf_to.fetch_update(Ordering::AcqRel, Ordering::Acquire, |left| left.checked_sub(1)).is_err()
+    {
+        fate.is_on.store(false, Ordering::Release);
+    }
+    let status = if fate.is_on.load(Ordering::Acquire) { MotorStatus::Enabled } else { MotorStatus::Disabled };
+    let feedback = Feedback { id: 1, status, q: 0.5, dq: 0.0, tau: 0.1, mos: 40, rotor: 41 };
+    feedback.encode(0x11, &Ranges::new(12.5, 30.0, 10.0).unwrap()).unwrap()
+}
+
+/// Takes notices until one is as `wanted`.
+async fn told(motors: &mut Motors, wanted: impl Fn(&ActuatorNotice) -> bool) -> ActuatorNotice {
+    let mut ticks = interval(Duration::from_millis(1));
+    let mut all = Vec::new();
+    let begun = Instant::now();
+    loop {
+        ticks.tick().await;
+        while let Some(notice) = motors.take_notice() {
+            if wanted(&notice) {
+                return notice;
+            }
+            all.push(notice);
+        }
+        assert!(begun.elapsed() < PATIENCE, "not told; {all:?}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_bus_off_without_a_return_is_told_and_ends_the_driver() {
+    let (link, bus) = bus();
+    let mut motors = Motors::start(link, &spec(1, 200)).unwrap();
+    bus.send(&bytes(&CanFrame { id: 0x40, error: true, len: 8, ..CanFrame::default() })).unwrap();
+    let ended = timeout(PATIENCE, motors.read()).await.expect("it ends");
+    assert!(matches!(ended, Err(DriverError::Retry(text)) if text.contains("bus-off")));
+    let notice = told(&mut motors, |notice| notice.text.contains("bus-off")).await;
+    assert!(notice.is_problem && notice.arming == Arming::Disarmed, "{notice:?}");
+    assert!(motors.order(Order::Arm).is_err(), "nobody is there to take it");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_bus_without_room_is_told() {
+    // Nobody reads at the other end.
+    let (link, _adapter) = damiao_link();
+    let mut motors = Motors::start(link, &spec(10, 1000)).unwrap();
+    let notice = told(&mut motors, |notice| notice.text.contains("the queue to the bus is full")).await;
+    assert!(notice.is_problem, "{notice:?}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn there_is_room_for_an_order_where_there_is_none_for_actions() {
+    let (link, bus) = bus();
+    let (fate, thread) = motor(bus);
+    let mut motors = Motors::start(link, &spec(1, 10)).unwrap();
+    told(&mut motors, |notice| notice.text.contains("all motors have answered")).await;
+    let full = loop {
+        // 64 in a cycle of a tenth of a second.
+        if let Err(error) = motors.command(&[0.5], Stamp::now()) {
+            break error;
+        }
+    };
+    assert!(full.to_string().contains("behind"), "{full}");
+    motors.order(Order::Arm).unwrap();
+    told(&mut motors, |notice| notice.arming == Arming::Holding).await;
+    // The last word counts, and a disarm is always one.
+    motors.order(Order::Disarm).unwrap();
+    motors.order(Order::Arm).unwrap();
+    told(&mut motors, |notice| notice.text == "motors are being armed").await;
+    told(&mut motors, |notice| notice.arming == Arming::Holding).await;
+    motors.order(Order::Arm).unwrap();
+    motors.order(Order::Disarm).unwrap();
+    told(&mut motors, |notice| notice.text == "motors are disabled").await;
+    assert!(!fate.is_on.load(Ordering::Acquire));
+    motors.close().await;
+    fate.ends.store(true, Ordering::Release);
+    thread.join().unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn notices_wait_for_room() {
+    const COUNT: usize = NOTICES + 30;
+    let (link, _bus) = bus();
+    let mut motors = Motors::start(link, &spec(1, 1000)).unwrap();
+    let begun = Instant::now();
+    for at in 0..2 * COUNT {
+        let target = if at % 2 == 0 { f64::NAN } else { 0.0 };
+        while motors.command(&[target], Stamp::now()).is_err() {
+            assert!(begun.elapsed() < PATIENCE, "actions are not taken");
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+    }
+    for _ in 0..COUNT {
+        told(&mut motors, |notice| notice.text.contains("not finite")).await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_motor_that_misses_orders_is_told_to_turn_off_until_it_says_that_it_is() {
+    let (link, bus) = bus();
+    let (fate, thread) = motor(bus);
+    let mut motors = Motors::start(link, &spec(1, 200)).unwrap();
+    motors.order(Order::Arm).unwrap();
+    told(&mut motors, |notice| notice.arming == Arming::Holding).await;
+    assert!(fate.is_on.load(Ordering::Acquire));
+    fate.deaf_to.store(6, Ordering::Release);
+    motors.close().await;
+    assert!(!fate.is_on.load(Ordering::Acquire));
+    fate.ends.store(true, Ordering::Release);
+    thread.join().unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_time_of_a_sample_is_the_kernels_only_where_it_stamped_all_frames() {
+    let (link, bus) = bus();
+    let (fate, thread) = motor(bus);
+    let mut motors = Motors::start(link, &spec(1, 200)).unwrap();
+    // The kernel begins to stamp a moment after it is asked to.
+    let begun = Instant::now();
+    while timeout(PATIENCE, motors.read()).await.expect("a sample").unwrap().flags != FLAG_DEVICE_TIME {
+        assert!(begun.elapsed() < PATIENCE, "no sample has the kernel's time");
+    }
+    motors.close().await;
+    fate.ends.store(true, Ordering::Release);
+    thread.join().unwrap();
+
+    let (link, mut line) = damiao_link();
+    let mut motors = Motors::start(link, &spec(1, 200)).unwrap();
+    let fate = Arc::<Fate>::default();
+    let thread = thread::spawn({
+        let fate = Arc::clone(&fate);
+        move || {
+            use std::io::{Read as _, Write as _};
+            let mut sent = [0; 30];
+            // Until the line hangs up.
+            while line.read_exact(&mut sent).is_ok() {
+                let frame =
+                    CanFrame::standard(u16::from_le_bytes([sent[13], sent[14]]), sent[21..29].try_into().unwrap());
+                let told = crate::driver::can::link::tests::received(&answer(&frame, &fate));
+                if line.write_all(&told).is_err() {
+                    return;
+                }
+            }
+        }
+    });
+    for _ in 0..5 {
+        assert_eq!(timeout(PATIENCE, motors.read()).await.expect("a sample").unwrap().flags, 0);
+    }
+    motors.close().await;
+    thread.join().unwrap();
+}
