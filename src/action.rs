@@ -106,7 +106,9 @@ mod tests {
             (&[Arm, Disarm, Arm, Arm], &[Disarm, Arm]),
             (&[Disarm, Arm, Disarm], &[Disarm]),
         ] {
-            given.iter().for_each(|order| slot.give(*order));
+            for order in given {
+                slot.give(*order);
+            }
             assert_eq!(slot.take().collect::<Vec<_>>(), taken, "{given:?}");
             assert_eq!(slot.take().count(), 0);
         }

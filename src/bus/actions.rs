@@ -42,6 +42,7 @@ impl Actions {
 
     /// Forgets orders and actions that were meant for a device before this one; says whether there was an
     /// order.
+    #[must_use]
     pub fn discard(&self) -> bool {
         let _ = self.newest(&mut [0.0; MAX_ACTION]);
         self.orders.discard()

@@ -4,7 +4,7 @@
 //! |-----------|--------------------------------|--------------------------------------------------|
 //! | Probing   | disabled, parameters are read  | Disarmed, when all have answered                 |
 //! | Disarmed  | disabled, positions stream     | Arming, when asked                               |
-//! | Arming    | read, cleared, enabled         | Holding, when all are enabled; Faulted after 1 s |
+//! | Arming    | read, cleared, enabled         | Holding, when all are enabled; Faulted, when not |
 //! | Following | go where actions say           | Holding, without a fresh action                  |
 //! | Holding   | stay                           | Following; Disabling, after a while              |
 //! | Disabling | told to turn off               | Disarmed, when all have said so                  |

@@ -9,8 +9,10 @@ use crate::control::deadman::Verdict;
 use crate::registry::MotorMode;
 use crate::time::Stamp;
 
-/// An arm that took longer has failed. Reading the parameters takes a cycle each.
+/// An arm that took longer has failed...
 const ARM_WITHIN: Duration = Duration::from_secs(1);
+/// ...and more cycles: to read a parameter takes one, to set it another, and answers may take several.
+const ARM_CYCLES: u32 = 40;
 /// Motors that have not told their parameters after this are told of.
 const PROBE_WITHIN: Duration = Duration::from_secs(1);
 /// Motors that answer have to turn off within this.
@@ -118,7 +120,7 @@ impl MotorBus {
             self.line.restart(&self.commands);
             self.hold(now);
             self.notices.tell(Notice::Armed);
-        } else if waited >= ARM_WITHIN
+        } else if waited >= ARM_WITHIN.max(self.cycle * ARM_CYCLES)
             && let Some(fault) = self.motors.iter().find_map(Motor::arm_fault)
         {
             self.fail(fault, now);

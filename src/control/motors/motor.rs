@@ -68,6 +68,7 @@ fn within([low, high]: [f64; 2], range: f64) -> [f64; 2] {
 
 /// See the module's comment.
 #[derive(Debug)]
+#[expect(clippy::struct_excessive_bools, reason = "each is a fact of its own about the motor")]
 pub(super) struct Motor {
     pub(super) spec: MotorSpec,
     pub(super) phase: Phase,

@@ -343,7 +343,9 @@ fn motors_that_may_be_on_are_known_after_a_stop() {
     for _ in 0..2 {
         for frame in &frames {
             let answers: Vec<_> = world.sims.iter_mut().filter_map(|sim| sim.answer(frame)).collect();
-            answers.iter().for_each(|answer| world.bus.feed(answer, world.now));
+            for answer in &answers {
+                world.bus.feed(answer, world.now);
+            }
         }
         // Asked for again, what was said stands.
         assert_eq!((world.stop().len(), still_on(&world)), (2, vec!["joint_2".to_owned()]));
@@ -365,4 +367,19 @@ fn every_motor_has_its_turn_to_be_first() {
         })
         .collect();
     assert!(first == [1, 2, 1, 2] || first == [2, 1, 2, 1], "{first:?}");
+}
+
+#[test]
+fn an_arm_has_time_for_all_its_cycles() {
+    let mut slow = spec(vec![motor(1, 0x11, MIT)]);
+    (slow.hz, slow.silent_after) = (10, Duration::from_secs(1));
+    let mut world = World::new(slow);
+    world.sims[0].mode = 2;
+    world.latency = 1;
+    world.arm();
+    while world.bus.state() == BusState::Arming {
+        world.now = world.now.after(Duration::from_millis(95));
+        world.cycle();
+    }
+    assert_eq!(world.bus.state(), BusState::Holding);
 }

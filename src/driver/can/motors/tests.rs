@@ -38,7 +38,7 @@ fn spec(count: u16, hz: u32) -> DamiaoSpec {
         motors: (1..=count).map(motor).collect(),
         hz,
         deadman: None,
-        disable_after: Duration::from_secs(60),
+        disable_after: Duration::from_mins(1),
         timeout: Duration::from_millis(400),
         // A busy machine is slower than a bus.
         silent_after: Duration::from_secs(2),
@@ -217,7 +217,7 @@ async fn the_time_of_a_sample_is_the_kernels_only_where_it_stamped_all_frames() 
     fate.ends.store(true, Ordering::Release);
     thread.join().unwrap();
 
-    let (link, mut line) = damiao_link();
+    let (link, mut adapter) = damiao_link();
     let mut motors = Motors::start(link, &spec(1, 200)).unwrap();
     let fate = Arc::<Fate>::default();
     let thread = thread::spawn({
@@ -226,11 +226,11 @@ async fn the_time_of_a_sample_is_the_kernels_only_where_it_stamped_all_frames() 
             use std::io::{Read as _, Write as _};
             let mut sent = [0; 30];
             // Until the line hangs up.
-            while line.read_exact(&mut sent).is_ok() {
+            while adapter.read_exact(&mut sent).is_ok() {
                 let frame =
                     CanFrame::standard(u16::from_le_bytes([sent[13], sent[14]]), sent[21..29].try_into().unwrap());
                 let told = crate::driver::can::link::tests::received(&answer(&frame, &fate));
-                if line.write_all(&told).is_err() {
+                if adapter.write_all(&told).is_err() {
                     return;
                 }
             }

@@ -63,11 +63,12 @@ async fn an_arm_at_the_start_is_given_once() {
             [&UP[..], &["a gone kernel", "a disarmed", "a absent"], &again, &["a disarmed"]].concat(),
         ),
         (
-            "not when the stream is opened again",
+            "not after an unplug that its stream saw first",
             true,
             plug()
                 .into_iter()
-                .chain([Pull("1"), Until("a absent"), Plug("1", NUMBERS), Until("a streaming")])
+                .chain([Pull("1"), Until("a absent"), Removed("1", Witness::Kernel)])
+                .chain(plug())
                 .collect(),
             [&UP[..], &["a gone stream", "a disarmed", "a absent"], &again, &["a disarmed"]].concat(),
         ),
