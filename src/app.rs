@@ -25,6 +25,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::action::Order;
 use crate::bus::{Bus, BusError, TopicId};
+use crate::driver;
 use crate::fault;
 use crate::headless::style::ColourChoice;
 use crate::headless::{self, HeadlessOptions};
@@ -186,10 +187,13 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     let recorder = Recorder::spawn(bus.inbox()?, RecorderConfig::new(Arc::clone(&registry), Arc::clone(&board)))?;
     // Before the screen: what fails until here is said on an ordinary terminal.
     let hotplug: HotplugStream = match options.devices {
-        Devices::Machine => match LanMonitor::open(&registry) {
-            Some(lan) => Box::pin(futures::stream::select(UdevMonitor::open()?, lan)),
-            None => Box::pin(UdevMonitor::open()?),
-        },
+        Devices::Machine => {
+            driver::can::prepare(&registry);
+            match LanMonitor::open(&registry) {
+                Some(lan) => Box::pin(futures::stream::select(UdevMonitor::open()?, lan)),
+                None => Box::pin(UdevMonitor::open()?),
+            }
+        }
         Devices::Simulated(scenario) => Box::pin(Script::new(scenario)),
     };
     let screen_stop = CancellationToken::new();

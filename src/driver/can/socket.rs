@@ -5,7 +5,7 @@
 
 use std::io;
 use std::mem::{size_of, zeroed};
-use std::os::fd::{AsFd, AsRawFd as _, BorrowedFd, OwnedFd};
+use std::os::fd::{AsFd, AsRawFd as _, BorrowedFd, FromRawFd as _, OwnedFd};
 use std::time::Duration;
 
 use socketcan::{CanSocket, Socket as _, SocketOptions as _};
@@ -120,6 +120,16 @@ impl Socket {
 impl AsFd for Socket {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.bound.as_fd()
+    }
+}
+
+/// Opens a socket and closes it: the first one of a kind makes the kernel load its modules.
+pub(super) fn load() {
+    // SAFETY: plain numbers.
+    let socket = unsafe { libc::socket(libc::PF_CAN, libc::SOCK_RAW | libc::SOCK_CLOEXEC, libc::CAN_RAW) };
+    if socket >= 0 {
+        // SAFETY: it was just opened, and nobody else has it.
+        drop(unsafe { OwnedFd::from_raw_fd(socket) });
     }
 }
 
