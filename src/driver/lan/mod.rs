@@ -109,8 +109,9 @@ impl Lan {
     pub fn record(&mut self, episode: Option<std::path::PathBuf>) -> Result<(), DriverError> {
         match &mut self.protocol {
             Protocol::Gopro(gopro) => gopro.record(episode),
-            Protocol::Mjpeg(_) | Protocol::Udp(_) | Protocol::Iphone(_) => Ok(()),
+            Protocol::Mjpeg(_) | Protocol::Udp(_) | Protocol::Iphone(_) => {}
         }
+        Ok(())
     }
 
     /// Ends in order what the device does by itself.
