@@ -143,10 +143,11 @@ fn publish(node: &mut RapidNode, said: &RapidSample, bytes: &[u8]) -> Result<(),
     let mut sample = node.publisher.loan_slice_uninit(bytes.len())?;
     let RapidSample { capture_ns, encoding, width, height, lost, .. } = *said;
     // What the device lost leaves a hole.
-    node.header.seq += lost;
-    *sample.user_header_mut() = SampleHeader { capture_ns, encoding, width, height, ..node.header };
+    let seq = node.header.seq + lost;
+    *sample.user_header_mut() = SampleHeader { seq, capture_ns, encoding, width, height, ..node.header };
     sample.write_from_slice(bytes).send()?;
-    node.header.seq += 1;
+    // Until it was sent nothing is counted: who tries again says the same again.
+    node.header.seq = seq + 1;
     // Without a notification a sample is found a little later.
     node.wake.notify()?;
     Ok(())
