@@ -5,7 +5,7 @@
 //!
 //! An action is a list of numbers, one an axis, in the order and the units of the actuator's entry; its
 //! capture time is the moment it is for. Here they follow a sine around 0. Real motors move only after
-//! they were armed, and stay where they are when actions stop coming.
+//! they were armed; when actions stop coming they hold, and after a while they are disabled.
 //!
 //! Options: `--axes N`, `--rate HZ`, `--amplitude A`, `--period SECONDS`, `--seconds S` (0: for ever).
 

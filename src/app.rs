@@ -6,6 +6,7 @@
 //! Invariant: only this module sees every stage.
 //! Invariant: whatever ends the run, an episode in progress is finished first.
 
+mod asked;
 mod autopilot;
 mod conductor;
 pub(crate) mod signals;
@@ -22,7 +23,9 @@ use tokio::task::JoinHandle;
 use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
+use crate::action::Order;
 use crate::bus::{Bus, BusError, TopicId};
+use crate::driver;
 use crate::fault;
 use crate::headless::style::ColourChoice;
 use crate::headless::{self, HeadlessOptions};
@@ -38,9 +41,10 @@ use crate::record::{EpisodeRequest, RecordError, Recorder, RecorderConfig};
 use crate::registry::Registry;
 use crate::registry::scenario::Scenario;
 use crate::rig::presence::{Claim, Presence, PresenceError};
-use crate::rig::{Rig, RigError};
+use crate::rig::{Rig, RigCommand, RigError};
 use crate::status::{Board, Command};
 use crate::tui::{self, TuiError};
+use asked::Asked;
 use autopilot::Autopilot;
 pub use autopilot::PolicyOptions;
 use conductor::Conductor;
@@ -183,18 +187,22 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     let recorder = Recorder::spawn(bus.inbox()?, RecorderConfig::new(Arc::clone(&registry), Arc::clone(&board)))?;
     // Before the screen: what fails until here is said on an ordinary terminal.
     let hotplug: HotplugStream = match options.devices {
-        Devices::Machine => match LanMonitor::open(&registry) {
-            Some(lan) => Box::pin(futures::stream::select(UdevMonitor::open()?, lan)),
-            None => Box::pin(UdevMonitor::open()?),
-        },
+        Devices::Machine => {
+            driver::can::prepare(&registry);
+            match LanMonitor::open(&registry) {
+                Some(lan) => Box::pin(futures::stream::select(UdevMonitor::open()?, lan)),
+                None => Box::pin(UdevMonitor::open()?),
+            }
+        }
         Devices::Simulated(scenario) => Box::pin(Script::new(scenario)),
     };
     let screen_stop = CancellationToken::new();
-    let (commands, asked) = mpsc::channel(16);
+    let (commands, from_screen) = mpsc::channel(16);
     let screen = start_screen(options.screen, &board, commands, screen_stop.clone(), options.duration);
 
     let rig_stop = CancellationToken::new();
     let (rig_commands, rig_asked) = mpsc::channel(16);
+    let asked = asked::sorted(from_screen, rig_commands.clone());
     let mut rig =
         Rig::new(&registry, &bus, presence, Arc::clone(&board)).following(recorder.episode()).arming(options.arm);
     let rig_ended = CancellationToken::new();
@@ -225,15 +233,26 @@ pub async fn run(options: Options) -> Result<(), AppError> {
         board,
         writer_ended: recorder.ended(),
         recorder,
-        rig_commands,
         episode,
         record: options.record,
         duration: options.duration,
         begin_episode: options.record,
     };
     let (kind, screen) = (options.screen, Some(screen));
-    let mut running =
-        Running { rig, rig_ended, rig_stop, hurry, mask_ended, kind, screen, screen_stop, signals, asked, autopilot };
+    let mut running = Running {
+        rig,
+        rig_commands,
+        rig_ended,
+        rig_stop,
+        hurry,
+        mask_ended,
+        kind,
+        screen,
+        screen_stop,
+        signals,
+        asked,
+        autopilot,
+    };
     // A panic here ends the run like any other: what it leaves is taken down in order.
     let conducted = AssertUnwindSafe(conductor.conduct(&mut running)).catch_unwind().await;
     let outcome = conducted.unwrap_or(Err(AppError::Panicked("the main task")));
@@ -294,6 +313,7 @@ fn start_screen(
 /// The tasks of a run, and what can be asked of it from outside.
 struct Running {
     rig: JoinHandle<(Rig, Result<(), RigError>)>,
+    rig_commands: mpsc::Sender<RigCommand>,
     rig_ended: CancellationToken,
     rig_stop: CancellationToken,
     hurry: CancellationToken,
@@ -303,7 +323,7 @@ struct Running {
     screen: Option<ScreenTask>,
     screen_stop: CancellationToken,
     signals: Signals,
-    asked: mpsc::Receiver<Command>,
+    asked: mpsc::UnboundedReceiver<Asked>,
     autopilot: Option<Autopilot>,
 }
 
@@ -329,10 +349,12 @@ async fn finish(
     mut conductor: Conductor,
     mut outcome: Result<(), AppError>,
 ) -> Result<(), AppError> {
-    // First of all nothing moves any more. A chunk that is being computed is waited for with the rest.
+    // First of all nothing moves any more, whoever publishes actions. A chunk that is being computed is waited for
+    // with the rest.
     let policy_ended = async {
         match &mut running.autopilot {
             Some(autopilot) => {
+                let _ = running.rig_commands.try_send(RigCommand::Order(Order::Disarm));
                 let ended = timeout(LAST_CHUNK, autopilot.stop()).await;
                 ended.unwrap_or(Err(AppError::Stuck))
             }

@@ -205,8 +205,10 @@ pub enum Command {
         watch: bool,
     },
     /// Lets the actuator of a running rapid move: motors are enabled, and follow actions
-    #[command(after_help = "An actuator that was unplugged, failed or was disarmed needs this again.\n\nExamples:\n  \
-        rapid arm\n  rapid arm --instance left")]
+    #[command(
+        after_help = "An actuator that was unplugged, failed, was disarmed or got no actions for a while needs this again.\n\nExamples:\n  \
+        rapid arm\n  rapid arm --instance left"
+    )]
     Arm,
     /// Stops the actuator of a running rapid: its motors are disabled
     Disarm,

@@ -79,6 +79,18 @@ impl From<FolderError> for io::Error {
     }
 }
 
+/// Where this program keeps what should survive a restart: systemd.exec(5), XDG Base Directory
+/// Specification 0.8. `None` where nothing says.
+#[must_use]
+pub fn state_directory() -> Option<PathBuf> {
+    let absolute = |name| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
+    let systemd = std::env::var_os("STATE_DIRECTORY").and_then(|list| std::env::split_paths(&list).next());
+    systemd.filter(|path| path.is_absolute()).or_else(|| {
+        let state = absolute("XDG_STATE_HOME").or_else(|| Some(absolute("HOME")?.join(".local/state")));
+        state.map(|state| state.join("rapid"))
+    })
+}
+
 fn of(owner: u32) -> String {
     if owner == rustix::process::geteuid().as_raw() { String::new() } else { format!(" of user {owner}") }
 }

@@ -56,7 +56,7 @@
 //!
 //! # One action
 //!
-//! 1. At each tick of the control grid, thread `control` of [`policy::live`] takes what the bus brought, and
+//! 1. At each tick of the control grid, thread `grid` of [`policy::live`] takes what the bus brought, and
 //!    [`policy::observer`] chooses what is seen, with [`sync`]'s rules.
 //! 2. When a chunk is due, or a bit of the mask has changed, the samples go to thread `policy`, which makes
 //!    tensors of them and runs the encoder once and the denoiser step by step.

@@ -4,6 +4,8 @@
 
 #[path = "support/allocations.rs"]
 mod allocations;
+#[path = "support/motor_spec.rs"]
+mod motor_spec;
 
 use std::time::Duration;
 
@@ -12,34 +14,9 @@ use rapid::control::can::CanFrame;
 use rapid::control::damiao::codec::{Feedback, MotorStatus, Order, Ranges};
 use rapid::control::damiao::parameter::{Parameter, Reply, Value};
 use rapid::control::motors::{BusState, MotorBus, SAMPLE_VALUES};
-use rapid::registry::{DamiaoSpec, MotorKind, MotorMode, MotorSpec};
 use rapid::time::Stamp;
 
 const MOTORS: u16 = 7;
-
-fn spec() -> DamiaoSpec {
-    let motor = |slave: u16| MotorSpec {
-        name: format!("joint_{slave}"),
-        slave,
-        master: 0x10 + slave,
-        kind: MotorKind::Dm4310,
-        mode: MotorMode::Mit { kp: 10.0, kd: 1.0 },
-        position: [-2.0, 2.0],
-        velocity: 20.0,
-        torque: 5.0,
-        slew: 5.0,
-        max_mos: 80.0,
-        max_rotor: 100.0,
-    };
-    DamiaoSpec {
-        motors: (1..=MOTORS).map(motor).collect(),
-        hz: 200,
-        deadman: None,
-        disable_after: Duration::from_secs(1),
-        timeout: Duration::from_millis(400),
-        silent_after: Duration::from_millis(50),
-    }
-}
 
 /// What a motor answers, as long as it is well.
 fn answer(frame: &CanFrame, enabled: &mut [bool; 8]) -> CanFrame {
@@ -68,7 +45,8 @@ fn answer(frame: &CanFrame, enabled: &mut [bool; 8]) -> CanFrame {
 #[test]
 fn a_bus_of_motors_allocates_nothing() {
     let mut now = Stamp(1_000_000_000_000);
-    let mut bus = MotorBus::new(&spec(), now);
+    let spec = motor_spec::bus((1..=MOTORS).map(motor_spec::motor).collect());
+    let mut bus = MotorBus::new(&spec, now);
     let mut enabled = [false; 8];
     let mut answers = [CanFrame::default(); 2 * MOTORS as usize];
     let mut sample = [0.0; SAMPLE_VALUES * MOTORS as usize];

@@ -155,7 +155,10 @@ impl Shared {
         let place = Place::new();
         fs::set_permissions(place.folder.path(), PermissionsExt::from_mode(0o755)).expect("mode");
         let program = place.path("rapid");
-        fs::copy(env!("CARGO_BIN_EXE_rapid"), &program).expect("copy");
+        // By another process: a child that a test beside this one starts would inherit the file open for writing, and
+        // what somebody may write to cannot be run.
+        let copied = Command::new("cp").arg(env!("CARGO_BIN_EXE_rapid")).arg(&program).status().expect("cp");
+        assert!(copied.success(), "{copied}");
         Some(Self { place, program })
     }
 

@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use rustix::process::Signal;
 use serde_json::Value;
-use support::{Episode, EventMessage, Place, Running, events, until};
+use support::{Episode, EventMessage, Place, Running, events, logged, until};
 
 const TOPIC: &str = "/rapid/process/counter";
 
@@ -51,11 +51,6 @@ fn states(events: &[Value]) -> Vec<&str> {
     events.iter().filter_map(|event| event["state"].as_str()).collect()
 }
 
-/// Texts of the log that hold `words`.
-fn logged<'a>(events: &'a [Value], words: &str) -> Vec<&'a str> {
-    events.iter().filter_map(|event| event["text"].as_str()).filter(|text| text.contains(words)).collect()
-}
-
 /// Process ids of the programs that came to stream, in order.
 fn programs(events: &[Value]) -> Vec<u32> {
     let details = events.iter().filter(|event| event["state"] == "streaming").filter_map(|e| e["detail"].as_str());
@@ -80,6 +75,16 @@ fn descriptors(pid: u32) -> usize {
 /// Waits until the words have been printed this many times.
 fn wait_for_count(running: &Running, words: &str, count: usize) {
     until(&format!("{words:?} {count} times"), || running.output().matches(words).count() >= count);
+}
+
+/// Process ids of the programs that stream, as soon as there is one.
+fn wait_for_programs(running: &Running) -> Vec<u32> {
+    let mut pids = Vec::new();
+    until("a program", || {
+        pids = programs(&running.told());
+        !pids.is_empty()
+    });
+    pids
 }
 
 #[test]
@@ -225,7 +230,7 @@ fn the_end_of_a_run_waits_for_a_deaf_program_and_a_second_signal_does_not() {
         let place = Place::new();
         registry(&place, ", \"--ignore-sigterm\"", "");
         let mut running = place.start(&sim(&place, ""), "\"streaming\"");
-        let told = events(&running.output());
+        let pids = wait_for_programs(&running);
         let begun = Instant::now();
         running.signal(Signal::INT);
         if second {
@@ -237,7 +242,7 @@ fn the_end_of_a_run_waits_for_a_deaf_program_and_a_second_signal_does_not() {
         assert_eq!(code, Some(if second { 130 } else { 0 }));
         assert!(second || begun.elapsed().as_secs() >= 5, "SIGTERM has its time");
         assert_eq!(logged(&events(&output), "was killed").len(), 1, "{output}");
-        for pid in programs(&told) {
+        for pid in pids {
             assert!(!is_alive(pid), "{pid} outlived the run");
         }
     }
@@ -248,7 +253,7 @@ fn a_killed_rapid_takes_its_programs_along() {
     let place = Place::new();
     registry(&place, ", \"--ignore-sigterm\"", "");
     let running = place.start(&sim(&place, ""), "\"streaming\"");
-    let pids = programs(&events(&running.output()));
+    let pids = wait_for_programs(&running);
     assert!(pids.iter().all(|pid| is_alive(*pid)) && pids.len() == 1);
     running.signal(Signal::KILL);
     running.end();

@@ -3,6 +3,9 @@
 
 #![expect(clippy::unwrap_used, reason = "helpers of tests")]
 
+#[path = "support/mistakes.rs"]
+mod mistakes;
+
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -15,35 +18,20 @@ use rapid::registry::{
 };
 
 fn files(folder: &str) -> Vec<PathBuf> {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/registry").join(folder);
-    let mut files: Vec<_> = std::fs::read_dir(folder)
-        .unwrap()
-        .map(|entry| entry.unwrap().path())
-        .filter(|path| path.extension().is_some_and(|extension| extension == "toml"))
-        .collect();
-    files.sort();
-    files
+    mistakes::files(&format!("registry/{folder}"), "toml")
 }
 
 fn valid(name: &str) -> Loaded {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/registry/valid").join(format!("{name}.toml"));
-    Registry::parse(&std::fs::read_to_string(path).unwrap(), None).unwrap()
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/registry/valid/{name}.toml"));
+    Registry::parse(&mistakes::read(&path), None).unwrap()
 }
 
 #[test]
 fn every_mistake_is_told_in_full() {
-    let files = files("invalid");
-    assert!(files.len() >= 30, "{} files", files.len());
-    for path in files {
-        let text = std::fs::read_to_string(&path).unwrap();
-        let errors = Registry::parse(&text, Some(Path::new("devices.toml"))).expect_err(&path.display().to_string());
-        let expected = std::fs::read_to_string(path.with_extension("expected")).unwrap_or_default();
-        assert_eq!(format!("{errors}\n"), expected, "{}", path.display());
-        for diagnostic in &errors.diagnostics {
-            assert!(diagnostic.fix.as_ref().is_some_and(|fix| !fix.is_empty()), "{diagnostic}");
-            assert!(!diagnostic.to_string().chars().any(|c| c.is_control() && c != '\n'), "{diagnostic:?}");
-        }
-    }
+    mistakes::check("registry/invalid", "toml", 171, |text| {
+        let errors = Registry::parse(text, Some(Path::new("devices.toml"))).err()?;
+        Some((errors.to_string(), errors.diagnostics))
+    });
 }
 
 #[test]

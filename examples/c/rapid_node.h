@@ -1,7 +1,7 @@
 /* A program that reads a device for `rapid`, in C. publisher.c is one.
  *
  * Build:  cargo build --release -p rapid-node
- *         cc publisher.c -I examples/c target/release/librapid_node.a -lpthread -ldl -lm -o publisher
+ *         cc examples/c/publisher.c -I examples/c target/release/librapid_node.a -lpthread -ldl -lm -o publisher
  *
  * Everything is called from one thread. */
 #ifndef RAPID_NODE_H

@@ -1,8 +1,7 @@
 //! `librapid_node.a`: what `rapid_node.h` declares.
 //!
-//! iceoryx2's own binding for C is no package of any registry in the version that `rapid` has. A program
-//! that builds that binding from its sources can do without this library: topic, types and header are
-//! those of the README.
+//! It is no binding of iceoryx2. A program that has one can do without this library: topic, types and header
+//! are those of the README.
 
 use std::cell::RefCell;
 use std::error::Error;
@@ -144,10 +143,11 @@ fn publish(node: &mut RapidNode, said: &RapidSample, bytes: &[u8]) -> Result<(),
     let mut sample = node.publisher.loan_slice_uninit(bytes.len())?;
     let RapidSample { capture_ns, encoding, width, height, lost, .. } = *said;
     // What the device lost leaves a hole.
-    node.header.seq += lost;
-    *sample.user_header_mut() = SampleHeader { capture_ns, encoding, width, height, ..node.header };
+    let seq = node.header.seq + lost;
+    *sample.user_header_mut() = SampleHeader { seq, capture_ns, encoding, width, height, ..node.header };
     sample.write_from_slice(bytes).send()?;
-    node.header.seq += 1;
+    // Until it was sent nothing is counted: who tries again says the same again.
+    node.header.seq = seq + 1;
     // Without a notification a sample is found a little later.
     node.wake.notify()?;
     Ok(())

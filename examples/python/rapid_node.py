@@ -113,6 +113,6 @@ class Actions:
         newest = None
         while (sample := self._port.receive()) is not None:
             payload = bytes(sample.payload().as_memory_view())
-            if sample.user_header().contents.encoding == F64 and 0 < len(payload) <= 8 * MOST_AXES:
+            if sample.user_header().contents.encoding == F64 and 0 < len(payload) <= 8 * MOST_AXES and len(payload) % 8 == 0:
                 newest = [number for (number,) in struct.iter_unpack("<d", payload)]
         return newest

@@ -6,16 +6,15 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use tokio::sync::broadcast;
 use tokio::sync::broadcast::error::{RecvError, TryRecvError};
-use tokio::sync::{broadcast, mpsc};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
 use tokio_util::sync::CancellationToken;
 
-use super::{AppError, Running, Screen, policy_ended, screen_ended};
+use super::{AppError, Asked, Running, Screen, policy_ended, screen_ended};
 use crate::fault;
 use crate::record::{EpisodeRequest, RecordError, Recorder};
-use crate::rig::RigCommand;
-use crate::status::{Board, Command, EpisodeEnd, Event, SlotState, What};
+use crate::status::{Board, EpisodeEnd, Event, SlotState, What};
 
 /// An episode asked for at the start begins when every attached device delivers, at the latest
 /// after this time.
@@ -31,7 +30,6 @@ pub(super) struct Conductor {
     pub(super) events: broadcast::Receiver<Event>,
     pub(super) recorder: Recorder,
     pub(super) writer_ended: CancellationToken,
-    pub(super) rig_commands: mpsc::Sender<RigCommand>,
     pub(super) episode: EpisodeRequest,
     pub(super) record: bool,
     pub(super) duration: Option<Duration>,
@@ -70,12 +68,15 @@ impl Conductor {
                 event = self.events.recv() => {
                     if self.episode_ended(event)? { return output; }
                 }
-                Some(command) = running.asked.recv() => match command {
-                    Command::ToggleRecording => self.toggle().await?,
-                    // A rig that is so far behind will not get to it in time either.
-                    Command::Restart(id) => { let _ = self.rig_commands.try_send(RigCommand::Restart(id)); }
-                    Command::Order(order) => { let _ = self.rig_commands.try_send(RigCommand::Order(order)); }
-                    Command::Quit => return output,
+                Some(asked) = running.asked.recv() => match asked {
+                    // A slow disk takes its time to close a file: a signal does not wait for it. What was asked of
+                    // the recorder is done all the same, and its end is taken when everything is taken down.
+                    Asked::ToggleRecording => tokio::select! {
+                        biased;
+                        () = running.signals.next() => return output,
+                        done = self.toggle() => done?,
+                    },
+                    Asked::Quit => return output,
                 },
                 // After the events: what became of its episode says more.
                 () = self.writer_ended.cancelled() => return Err(AppError::Panicked("thread `writer`")),

@@ -78,6 +78,16 @@ pub enum Driver {
 }
 
 impl Driver {
+    /// Says what is in the way of opening `node`, if anything is, with a future that ends when it is not: while a cable
+    /// is out, opening again and again leads nowhere.
+    #[must_use]
+    pub fn obstacle(
+        spec: &DeviceSpec,
+        node: &DeviceNode,
+    ) -> Option<(&'static str, impl Future<Output = ()> + Send + use<>)> {
+        if matches!(spec.node, NodeSpec::Lan(_)) { lan::Lan::obstacle(node) } else { None }
+    }
+
     /// Opens the node of `spec` and starts it.
     ///
     /// # Errors

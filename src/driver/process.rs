@@ -1,5 +1,5 @@
-//! The edge to child processes: starting one so that nothing of ours leaks into it and nothing of
-//! it outlives us, and ending all of it.
+//! The edge to child processes: starting one so that nothing of ours leaks into it and it does not
+//! outlive us, and ending all of it.
 //!
 //! A child leads a session and group of its own: a Ctrl-C in our terminal is not meant for it, and a
 //! signal reaches whatever it started itself. It inherits no descriptor but the standard ones: a
@@ -8,7 +8,9 @@
 //! Invariant: no shell.
 //! Invariant: a group is signalled only before its leader is reaped, while nobody else can have got
 //! its number.
-//! Invariant: when we end, however that comes, the kernel kills the children.
+//! Invariant: when we end, however that comes, the kernel kills the children. Not what they have started in
+//! turn: that ends with them only where we are still there to end the group. A script whose last command is
+//! `exec PROGRAM` is that program.
 
 use std::ffi::OsString;
 use std::io;

@@ -6,8 +6,8 @@
 //!
 //! * at once when it says goodbye ([`Witness::Goodbye`]) or the link that leads to it is down
 //!   ([`Witness::Link`]),
-//! * otherwise when nothing of it was heard for the entry's lease, or its address says that nobody is there
-//!   ([`Witness::Lease`]).
+//! * otherwise when nothing of it was heard for the entry's lease, or its address says that nobody is there and its
+//!   driver did not hear it either ([`Witness::Lease`]).
 //!
 //! What a driver hears counts: a device that sends is not asked, and one whose announcements are lost in the
 //! air while its pictures arrive is there.
@@ -23,6 +23,7 @@ mod watch;
 
 use std::pin::Pin;
 use std::task::{Context, Poll};
+use std::time::Duration;
 
 use futures::Stream;
 use tokio::sync::mpsc;
@@ -31,7 +32,7 @@ use tokio::task::JoinSet;
 use self::mdns::Browser;
 use self::watch::Watch;
 use super::{HotplugError, HotplugEvent};
-use crate::registry::{LanFind, LanSpec, NodeSpec, Registry};
+use crate::registry::{LanFind, LanSpec, NodeSpec, Probe, Registry};
 
 /// Events that may wait; the rig reads them at once.
 const DEPTH: usize = 64;
@@ -58,7 +59,9 @@ impl LanMonitor {
             match &lan.find {
                 LanFind::Adapter { .. } => {}
                 LanFind::Host { host, probe, port } => {
-                    tasks.spawn(probe::watch(watch(), lan.server(*host), (*host, *port).into(), *probe));
+                    // While the driver waits for the end of a cooldown, nobody hears packets.
+                    let grace = if *probe == Probe::Udp { registry.rig.cooldown } else { Duration::ZERO };
+                    tasks.spawn(probe::watch(watch().waits(grace), lan.server(*host), (*host, *port).into(), *probe));
                 }
                 LanFind::Mdns { service, instance } => {
                     let wanted = mdns::Wanted::new(watch(), instance.clone(), lan);

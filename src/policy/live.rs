@@ -1,6 +1,6 @@
 //! A policy at the controls of a rig in real time.
 //!
-//! Thread `control` keeps the control grid: at each tick it takes what the bus brought, looks, hands a
+//! Thread `grid` keeps the control grid: at each tick it takes what the bus brought, looks, hands a
 //! request over when one is due, and publishes the action of the tick. Thread `policy` computes: a chunk may
 //! take as long as it takes, and no tick waits for it. One request goes back and forth between them.
 //!
@@ -82,7 +82,7 @@ impl Live {
         let latencies = Histogram::new_with_bounds(1, LONGEST_US, 3).map_err(io::Error::other)?;
         let control = Control::new(options, registry, (inbox, actions, board), (ask, told), request, latencies);
         let (stopped, guard) = (stop.clone(), ended.clone().drop_guard());
-        let control = std::thread::Builder::new().name("control".to_owned()).spawn(move || {
+        let control = std::thread::Builder::new().name("grid".to_owned()).spawn(move || {
             // Dropped by a panic too.
             let _guard = guard;
             control.run(&stopped);

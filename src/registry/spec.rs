@@ -318,6 +318,18 @@ impl DeviceSpec {
 }
 
 impl NodeSpec {
+    /// Which node of its device it is read from.
+    #[must_use]
+    pub fn opens(&self) -> Opens {
+        match self {
+            Self::Camera(_) => Opens::Video,
+            Self::Serial(_) => Opens::Tty,
+            Self::Process(process) => process.opens,
+            Self::Can(can) if can.adapter != CanAdapter::SocketCan => Opens::Tty,
+            Self::Can(_) | Self::Lan(_) => Opens::Net,
+        }
+    }
+
     /// What samples of a device that is read like this hold.
     #[must_use]
     pub fn modality_kind(&self) -> ModalityKind {

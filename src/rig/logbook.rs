@@ -20,6 +20,7 @@ use std::time::Duration;
 use tokio::sync::oneshot;
 use tokio::time::timeout;
 
+use crate::folder::state_directory;
 use crate::status::{Board, Level, What};
 use crate::time;
 
@@ -91,17 +92,6 @@ impl Logbook {
             let _ = timeout(LAST, is_done).await;
         }
     }
-}
-
-/// Where programs of this user keep what should survive a restart: systemd.exec(5), XDG Base Directory
-/// Specification 0.8. `None` where nothing says.
-fn state_directory() -> Option<PathBuf> {
-    let absolute = |name| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
-    let systemd = std::env::var_os("STATE_DIRECTORY").and_then(|list| std::env::split_paths(&list).next());
-    systemd.filter(|path| path.is_absolute()).or_else(|| {
-        let state = absolute("XDG_STATE_HOME").or_else(|| Some(absolute("HOME")?.join(".local/state")));
-        state.map(|state| state.join("rapid"))
-    })
 }
 
 /// The thread's work.

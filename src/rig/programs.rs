@@ -52,8 +52,9 @@ impl Programs {
     pub(super) async fn ended(&self) {
         self.closing.cancel();
         self.tasks.close();
-        // A hook that began a moment ago, and the one that follows it.
-        let limit = TERM_LIMIT.max(2 * HOOK_LIMIT) + MARGIN;
+        // Of a device removed a moment ago: the hook that just began, the two that follow it, and between them the wait
+        // for its program.
+        let limit = 3 * HOOK_LIMIT + TERM_LIMIT + 2 * MARGIN;
         if timeout(limit, self.tasks.wait()).await.is_err() {
             tracing::warn!(programs = self.tasks.len(), "did not end even when killed and are abandoned");
         }

@@ -19,7 +19,7 @@ use super::slot::End;
 use super::worker::Seat;
 use crate::action::ActuatorNotice;
 use crate::bus::Writer;
-use crate::driver::{DriverError, Reading};
+use crate::driver::{Driver, DriverError, Reading};
 use crate::fault;
 use crate::registry::{Attachment, DeviceSpec, NodeSpec};
 use crate::sample::{Epoch, SampleHeader};
@@ -46,6 +46,8 @@ use source::Source;
 /// What a stream tells the rig while it runs.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Report {
+    /// The node is not opened before this is out of the way.
+    Waits(&'static str),
     /// The node is open; what was agreed with the device, for people and for the recording.
     Opened(String, Box<Provenance>),
     /// Open for so long, and no sample yet.
@@ -109,10 +111,17 @@ impl Stream {
     /// Reads the device until it ends or the stream is told to stop. The reason is for people.
     pub(super) async fn run(self) -> (End, String) {
         let stopped = || (End::Gone, "stopped".to_owned());
+        let open = async {
+            if let Some((what, is_over)) = Driver::obstacle(&self.spec, &self.attachment.node) {
+                self.report(Report::Waits(what)).await;
+                is_over.await;
+            }
+            timeout(OPEN_LIMIT, Source::open(&self)).await
+        };
         let opened = tokio::select! {
             biased;
             () = self.stop.cancelled() => return stopped(),
-            opened = timeout(OPEN_LIMIT, Source::open(&self)) => opened,
+            opened = open => opened,
         };
         let mut source = match opened {
             Ok(Ok(source)) => source,

@@ -189,6 +189,12 @@ impl Model {
         }
         // Only the key after the first asks for it.
         let armed = std::mem::take(&mut self.arming);
+        // What stops motion works everywhere.
+        if key.code == KeyCode::Char('d') {
+            self.help = false;
+            self.say("disarming the actuator");
+            return Effect::Send(Command::Order(Order::Disarm));
+        }
         if self.help {
             // A key that closes the help does nothing else.
             self.help = false;
@@ -199,10 +205,6 @@ impl Model {
             KeyCode::Char(' ') if key.kind == KeyEventKind::Press => return self.toggle_recording(),
             KeyCode::Char('r') => return self.restart(),
             KeyCode::Char('a') if key.kind == KeyEventKind::Press => return self.arm(armed),
-            KeyCode::Char('d') => {
-                self.say("disarming the actuator");
-                return Effect::Send(Command::Order(Order::Disarm));
-            }
             KeyCode::Char('p') => self.toggle_pause(),
             KeyCode::Char('?') | KeyCode::F(1) => self.help = true,
             KeyCode::Up | KeyCode::Char('k') => self.selected = self.selected.saturating_sub(1),

@@ -152,6 +152,11 @@ impl Running {
         std::fs::read_to_string(&self.log).unwrap_or_default()
     }
 
+    /// The events so far of a run with `--json`. A line that is half written is none yet.
+    pub(crate) fn told(&self) -> Vec<serde_json::Value> {
+        events(self.output().rsplit_once('\n').map_or("", |(whole, _)| whole))
+    }
+
     pub(crate) fn wait_for(&mut self, word: &str) {
         let begun = Instant::now();
         while !self.output().contains(word) {
@@ -191,6 +196,11 @@ pub(crate) fn events(output: &str) -> Vec<serde_json::Value> {
         .lines()
         .map(|line| serde_json::from_str(line).unwrap_or_else(|error| panic!("not JSON ({error}): {line}")))
         .collect()
+}
+
+/// Texts of the log that hold `words`.
+pub(crate) fn logged<'a>(events: &'a [serde_json::Value], words: &str) -> Vec<&'a str> {
+    events.iter().filter_map(|event| event["text"].as_str()).filter(|text| text.contains(words)).collect()
 }
 
 /// Everything a recorded episode says, read by the mcap crate.

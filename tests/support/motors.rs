@@ -1,6 +1,9 @@
 //! Motors on a serial line: the simulated motors of the virtual bench behind Damiao's adapter, on a
 //! pseudo-terminal.
 
+#[path = "motor_spec.rs"]
+mod motor_spec;
+
 use std::fs::File;
 use std::io::{Read, Write};
 use std::os::fd::{AsFd, OwnedFd};
@@ -10,7 +13,7 @@ use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use rapid::registry::{DamiaoSpec, MotorKind, MotorMode, MotorSpec};
+use rapid::registry::{DamiaoSpec, MotorMode, MotorSpec};
 use rapid::time::Stamp;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use vbench::emu::can::bus::{self, Bus};
@@ -69,18 +72,21 @@ impl Adapter {
         self.told().iter().filter(|told| **told == action).count()
     }
 
-    /// Waits until each of `count` motors was turned off after the last time that one was enabled.
-    pub(crate) fn wait_until_off(&self, count: usize) {
+    /// Waits until each of these motors was turned off after the last time that it was enabled. One motor
+    /// may tell several times that it was turned off.
+    pub(crate) fn wait_until_off(&self, motors: &[u16]) {
         let begun = Instant::now();
-        loop {
-            let told = self.told();
-            let enabled = told.iter().rposition(|told| *told == "motor_enabled").unwrap_or(0);
-            if told[enabled..].iter().filter(|told| **told == "motor_disabled").count() >= count {
-                return;
-            }
-            assert!(begun.elapsed() < PATIENCE, "not turned off: {told:?}");
+        while !motors.iter().all(|motor| self.is_off(*motor)) {
+            assert!(begun.elapsed() < PATIENCE, "of {motors:?} one was not turned off: {:?}", self.told());
             std::thread::sleep(Duration::from_millis(2));
         }
+    }
+
+    /// It was enabled, and turned off after that.
+    fn is_off(&self, motor: u16) -> bool {
+        let told = &self.shared.lock().expect("whole").told;
+        let last = |action| told.iter().rposition(|told| told.action == action && told.fields["motor"] == motor);
+        last("motor_enabled").is_some_and(|enabled| last("motor_disabled").is_some_and(|off| off > enabled))
     }
 }
 
@@ -129,26 +135,19 @@ fn serve(master: OwnedFd, shared: &Mutex<Shared>, pulled: &AtomicBool) {
 
 /// The entry of `count` motors, position driven, at 200 Hz.
 pub(crate) fn spec(count: u16) -> DamiaoSpec {
-    let motor = |id: u16| MotorSpec {
-        name: format!("joint{id}"),
-        slave: id,
-        master: id + 0x10,
-        kind: MotorKind::Dm4310,
+    let motor = |id| MotorSpec {
         mode: MotorMode::Mit { kp: 20.0, kd: 1.0 },
         position: [-1.0, 1.0],
         velocity: 5.0,
         torque: 8.0,
         slew: 4.0,
-        max_mos: 80.0,
         max_rotor: 80.0,
+        ..motor_spec::motor(id)
     };
     DamiaoSpec {
-        motors: (1..=count).map(motor).collect(),
-        hz: 200,
-        deadman: None,
         disable_after: Duration::from_millis(500),
-        timeout: Duration::from_millis(400),
         // The terminals of a busy machine are slower than a bus.
         silent_after: Duration::from_millis(400),
+        ..motor_spec::bus((1..=count).map(motor).collect())
     }
 }

@@ -1,6 +1,7 @@
 use std::fs::File;
 use std::io;
 
+use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
 use super::super::Signals;
@@ -51,7 +52,7 @@ impl Sink for Lost {
 struct Bench {
     conductor: Conductor,
     running: Running,
-    keys: mpsc::Sender<Command>,
+    keys: mpsc::UnboundedSender<Asked>,
     board: Arc<Board>,
     out: tempfile::TempDir,
 }
@@ -63,7 +64,7 @@ impl Bench {
         let out = tempfile::tempdir().unwrap();
         let config = RecorderConfig { sink: Box::new(sink), ..RecorderConfig::new(registry, Arc::clone(&board)) };
         let recorder = Recorder::spawn(Quiet, config).unwrap();
-        let (keys, asked) = mpsc::channel(16);
+        let (keys, asked) = mpsc::unbounded_channel();
         let episode = EpisodeRequest {
             out: out.path().to_owned(),
             task: "test".to_owned(),
@@ -76,7 +77,6 @@ impl Bench {
             board: Arc::clone(&board),
             writer_ended: recorder.ended(),
             recorder,
-            rig_commands: mpsc::channel(1).0,
             episode,
             record,
             duration,
@@ -85,6 +85,7 @@ impl Bench {
         let running = Running {
             autopilot: None,
             rig: never(),
+            rig_commands: mpsc::channel(1).0,
             rig_ended: CancellationToken::new(),
             rig_stop: CancellationToken::new(),
             hurry: CancellationToken::new(),
@@ -136,7 +137,7 @@ async fn keys_that_come_while_an_episode_ends_are_obeyed_one_after_the_other() {
     let keys = async {
         let press = async |count: usize| {
             for _ in 0..count {
-                bench.keys.send(Command::ToggleRecording).await.unwrap();
+                bench.keys.send(Asked::ToggleRecording).unwrap();
             }
         };
         press(1).await;
@@ -146,7 +147,7 @@ async fn keys_that_come_while_an_episode_ends_are_obeyed_one_after_the_other() {
         idle().await;
         press(1).await;
         until(&bench.board, "the end of the second", |file| file.is_none()).await;
-        bench.keys.send(Command::Quit).await.unwrap();
+        bench.keys.send(Asked::Quit).unwrap();
     };
     let (outcome, ()) = tokio::join!(bench.conductor.conduct(&mut bench.running), keys);
     outcome.unwrap();
@@ -161,10 +162,10 @@ async fn a_key_while_devices_settle_begins_the_one_episode() {
     let silent = Registry::builtin().devices[0].id;
     bench.board.set_slot(silent, SlotState::Opening, Epoch(1), "");
     let keys = async {
-        bench.keys.send(Command::ToggleRecording).await.unwrap();
+        bench.keys.send(Asked::ToggleRecording).unwrap();
         until(&bench.board, "an episode", |file| file.is_some()).await;
         idle().await;
-        bench.keys.send(Command::Quit).await.unwrap();
+        bench.keys.send(Asked::Quit).unwrap();
     };
     let (outcome, ()) = tokio::join!(bench.conductor.conduct(&mut bench.running), keys);
     outcome.unwrap();

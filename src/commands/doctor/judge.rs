@@ -2,13 +2,15 @@
 //!
 //! Pure: facts and registry in, findings out.
 
+use std::path::PathBuf;
+
 use serde::Serialize;
 
 use super::bandwidth::{self, Wish};
 use super::facts::{Facts, Node};
 use super::machine;
 use super::usb::UsbDevice;
-use crate::registry::{DeviceSpec, NodeSpec, Opens, Registry};
+use crate::registry::{Assigner, Attachment, DeviceNode, DeviceSpec, NodeSpec, Opens, Registry, UsbIdentity};
 
 /// A camera that runs slower than this, Mbit/s, is in the wrong port or on a bad cable.
 const SLOWEST: f64 = 480.0;
@@ -57,7 +59,7 @@ impl Finding {
 #[must_use]
 pub(super) fn judge(facts: &Facts, registry: Option<&Registry>, rules: Option<&str>) -> Vec<Finding> {
     let entries = registry.map(|registry| registry.devices.as_slice()).unwrap_or_default();
-    let plugged = plugged(entries, &facts.usb);
+    let plugged = plugged(registry, &facts.usb);
     let mut found = Vec::new();
     found.extend(buses(facts, &plugged));
     found.extend(speeds(&plugged));
@@ -71,40 +73,55 @@ pub(super) fn judge(facts: &Facts, registry: Option<&Registry>, rules: Option<&s
     found
 }
 
-/// Entries with the USB device that they mean, of those that are plugged in. Interchangeable units take
-/// the entries in the order of their ports, as at a start.
+/// Entries with the USB device that they mean, of those that are plugged in, as a rig that starts now would assign
+/// them.
 #[must_use]
-pub(super) fn plugged<'a>(entries: &'a [DeviceSpec], usb: &'a [UsbDevice]) -> Vec<(&'a DeviceSpec, &'a UsbDevice)> {
-    let mut found: Vec<(&DeviceSpec, &UsbDevice)> = Vec::new();
-    for entry in entries {
-        let Some(wished) = entry.identity.usb() else { continue };
-        let is_free = |device: &UsbDevice| {
-            !found.iter().any(|(other, taken)| taken.port == device.port && same_node(other, entry))
-        };
-        let mut model = usb.iter().filter(|device| (device.vid, device.pid) == (wished.vid, wished.pid));
-        let unit = match (&wished.serial, &wished.port) {
-            (Some(serial), _) => model.find(|device| device.serial.as_ref() == Some(serial)),
-            (None, Some(port)) => model.find(|device| device.port == *port),
-            (None, None) => model.find(|device| is_free(device)),
-        };
-        found.extend(unit.map(|unit| (entry, unit)));
+pub(super) fn plugged<'a>(
+    registry: Option<&'a Registry>,
+    usb: &'a [UsbDevice],
+) -> Vec<(&'a DeviceSpec, &'a UsbDevice)> {
+    let Some(registry) = registry else { return Vec::new() };
+    let mut assigner = Assigner::new(registry);
+    let mut units: Vec<&UsbDevice> = usb.iter().collect();
+    // In the order in which hot-plug tells them at a start.
+    units.sort_by(|a, b| a.port.cmp(&b.port));
+    for unit in units {
+        for node in nodes_of(unit) {
+            assigner.attach(&node);
+        }
     }
-    found
+    let meant = |entry: &'a DeviceSpec| {
+        let attached = assigner.attached_as(entry.id)?;
+        Some((entry, usb.iter().find(|unit| unit.port == attached.unit.place())?))
+    };
+    registry.devices.iter().filter_map(meant).collect()
 }
 
-fn same_node(a: &DeviceSpec, b: &DeviceSpec) -> bool {
-    subsystem(a) == subsystem(b)
+/// A node of each kind: whether the device has it is another question.
+fn nodes_of(unit: &UsbDevice) -> [Attachment; 4] {
+    let usb = UsbIdentity {
+        vid: unit.vid,
+        pid: unit.pid,
+        serial: unit.serial.clone(),
+        port: unit.port.clone(),
+        ..UsbIdentity::default()
+    };
+    let folder = PathBuf::from("/usb").join(&unit.port);
+    let node = |kind: &str, node: fn(PathBuf) -> DeviceNode| {
+        let syspath = folder.join(kind);
+        Attachment { node: node(syspath.clone()), syspath, unit: usb.clone().into(), driver: None }
+    };
+    [
+        node("video", DeviceNode::Video),
+        node("tty", DeviceNode::Tty),
+        node("usb", DeviceNode::Usb),
+        node("net", |path| DeviceNode::Net(path.display().to_string())),
+    ]
 }
 
 /// The subsystem of the node that an entry opens, and its group.
-const fn subsystem(entry: &DeviceSpec) -> Option<(&'static str, &'static str)> {
-    let opens = match &entry.node {
-        NodeSpec::Camera(_) => Opens::Video,
-        NodeSpec::Serial(_) => Opens::Tty,
-        NodeSpec::Process(process) => process.opens,
-        _ => return None,
-    };
-    match opens {
+fn subsystem(entry: &DeviceSpec) -> Option<(&'static str, &'static str)> {
+    match entry.node.opens() {
         Opens::Video => Some(("video4linux", "video")),
         Opens::Tty => Some(("tty", "dialout")),
         Opens::Usb => Some(("usb", "plugdev")),

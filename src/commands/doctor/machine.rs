@@ -141,7 +141,10 @@ pub(super) fn disk(facts: &Facts, registry: Option<&Registry>) -> Vec<Finding> {
     let Some(disk) = &facts.disk else { return Vec::new() };
     let folder = text::plain(&disk.folder.display().to_string()).into_owned();
     let mut found = Vec::new();
-    let wanted: f64 = registry.map(|registry| registry.devices.iter().map(most).sum()).unwrap_or_default();
+    let entries = registry.map(|registry| registry.devices.as_slice()).unwrap_or_default();
+    let wanted: f64 = entries.iter().filter_map(most).sum();
+    let unknown = entries.iter().filter(|entry| most(entry).is_none());
+    let unknown = unknown.map(|entry| format!("[device.{}]", entry.name)).collect::<Vec<_>>().join(", ");
     match &disk.rate {
         Err(error) => {
             found.push(Finding::bad(
@@ -151,11 +154,12 @@ pub(super) fn disk(facts: &Facts, registry: Option<&Registry>) -> Vec<Finding> {
             ));
         }
         Ok(rate) => {
-            let what = format!(
-                "{folder} took {}; the devices send at most {} (estimated)",
-                megabytes(*rate),
-                megabytes(wanted)
-            );
+            let (took, wanted_said) = (megabytes(*rate), megabytes(wanted));
+            let what = if unknown.is_empty() {
+                format!("{folder} took {took}; the devices send at most {wanted_said} (estimated)")
+            } else {
+                format!("{folder} took {took}; the devices send {wanted_said} (estimated) and what {unknown} may send")
+            };
             found.push(if *rate < wanted {
                 Finding::warn("disk", what, "record on a faster disk: --out DIR")
             } else {
@@ -167,8 +171,11 @@ pub(super) fn disk(facts: &Facts, registry: Option<&Registry>) -> Vec<Finding> {
     let reserve = registry.and_then(|registry| registry.rig.disk_reserve).unwrap_or(usual);
     let room = disk.free.saturating_sub(reserve);
     let seconds = if wanted > 0.0 { room as f64 / wanted } else { f64::INFINITY };
-    let lasts =
-        if seconds.is_finite() { format!(", {:.0} min of everything at most", seconds / 60.0) } else { String::new() };
+    let lasts = match seconds.is_finite() {
+        true if unknown.is_empty() => format!(", {:.0} min of everything at most", seconds / 60.0),
+        true => format!(", {:.0} min without {unknown}", seconds / 60.0),
+        false => String::new(),
+    };
     let what = format!("{} free besides the reserve of {}{lasts}", text::size(room), text::size(reserve));
     found.push(if room == 0 {
         Finding::bad("disk", what, "remove or move recordings, or choose another folder with --out")
@@ -180,14 +187,17 @@ pub(super) fn disk(facts: &Facts, registry: Option<&Registry>) -> Vec<Finding> {
     found
 }
 
-/// Bytes a second that a device sends at the most.
-fn most(entry: &DeviceSpec) -> f64 {
+/// Bytes a second that a device sends at the most; `None` where only the device, or its program, knows how often it
+/// sends.
+fn most(entry: &DeviceSpec) -> Option<f64> {
     match &entry.node {
         NodeSpec::Camera(camera) => {
-            Wish { name: String::new(), camera: camera.clone(), max_bytes: entry.max_bytes }.bytes_per_second()
+            let wish = Wish { name: String::new(), camera: camera.clone(), max_bytes: entry.max_bytes };
+            Some(wish.bytes_per_second())
         }
-        NodeSpec::Serial(serial) => f64::from(serial.baud) / 10.0,
-        NodeSpec::Can(can) => f64::from(can.bitrate) / 8.0,
-        _ => 0.0,
+        NodeSpec::Serial(serial) => Some(f64::from(serial.baud) / 10.0),
+        NodeSpec::Can(can) => Some(f64::from(can.bitrate) / 8.0),
+        NodeSpec::Lan(lan) => Some(lan.rate()? * entry.max_bytes as f64),
+        NodeSpec::Process(_) => None,
     }
 }

@@ -54,8 +54,7 @@ fn report(facts: &Facts, registry: Result<&Registry, &str>, format: Format, out:
             .map(|rules| rules.contents)
     });
     findings.extend(judge::judge(facts, registry, rules.as_deref()));
-    let devices = registry.map(|registry| registry.devices.as_slice()).unwrap_or_default();
-    let plugged = judge::plugged(devices, &facts.usb);
+    let plugged = judge::plugged(registry, &facts.usb);
     let names = |device: &UsbDevice| -> Vec<&str> {
         plugged.iter().filter(|(_, usb)| usb.port == device.port).map(|(entry, _)| entry.name.as_str()).collect()
     };

@@ -298,6 +298,69 @@ fn one_thing_wrong_is_one_finding() {
 }
 
 #[test]
+fn an_exact_unit_is_not_taken_by_an_entry_that_takes_any() {
+    let entry = |name: &str, bit: u8, more: &str| {
+        format!("[device.{name}]\nvid = \"1\"\npid = \"2\"\nnode = \"camera\"\nbit = {bit}\n{more}\n")
+    };
+    let text = entry("any", 0, "") + &entry("exact", 1, "serial = \"S1\"");
+    let registry = Registry::parse(&text, None).unwrap().registry;
+    let unit = |port: &str, serial: Option<&str>| UsbDevice {
+        port: port.into(),
+        vid: 1,
+        pid: 2,
+        serial: serial.map(str::to_owned),
+        ..UsbDevice::default()
+    };
+    let usb = [unit("1-1", Some("S1")), unit("1-2", Some("S2"))];
+    let plugged = judge::plugged(Some(&registry), &usb);
+    let plugged: Vec<_> = plugged.iter().map(|(entry, unit)| (entry.name.as_str(), unit.port.as_str())).collect();
+    assert_eq!(plugged, [("any", "1-2"), ("exact", "1-1")]);
+}
+
+#[test]
+fn a_can_adapter_that_is_a_serial_line_is_looked_at_as_one() {
+    let text =
+        "[device.arm]\nvid = \"1\"\npid = \"2\"\nnode = \"can\"\nbit = 0\n[device.arm.can]\nadapter = \"slcan\"\n";
+    let registry = Registry::parse(text, None).unwrap().registry;
+    let usb = UsbDevice { port: "1-1".into(), bus: 1, mbit: 12.0, vid: 1, pid: 2, ..UsbDevice::default() };
+    let node = Node {
+        path: "/dev/ttyACM0".into(),
+        subsystem: "tty",
+        port: "1-1".into(),
+        is_open_to_us: false,
+        group: "dialout".into(),
+        mode: 0o660,
+    };
+    let facts = Facts { usb: vec![usb], nodes: vec![node], ..Facts::default() };
+    let found: Vec<String> =
+        judge::judge(&facts, Some(&registry), None).into_iter().map(|finding| finding.what).collect();
+    assert!(found.iter().any(|what| what.starts_with("/dev/ttyACM0 of [device.arm] may not be opened")), "{found:?}");
+    assert!(found.iter().any(|what| what.contains("not in the group dialout")), "{found:?}");
+}
+
+#[test]
+fn what_only_a_device_knows_is_not_said_to_be_the_most() {
+    let camera = "[device.cam]\nnode = \"lan\"\nbit = 0\nmax_bytes = \"100KiB\"\n[device.cam.lan]\nprotocol = \"mjpeg\"\nhost = \"192.0.2.1\"\nfps = 10\n";
+    let lidar = "[device.lidar]\nnode = \"lan\"\nbit = 1\n[device.lidar.lan]\nprotocol = \"udp\"\nhost = \"192.0.2.2\"\nport = 2368\n";
+    let disk = Some(Disk { folder: "/data".into(), free: 10 << 30, size: 20 << 30, rate: Ok(500e6) });
+    let facts = Facts { disk, ..Facts::default() };
+    let said = |text: &str| -> Vec<String> {
+        let registry = Registry::parse(text, None).unwrap().registry;
+        let found = judge::judge(&facts, Some(&registry), None).into_iter();
+        found.filter(|finding| finding.about == "disk").map(|finding| finding.what).collect()
+    };
+    let known = said(camera);
+    assert_eq!(known[0], "/data took 500.0 MB/s; the devices send at most 1.0 MB/s (estimated)");
+    assert!(known[1].ends_with("min of everything at most"), "{known:?}");
+    let unknown = said(&format!("{camera}{lidar}"));
+    assert_eq!(
+        unknown[0],
+        "/data took 500.0 MB/s; the devices send 1.0 MB/s (estimated) and what [device.lidar] may send"
+    );
+    assert!(unknown[1].ends_with("min without [device.lidar]"), "{unknown:?}");
+}
+
+#[test]
 fn cameras_that_do_not_fit_are_told_what_would() {
     let entry = |at: usize| {
         format!(

@@ -7,7 +7,7 @@
 //! Invariant: bytes from an adapter never make it panic.
 
 use std::io;
-use std::os::fd::{AsFd, AsRawFd, BorrowedFd, RawFd};
+use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd};
 use std::path::Path;
 use std::time::Duration;
 
@@ -113,6 +113,11 @@ impl Link {
     /// When the interface is gone, no CAN bus, or not up and may not be brought up.
     pub fn open_socket(name: &str, bitrate: u32) -> Result<Self, LinkError> {
         Socket::open(name, bitrate).map(Self::Socket)
+    }
+
+    /// A socket of datagrams in the place of a network interface's.
+    pub(super) fn stand_in(socket: OwnedFd) -> Result<Self, LinkError> {
+        Socket::stand_in(socket).map(Self::Socket)
     }
 
     /// Opens the serial line at `path`, and the bus behind it with `bitrate`. Waits for the adapter's

@@ -19,6 +19,7 @@
 //!
 //! Invariant: nothing is allocated between two samples.
 
+use std::os::fd::OwnedFd;
 use std::time::Duration;
 
 use super::link::{AsyncLink, Link, LinkError, Received, is_bus_off};
@@ -56,6 +57,16 @@ impl Raw {
         let (spec, node) = (spec.clone(), node.clone());
         let link = unblock(move || Link::open(&spec, &node).map_err(LinkError::into_driver)).await?;
         Self::on(link, format)
+    }
+
+    /// Reads datagrams of 16 bytes as a bus's frames: for measurements on a kernel that has no CAN.
+    ///
+    /// # Errors
+    /// When the socket cannot be set up.
+    #[doc(hidden)]
+    pub fn stand_in(socket: OwnedFd) -> Result<Self, DriverError> {
+        let link = Link::stand_in(socket).map_err(LinkError::into_driver)?;
+        Self::on(link, Format::Messages { baud: None, channels: 0, hz: None })
     }
 
     fn on(link: Link, format: Format) -> Result<Self, DriverError> {

@@ -5,7 +5,7 @@
 
 use std::io;
 use std::mem::{size_of, zeroed};
-use std::os::fd::{AsFd, AsRawFd as _, BorrowedFd};
+use std::os::fd::{AsFd, AsRawFd as _, BorrowedFd, FromRawFd as _, OwnedFd};
 use std::time::Duration;
 
 use socketcan::{CanSocket, Socket as _, SocketOptions as _};
@@ -39,6 +39,14 @@ impl Socket {
         let ready = netlink::bring_up(name, bitrate)?;
         let socket = listen(ready.index).map_err(|error| open_error(name, &error))?;
         Ok(Self::of(socket, name, ready, format!("{name} at {bitrate} bit/s")))
+    }
+
+    /// Datagrams stand in for frames: the kernel hands over both, their stamps and the count of what found the
+    /// queue full in the same way.
+    pub(super) fn stand_in(socket: OwnedFd) -> Result<Self, LinkError> {
+        let socket = CanSocket::from(socket);
+        set_up(&socket).map_err(|error| LinkError::Retry(format!("the stand-in for a bus: {error}")))?;
+        Ok(Self::of(socket, "stand-in", Ready { index: 0, restarts: false }, "stand-in".to_owned()))
     }
 
     fn of(socket: CanSocket, name: &str, ready: Ready, description: String) -> Self {
@@ -112,6 +120,16 @@ impl Socket {
 impl AsFd for Socket {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.bound.as_fd()
+    }
+}
+
+/// Opens a socket and closes it: the first one of a kind makes the kernel load its modules.
+pub(super) fn load() {
+    // SAFETY: plain numbers.
+    let socket = unsafe { libc::socket(libc::PF_CAN, libc::SOCK_RAW | libc::SOCK_CLOEXEC, libc::CAN_RAW) };
+    if socket >= 0 {
+        // SAFETY: it was just opened, and nobody else has it.
+        drop(unsafe { OwnedFd::from_raw_fd(socket) });
     }
 }
 

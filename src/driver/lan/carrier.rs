@@ -3,6 +3,7 @@
 //! The adapter itself stays plugged in when that goes, so nobody else tells of it.
 
 use std::fs;
+use std::io;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -39,6 +40,25 @@ impl Carrier {
         Self { file, was_up: false, beat }
     }
 
+    /// Is it known to be down?
+    pub(super) fn is_down(&self) -> bool {
+        self.file.as_ref().is_some_and(|file| matches!(fs::read(file).as_deref(), Ok([b'0', ..])))
+    }
+
+    /// Waits until it is up, or the adapter is gone. Cancel-safe.
+    pub(super) async fn up(&mut self) {
+        let Some(file) = &self.file else { return };
+        loop {
+            self.beat.tick().await;
+            match fs::read(file) {
+                Ok(told) if told.starts_with(b"1") => return,
+                Err(error) if error.kind() == io::ErrorKind::NotFound => return,
+                // Of an interface that is down nothing is known.
+                _ => {}
+            }
+        }
+    }
+
     /// Waits until it is lost, after it was there. Cancel-safe.
     pub(super) async fn lost(&mut self) {
         let Some(file) = &self.file else { return std::future::pending().await };
@@ -59,6 +79,23 @@ mod tests {
     use tokio::time::timeout;
 
     use super::*;
+
+    #[tokio::test]
+    async fn a_link_that_is_down_is_waited_for() {
+        let file = tempfile::NamedTempFile::new().expect("file");
+        fs::write(file.path(), "0\n").expect("written");
+        let mut carrier = Carrier::watching(Some(file.path().to_owned()));
+        assert!(carrier.is_down());
+        assert!(timeout(Duration::from_millis(350), carrier.up()).await.is_err(), "it is down");
+        fs::write(file.path(), "1\n").expect("written");
+        carrier.up().await;
+        assert!(!carrier.is_down());
+        // The adapter is unplugged meanwhile.
+        fs::write(file.path(), "0\n").expect("written");
+        file.close().expect("removed");
+        carrier.up().await;
+        assert!(!carrier.is_down() && !Carrier::watching(None).is_down());
+    }
 
     #[tokio::test]
     async fn only_a_link_that_was_there_is_lost() {

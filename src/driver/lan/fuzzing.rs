@@ -29,22 +29,32 @@ pub fn multipart<'p>(
     (parts, malformed)
 }
 
-/// Pictures and sessions that a phone sends in these pieces, and how many were given up.
-pub fn phone<'p>(largest: usize, pieces: impl IntoIterator<Item = &'p [u8]>) -> (Vec<Vec<u8>>, u64) {
+/// What a phone sends.
+#[derive(Debug, PartialEq)]
+pub enum Sent {
+    /// A picture.
+    Picture(Vec<u8>),
+    /// A session, in JSON.
+    Session(Vec<u8>),
+}
+
+/// What a phone sends in these pieces, and how many were given up.
+pub fn phone<'p>(largest: usize, pieces: impl IntoIterator<Item = &'p [u8]>) -> (Vec<Sent>, u64) {
     let mut packets = Packets::new(largest);
-    let (mut payloads, mut malformed) = (Vec::new(), 0);
+    let (mut sent, mut malformed) = (Vec::new(), 0);
     for mut piece in pieces {
         while !piece.is_empty() {
             let (taken, cut) = packets.feed(piece);
             piece = piece.get(taken..).unwrap_or_default();
             match cut {
                 packet::Cut::Open => {}
-                packet::Cut::Frame(_) | packet::Cut::Session => payloads.push(packets.payload().to_vec()),
+                packet::Cut::Frame(_) => sent.push(Sent::Picture(packets.payload().to_vec())),
+                packet::Cut::Session => sent.push(Sent::Session(packets.payload().to_vec())),
                 packet::Cut::Malformed => malformed += 1,
             }
         }
     }
-    (payloads, malformed)
+    (sent, malformed)
 }
 
 /// What is looked at in a GoPro's answers and in a picture.

@@ -3,35 +3,40 @@
 //! The requests are those of Open GoPro (gopro.github.io/OpenGoPro, HTTP, version 2.0): wired control on,
 //! clock set, then every 3 s a keep-alive and a look at the camera's state, which is the sample, in JSON:
 //! `{"recording":bool,"busy":bool,"battery_percent":n,"card_free_kb":n,"remaining_s":n}`, null where the
-//! camera does not say. With an episode the shutter is started and stopped; which clip it made is written
-//! beside the episode, and the clip is fetched if the entry says so (`clip`).
+//! camera does not say. With an episode the shutter is started and stopped (`camera`); which clip it made is written
+//! beside the episode, and the clip is fetched if the entry says so (`clip`), by the next run if this one ends before.
 //!
 //! The camera gives itself 172.2X.1YZ.51 and its host an address in the same network, XYZ being the last
 //! digits of its serial number.
 //!
 //! Invariant: a task speaks with the camera; whoever reads or tells it something never waits for it.
-//! Invariant: what goes wrong with a clip is said, and changes nothing of the episode.
+//! Invariant: however the connection or the run ends, the shutter that is ours and the clips that are to be fetched are
+//! known to whoever opens the camera next (`books`).
 
+mod answer;
+mod books;
+mod camera;
 mod clip;
 
-use std::collections::VecDeque;
 use std::net::Ipv4Addr;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use tokio::sync::mpsc;
-use tokio::time::{MissedTickBehavior, interval, sleep};
+use tokio::sync::{mpsc, watch};
+use tokio::time::sleep;
 use tokio_util::task::AbortOnDropHandle;
 
+use self::answer::State;
+use self::books::Books;
+use self::camera::{Camera, Pace, Told};
 use self::clip::Clip;
 use super::http;
 use super::place::{Place, Server};
 use crate::driver::{DriverError, Reading};
+use crate::folder::state_directory;
 use crate::sample::Encoding;
 use crate::time::Stamp;
 
-/// The camera switches itself off when it hears nothing for longer than this (Open GoPro, "keep alive").
-const KEEP_ALIVE: Duration = Duration::from_secs(3);
 /// The camera answers within a tenth of a second, while it encodes too.
 const ANSWER_LIMIT: Duration = Duration::from_secs(2);
 /// The state is 5 KB of numbers.
@@ -39,9 +44,6 @@ const LARGEST_ANSWER: usize = 256 << 10;
 /// The host asks the camera for its address (DHCP), which takes a moment after the plug.
 const ADDRESS_LIMIT: Duration = Duration::from_secs(8);
 const LOOK_FOR_ADDRESS: Duration = Duration::from_millis(200);
-/// The clip is in the camera's list a moment after it was stopped, usually within 1.5 s.
-const CLIP_IS_LISTED_WITHIN: Duration = Duration::from_secs(4);
-const LOOK_FOR_CLIP: Duration = Duration::from_millis(100);
 /// An answer that did not come is asked for again.
 const TRIES: u32 = 2;
 
@@ -49,29 +51,10 @@ const TRIES: u32 = 2;
 #[derive(Debug)]
 pub(super) struct Gopro {
     states: mpsc::Receiver<Result<State, DriverError>>,
-    orders: mpsc::Sender<Order>,
+    told: watch::Sender<Told>,
     task: AbortOnDropHandle<()>,
     model: Option<String>,
     payload: Vec<u8>,
-}
-
-#[derive(Debug)]
-enum Order {
-    /// An episode that will be this file.
-    Start(PathBuf),
-    Stop,
-}
-
-/// What the camera says of itself.
-#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
-struct State {
-    recording: bool,
-    busy: bool,
-    battery_percent: Option<u64>,
-    card_free_kb: Option<u64>,
-    remaining_s: Option<u64>,
-    #[serde(skip)]
-    asked: Stamp,
 }
 
 impl Gopro {
@@ -80,27 +63,29 @@ impl Gopro {
             Some(_) => place.clone(),
             None => place.at(address(place).await?.into()),
         };
-        let server = place.server(port)?;
+        Self::begin(name, place.server(port)?, download, state_directory(), Pace::USUAL).await
+    }
+
+    /// `state` is the folder of the books.
+    async fn begin(
+        name: &str,
+        server: Server,
+        download: bool,
+        state: Option<PathBuf>,
+        pace: Pace,
+    ) -> Result<Self, DriverError> {
         ask(&server, "/gopro/camera/control/wired_usb?p=1").await?;
         let info = ask(&server, "/gopro/camera/info").await?;
-        if let Err(error) = ask(&server, &clock()).await {
+        if let Err(error) = ask(&server, &answer::clock()).await {
             tracing::warn!(device = name, %error, "the camera's clock is not set");
         }
-        let newest = newest(&server).await.ok();
+        let serial = answer::serial(&info);
+        let books = Books::open(state.as_deref(), serial.as_deref().unwrap_or(name)).await;
         let (tell, states) = mpsc::channel(4);
-        let (orders, asked) = mpsc::channel(4);
-        let camera = Camera {
-            name: name.to_owned(),
-            server,
-            download,
-            newest,
-            states: tell,
-            episode: None,
-            pending: VecDeque::new(),
-            fetching: None,
-        };
-        let task = AbortOnDropHandle::new(tokio::spawn(camera.run(asked)));
-        Ok(Self { states, orders, task, model: model(&info), payload: Vec::new() })
+        let (told, tasks) = watch::channel(None);
+        let camera = Camera::new(name, server, download, books, tell, pace).await;
+        let task = AbortOnDropHandle::new(tokio::spawn(camera.run(tasks)));
+        Ok(Self { states, told, task, model: answer::model(&info), payload: Vec::new() })
     }
 
     pub(super) async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
@@ -121,166 +106,21 @@ impl Gopro {
     }
 
     /// The episode that will be `episode` begins, or with `None` the one in progress ends.
-    pub(super) fn record(&mut self, episode: Option<PathBuf>) -> Result<(), DriverError> {
-        let order = episode.map_or(Order::Stop, Order::Start);
-        self.orders.try_send(order).map_err(|_| DriverError::Retry("the camera does not answer".to_owned()))
+    pub(super) fn record(&self, episode: Option<PathBuf>) {
+        self.told.send_replace(Some(episode));
     }
 
     /// Stops the shutter, if it is ours, and notes the clip.
     pub(super) async fn close(self) {
-        let Self { orders, task, states, .. } = self;
-        let _ = orders.send(Order::Stop).await;
-        drop((orders, states));
+        let Self { told, task, states, .. } = self;
+        told.send_replace(Some(None));
+        drop((told, states));
         // Who gives this up leaves the task its time: the camera is not to record on.
         let _ = task.detach().await;
     }
 
     pub(super) fn card(&self) -> Option<String> {
         self.model.clone()
-    }
-}
-
-/// What the task owns.
-#[derive(Debug)]
-struct Camera {
-    name: String,
-    server: Server,
-    download: bool,
-    /// The newest clip, as far as is known: folder and file.
-    newest: Option<(String, String)>,
-    states: mpsc::Sender<Result<State, DriverError>>,
-    /// The episode in progress, for which the shutter was started.
-    episode: Option<PathBuf>,
-    /// Clips that are still to be fetched.
-    pending: VecDeque<Clip>,
-    fetching: Option<AbortOnDropHandle<Result<(), String>>>,
-}
-
-impl Camera {
-    async fn run(mut self, mut orders: mpsc::Receiver<Order>) {
-        let mut beat = interval(KEEP_ALIVE);
-        beat.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        loop {
-            tokio::select! {
-                biased;
-                order = orders.recv() => match order {
-                    Some(Order::Start(episode)) => self.start(episode).await,
-                    Some(Order::Stop) => self.stop().await,
-                    None => return,
-                },
-                _ = beat.tick() => {
-                    let state = self.look().await;
-                    let is_over = state.is_err();
-                    if !self.states.is_closed() && self.states.try_send(state).is_err() {
-                        tracing::debug!(device = self.name, "a state that nobody read");
-                    }
-                    if is_over {
-                        return;
-                    }
-                }
-                fetched = fetched(&mut self.fetching) => {
-                    self.fetching = None;
-                    if let Some(clip) = self.pending.pop_front()
-                        && let Err(reason) = fetched
-                    {
-                        tracing::error!(device = self.name, %reason, "{} stays on the camera: {}", clip.file, clip.url(&self.server));
-                    }
-                    self.fetch();
-                }
-            }
-        }
-    }
-
-    async fn look(&self) -> Result<State, DriverError> {
-        ask(&self.server, "/gopro/camera/keep_alive").await?;
-        let asked = Stamp::now();
-        let answer = ask(&self.server, "/gopro/camera/state").await?;
-        state(&answer, asked).ok_or_else(|| self.server.place.lost("its state is not what a GoPro says"))
-    }
-
-    async fn start(&mut self, episode: PathBuf) {
-        // The camera reads one card: the clip in progress comes first.
-        self.fetching = None;
-        let started = ask(&self.server, "/gopro/camera/shutter/start").await;
-        // It may record already: its connection was lost in the middle of the episode.
-        let records = started.is_ok() || self.look().await.is_ok_and(|state| state.recording);
-        if records {
-            self.episode = Some(episode);
-        } else if let Err(error) = started {
-            tracing::error!(device = self.name, %error, "the camera does not record this episode");
-            self.fetch();
-        }
-    }
-
-    async fn stop(&mut self) {
-        let Some(episode) = self.episode.take() else { return };
-        if let Err(error) = ask(&self.server, "/gopro/camera/shutter/stop").await {
-            tracing::error!(device = self.name, %error, "the camera may record on: stop it by hand");
-            return;
-        }
-        match self.note(episode).await {
-            Ok(clip) => {
-                self.newest = Some((clip.folder.clone(), clip.file.clone()));
-                tracing::info!(
-                    device = self.name,
-                    clip = clip.file,
-                    folder = clip.folder,
-                    size = clip.size,
-                    "recorded"
-                );
-                if self.download {
-                    self.pending.push_back(clip);
-                }
-            }
-            Err(reason) => {
-                tracing::error!(device = self.name, %reason, "which clip belongs to the episode is not known");
-            }
-        }
-        self.fetch();
-    }
-
-    /// Writes beside the episode which clip belongs to it.
-    async fn note(&self, episode: PathBuf) -> Result<Clip, String> {
-        let (folder, file) = self.made().await?;
-        let mut clip = Clip::new(folder, file, episode, &self.name);
-        let info = ask(&self.server, &format!("/gopro/media/info?path={}/{}", clip.folder, clip.file)).await;
-        clip.size = info.ok().and_then(|info| clip::size(&info));
-        let (noted, url) = (clip.clone(), clip.url(&self.server));
-        let written = tokio::task::spawn_blocking(move || noted.note(&url)).await;
-        written.map_err(|error| error.to_string())?.map_err(|error| error.to_string())?;
-        Ok(clip)
-    }
-
-    /// The clip that was just made: another than was the newest before.
-    async fn made(&self) -> Result<(String, String), String> {
-        let looks = CLIP_IS_LISTED_WITHIN.as_millis() / LOOK_FOR_CLIP.as_millis();
-        for _ in 0..looks {
-            match newest(&self.server).await {
-                Ok(clip) if self.newest.as_ref() != Some(&clip) => return Ok(clip),
-                Ok(_) => {}
-                Err(reason) => tracing::debug!(device = self.name, %reason, "the newest clip is not known yet"),
-            }
-            sleep(LOOK_FOR_CLIP).await;
-        }
-        Err(format!("it names no new clip within {} s", CLIP_IS_LISTED_WITHIN.as_secs()))
-    }
-
-    /// Goes on with the clips that are to be fetched.
-    fn fetch(&mut self) {
-        if self.fetching.is_some() || self.episode.is_some() {
-            return;
-        }
-        if let Some(clip) = self.pending.front() {
-            let fetching = clip::fetch(clip.clone(), self.server.clone());
-            self.fetching = Some(AbortOnDropHandle::new(tokio::spawn(fetching)));
-        }
-    }
-}
-
-async fn fetched(fetching: &mut Option<AbortOnDropHandle<Result<(), String>>>) -> Result<(), String> {
-    match fetching {
-        Some(fetching) => fetching.await.map_err(|error| error.to_string())?,
-        None => std::future::pending().await,
     }
 }
 
@@ -292,12 +132,6 @@ async fn ask(server: &Server, path: &str) -> Result<Vec<u8>, DriverError> {
             outcome => return outcome,
         }
     }
-}
-
-/// Folder and file of the newest clip on the card.
-async fn newest(server: &Server) -> Result<(String, String), String> {
-    let answer = ask(server, "/gopro/media/last_captured").await.map_err(|error| error.to_string())?;
-    clip::named(&answer)
 }
 
 /// The camera's address, once the host has one in its network.
@@ -313,8 +147,7 @@ async fn address(place: &Place) -> Result<Ipv4Addr, DriverError> {
         sleep(LOOK_FOR_ADDRESS).await;
     }
     Err(place.lost(
-        "it has no address in 172.20.0.0/14 by DHCP: let the system configure the interface, or write host = the camera's \
-         address",
+        "no address 172.2X.1YZ.* by DHCP: let the system configure the interface, or write host = the camera's address",
     ))
 }
 
@@ -328,65 +161,19 @@ fn camera_of(own: Ipv4Addr) -> Ipv4Addr {
     Ipv4Addr::new(a, b, c, 51)
 }
 
-/// The request that sets the camera's clock, to the second, to the local time.
-fn clock() -> String {
-    // SAFETY: all zeroes are a valid time.
-    let mut local: libc::tm = unsafe { std::mem::zeroed() };
-    // SAFETY: null asks for the time alone.
-    let now = unsafe { libc::time(std::ptr::null_mut()) };
-    // SAFETY: both pointers are to locals. Without time zones on the machine it is UTC.
-    unsafe { libc::localtime_r(&raw const now, &raw mut local) };
-    format!(
-        "/gopro/camera/set_date_time?date={:04}_{:02}_{:02}&time={:02}_{:02}_{:02}&tzone={}&dst={}",
-        local.tm_year + 1900,
-        local.tm_mon + 1,
-        local.tm_mday,
-        local.tm_hour,
-        local.tm_min,
-        local.tm_sec,
-        // The zone without daylight saving, which is told apart.
-        local.tm_gmtoff / 60 - if local.tm_isdst > 0 { 60 } else { 0 },
-        i32::from(local.tm_isdst > 0),
-    )
-}
-
-/// The model and firmware, as `/gopro/camera/info` tells them.
-fn model(info: &[u8]) -> Option<String> {
-    let info: serde_json::Value = serde_json::from_slice(info).ok()?;
-    // Older firmware wraps it.
-    let info = info.get("info").unwrap_or(&info);
-    let text = |key: &str| Some(info.get(key)?.as_str()?.chars().take(64).collect::<String>());
-    let model = text("model_name")?;
-    Some(text("firmware_version").map_or_else(|| model.clone(), |firmware| format!("{model}, firmware {firmware}")))
-}
-
-/// The state, whose parts have numbers (Open GoPro, "Camera State", status ids).
-fn state(answer: &[u8], asked: Stamp) -> Option<State> {
-    const BUSY: &str = "8";
-    const ENCODING: &str = "10";
-    const REMAINING_VIDEO_S: &str = "35";
-    const CARD_FREE_KB: &str = "54";
-    const BATTERY_PERCENT: &str = "70";
-    let answer: serde_json::Value = serde_json::from_slice(answer).ok()?;
-    let status = answer.get("status")?.as_object()?;
-    let number = |id: &str| status.get(id)?.as_u64();
-    Some(State {
-        recording: number(ENCODING)? != 0,
-        busy: number(BUSY).is_some_and(|busy| busy != 0),
-        battery_percent: number(BATTERY_PERCENT),
-        card_free_kb: number(CARD_FREE_KB),
-        remaining_s: number(REMAINING_VIDEO_S),
-        asked,
-    })
-}
-
+/// What is read of a camera's answers and of a note, for the fuzzer.
 #[doc(hidden)]
-pub(super) fn fuzz(answer: &[u8]) {
-    let _ = (state(answer, Stamp::default()), model(answer), clip::size(answer));
-    if let Ok((folder, file)) = clip::named(answer) {
-        let clip = Clip::new(folder, file, PathBuf::from("/a/b.mcap"), "gopro");
+pub(super) fn fuzz(bytes: &[u8]) {
+    let _ = (answer::state(bytes, Stamp::default()), answer::model(bytes), answer::size(bytes));
+    assert!(answer::serial(bytes).is_none_or(|serial| !serial.contains('/')), "a serial number leaves its folder");
+    let newest = answer::newest(bytes).ok().flatten();
+    let newest = newest.map(|name| Clip::new(name, None, PathBuf::from("/a/b.mcap"), "gopro"));
+    let text = String::from_utf8_lossy(bytes);
+    let noted = Clip::read(std::path::Path::new("/a/b.gopro.clip.json"), &text);
+    for clip in newest.into_iter().chain(noted) {
         assert_eq!(clip.target().parent(), Some(std::path::Path::new("/a")), "a clip leaves its folder");
-        assert!(clip.folder.bytes().chain(clip.file.bytes()).all(|byte| byte.is_ascii_graphic() && byte != b'/'));
+        let name = &clip.name;
+        assert!(name.folder.bytes().chain(name.file.bytes()).all(|byte| byte.is_ascii_graphic() && byte != b'/'));
     }
 }
 

@@ -74,11 +74,21 @@ pub(super) async fn get(server: &Server, path: &str, from: u64, limit: Duration)
 
 /// The whole body of an answer that is good, at most so many bytes.
 pub(super) async fn text(server: &Server, path: &str, most: usize, limit: Duration) -> Result<Vec<u8>, DriverError> {
+    match answer(server, path, most, limit).await? {
+        (status, body) if status.is_success() => Ok(body),
+        (status, _) => Err(DriverError::Retry(format!("{}: {path}: {status}", server.place))),
+    }
+}
+
+/// The status and the whole body of an answer, at most so many bytes.
+pub(super) async fn answer(
+    server: &Server,
+    path: &str,
+    most: usize,
+    limit: Duration,
+) -> Result<(StatusCode, Vec<u8>), DriverError> {
     let fetch = async {
         let mut reply = get(server, path, 0, limit).await?;
-        if !reply.status.is_success() {
-            return Err(DriverError::Retry(format!("{}: {path}: {}", server.place, reply.status)));
-        }
         let mut body = Vec::new();
         while let Some(bytes) = reply.next().await? {
             if body.len() + bytes.len() > most {
@@ -86,10 +96,10 @@ pub(super) async fn text(server: &Server, path: &str, most: usize, limit: Durati
             }
             body.extend_from_slice(&bytes);
         }
-        Ok(body)
+        Ok((reply.status, body))
     };
     match timeout(limit, fetch).await {
-        Ok(body) => body,
+        Ok(answer) => answer,
         Err(_) => Err(server.place.lost(format_args!("no answer to {path} within {} s", limit.as_secs()))),
     }
 }

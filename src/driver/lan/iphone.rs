@@ -49,7 +49,6 @@ pub(super) struct Phone {
     connection: Option<Connection>,
     stream: PhoneStream,
     picture: LanPicture,
-    is_checked: bool,
     max_bytes: usize,
     output: Vec<u8>,
     lost: u64,
@@ -86,7 +85,6 @@ impl Phone {
             connection: None,
             stream,
             picture,
-            is_checked: false,
             max_bytes,
             output: Vec::new(),
             lost: 0,
@@ -116,11 +114,8 @@ impl Phone {
             let (bytes, width) = (self.output.as_slice(), 16);
             return Ok(Reading { bytes, encoding: Encoding::F64, captured, flags, width, height: 0, lost });
         }
-        if !self.is_checked
-            && let Some(size) = jpeg::size(picture)
-        {
+        if let Some(size) = jpeg::size(picture) {
             check_size(&self.name, size, self.picture)?;
-            self.is_checked = true;
         }
         if !annotate(picture, &frame, &mut self.output) {
             flags |= FLAG_ERROR;

@@ -35,8 +35,6 @@ pub(super) struct Camera {
     /// When the newest picture was complete.
     newest: Instant,
     picture: LanPicture,
-    /// The size of a picture was looked at.
-    is_checked: bool,
     lost: u64,
 }
 
@@ -60,7 +58,6 @@ impl Camera {
             begun: Stamp::now(),
             newest: Instant::now(),
             picture,
-            is_checked: false,
             lost: 0,
         })
     }
@@ -78,11 +75,8 @@ impl Camera {
         self.newest = Instant::now();
         let bytes = self.parser.part();
         let flags = if bytes.starts_with(&jpeg::START) { 0 } else { FLAG_ERROR };
-        if !self.is_checked
-            && let Some(size) = jpeg::size(bytes)
-        {
+        if let Some(size) = jpeg::size(bytes) {
             check_size(&self.name, size, self.picture)?;
-            self.is_checked = true;
         }
         Ok(Reading {
             bytes,

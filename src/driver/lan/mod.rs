@@ -49,7 +49,17 @@ enum Protocol {
     Iphone(iphone::Phone),
 }
 
+/// Why a device behind an adapter is not there though its adapter is.
+const LINK_IS_DOWN: &str = "the network link is down";
+
 impl Lan {
+    /// Says what is in the way of the device at `node`, if anything is, with a future that ends when it is not.
+    #[must_use]
+    pub fn obstacle(node: &DeviceNode) -> Option<(&'static str, impl Future<Output = ()> + Send + use<>)> {
+        let mut carrier = Carrier::of(node);
+        carrier.is_down().then(|| (LINK_IS_DOWN, async move { carrier.up().await }))
+    }
+
     /// Opens the device of `spec` at `node`.
     ///
     /// # Errors
@@ -97,7 +107,7 @@ impl Lan {
         tokio::select! {
             biased;
             reading = read => reading,
-            () = carrier.lost() => Err(DriverError::Retry("the network link is down".to_owned())),
+            () = carrier.lost() => Err(DriverError::Retry(LINK_IS_DOWN.to_owned())),
         }
     }
 
@@ -109,8 +119,9 @@ impl Lan {
     pub fn record(&mut self, episode: Option<std::path::PathBuf>) -> Result<(), DriverError> {
         match &mut self.protocol {
             Protocol::Gopro(gopro) => gopro.record(episode),
-            Protocol::Mjpeg(_) | Protocol::Udp(_) | Protocol::Iphone(_) => Ok(()),
+            Protocol::Mjpeg(_) | Protocol::Udp(_) | Protocol::Iphone(_) => {}
         }
+        Ok(())
     }
 
     /// Ends in order what the device does by itself.

@@ -15,6 +15,7 @@ use std::time::Duration;
 
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
+use tokio::task::coop::consume_budget;
 use tokio::time::timeout;
 
 use super::place::{Place, port_error};
@@ -77,6 +78,8 @@ impl Packets {
 
     pub(super) async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
         let captured = loop {
+            // Strangers and what is too large may come without end.
+            consume_budget().await;
             // A dropped future leaves every packet with the kernel.
             let ready = timeout(ASK_AFTER, self.socket.readable()).await;
             let Ok(ready) = ready else {

@@ -18,6 +18,7 @@ use mdns_sd::{Receiver, ResolvedService, ScopedIp, ServiceDaemon, ServiceEvent, 
 use tokio::time::{MissedTickBehavior, interval};
 
 use super::super::Witness;
+use super::link::Link;
 use super::watch::{LOOK_EVERY, Watch};
 use crate::registry::LanSpec;
 use crate::time::Stamp;
@@ -94,7 +95,9 @@ impl Browser {
         async move {
             let Some(daemon) = daemon else { return };
             match daemon.browse(&domain) {
-                Ok(events) => Service { domain, wanted, known: BTreeMap::new() }.run(&daemon, events).await,
+                Ok(events) => {
+                    Service { domain, wanted, known: BTreeMap::new(), cut: BTreeMap::new() }.run(&daemon, events).await
+                }
                 Err(error) => tracing::error!(%error, service = domain, "devices of this service are not found"),
             }
         }
@@ -122,6 +125,9 @@ struct Service {
     wanted: Vec<Wanted>,
     /// What is announced, by full name.
     known: BTreeMap<String, Found>,
+    /// Instances whose link went down, with that link: they are told again when it is up. The library says nothing
+    /// then, as they are announced as they were.
+    cut: BTreeMap<String, Link>,
 }
 
 impl Service {
@@ -155,18 +161,28 @@ impl Service {
         if self.known.len() >= MOST_INSTANCES && !self.known.contains_key(&full) {
             return;
         }
-        self.known.insert(full, found);
-        self.assign(now).await;
+        self.cut.remove(&full);
+        self.known.insert(full.clone(), found);
+        self.assign(Some(&full), now).await;
     }
 
-    /// Gives what is announced to the entries, each to one.
-    async fn assign(&mut self, now: Stamp) {
+    /// Gives what is known to the entries, each to one. `announced` was announced just now: its lease begins anew.
+    async fn assign(&mut self, announced: Option<&str>, now: Stamp) {
         for index in 0..self.wanted.len() {
             let Some(wanted) = self.wanted.get(index) else { continue };
             let full = wanted.current.clone().filter(|full| self.known.contains_key(full)).or_else(|| {
-                let is_free = |full: &&String| !self.wanted.iter().any(|other| other.current.as_ref() == Some(full));
-                let fits =
-                    |found: &Found| wanted.instance.as_ref().is_none_or(|name| name.eq_ignore_ascii_case(&found.name));
+                let is_free = |full: &&String| {
+                    !self.cut.contains_key(*full)
+                        && !self.wanted.iter().any(|other| other.current.as_ref() == Some(full))
+                };
+                let names = |wanted: &Wanted, found: &Found| {
+                    wanted.instance.as_ref().is_some_and(|name| name.eq_ignore_ascii_case(&found.name))
+                };
+                // What another entry names is that one's, though it may be announced first.
+                let fits = |found: &Found| match wanted.instance {
+                    Some(_) => names(wanted, found),
+                    None => !self.wanted.iter().any(|other| names(other, found)),
+                };
                 self.known.iter().filter(|(_, found)| fits(found)).map(|(full, _)| full).find(is_free).cloned()
             });
             let Some(found) = full.as_ref().and_then(|full| self.known.get(full)) else { continue };
@@ -179,13 +195,17 @@ impl Service {
             // Announcements come in parts: an address that is good enough stays.
             let Some(address) = kept.or_else(|| found.addresses.first().map(at)) else { continue };
             let Some(wanted) = self.wanted.get_mut(index) else { continue };
-            (wanted.current, wanted.asked) = (full, None);
+            if wanted.current != full || announced == full.as_deref() {
+                wanted.asked = None;
+            }
+            wanted.current = full;
             wanted.watch.found(address, Some(&found.name), now).await;
         }
     }
 
     async fn removed(&mut self, full: &str, now: Stamp) {
         self.known.remove(full);
+        self.cut.remove(full);
         for wanted in self.wanted.iter_mut().filter(|wanted| wanted.current.as_deref() == Some(full)) {
             let witness = wanted.witness(now);
             wanted.asked = None;
@@ -197,7 +217,7 @@ impl Service {
             wanted.current = None;
             wanted.watch.gone(witness, now).await;
         }
-        self.assign(now).await;
+        self.assign(None, now).await;
     }
 
     /// Looks at leases and links; says which instances are to be asked again, and how long they have.
@@ -217,9 +237,17 @@ impl Service {
                 wanted.watch.renew(now);
             }
             wanted.watch.look(now).await;
-            if !wanted.watch.is_there() {
-                wanted.current = None;
+            if !wanted.watch.is_there()
+                && let Some(full) = wanted.current.take()
+                && self.known.contains_key(&full)
+            {
+                self.cut.insert(full, wanted.watch.link());
             }
+        }
+        let before = self.cut.len();
+        self.cut.retain(|_, link| link.is_down());
+        if self.cut.len() != before {
+            self.assign(None, now).await;
         }
         questions
     }

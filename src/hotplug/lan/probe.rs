@@ -39,9 +39,12 @@ pub(super) async fn watch(mut watch: Watch, server: SocketAddr, asked: SocketAdd
     loop {
         tokio::select! {
             answered = &mut answer => {
+                let now = Stamp::now();
                 match answered {
-                    Answer::Here => watch.found(server, None, Stamp::now()).await,
-                    Answer::Nobody => watch.gone(Witness::Lease, Stamp::now()).await,
+                    Answer::Here => watch.found(server, None, now).await,
+                    // A server that takes one connection refuses the next, while its driver has the one.
+                    Answer::Nobody if watch.is_sending(watch.length(), now) => {}
+                    Answer::Nobody => watch.gone(Witness::Lease, now).await,
                     Answer::Silence => {}
                 }
                 let driver_has_port = probe == Probe::Udp && watch.is_there();

@@ -20,6 +20,8 @@ pub(super) const LOOK_EVERY: Duration = Duration::from_millis(100);
 pub(super) struct Watch {
     entry: String,
     length: Duration,
+    /// How much longer the lease is until the driver has heard of the device.
+    grace: Duration,
     lease: Lease,
     /// What the driver hears.
     heard: Heard,
@@ -34,12 +36,19 @@ impl Watch {
         Self {
             entry: entry.to_owned(),
             length,
+            grace: Duration::ZERO,
             lease: Lease::new(length),
             heard: Heard::default(),
             link: Link::default(),
             address: None,
             events,
         }
+    }
+
+    /// Its driver alone can hear it, and may be started this much later.
+    pub(super) const fn waits(mut self, grace: Duration) -> Self {
+        self.grace = grace;
+        self
     }
 
     pub(super) fn entry(&self) -> &str {
@@ -57,6 +66,11 @@ impl Watch {
 
     pub(super) const fn is_there(&self) -> bool {
         self.lease.is_there()
+    }
+
+    /// The link that leads, or led, to it.
+    pub(super) fn link(&self) -> Link {
+        self.link.clone()
     }
 
     /// What its driver hears.
@@ -78,7 +92,7 @@ impl Watch {
         // Found at another address, it is told anew: the rig sees that the unit at its path is another.
         self.address = Some(address);
         self.heard = Heard::default();
-        self.link = Link::to(address.ip());
+        self.link = Link::to(address);
         let unit = LanIdentity {
             entry: self.entry.clone(),
             address: address.to_string(),
@@ -107,11 +121,13 @@ impl Watch {
         if !self.is_there() {
             return;
         }
-        self.lease.heard(self.heard.at());
+        let heard = self.heard.at();
+        self.lease.heard(heard);
         if self.link.is_down() {
             return self.gone(Witness::Link, now).await;
         }
-        let change = self.lease.look(now);
+        let grace = if heard == Stamp::default() { self.grace } else { Duration::ZERO };
+        let change = self.lease.look(now.before(grace));
         self.went(change, Witness::Lease, now).await;
     }
 
@@ -126,6 +142,11 @@ impl Watch {
     async fn tell(&self, event: HotplugEvent) {
         // The rig reads until it ends, and this with it.
         let _ = self.events.send(event).await;
+    }
+
+    #[cfg(test)]
+    pub(super) fn lead_over(&mut self, link: Link) {
+        self.link = link;
     }
 
     fn syspath(&self) -> PathBuf {

@@ -1,4 +1,4 @@
-//! Thread `control`: the control grid.
+//! Thread `grid`: the control grid.
 
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, TryRecvError};
@@ -90,7 +90,7 @@ impl Control {
             if stop.is_cancelled() {
                 break;
             }
-            fault::point("control");
+            fault::point("grid");
             if !self.take_answer() {
                 break;
             }

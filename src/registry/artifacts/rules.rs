@@ -13,7 +13,7 @@
 use std::fmt::Write as _;
 
 use super::HEADER;
-use crate::registry::spec::{CAN_RESTART_MS, CanAdapter, DeviceSpec, NodeSpec, Opens, Registry, UsbSpec};
+use crate::registry::spec::{CAN_RESTART_MS, DeviceSpec, NodeSpec, Opens, Registry, UsbSpec};
 
 /// What `linux/if_arp.h` calls a CAN interface (`ARPHRD_CAN`).
 const ARPHRD_CAN: u32 = 280;
@@ -31,7 +31,7 @@ pub(super) fn rules(registry: &Registry) -> String {
         // Writing to a String cannot fail.
         let _ = writeln!(text, "\n# {}: {:04x}:{:04x}", device.name, usb.vid, usb.pid);
         let bitrate = if let NodeSpec::Can(can) = &device.node { Some(can.bitrate) } else { None };
-        let _ = match (opens(device), bitrate) {
+        let _ = match (device.node.opens(), bitrate) {
             (Opens::Net, Some(bitrate)) => match single_out(registry, device, usb) {
                 Ok(identity) => writeln!(text, "{}", bring_up(usb, &identity, bitrate)),
                 Err(reason) => writeln!(text, "# Not brought up: {reason}."),
@@ -48,7 +48,7 @@ pub(super) fn rules(registry: &Registry) -> String {
 /// The matches that single out the node of an entry's unit, or why there are none.
 pub(super) fn identify(registry: &Registry, device: &DeviceSpec) -> Result<String, String> {
     let Some(usb) = device.identity.usb() else { return Err("it is no USB device".to_owned()) };
-    if opens(device) == Opens::Net {
+    if device.node.opens() == Opens::Net {
         return Err("a network interface has no path".to_owned());
     }
     single_out(registry, device, usb)
@@ -80,7 +80,7 @@ fn single_out(registry: &Registry, device: &DeviceSpec, usb: &UsbSpec) -> Result
 
 fn rule(device: &DeviceSpec, usb: &UsbSpec, identity: &str) -> String {
     // A camera has several nodes; index 0 is the one that captures pictures.
-    let (index, group) = match opens(device) {
+    let (index, group) = match device.node.opens() {
         Opens::Video => (", ATTR{index}==\"0\"", "video"),
         Opens::Tty => ("", "dialout"),
         Opens::Usb | Opens::Net => (", ENV{DEVTYPE}==\"usb_device\"", "plugdev"),
@@ -106,8 +106,8 @@ fn bring_up(usb: &UsbSpec, identity: &str, bitrate: u32) -> String {
     )
 }
 
-const fn subsystem(device: &DeviceSpec) -> &'static str {
-    match opens(device) {
+fn subsystem(device: &DeviceSpec) -> &'static str {
+    match device.node.opens() {
         Opens::Video => "video4linux",
         Opens::Tty => "tty",
         Opens::Usb => "usb",
@@ -115,24 +115,10 @@ const fn subsystem(device: &DeviceSpec) -> &'static str {
     }
 }
 
-/// Which node of its device an entry is read from.
-pub(super) const fn opens(device: &DeviceSpec) -> Opens {
-    match &device.node {
-        NodeSpec::Camera(_) => Opens::Video,
-        NodeSpec::Serial(_) => Opens::Tty,
-        NodeSpec::Process(process) => process.opens,
-        NodeSpec::Can(can) => match can.adapter {
-            CanAdapter::SocketCan => Opens::Net,
-            CanAdapter::Slcan | CanAdapter::Damiao => Opens::Tty,
-        },
-        NodeSpec::Lan(_) => Opens::Net,
-    }
-}
-
 /// The keys that match an attribute of the USB device and its name. Those that also look at parents
 /// would match the devices behind a hub with the hub's.
-const fn keys(device: &DeviceSpec) -> (&'static str, &'static str) {
-    match opens(device) {
+fn keys(device: &DeviceSpec) -> (&'static str, &'static str) {
+    match device.node.opens() {
         Opens::Usb => ("ATTR", "KERNEL"),
         Opens::Video | Opens::Tty | Opens::Net => ("ATTRS", "KERNELS"),
     }

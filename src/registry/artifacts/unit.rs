@@ -1,6 +1,6 @@
 //! `rapid.service`: records without a screen from boot to shutdown.
 
-use super::{HEADER, rules};
+use super::HEADER;
 use crate::registry::spec::{DeviceSpec, NodeSpec, Opens, Registry};
 
 /// Where the unit expects the registry.
@@ -11,8 +11,8 @@ pub const SYSTEM_REGISTRY: &str = "/etc/rapid/devices.toml";
 pub(super) fn unit(registry: &Registry) -> String {
     let rig = &registry.rig.name;
     // Programs that open the USB device itself; the group is that of the rules.
-    let usb = registry.devices.iter().any(|device| rules::opens(device) == Opens::Usb);
-    let is_bus = |device: &DeviceSpec| matches!(device.node, NodeSpec::Can(_)) && rules::opens(device) == Opens::Net;
+    let usb = registry.devices.iter().any(|device| device.node.opens() == Opens::Usb);
+    let is_bus = |device: &DeviceSpec| matches!(device.node, NodeSpec::Can(_)) && device.node.opens() == Opens::Net;
     let can = if registry.devices.iter().any(is_bus) { " AF_CAN" } else { "" };
     let (make_group, group, allow) = if usb {
         ("#   groupadd --system --force plugdev\n", " plugdev", "DeviceAllow=char-usb_device rw\n")

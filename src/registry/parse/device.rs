@@ -13,8 +13,7 @@ use crate::modality::ModalityId;
 use crate::registry::diagnostic::did_you_mean;
 use crate::registry::section::{At, Problems, Section};
 use crate::registry::spec::{
-    ActionSpec, CanAdapter, CanProtocol, CanSpec, DeviceSpec, Hook, Hooks, IdentitySpec, LanSpec, Mount, NodeSpec,
-    Opens, WhenStale,
+    ActionSpec, CanProtocol, CanSpec, DeviceSpec, Hook, Hooks, IdentitySpec, LanSpec, Mount, NodeSpec, Opens, WhenStale,
 };
 
 /// Kinds of node this version has a driver for.
@@ -127,13 +126,7 @@ impl Draft<'_> {
 
     /// Which node of the unit the entry takes.
     pub(super) fn opens(&self) -> Option<Opens> {
-        Some(match self.node.as_ref()? {
-            NodeSpec::Camera(_) => Opens::Video,
-            NodeSpec::Serial(_) => Opens::Tty,
-            NodeSpec::Process(process) => process.opens,
-            NodeSpec::Can(can) if can.adapter != CanAdapter::SocketCan => Opens::Tty,
-            NodeSpec::Can(_) | NodeSpec::Lan(_) => Opens::Net,
-        })
+        Some(self.node.as_ref()?.opens())
     }
 
     /// The programs that are run for it, each with the key that names it.

@@ -25,6 +25,12 @@ impl Rig {
         // A report may arrive after the end of its stream, whose reason must stay.
         let Some(modality) = self.modality(id).filter(|modality| modality.slot.is_current(epoch)) else { return };
         match report {
+            Report::Waits(what) => {
+                what.clone_into(&mut modality.detail);
+                let text = format!("{}: {what}; it is opened when that is over", modality.spec.name);
+                self.show(id);
+                self.board.announce(What::Log { level: Level::Warn, text });
+            }
             Report::Opened(description, provenance) => {
                 modality.detail = description;
                 let device = modality.spec.name.clone();

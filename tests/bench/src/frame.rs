@@ -61,6 +61,8 @@ pub(crate) struct Passed {
     pub topic: TopicId,
     /// Its header.
     pub header: SampleHeader,
+    /// Bytes behind it.
+    pub bytes: usize,
     /// When the recorder was handed it.
     pub handed: Stamp,
     /// When the recorder had written it.
@@ -86,7 +88,7 @@ impl Source for Noting {
         Source::drain(&mut self.inbox, &mut |topic, header, payload| {
             let handed = Stamp::now();
             take(topic, header, payload);
-            let passed = Passed { topic, header: *header, handed, written: Stamp::now() };
+            let passed = Passed { topic, header: *header, bytes: payload.len(), handed, written: Stamp::now() };
             log.lock().unwrap_or_else(PoisonError::into_inner).push(passed);
         })
     }

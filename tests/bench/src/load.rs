@@ -87,17 +87,7 @@ fn one(bench: &Bench) -> Result<Run, Failure> {
     if !usage.success {
         return Err(format!("rapid ended with an error: {}", usage.output).into());
     }
-    let file = std::fs::read_dir(out.path())?
-        .flatten()
-        .map(|entry| entry.path())
-        .find(|path| path.extension().is_some_and(|extension| extension == "mcap"));
-    let file = file.ok_or("rapid wrote no episode")?;
-    let inspected = inspect(bench, &file)?;
-    let number = |value: &Value| value.as_f64().unwrap_or(0.0);
-    let missing = |list: &Value| list.as_array().into_iter().flatten().map(|one| number(&one["missing"])).sum::<f64>();
-    let lost = number(&inspected["lost"]);
-    let holes = missing(&inspected["modalities"]) + missing(&inspected["topics"]);
-    let dropped = number(&inspected["dropped"]).max(holes - lost);
+    let Episode { dropped, lost, messages, bytes, seconds: recorded } = Episode::inspect(bench, out.path())?;
     // The file goes before the next one is written: a disk need not hold two.
     drop(out);
     bench.progress("load: the baselines");
@@ -106,9 +96,9 @@ fn one(bench: &Bench) -> Result<Run, Failure> {
         seen,
         dropped,
         lost,
-        messages: number(&inspected["messages"]),
-        bytes: number(&inspected["bytes"]),
-        seconds: number(&inspected["seconds"]).max(0.001),
+        messages,
+        bytes,
+        seconds: recorded,
         mcap: Spent::of(Command::new(std::env::current_exe()?).arg("mcap").arg(bench.scratch.path()).arg(&seconds))?,
         devices: Spent::of(Command::new(std::env::current_exe()?).arg("devices").arg(&seconds))?,
         usage,
@@ -120,9 +110,41 @@ pub(crate) fn kind(line: &str) -> Option<String> {
     Some(serde_json::from_str::<Value>(line).ok()?.get("event")?.as_str()?.to_owned())
 }
 
-fn inspect(bench: &Bench, file: &Path) -> Result<Value, Failure> {
-    let output = Command::new(&bench.rapid).args(["--json", "inspect"]).arg(file).output()?;
-    Ok(serde_json::from_slice(&output.stdout)?)
+/// What `rapid inspect` says of an episode.
+pub(crate) struct Episode {
+    /// Samples, masks included, that did not come from the driver into the file.
+    pub dropped: f64,
+    /// Samples that a device did not keep, because nobody read them in time.
+    pub lost: f64,
+    /// Messages in the file.
+    pub messages: f64,
+    /// Of the file.
+    pub bytes: f64,
+    /// Its length.
+    pub seconds: f64,
+}
+
+impl Episode {
+    /// Reads the only episode of a folder.
+    pub(crate) fn inspect(bench: &Bench, folder: &Path) -> Result<Self, Failure> {
+        let mut files = std::fs::read_dir(folder)?.flatten().map(|entry| entry.path());
+        let file = files.find(|path| path.extension().is_some_and(|extension| extension == "mcap"));
+        let file = file.ok_or("rapid wrote no episode")?;
+        let output = Command::new(&bench.rapid).args(["--json", "inspect"]).arg(file).output()?;
+        let said: Value = serde_json::from_slice(&output.stdout)?;
+        let number = |value: &Value| value.as_f64().unwrap_or(0.0);
+        let missing =
+            |list: &Value| list.as_array().into_iter().flatten().map(|one| number(&one["missing"])).sum::<f64>();
+        let lost = number(&said["lost"]);
+        let holes = missing(&said["modalities"]) + missing(&said["topics"]);
+        Ok(Self {
+            dropped: number(&said["dropped"]).max(holes - lost),
+            lost,
+            messages: number(&said["messages"]),
+            bytes: number(&said["bytes"]),
+            seconds: number(&said["seconds"]).max(0.001),
+        })
+    }
 }
 
 fn own(runs: &[Run]) -> Vec<Figure> {

@@ -6,6 +6,7 @@
 //! Invariant: no value makes the program fail; only wrong arguments do.
 
 mod beat;
+mod can;
 mod child;
 mod control;
 mod eager;
@@ -16,6 +17,7 @@ mod frame;
 mod heap;
 mod infer;
 mod load;
+mod many;
 mod mask;
 mod motors;
 mod others;
@@ -81,6 +83,7 @@ enum Section {
     Frame,
     Replug,
     Load,
+    Many,
     Write,
     Sync,
     Start,
@@ -89,15 +92,17 @@ enum Section {
     Infer,
     Control,
     Motors,
+    Can,
     Eval,
     Unplug,
     Cycles,
+    Sweep,
     Deaf,
 }
 
 impl Section {
     /// In this order: what must not be disturbed comes before what leaves dirty pages behind.
-    const ALL: [Self; 16] = [
+    const ALL: [Self; 19] = [
         Self::Start,
         Self::Infer,
         Self::Sync,
@@ -105,14 +110,17 @@ impl Section {
         Self::Policy,
         Self::Control,
         Self::Motors,
+        Self::Can,
         Self::Eval,
         Self::Frame,
         Self::Replug,
         Self::Unplug,
         Self::Mask,
+        Self::Many,
         Self::Load,
         Self::Write,
         Self::Cycles,
+        Self::Sweep,
         Self::Deaf,
     ];
 
@@ -122,6 +130,7 @@ impl Section {
             Self::Frame => "frame",
             Self::Replug => "replug",
             Self::Load => "load",
+            Self::Many => "many",
             Self::Write => "write",
             Self::Sync => "sync",
             Self::Start => "start",
@@ -130,9 +139,11 @@ impl Section {
             Self::Infer => "infer",
             Self::Control => "control",
             Self::Motors => "motors",
+            Self::Can => "can",
             Self::Eval => "eval",
             Self::Unplug => "unplug",
             Self::Cycles => "cycles",
+            Self::Sweep => "sweep",
             Self::Deaf => "deaf",
         }
     }
@@ -148,6 +159,7 @@ impl Section {
             Self::Frame => frame::measure(bench),
             Self::Replug => replug::measure(bench),
             Self::Load => load::measure(bench),
+            Self::Many => many::measure(bench),
             Self::Write => write::measure(bench),
             Self::Sync => sync::measure(bench),
             Self::Start => start::measure(bench),
@@ -156,9 +168,11 @@ impl Section {
             Self::Infer => infer::measure(bench),
             Self::Control => control::measure(bench),
             Self::Motors => motors::measure(bench),
+            Self::Can => can::measure(bench),
             Self::Eval => eval::measure(bench),
             Self::Unplug => others::unplug(bench),
             Self::Cycles => others::cycles(bench),
+            Self::Sweep => others::sweep(bench),
             Self::Deaf => others::deaf(bench),
         }
     }

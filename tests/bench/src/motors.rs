@@ -1,4 +1,4 @@
-//! How well thread `control` keeps its beat, what an answer of a motor costs, and what a full bus does.
+//! How well thread `control` keeps its beat, how soon an action is on the wire, and what an answer of a motor costs.
 //!
 //! The motors are those of the virtual bench, behind Damiao's adapter on a pseudo-terminal.
 

@@ -25,6 +25,11 @@ pub(crate) fn cycles(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     Ok(vbench(bench, "cycles", "vbench-cycles", &[cycles.into()]))
 }
 
+/// Nine configurations, one after the other, on the virtual bench.
+pub(crate) fn sweep(bench: &Bench) -> Result<Vec<Figure>, Failure> {
+    Ok(vbench(bench, "sweep", "vbench-sweep", &[]))
+}
+
 /// A child process that does not listen, on the virtual bench.
 pub(crate) fn deaf(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     Ok(vbench(bench, "deaf", "vbench-deaf", &[]))

@@ -5,6 +5,8 @@ use rapid::hotplug::lan::fuzz_label;
 
 /// Of the smallest entry.
 const LARGEST: usize = 1024;
+/// A session has a bound of its own, whatever the entry.
+const LARGEST_SESSION: usize = 64 << 10;
 
 /// The stream in pieces whose lengths the first byte says.
 fn pieces(bytes: &[u8]) -> impl Iterator<Item = &[u8]> {
@@ -26,10 +28,12 @@ pub fn multipart(bytes: &[u8]) {
 
 /// A phone's messages, likewise.
 pub fn phone(bytes: &[u8]) {
-    let (payloads, malformed) = fuzzing::phone(LARGEST, pieces(bytes));
-    // A session has a bound of its own.
-    assert!(payloads.iter().all(|payload| payload.len() <= 64 << 10));
-    assert_eq!((payloads, malformed), fuzzing::phone(LARGEST, [bytes.get(1..).unwrap_or_default()]));
+    let (sent, malformed) = fuzzing::phone(LARGEST, pieces(bytes));
+    assert!(sent.iter().all(|sent| match sent {
+        fuzzing::Sent::Picture(picture) => picture.len() <= LARGEST,
+        fuzzing::Sent::Session(session) => session.len() <= LARGEST_SESSION,
+    }));
+    assert_eq!((sent, malformed), fuzzing::phone(LARGEST, [bytes.get(1..).unwrap_or_default()]));
 }
 
 /// What is looked at in the answers of a server: no path leaves its folder.
@@ -68,6 +72,7 @@ pub fn phones() -> Vec<Vec<u8>> {
     };
     vec![
         [&[7][..], &message(0, b"{\"sessionId\":\"a\"}"), &frame(b"one"), &message(3, b"{}"), &frame(b"")].concat(),
+        [&[200][..], &message(0, &[b' '; 2000]), &frame(b"one"), &message(0, &[b' '; 70_000]), &frame(b"two")].concat(),
         [&[255][..], &frame(&[9; 1024]), &frame(&[9; 1025]), &message(1, b"short"), &frame(b"two")].concat(),
     ]
 }

@@ -7,6 +7,8 @@
 //!
 //! Invariant: a target depends on its input alone, so that an input that broke it breaks it again.
 
+mod artifacts;
+pub mod can;
 pub mod lan;
 pub mod motors;
 pub mod mutate;
@@ -31,8 +33,8 @@ pub const TARGETS: &[Target] = &[
     Target { name: "scenario", run: targets::scenario, seeds: seeds::scenarios },
     Target { name: "units", run: targets::units, seeds: seeds::units },
     Target { name: "serial", run: targets::serial, seeds: seeds::serial },
-    Target { name: "slcan", run: targets::slcan, seeds: seeds::slcan },
-    Target { name: "damiao_serial", run: targets::damiao_serial, seeds: seeds::damiao_serial },
+    Target { name: "slcan", run: can::slcan, seeds: seeds::slcan },
+    Target { name: "damiao_serial", run: can::damiao_serial, seeds: seeds::damiao_serial },
     Target { name: "multipart", run: lan::multipart, seeds: lan::multiparts },
     Target { name: "phone", run: lan::phone, seeds: lan::phones },
     Target { name: "http_answer", run: lan::answer, seeds: lan::answers },

@@ -1,12 +1,15 @@
 //! Motors: frames that strangers send on their bus, and numbers that strangers want of them.
 
+#[path = "../../support/motor_spec.rs"]
+mod motor_spec;
+
 use std::time::Duration;
 
 use rapid::control::can::CanFrame;
-use rapid::control::damiao::codec::{Feedback, MotorStatus, Ranges};
+use rapid::control::damiao::codec::{Feedback, MotorStatus, Order, Ranges};
 use rapid::control::damiao::parameter::{Parameter, Reply, Value};
-use rapid::control::motors::{BusState, MotorBus};
-use rapid::registry::{DamiaoSpec, MotorKind, MotorMode, MotorSpec};
+use rapid::control::motors::{BusState, MotorBus, SAMPLE_VALUES};
+use rapid::registry::{DamiaoSpec, MotorMode, MotorSpec};
 use rapid::time::Stamp;
 
 /// Bytes of one thing that happens: what, a number, and eight more.
@@ -21,13 +24,15 @@ const DISARM: u8 = 4;
 const KINDS: u8 = 5;
 
 /// A bus of two motors: whatever comes, what is measured is a number within the motor's ranges, what is
-/// commanded lies within the limits or where the joint is, and nothing moves before an arm.
+/// commanded lies within the limits or where the joint is, and nothing moves before an arm, nor after what
+/// ended it.
 pub fn motors(bytes: &[u8]) {
     let spec = spec();
     let mut now = Stamp(1_000_000_000_000);
     let mut bus = MotorBus::new(&spec, now);
-    let mut sample = [0.0; 12];
-    let mut was_armed = false;
+    let mut axes: Vec<Axis> = spec.motors.iter().map(Axis::new).collect();
+    let mut sample = [0.0; 2 * SAMPLE_VALUES];
+    let mut may_move = false;
     for record in bytes.chunks_exact(RECORD).take(LONGEST) {
         let [what, number, data @ ..] = record else { return };
         let data: [u8; 8] = data.try_into().unwrap_or_default();
@@ -39,15 +44,20 @@ pub fn motors(bytes: &[u8]) {
                     assert_eq!(reply.encode(u16::from(*number)), frame, "a reply is what was sent");
                 }
                 bus.feed(&frame, now);
+                axes.iter_mut().for_each(|axis| axis.hear(&frame));
             }
             STEP => {
                 now = now.after(Duration::from_millis(ms));
                 let mut sent = 0;
                 bus.step(now, |frame| {
-                    assert!(was_armed || is_harmless(&frame), "{frame:x?} before an arm");
+                    assert!(may_move || is_harmless(&frame), "{frame:x?} while nothing may move");
+                    axes.iter().for_each(|axis| axis.judge_frame(&frame));
                     sent += 1;
                 });
                 assert!(sent <= 4);
+                if bus.is_armed() {
+                    axes.iter().zip(bus.commands()).for_each(|(axis, command)| axis.judge(*command));
+                }
             }
             TARGET => {
                 let [a, b, c, d, e, f, g, h] = data;
@@ -57,15 +67,23 @@ pub fn motors(bytes: &[u8]) {
                 assert!(!taken || first.is_finite() && second.is_finite() && bus.is_armed());
             }
             ARM => {
-                was_armed = true;
+                let was_off = !is_on(bus.state());
                 bus.arm(now);
+                if was_off && is_on(bus.state()) {
+                    axes.iter_mut().for_each(Axis::arm);
+                }
+                may_move = true;
             }
-            _ => bus.disarm(now),
+            _ => {
+                bus.disarm(now);
+                may_move = false;
+            }
         }
+        // A fault and the deadman end an arm as an order does.
+        may_move &= is_on(bus.state());
         if bus.sample(&mut sample).is_some() {
-            assert!(sample.iter().all(|value| value.is_finite()), "{sample:?}");
+            axes.iter().zip(sample.as_chunks().0).for_each(|(axis, values)| axis.judge_sample(values));
         }
-        assert!(bus.commands().iter().all(|command| command.is_finite()), "{:?}", bus.commands());
         while let Some(notice) = bus.take_notice() {
             assert!(!notice.words(bus.names()).to_string().is_empty());
         }
@@ -76,33 +94,125 @@ pub fn motors(bytes: &[u8]) {
     bus.step(now, |frame| panic!("{frame:x?} after a stop"));
 }
 
+/// An arm was asked for, and nothing has ended it.
+fn is_on(state: BusState) -> bool {
+    matches!(state, BusState::Arming | BusState::Following | BusState::Holding)
+}
+
 /// Requests for parameters and feedback, and orders to turn off.
 fn is_harmless(frame: &CanFrame) -> bool {
-    frame.id == 0x7ff || frame.data == [0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xfd]
+    frame.id == 0x7ff || *frame == Order::Disable.frame(u16::try_from(frame.id).unwrap_or_default())
+}
+
+/// What is known of a motor from the frames alone.
+struct Axis {
+    spec: MotorSpec,
+    /// The ends of position, velocity and torque that it told: the smallest and the largest of each. Which of
+    /// them counts is for the bus to say, so what is judged by them is judged by the largest.
+    told: [[f64; 2]; 3],
+    /// The newest position it told, rad.
+    measured: Option<f64>,
+    /// What a position may be commanded: within the limits, or where the joint was since the arm.
+    span: [f64; 2],
+}
+
+impl Axis {
+    fn new(spec: &MotorSpec) -> Self {
+        Self { spec: spec.clone(), told: [[f64::INFINITY, 0.0]; 3], measured: None, span: spec.position }
+    }
+
+    fn hear(&mut self, frame: &CanFrame) {
+        if frame.id != u32::from(self.spec.master) {
+            return;
+        }
+        let Some(reply) = Reply::decode(frame) else { return self.measure(frame) };
+        let value = reply.value.number();
+        let which = match reply.parameter {
+            Parameter::PMax => 0,
+            Parameter::VMax => 1,
+            Parameter::TMax => 2,
+            _ => return,
+        };
+        if reply.slave == self.spec.slave && value.is_finite() && value > 0.0 {
+            let [smallest, largest] = &mut self.told[which];
+            (*smallest, *largest) = (smallest.min(value), largest.max(value));
+        }
+    }
+
+    fn measure(&mut self, frame: &CanFrame) {
+        let ranges = Ranges::new(self.told[0][1], 1.0, 1.0);
+        let Some(feedback) = ranges.and_then(|ranges| Feedback::decode(frame, &ranges)) else { return };
+        if u16::from(feedback.id) == self.spec.slave {
+            self.measured = Some(feedback.q);
+            self.span = [self.span[0].min(feedback.q), self.span[1].max(feedback.q)];
+        }
+    }
+
+    /// What was before is of the past, but for where the joint is.
+    fn arm(&mut self) {
+        let [low, high] = self.spec.position;
+        self.span = [self.measured.map_or(low, |q| q.min(low)), self.measured.map_or(high, |q| q.max(high))];
+    }
+
+    /// What a position is counted in, rad, if it has told one range alone.
+    fn quantum(&self) -> Option<f64> {
+        let [smallest, largest] = self.told[0];
+        (smallest.to_bits() == largest.to_bits()).then_some(2.0 * largest / 65_535.0)
+    }
+
+    /// A command, after a step.
+    fn judge(&self, command: f64) {
+        let [low, high] = self.spec.position;
+        let slack = self.quantum().unwrap_or(2.0 * self.told[0][1] / 65_535.0);
+        let measured = self.measured.expect("a command before any answer");
+        match self.spec.mode {
+            MotorMode::Velocity => {
+                assert!(command.abs() <= self.spec.velocity, "{command} rad/s");
+                let back = (measured <= high + slack || command <= 0.0) && (measured >= low - slack || command >= 0.0);
+                assert!(back || self.quantum().is_none(), "{command} rad/s at {measured}");
+            }
+            _ => {
+                let [low, high] = self.span;
+                assert!((low - slack..=high + slack).contains(&command), "{command} is beyond {low}..{high}");
+            }
+        }
+        if let (MotorMode::Mit { kp, .. }, Some(quantum)) = (self.spec.mode, self.quantum()) {
+            let reach = self.spec.torque / kp + quantum;
+            assert!((command - measured).abs() <= reach, "{command} is too far from {measured}");
+        }
+    }
+
+    /// A frame: what it commands of this motor is judged as it is written there.
+    fn judge_frame(&self, frame: &CanFrame) {
+        let [a, b, c, d, ..] = frame.data;
+        match self.spec.mode {
+            MotorMode::Velocity if frame.id == u32::from(self.spec.slave) + 0x200 => {
+                self.judge(f64::from(f32::from_le_bytes([a, b, c, d])));
+            }
+            // Seven such bytes begin an order.
+            MotorMode::Mit { .. } if frame.id == u32::from(self.spec.slave) && !frame.data.starts_with(&[0xff; 7]) => {
+                let Some(quantum) = self.quantum() else { return };
+                self.judge(f64::from(u16::from_be_bytes([a, b])) * quantum - self.told[0][1]);
+            }
+            _ => {}
+        }
+    }
+
+    /// What it is said to have answered.
+    fn judge_sample(&self, values: &[f64; SAMPLE_VALUES]) {
+        let [q, dq, tau, rest @ ..] = values;
+        for (value, [_, end]) in [q, dq, tau].into_iter().zip(self.told) {
+            assert!(value.abs() <= end, "{value} of {end}");
+        }
+        let [mos, rotor, status] = rest.map(|value| (0_u8..=255).find(|byte| f64::from(*byte) == value));
+        assert!(mos.is_some() && rotor.is_some() && status.is_some_and(|status| status <= 15), "{values:?}");
+    }
 }
 
 fn spec() -> DamiaoSpec {
-    let motor = |slave: u16, mode| MotorSpec {
-        name: format!("joint_{slave}"),
-        slave,
-        master: 0x10 + slave,
-        kind: MotorKind::Dm4310,
-        mode,
-        position: [-2.0, 2.0],
-        velocity: 20.0,
-        torque: 5.0,
-        slew: 5.0,
-        max_mos: 80.0,
-        max_rotor: 100.0,
-    };
-    DamiaoSpec {
-        motors: vec![motor(1, MotorMode::Mit { kp: 10.0, kd: 1.0 }), motor(2, MotorMode::Velocity)],
-        hz: 200,
-        deadman: None,
-        disable_after: Duration::from_secs(1),
-        timeout: Duration::from_millis(400),
-        silent_after: Duration::from_millis(50),
-    }
+    // Slow, so that it gets there before it has to brake.
+    let wheel = MotorSpec { mode: MotorMode::Velocity, velocity: 2.0, ..motor_spec::motor(2) };
+    motor_spec::bus(vec![motor_spec::motor(1), wheel])
 }
 
 /// From the first frame to motors that follow; and the same, stopped by each of what stops motors.
@@ -126,6 +236,7 @@ pub fn sessions() -> Vec<Vec<u8>> {
             .flat_map(|_| [step(), feedback(1, MotorStatus::Enabled), feedback(2, MotorStatus::Enabled)])
             .collect::<Vec<_>>()),
         and(&[target(f32::NAN, 1.0), target(1e30, -1e30), step()]),
+        and(&[beyond(1.9, -1.9).repeat(60), beyond(2.3, 2.3).repeat(5)]),
     ]
 }
 
@@ -161,9 +272,19 @@ fn session() -> Vec<u8> {
     [probe.clone(), record(ARM, 0, [0; 8]), probe, enable, follow.repeat(3)].concat()
 }
 
+/// Motors that are here, and are wanted far beyond their limits.
+fn beyond(first: f64, second: f64) -> Vec<u8> {
+    let joints = [(1, first), (2, second)].map(|(slave, q)| feedback_at(slave, MotorStatus::Enabled, q));
+    [target(9.0, 9.0), record(STEP, 10, [0; 8]), joints.concat()].concat()
+}
+
 fn feedback(slave: u16, status: MotorStatus) -> Vec<u8> {
+    feedback_at(slave, status, 0.5)
+}
+
+fn feedback_at(slave: u16, status: MotorStatus, q: f64) -> Vec<u8> {
     let id = slave.to_le_bytes()[0];
-    let feedback = Feedback { id, status, q: 0.5, dq: 0.0, tau: 0.1, mos: 40, rotor: 41 };
+    let feedback = Feedback { id, status, q, dq: 0.0, tau: 0.1, mos: 40, rotor: 41 };
     let frame = Ranges::new(12.5, 30.0, 10.0).and_then(|ranges| feedback.encode(0x10 + slave, &ranges));
     frame.map_or_else(Vec::new, |frame| record(FEED, frame.id.to_le_bytes()[0], frame.data))
 }

@@ -2,30 +2,25 @@
 
 use std::cell::RefCell;
 use std::collections::BTreeSet;
-use std::fmt::Write as _;
 use std::io::Write as _;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Duration;
 
 use rapid::commands;
-use rapid::control::can::CanFrame;
 use rapid::driver;
 use rapid::headless::style::Palette;
 use rapid::mask::{MaskRecord, RECORD_LEN};
-use rapid::modality::ModalityKind;
 use rapid::record::inspect as inspection;
 use rapid::record::recover::recover_bytes;
-use rapid::registry::artifacts::{ArtifactKind, artifacts};
 use rapid::registry::scenario::Scenario;
 use rapid::registry::units::{parse_duration, parse_size, show_duration, show_size};
 use rapid::registry::{
-    Assigner, Assignment, Attachment, CanAdapter, DeviceNode, DeviceSpec, Framing, NodeSpec, Opens, Parse, ProcessSpec,
-    Registry, RegistryErrors, SerialSpec, Unit, UsbIdentity,
+    Assigner, Assignment, Attachment, DeviceNode, Framing, Parse, Registry, RegistryErrors, SerialSpec, Unit,
+    UsbIdentity,
 };
 use rapid::text as shown;
-use yaml_rust2::{Yaml, YamlLoader};
 
-use crate::rules::{self, Token};
+use crate::artifacts;
 
 /// Longest input worth reading: beyond it a mutation only makes a case slower.
 const LONGEST: usize = 64 << 10;
@@ -39,7 +34,7 @@ pub fn registry(bytes: &[u8]) {
             for warning in &loaded.warnings {
                 harmless(&warning.to_string());
             }
-            check_artifacts(&loaded.registry);
+            artifacts::check(&loaded.registry);
         }
         Err(errors) => check_errors(&errors, text),
     }
@@ -104,62 +99,6 @@ pub fn serial(bytes: &[u8]) {
         };
         assert!(permitted, "{} bytes of {spec:?}", payload.len());
     }
-}
-
-/// A CAN adapter that speaks slcan: what it says depends on the bytes alone, and a frame that is sent
-/// again comes back as it was.
-pub fn slcan(bytes: &[u8]) {
-    use driver::can::slcan::{Decoder, Event, encode};
-    let Some((cut, stream)) = short(bytes).and_then(<[u8]>::split_first) else { return };
-    let decode = |pieces: &mut dyn Iterator<Item = &[u8]>| {
-        let (mut decoder, mut events) = (Decoder::default(), Vec::new());
-        for mut piece in pieces {
-            while !piece.is_empty() {
-                let (taken, event) = decoder.feed(piece);
-                piece = &piece[taken..];
-                events.extend(event);
-            }
-        }
-        events
-    };
-    let whole = decode(&mut std::iter::once(stream));
-    assert_eq!(whole, decode(&mut stream.chunks(usize::from(*cut) % 7 + 1)), "how the bytes were cut");
-    for event in &whole {
-        let Event::Frame(frame, _) = event else { continue };
-        legal_frame(frame);
-        assert_eq!(decode(&mut std::iter::once(encode(frame).bytes())), [Event::Frame(*frame, None)]);
-    }
-}
-
-/// Damiao's CAN adapter: what it says depends on the bytes alone, and every byte of it is of a message or
-/// was passed over.
-pub fn damiao_serial(bytes: &[u8]) {
-    use driver::can::damiao_serial::{Decoder, Kind, RECEIVED, encode};
-    let Some((cut, stream)) = short(bytes).and_then(<[u8]>::split_first) else { return };
-    let decode = |pieces: &mut dyn Iterator<Item = &[u8]>| {
-        let (mut decoder, mut messages) = (Decoder::default(), Vec::new());
-        for mut piece in pieces {
-            while !piece.is_empty() {
-                let (taken, message) = decoder.feed(piece);
-                piece = &piece[taken..];
-                messages.extend(message);
-            }
-        }
-        (messages, decoder.skipped())
-    };
-    let whole = decode(&mut std::iter::once(stream));
-    assert_eq!(whole, decode(&mut stream.chunks(usize::from(*cut) % 7 + 1)), "how the bytes were cut");
-    let used = whole.0.len() * RECEIVED + usize::try_from(whole.1).expect("a count of bytes");
-    assert!((stream.len().saturating_sub(RECEIVED)..=stream.len()).contains(&used), "{used} of {}", stream.len());
-    for message in whole.0.iter().filter(|message| message.kind == Kind::Received) {
-        legal_frame(&message.frame);
-        assert!(encode(&message.frame).is_some());
-    }
-}
-
-fn legal_frame(frame: &CanFrame) {
-    assert!(frame.len <= 8 && frame.id <= if frame.extended { 0x1fff_ffff } else { 0x7ff }, "{frame:?}");
-    assert!(!frame.error && frame.data[usize::from(frame.len)..].iter().all(|byte| *byte == 0), "{frame:?}");
 }
 
 /// One recorded message, of each schema.
@@ -279,7 +218,7 @@ pub fn strings(bytes: &[u8]) {
         Ok(loaded) => loaded.registry,
         Err(errors) => return check_errors(&errors, &text),
     };
-    check_artifacts(&registry);
+    artifacts::check(&registry);
     let matched = |serial: &str| matches!(Assigner::new(&registry).attach(&device(serial)), Assignment::Entry(_));
     assert!(matched(&serial), "a registered unit is not matched");
     assert!(!matched(&format!("{serial}x")) && !matched(&format!(" {serial}")), "another unit is matched");
@@ -315,7 +254,7 @@ pub fn text(bytes: &[u8]) {
     assert!(shown::ascii(&text).is_ascii());
 }
 
-fn short(bytes: &[u8]) -> Option<&[u8]> {
+pub(crate) fn short(bytes: &[u8]) -> Option<&[u8]> {
     (bytes.len() <= LONGEST).then_some(bytes)
 }
 
@@ -340,130 +279,4 @@ fn check_errors(errors: &RegistryErrors, text: &str) {
         assert!(!diagnostic.message.is_empty());
     }
     harmless(&errors.to_string());
-}
-
-/// The rules, descriptors and unit of a registry, read back by readers that are not ours.
-fn check_artifacts(registry: &Registry) {
-    let unit_without_names = |text: &str| text.replace(&registry.rig.name, "");
-    // A harmless registry that has as much to open: of all that is in a registry only that may change the unit.
-    let mut harmless = Registry::builtin();
-    let on_usb =
-        |device: &DeviceSpec| matches!(&device.node, NodeSpec::Process(program) if program.opens == Opens::Usb);
-    if let (true, Some(first)) = (registry.devices.iter().any(on_usb), harmless.devices.first_mut()) {
-        first.node = NodeSpec::Process(ProcessSpec {
-            program: "/usr/bin/true".into(),
-            args: Vec::new(),
-            opens: Opens::Usb,
-            kind: ModalityKind::Bytes,
-            shape: Vec::new(),
-        });
-    }
-    let bus = |device: &DeviceSpec| {
-        matches!(&device.node, NodeSpec::Can(can) if can.adapter == CanAdapter::SocketCan).then(|| device.node.clone())
-    };
-    if let (Some(bus), Some(last)) = (registry.devices.iter().find_map(bus), harmless.devices.last_mut()) {
-        last.node = bus;
-    }
-    let expected = unit_without_names(&text_of_unit(&harmless).replace(&harmless.rig.name, ""));
-    for artifact in artifacts(registry) {
-        let text = &artifact.contents;
-        match artifact.kind {
-            ArtifactKind::Rules => check_rules(registry, text),
-            ArtifactKind::Unit => assert_eq!(unit_without_names(text), expected, "the unit says more than its name"),
-            ArtifactKind::Descriptor => check_descriptor(registry, &artifact.path, text),
-        }
-    }
-}
-
-fn text_of_unit(registry: &Registry) -> String {
-    artifacts(registry).into_iter().find(|artifact| artifact.kind == ArtifactKind::Unit).expect("a unit").contents
-}
-
-/// At most one rule a device, with the keys we know and no others, that matches its serial number
-/// and not another.
-fn check_rules(registry: &Registry, text: &str) {
-    const KEYS: [&str; 6] = ["SUBSYSTEM==", "SYMLINK+=", "GROUP=", "MODE=", "TAG+=", "RUN{builtin}+="];
-    // Of the device itself, or of one above it.
-    const OF_USB: [&str; 5] = ["ENV{DEVTYPE}==", "ATTR{idVendor}==", "ATTR{idProduct}==", "ATTR{serial}==", "KERNEL=="];
-    const OF_OTHERS: [&str; 5] =
-        ["ATTR{index}==", "ATTRS{idVendor}==", "ATTRS{idProduct}==", "ATTRS{serial}==", "KERNELS=="];
-    let rules = rules::parse(text).unwrap_or_else(|line| panic!("udev cannot read {line:?} in:\n{text}"));
-    let mut named = BTreeSet::new();
-    for rule in &rules {
-        let value = |key: &str| rule.iter().find(|token| token.key == key).map(|token| token.value.as_str());
-        if let Some(command) = value("RUN") {
-            check_command(registry, rule, command);
-            continue;
-        }
-        let link = value("SYMLINK").expect("every rule gives a name");
-        assert!(named.insert(link.to_owned()), "two rules for {link}");
-        let device = registry.devices.iter().find(|device| format!("rapid/{}", device.name) == link);
-        let device = device.unwrap_or_else(|| panic!("a rule for {link}, which is no device"));
-        let (own, serial_key) =
-            if value("SUBSYSTEM") == Some("usb") { (OF_USB, "ATTR{serial}") } else { (OF_OTHERS, "ATTRS{serial}") };
-        for Token { key, operator, .. } in rule {
-            let match_or_set = format!("{key}{operator}");
-            let known = KEYS.contains(&match_or_set.as_str()) || own.contains(&match_or_set.as_str());
-            assert!(known, "{match_or_set} in a rule");
-        }
-        let keys: BTreeSet<_> = rule.iter().map(|token| &token.key).collect();
-        assert_eq!(keys.len(), rule.len(), "a key twice in {rule:?}");
-        assert_eq!(value("RUN{builtin}"), Some("uaccess"));
-        let serial = device.identity.serial();
-        assert_eq!(value(serial_key).is_some(), serial.is_some());
-        if let (Some(pattern), Some(serial)) = (value(serial_key), serial) {
-            assert!(rules::matches(pattern, serial), "{pattern:?} does not match {serial:?}");
-            for other in
-                [format!("{serial}x"), format!("x{serial}"), serial.replace(['*', '?', '['], "x"), String::new()]
-            {
-                assert!(other == serial || !rules::matches(pattern, &other), "{pattern:?} matches {other:?}");
-            }
-        }
-    }
-}
-
-/// A CAN interface is brought up, and nothing else: the words are ours and a number of the registry.
-fn check_command(registry: &Registry, rule: &[Token], command: &str) {
-    const KEYS: [&str; 8] = [
-        "ACTION==",
-        "SUBSYSTEM==",
-        "ATTR{type}==",
-        "ATTRS{idVendor}==",
-        "ATTRS{idProduct}==",
-        "ATTRS{serial}==",
-        "KERNELS==",
-        "RUN+=",
-    ];
-    for Token { key, operator, .. } in rule {
-        assert!(KEYS.contains(&format!("{key}{operator}").as_str()), "{key}{operator} in a rule");
-    }
-    let commands = registry.devices.iter().filter_map(|device| {
-        let NodeSpec::Can(can) = &device.node else { return None };
-        Some(format!("/usr/sbin/ip link set dev $name up type can bitrate {} restart-ms 100", can.bitrate))
-    });
-    assert!(commands.into_iter().any(|known| known == command), "udev would run {command:?}");
-}
-
-/// One document with the keys we know, and the values of the registry.
-fn check_descriptor(registry: &Registry, path: &Path, text: &str) {
-    let name = path.file_stem().unwrap_or_default().to_string_lossy();
-    let device = registry.named(&name).expect("a descriptor of a device");
-    let documents = YamlLoader::load_from_str(text).unwrap_or_else(|error| panic!("{error} in:\n{text}"));
-    let [document] = documents.as_slice() else { panic!("{} documents in:\n{text}", documents.len()) };
-    let keys = |yaml: &Yaml| {
-        let mut line = String::new();
-        for key in yaml.as_hash().expect("a map").keys() {
-            let _ = write!(line, "{} ", key.as_str().expect("a text"));
-        }
-        line
-    };
-    assert_eq!(keys(document), "module slot sensors bring_up identity path topic bit ");
-    if device.identity.usb().is_none() {
-        assert_eq!(document["identity"], Yaml::Null, "of a device on the network");
-    } else {
-        assert_eq!(keys(&document["identity"]), "vid pid serial port ");
-    }
-    assert_eq!(document["identity"]["serial"].as_str(), device.identity.serial());
-    assert_eq!(document["topic"].as_str(), Some(device.topic.as_str()));
-    assert_eq!(document["module"].as_str(), Some(device.name.as_str()));
 }

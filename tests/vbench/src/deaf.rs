@@ -3,10 +3,9 @@
 //!
 //! Invariant: spans of equal length are compared, of one guest: nothing happens, or one of the above.
 
-use serde_json::Value;
-
 use crate::emu::spec::DeviceSpec;
 use crate::outcome::Outcome;
+use crate::rhythm::Rhythm;
 use crate::scenario::Scenario;
 
 /// Length of each span: SIGTERM has 5 s to work, and then the program is killed.
@@ -16,8 +15,8 @@ const PROMPT_MS: u64 = 10_000;
 const DEAF_MS: u64 = 18_000;
 const CRASH_MS: u64 = 26_000;
 const FLOOD_MS: u64 = 34_000;
-/// The timeline begins some seconds after the recording.
-/// Between the first crash and the fifth are 7.5 s of waiting and four starts, which take seconds in the guest.
+/// The timeline begins some seconds after the recording. Between the first crash and the fifth are 7.5 s of waiting and
+/// four starts, which take seconds in the guest.
 const SECONDS: u32 = 75;
 const REGISTRY: &str = r#"
 [rig]
@@ -83,19 +82,6 @@ pub enum Span {
     Flooding,
 }
 
-/// How the mask beat in a span.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Rhythm {
-    /// Longest time in which a sampler that looks every 0.5 ms saw no new publication, ms.
-    pub longest_ms: f64,
-    /// Longest pause between two looks of the sampler itself, ms: what the guest's processors do to any program.
-    pub pause_ms: f64,
-    /// Publications.
-    pub publications: u64,
-    /// Tenths of a second in which the sampler looked often and saw no publication at all.
-    pub silent_tenths: usize,
-}
-
 /// The scenario.
 pub fn scenario() -> Scenario {
     Scenario::new("deaf")
@@ -115,8 +101,6 @@ pub fn scenario() -> Scenario {
 
 /// The mask's rhythm in a span; `None` when the sampler saw nothing of it.
 pub fn rhythm(outcome: &Outcome, span: Span) -> Option<Rhythm> {
-    /// A sampler that looked this often in a tenth of a second had the processor, and so could the publisher.
-    const OFTEN: u64 = 10;
     let offset = match span {
         Span::Idle => IDLE_MS,
         Span::Prompt => PROMPT_MS,
@@ -125,20 +109,5 @@ pub fn rhythm(outcome: &Outcome, span: Span) -> Option<Rhythm> {
         Span::Flooding => FLOOD_MS,
     };
     let from = outcome.origins().first()?.mono_ns + offset * 1_000_000;
-    let until = from + SPAN_MS * 1_000_000;
-    let number = |line: &Value, key: &str| line[key].as_u64().unwrap_or_default();
-    // A line belongs to the span if it ended in it: so does the silence in it.
-    let inside = |line: &&Value| line["action"] == "beat" && (from..until).contains(&number(line, "mono_ns"));
-    let mut rhythm = None;
-    for line in outcome.mask.iter().filter(inside) {
-        let Rhythm { longest_ms, pause_ms, publications, silent_tenths } = rhythm.unwrap_or_default();
-        let is_silent = number(line, "looks") >= OFTEN && number(line, "publications") == 0;
-        rhythm = Some(Rhythm {
-            longest_ms: longest_ms.max(number(line, "longest_ns") as f64 / 1e6),
-            pause_ms: pause_ms.max(number(line, "pause_ns") as f64 / 1e6),
-            publications: publications + number(line, "publications"),
-            silent_tenths: silent_tenths + usize::from(is_silent),
-        });
-    }
-    rhythm
+    Rhythm::between(outcome, from, from + SPAN_MS * 1_000_000)
 }

@@ -26,12 +26,16 @@ impl Delays {
         delays
     }
 
+    /// These, ms.
+    pub fn of(mut found: Vec<f64>) -> Self {
+        found.sort_by(f64::total_cmp);
+        Self { found, missing: 0 }
+    }
+
     /// The time from each of these moments to the next; ns on one clock, sorted.
     pub fn apart(moments: &[u64]) -> Self {
         let gaps = moments.iter().zip(moments.iter().skip(1)).map(|(one, next)| one.abs_diff(*next));
-        let mut found: Vec<f64> = gaps.map(|gap| gap as f64 / 1e6).collect();
-        found.sort_by(f64::total_cmp);
-        Self { found, missing: 0 }
+        Self::of(gaps.map(|gap| gap as f64 / 1e6).collect())
     }
 
     /// How many came, of how many: `n=19/20`.

@@ -19,4 +19,5 @@ pub mod probe;
 pub mod programs;
 pub mod proto;
 pub mod recording;
+pub mod rhythm;
 pub mod scenario;

@@ -24,7 +24,7 @@ wait_for 60 states 1 gopro streaming || fail 'the camera does not stream'
 wait_for 30 told http shutter/start || fail 'the shutter was not started'
 sleep 4
 emu unplug 1
-wait_for 30 states 1 lidar absent
+wait_for 30 states 1 lidar absent || fail 'the lidar is still there'
 emu plug 1
 wait_for 60 states 2 lidar streaming || fail 'the lidar does not stream again'
 sleep 2

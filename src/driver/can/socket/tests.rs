@@ -11,9 +11,7 @@ pub(in crate::driver::can) fn bus() -> (Link, UdpSocket) {
     let (ours, theirs) = (UdpSocket::bind("127.0.0.1:0").unwrap(), UdpSocket::bind("127.0.0.1:0").unwrap());
     ours.connect(theirs.local_addr().unwrap()).unwrap();
     theirs.connect(ours.local_addr().unwrap()).unwrap();
-    let socket = CanSocket::from(OwnedFd::from(ours));
-    set_up(&socket).unwrap();
-    (Link::Socket(Socket::of(socket, "stand-in", netlink::Ready { index: 0, restarts: false }, String::new())), theirs)
+    (Link::stand_in(OwnedFd::from(ours)).unwrap(), theirs)
 }
 
 pub(in crate::driver::can) fn bytes(frame: &CanFrame) -> [u8; 16] {

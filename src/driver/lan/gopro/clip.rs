@@ -4,47 +4,82 @@
 //! fetched its name ends in `.partial`, and what is there is gone on with.
 //!
 //! Invariant: the camera's words become part of a path only if they are plain names.
+//! Invariant: a byte is written where it belongs or not at all, by one fetch at a time, however often fetching is
+//! begun, broken off and begun again.
+//! Invariant: [`RESERVE`] stays free on the disk, whatever the camera says of the clip's size.
 
 use std::fs::{File, OpenOptions};
-use std::io::{self, Write as _};
+use std::io;
+use std::os::unix::fs::FileExt as _;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use hyper::StatusCode;
-use hyper::header::CONTENT_LENGTH;
+use hyper::header::{CONTENT_LENGTH, CONTENT_RANGE};
+use rustix::fs::FlockOperation;
+use rustix::io::Errno;
 use tokio::time::timeout;
 
 use super::super::http::{self, Reply};
 use super::super::place::Server;
+use super::answer::{Name, is_plain};
 
 const HEAD_LIMIT: Duration = Duration::from_secs(5);
 /// A camera that sends nothing for this long has stopped.
 const SILENCE_LIMIT: Duration = Duration::from_secs(10);
 /// A clip is asked for again where it broke off, so often without any progress.
 const TRIES: u32 = 3;
+const PAUSE: Duration = Duration::from_secs(1);
 /// Written to the disk at once, bytes.
 const BLOCK: usize = 1 << 20;
 /// What a clip leaves free on the disk, bytes: episodes need it more.
 const RESERVE: u64 = 1 << 30;
+/// A note has a few hundred bytes.
+const LARGEST_NOTE: u64 = 64 << 10;
 
 /// See the module's comment.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Clip {
-    pub(super) folder: String,
-    pub(super) file: String,
+    pub(super) name: Name,
     /// Bytes, if the camera says.
     pub(super) size: Option<u64>,
-    episode: PathBuf,
+    pub(super) episode: PathBuf,
     device: String,
 }
 
+/// Why a clip was not fetched.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) enum Failure {
+    /// It stays on the camera, and may be fetched another time.
+    Stays(String),
+    /// The camera does not have it any more.
+    Lost(String),
+}
+
 impl Clip {
-    pub(super) fn new(folder: String, file: String, episode: PathBuf, device: &str) -> Self {
-        Self { folder, file, size: None, episode, device: device.to_owned() }
+    pub(super) fn new(name: Name, size: Option<u64>, episode: PathBuf, device: &str) -> Self {
+        Self { name, size, episode, device: device.to_owned() }
+    }
+
+    /// The clip that a note tells of, which is at this path; `None` if it is no note of ours.
+    pub(super) fn of_note(path: &Path) -> Option<Self> {
+        let text = crate::folder::read_text(path, LARGEST_NOTE).ok()?;
+        Self::read(path, &text)
+    }
+
+    pub(super) fn read(path: &Path, text: &str) -> Option<Self> {
+        let note: serde_json::Value = serde_json::from_str(text).ok()?;
+        let plain = |key: &str| Some(note.get(key)?.as_str().filter(|name| is_plain(name))?.to_owned());
+        let device = plain("device")?;
+        let stem = path.file_name()?.to_str()?.strip_suffix(&format!(".{device}.clip.json"))?;
+        let episode = path.with_file_name(format!("{stem}.mcap"));
+        let name = Name { folder: plain("folder")?, file: plain("file")? };
+        let size = note.get("size").and_then(serde_json::Value::as_u64);
+        (!stem.is_empty()).then_some(Self { name, size, episode, device })
     }
 
     fn path(&self) -> String {
-        format!("/videos/DCIM/{}/{}", self.folder, self.file)
+        format!("/videos/DCIM/{}/{}", self.name.folder, self.name.file)
     }
 
     pub(super) fn url(&self, server: &Server) -> String {
@@ -58,42 +93,26 @@ impl Clip {
 
     /// Where the clip goes.
     pub(super) fn target(&self) -> PathBuf {
-        self.beside(&self.file)
+        self.beside(&self.name.file)
+    }
+
+    /// Where the note is.
+    pub(super) fn note_path(&self) -> PathBuf {
+        self.beside("clip.json")
     }
 
     /// Writes the note.
     pub(super) fn note(&self, url: &str) -> io::Result<()> {
+        let Name { folder, file } = &self.name;
         let note = serde_json::json!({
-            "device": self.device, "folder": self.folder, "file": self.file, "size": self.size, "url": url,
+            "device": self.device, "folder": folder, "file": file, "size": self.size, "url": url,
         });
-        std::fs::write(self.beside("clip.json"), format!("{note:#}\n"))
+        std::fs::write(self.note_path(), format!("{note:#}\n"))
     }
 }
 
-/// Folder and file, from the camera's answer to `last_captured`.
-pub(super) fn named(answer: &[u8]) -> Result<(String, String), String> {
-    let answer: serde_json::Value = serde_json::from_slice(answer).map_err(|error| error.to_string())?;
-    let name = |key: &str| {
-        let name = answer.get(key).and_then(serde_json::Value::as_str).unwrap_or_default();
-        if is_plain(name) { Ok(name.to_owned()) } else { Err(format!("{key} {name:?} is no plain name")) }
-    };
-    Ok((name("folder")?, name("file")?))
-}
-
-/// The size that the camera tells of a clip, as text or number.
-pub(super) fn size(info: &[u8]) -> Option<u64> {
-    let info: serde_json::Value = serde_json::from_slice(info).ok()?;
-    let size = info.get("s")?;
-    size.as_u64().or_else(|| size.as_str()?.parse().ok())
-}
-
-fn is_plain(name: &str) -> bool {
-    let legal = |byte: u8| byte.is_ascii_alphanumeric() || matches!(byte, b'_' | b'-' | b'.');
-    (1..=64).contains(&name.len()) && !name.starts_with('.') && name.bytes().all(legal)
-}
-
 /// Fetches the clip, from where an earlier try ended.
-pub(super) async fn fetch(clip: Clip, server: Server) -> Result<(), String> {
+pub(super) async fn fetch(clip: Clip, server: Server) -> Result<(), Failure> {
     let target = clip.target();
     if target.exists() {
         return Ok(());
@@ -101,79 +120,87 @@ pub(super) async fn fetch(clip: Clip, server: Server) -> Result<(), String> {
     let mut part = target.clone().into_os_string();
     part.push(".partial");
     let part = PathBuf::from(part);
-    let mut progress = Progress { device: clip.device.clone(), file: clip.file.clone(), told: 0 };
-    let mut failed = 0;
+    let mut progress = Progress { device: clip.device.clone(), file: clip.name.file.clone(), told: 0 };
+    let (mut failed, mut furthest) = (0, length(&part));
     loop {
-        let there = length(&part);
-        let error = match attempt(&clip, &server, &part, there, &mut progress).await {
+        let error = match attempt(&clip, &server, &part, &mut progress).await {
             Ok(()) => break,
-            Err(Failure::Final(reason)) => return Err(reason),
-            Err(Failure::Broke(reason)) => reason,
+            Err(Broken::Finally(failure)) => return Err(failure),
+            Err(Broken::Off(reason)) => reason,
         };
-        failed = if length(&part) > there { 0 } else { failed + 1 };
+        let there = length(&part);
+        // One that begins anew each time comes no further.
+        failed = if there > furthest { 0 } else { failed + 1 };
+        furthest = furthest.max(there);
         if failed == TRIES {
-            return Err(error);
+            return Err(Failure::Stays(error));
         }
-        tokio::time::sleep(Duration::from_secs(1)).await;
+        tokio::time::sleep(PAUSE).await;
     }
-    std::fs::rename(&part, &target).map_err(|error| format!("{}: {error}", target.display()))?;
-    tracing::info!(device = clip.device, "{} fetched: {}", clip.file, target.display());
+    let renamed = std::fs::rename(&part, &target);
+    renamed.map_err(|error| Failure::Stays(format!("{}: {error}", target.display())))?;
+    tracing::info!(device = clip.device, "{} fetched: {}", clip.name.file, target.display());
     Ok(())
 }
 
-enum Failure {
+enum Broken {
     /// Asking again may help.
-    Broke(String),
-    Final(String),
+    Off(String),
+    Finally(Failure),
 }
 
-async fn attempt(
-    clip: &Clip,
-    server: &Server,
-    part: &Path,
-    there: u64,
-    progress: &mut Progress,
-) -> Result<(), Failure> {
-    let broke = |error: &dyn std::fmt::Display| Failure::Broke(error.to_string());
-    let mut reply = http::get(server, &clip.path(), there, HEAD_LIMIT).await.map_err(|error| broke(&error))?;
-    let from = match reply.status {
-        StatusCode::PARTIAL_CONTENT => there,
+fn off(error: impl std::fmt::Display) -> Broken {
+    Broken::Off(error.to_string())
+}
+
+fn stays(reason: impl std::fmt::Display) -> Broken {
+    Broken::Finally(Failure::Stays(reason.to_string()))
+}
+
+async fn attempt(clip: &Clip, server: &Server, part: &Path, progress: &mut Progress) -> Result<(), Broken> {
+    let mut part = Part::open(part, clip.size).await?;
+    let mut reply = http::get(server, &clip.path(), part.there, HEAD_LIMIT).await.map_err(off)?;
+    match reply.status {
+        StatusCode::PARTIAL_CONTENT if begins(&reply) == Some(part.there) => {}
+        StatusCode::PARTIAL_CONTENT => {
+            part.begin_anew()?;
+            return Err(off("the camera goes on elsewhere than where it was asked to"));
+        }
         // All of it is there.
-        StatusCode::RANGE_NOT_SATISFIABLE if there > 0 && clip.size == Some(there) => return Ok(()),
-        status if status.is_success() => 0,
-        status => return Err(Failure::Final(format!("the camera answers {status}"))),
-    };
-    let whole = announced(&reply).map(|rest| from + rest).or(clip.size);
-    if let (Some(whole), Some(room)) = (whole, room(part))
-        && (whole - from).saturating_add(RESERVE) > room
-    {
-        return Err(Failure::Final(format!("{} MB do not fit on the disk", (whole - from) >> 20)));
+        StatusCode::RANGE_NOT_SATISFIABLE if part.there > 0 && clip.size == Some(part.there) => return Ok(()),
+        StatusCode::RANGE_NOT_SATISFIABLE if part.there > 0 => {
+            part.begin_anew()?;
+            return Err(off("more is there than the camera has"));
+        }
+        status @ (StatusCode::NOT_FOUND | StatusCode::GONE) => {
+            return Err(Broken::Finally(Failure::Lost(format!("the camera answers {status}"))));
+        }
+        status if status.is_success() => part.begin_anew()?,
+        status => return Err(stays(format_args!("the camera answers {status}"))),
     }
-    let mut file = open(part, from).map_err(|error| Failure::Final(format!("{}: {error}", part.display())))?;
-    let (mut block, mut got) = (Vec::with_capacity(BLOCK), from);
+    let from = part.there;
+    let whole = match announced(&reply) {
+        Some(rest) => {
+            Some(from.checked_add(rest).ok_or_else(|| stays("the camera announces more than any disk holds"))?)
+        }
+        None => clip.size,
+    };
+    part.has_room(whole.unwrap_or(0).saturating_sub(from))?;
+    let mut block = Vec::with_capacity(BLOCK);
     loop {
         let bytes = match timeout(SILENCE_LIMIT, reply.next()).await {
             Ok(Ok(bytes)) => bytes,
-            Ok(Err(error)) => return Err(broke(&error)),
-            Err(_) => return Err(Failure::Broke(format!("nothing came for {} s", SILENCE_LIMIT.as_secs()))),
+            Ok(Err(error)) => return Err(off(error)),
+            Err(_) => return Err(off(format_args!("nothing came for {} s", SILENCE_LIMIT.as_secs()))),
         };
         let is_last = bytes.is_none();
         block.extend_from_slice(&bytes.unwrap_or_default());
         if block.len() >= BLOCK || is_last {
-            got += block.len() as u64;
+            let got = part.there.saturating_add(block.len() as u64);
             if whole.is_some_and(|whole| got > whole) {
-                return Err(Failure::Final("the camera sends more than it announced".to_owned()));
+                return Err(stays("the camera sends more than it announced"));
             }
-            let written = tokio::task::spawn_blocking(move || {
-                file.write_all(&block)?;
-                block.clear();
-                if is_last {
-                    file.sync_all()?;
-                }
-                io::Result::Ok((file, block))
-            });
-            let written = written.await.map_err(|error| broke(&error))?;
-            (file, block) = written.map_err(|error| Failure::Final(format!("{}: {error}", part.display())))?;
+            (part, block) = part.write(block, is_last).await?;
             progress.tell(got, whole);
         }
         if is_last {
@@ -181,13 +208,103 @@ async fn attempt(
         }
     }
     match whole {
-        Some(whole) if got < whole => Err(Failure::Broke(format!("the camera stopped at {got} of {whole} bytes"))),
+        Some(whole) if part.there < whole => {
+            Err(off(format_args!("the camera stopped at {} of {whole} bytes", part.there)))
+        }
+        _ if part.file.metadata().map(|metadata| metadata.len()).ok() != Some(part.there) => {
+            part.begin_anew()?;
+            Err(off("what was written is not what came"))
+        }
         _ => Ok(()),
     }
 }
 
+/// What of a clip is there, held by this fetch alone until it is dropped.
+#[derive(Debug)]
+struct Part {
+    file: File,
+    path: PathBuf,
+    /// Bytes that are there.
+    there: u64,
+}
+
+impl Part {
+    /// `size` is that of the clip, if it is known: what is longer is of another.
+    async fn open(path: &Path, size: Option<u64>) -> Result<Self, Broken> {
+        let path = path.to_owned();
+        let named = path.display().to_string();
+        let open = move || {
+            let file = OpenOptions::new().create(true).truncate(false).write(true).open(&path)?;
+            // A fetch that was given up may still be writing its last block.
+            let locked = rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive);
+            // Not every file system can.
+            if locked == Err(Errno::WOULDBLOCK) {
+                return Err(Errno::WOULDBLOCK.into());
+            }
+            let there = file.metadata()?.len();
+            let mut part = Self { file, path, there };
+            if size.is_some_and(|size| part.there > size) {
+                part.truncate()?;
+            }
+            io::Result::Ok(part)
+        };
+        match tokio::task::spawn_blocking(open).await.map_err(off)? {
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => Err(off("somebody else is fetching it")),
+            opened => opened.map_err(|error| stays(format_args!("{named}: {error}"))),
+        }
+    }
+
+    fn truncate(&mut self) -> io::Result<()> {
+        self.file.set_len(0)?;
+        self.there = 0;
+        Ok(())
+    }
+
+    fn begin_anew(&mut self) -> Result<(), Broken> {
+        self.truncate().map_err(|error| stays(format_args!("{}: {error}", self.path.display())))
+    }
+
+    /// Is there room on the disk for so many bytes more?
+    fn has_room(&self, bytes: u64) -> Result<(), Broken> {
+        match room(&self.path) {
+            Some(room) if bytes.saturating_add(RESERVE) > room => Err(stays(full(bytes))),
+            _ => Ok(()),
+        }
+    }
+
+    /// Writes what follows; the emptied block comes back.
+    async fn write(self, mut block: Vec<u8>, is_last: bool) -> Result<(Self, Vec<u8>), Broken> {
+        let named = self.path.display().to_string();
+        let write = move || {
+            let Self { file, path, there } = self;
+            let bytes = block.len() as u64;
+            // Recordings eat the same disk.
+            if room(&path).is_some_and(|room| bytes.saturating_add(RESERVE) > room) {
+                return Err(io::Error::other(full(bytes)));
+            }
+            file.write_all_at(&block, there)?;
+            block.clear();
+            if is_last {
+                file.sync_all()?;
+            }
+            Ok((Self { file, path, there: there.saturating_add(bytes) }, block))
+        };
+        let written = tokio::task::spawn_blocking(write).await.map_err(off)?;
+        written.map_err(|error| stays(format_args!("{named}: {error}")))
+    }
+}
+
+fn full(bytes: u64) -> String {
+    format!("{} MB do not fit on the disk, of which {} MB stay free", bytes.div_ceil(1 << 20), RESERVE >> 20)
+}
+
 fn announced(reply: &Reply) -> Option<u64> {
     reply.header(CONTENT_LENGTH)?.parse().ok()
+}
+
+/// Where a part begins: `bytes 10-99/100` (RFC 9110, 14.4).
+fn begins(reply: &Reply) -> Option<u64> {
+    reply.header(CONTENT_RANGE)?.trim().strip_prefix("bytes ")?.split_once('-')?.0.trim().parse().ok()
 }
 
 fn length(path: &Path) -> u64 {
@@ -198,14 +315,6 @@ fn length(path: &Path) -> u64 {
 fn room(path: &Path) -> Option<u64> {
     let disk = rustix::fs::statvfs(path.parent()?).ok()?;
     disk.f_bavail.checked_mul(disk.f_frsize)
-}
-
-fn open(path: &Path, from: u64) -> io::Result<File> {
-    let file = OpenOptions::new().create(true).append(true).open(path)?;
-    if from == 0 {
-        file.set_len(0)?;
-    }
-    Ok(file)
 }
 
 /// Tells every tenth.

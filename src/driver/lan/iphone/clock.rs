@@ -2,7 +2,8 @@
 //!
 //! What the phone measured at its time `d` arrives here at `a`, some delay later. The least `a - d` of the
 //! last seconds is the difference of the clocks but for the shortest delay, which on a local network is a
-//! few milliseconds; a delay that is longer than that is thus seen as a delay and not as time.
+//! few milliseconds; a delay that is longer than that is thus seen as a delay and not as time, however long it is.
+//! Where the phone's clock goes backwards, or is further ahead than any delay explains, it is another session's.
 //!
 //! Invariant: a stamp is never later than the arrival.
 
@@ -12,7 +13,7 @@ use crate::time::Stamp;
 
 /// The least difference is looked for over so long, twice: clocks drift apart by some 50 us a second at most.
 const WINDOW: Duration = Duration::from_secs(5);
-/// A capture time further from what was expected is another clock's: the session began anew.
+/// A capture time this much before the shortest delay permits is another clock's: the session began anew.
 const LEAP_NS: i128 = 1_000_000_000;
 
 #[derive(Debug, Default)]
@@ -21,6 +22,8 @@ pub(super) struct Clock {
     now: Option<i128>,
     before: Option<i128>,
     since: Stamp,
+    /// The phone's newest time, ns.
+    newest: i128,
 }
 
 impl Clock {
@@ -33,9 +36,10 @@ impl Clock {
         #[expect(clippy::cast_possible_truncation, reason = "within the range just checked")]
         let device = (device * 1e9) as i128;
         let difference = i128::from(arrived.0) - device;
-        if self.least().is_some_and(|least| (difference - least).abs() > LEAP_NS) {
+        if device < self.newest || self.least().is_some_and(|least| difference < least - LEAP_NS) {
             *self = Self::default();
         }
+        self.newest = device;
         if self.now.is_none() || arrived.since(self.since) >= WINDOW {
             (self.before, self.now, self.since) = (self.now, None, arrived);
         }
@@ -75,6 +79,16 @@ mod tests {
     }
 
     #[test]
+    fn what_comes_after_a_stall_is_as_old_as_it_is() {
+        // The network stands still for four seconds, and what it held comes at once.
+        let stalled = (0..120).map(|frame| 4005 - frame * 1000 / 30);
+        let delays: Vec<u64> = [5; 60].into_iter().chain(stalled).chain([5; 30]).collect();
+        let errors = errors(&delays, 0);
+        let bounds = 4_900_000..40_000_000;
+        assert!(errors.iter().all(|error| bounds.contains(error)), "{errors:?}");
+    }
+
+    #[test]
     fn a_clock_that_drifts_is_followed() {
         let delays: Vec<u64> = (0..1800).map(|frame| 5 + (frame * 7) % 30).collect();
         for ppm in [-100, 100] {
@@ -92,5 +106,7 @@ mod tests {
         // The session began anew: its first frame stands at its arrival.
         clock.stamp(100.0, Stamp(10_000_000_000));
         assert_eq!(clock.stamp(5.0, Stamp(11_000_000_000)), Stamp(11_000_000_000));
+        // So did this one, whose clock is far ahead.
+        assert_eq!(clock.stamp(500.0, Stamp(12_000_000_000)), Stamp(12_000_000_000));
     }
 }

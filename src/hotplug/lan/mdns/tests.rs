@@ -23,7 +23,12 @@ impl Bench {
             current: None,
             asked: None,
         });
-        let service = Service { domain: "_s._tcp.local.".into(), wanted: wanted.collect(), known: BTreeMap::new() };
+        let service = Service {
+            domain: "_s._tcp.local.".into(),
+            wanted: wanted.collect(),
+            known: BTreeMap::new(),
+            cut: BTreeMap::new(),
+        };
         Self { service, told, now: Stamp(1_000_000_000_000) }
     }
 
@@ -120,8 +125,9 @@ async fn what_its_driver_hears_outlasts_a_lost_announcement_and_not_a_goodbye() 
 #[tokio::test]
 async fn each_instance_is_one_entry_and_a_named_one_the_one_of_its_name() {
     let mut bench = Bench::new(&[("left", None), ("named", Some("B")), ("right", None)]);
-    assert_eq!(bench.announced("b", &["127.0.0.1:2"]).await, ["+left b 127.0.0.1:2"], "the first free one");
-    assert_eq!(bench.removed("b").await, ["-/lan/left goodbye"]);
+    assert_eq!(bench.announced("b", &["127.0.0.1:2"]).await, ["+named b 127.0.0.1:2"], "not the first free one");
+    assert_eq!(bench.announced("a", &["127.0.0.1:1"]).await, ["+left a 127.0.0.1:1"]);
+    assert_eq!(bench.removed("b").await, ["-/lan/named goodbye"]);
     let mut bench = Bench::new(&[("named", Some("B")), ("left", None), ("right", None)]);
     assert_eq!(bench.announced("a", &["127.0.0.1:1"]).await, ["+left a 127.0.0.1:1"]);
     assert_eq!(bench.announced("b", &["127.0.0.1:2"]).await, ["+named b 127.0.0.1:2"]);
@@ -129,6 +135,51 @@ async fn each_instance_is_one_entry_and_a_named_one_the_one_of_its_name() {
     assert!(bench.announced("d", &["127.0.0.1:4"]).await.is_empty());
     // Whoever waits takes the place of one that left.
     assert_eq!(bench.removed("a").await, ["-/lan/left goodbye", "+left d 127.0.0.1:4"]);
+}
+
+#[tokio::test]
+async fn a_link_that_was_down_for_a_moment_brings_its_device_back() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let state = folder.path().join("operstate");
+    let mut bench = Bench::new(&[("phone", None)]);
+    bench.announced("a", &["127.0.0.1:5"]).await;
+    bench.pass(200).await;
+    std::fs::write(&state, "down\n").expect("written");
+    bench.service.wanted[0].watch.lead_over(Link::of(folder.path()));
+    assert_eq!(bench.pass(1000).await, (0, vec!["-/lan/phone link".to_owned()]));
+    // Another's announcement says nothing of it.
+    assert_eq!(bench.announced("b", &["127.0.0.1:6"]).await, ["+phone b 127.0.0.1:6"]);
+    assert_eq!(bench.removed("b").await, ["-/lan/phone goodbye"]);
+    std::fs::write(&state, "up\n").expect("written");
+    // The library announces nothing: it is as it was. So it is asked.
+    assert_eq!(bench.pass(1000).await, (1, vec!["+phone a 127.0.0.1:5".to_owned()]));
+    assert_eq!(bench.removed("a").await, ["-/lan/phone goodbye"]);
+}
+
+#[tokio::test]
+async fn an_announcement_over_another_link_counts_at_once() {
+    let folder = tempfile::tempdir().expect("a folder");
+    std::fs::write(folder.path().join("operstate"), "down\n").expect("written");
+    let mut bench = Bench::new(&[("phone", None)]);
+    bench.announced("a", &["127.0.0.1:5"]).await;
+    bench.service.wanted[0].watch.lead_over(Link::of(folder.path()));
+    assert_eq!(bench.pass(500).await.1, ["-/lan/phone link"]);
+    assert_eq!(bench.announced("a", &["127.0.0.2:5"]).await, ["+phone a 127.0.0.2:5"]);
+}
+
+#[tokio::test]
+async fn an_announcement_puts_off_the_question_to_its_own_device_alone() {
+    let mut bench = Bench::new(&[("left", None), ("right", None)]);
+    bench.announced("a", &["127.0.0.1:1"]).await;
+    bench.announced("b", &["127.0.0.1:2"]).await;
+    assert_eq!(bench.pass(100).await.0, 2);
+    // Again and again, faster than a lease.
+    let mut questions = 0;
+    for _ in 0..10 {
+        bench.announced("b", &["127.0.0.1:2"]).await;
+        questions += bench.pass(100).await.0;
+    }
+    assert_eq!(questions, 10, "`b` each time, `a` never again within its lease");
 }
 
 #[tokio::test]

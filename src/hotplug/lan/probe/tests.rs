@@ -88,6 +88,44 @@ async fn packets_of_the_device_are_heard_and_the_port_is_given_back() {
 }
 
 #[tokio::test]
+async fn a_refusal_says_nothing_while_the_driver_has_the_only_connection() {
+    let listener = TcpListener::bind((LOCAL, 0)).await.expect("a port");
+    let address = listener.local_addr().expect("an address");
+    let (tell, mut told) = mpsc::channel(8);
+    let lease = EVERY * 4;
+    tokio::spawn(watch(Watch::new("cam", lease, tell), address, address, Probe::Tcp));
+    let Some(HotplugEvent::Added(attachment)) = told.recv().await else { panic!("not found") };
+    let DeviceNode::Lan { heard, .. } = attachment.node else { panic!("not on the network") };
+    // It has a connection, and sends more seldom than it would be asked.
+    drop(listener);
+    heard.now();
+    let since = heard.at();
+    let Some(HotplugEvent::Removed { witnessed, .. }) = told.recv().await else { panic!("not gone") };
+    assert!(witnessed.since(since) >= lease, "gone after {:?}", witnessed.since(since));
+}
+
+#[tokio::test]
+async fn a_lease_waits_for_a_driver_that_is_started_later() {
+    let (tell, mut told) = mpsc::channel(8);
+    let mut watch = Watch::new("lidar", EVERY, tell).waits(EVERY * 2);
+    let begin = Stamp::now();
+    watch.found(nobody(), None, begin).await;
+    let Some(HotplugEvent::Added(attachment)) = told.recv().await else { panic!("not found") };
+    let DeviceNode::Lan { heard, .. } = attachment.node else { panic!("not on the network") };
+    watch.look(begin.after(EVERY * 2)).await;
+    assert!(watch.is_there(), "its driver has not begun");
+    // From the first packet on, the lease is what it is.
+    heard.now();
+    watch.look(begin).await;
+    watch.look(heard.at().after(EVERY)).await;
+    assert!(!watch.is_there());
+    // One that was never heard is gone at last.
+    watch.found(nobody(), None, begin.after(EVERY * 20)).await;
+    watch.look(begin.after(EVERY * 23)).await;
+    assert!(!watch.is_there());
+}
+
+#[tokio::test]
 async fn a_device_comes_and_goes_and_one_that_sends_is_not_asked() {
     let listener = TcpListener::bind((LOCAL, 0)).await.expect("a port");
     let address = listener.local_addr().expect("an address");

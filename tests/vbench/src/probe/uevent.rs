@@ -102,12 +102,12 @@ impl Listener {
     }
 }
 
-/// Prints `uevent` lines for USB devices and for the nodes of cameras and serial lines, without end.
+/// Prints `uevent` lines for USB devices, the nodes of cameras and serial lines and network interfaces, without end.
 pub fn watch(log: &Log) -> Result<(), Errno> {
     let mut listener = Listener::open()?;
     loop {
         let (event, moment) = listener.receive()?;
-        if matches!(event.get("SUBSYSTEM"), "usb" | "video4linux" | "tty") {
+        if matches!(event.get("SUBSYSTEM"), "usb" | "video4linux" | "tty" | "net") {
             log.say("uevent", moment, event.describe());
         }
     }

@@ -1,0 +1,67 @@
+//! What the screen asks for, on its way to whom it is for.
+//!
+//! Invariant: an order to the actuator waits for nothing that becomes of an episode: it does not pass
+//! through the conductor, which waits for files to be closed.
+
+use tokio::sync::mpsc;
+
+use crate::rig::RigCommand;
+use crate::status::Command;
+
+/// What the conductor is asked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Asked {
+    /// Begin an episode, or end the one in progress.
+    ToggleRecording,
+    /// End the run.
+    Quit,
+}
+
+/// Sorts what comes from the screen, until it is gone. What the conductor has not come to waits without a
+/// limit: it is what a hand types.
+pub(super) fn sorted(
+    mut screen: mpsc::Receiver<Command>,
+    rig: mpsc::Sender<RigCommand>,
+) -> mpsc::UnboundedReceiver<Asked> {
+    let (conductor, asked) = mpsc::unbounded_channel();
+    tokio::spawn(async move {
+        while let Some(command) = screen.recv().await {
+            // Either is gone only when the run ends.
+            let _ = match command {
+                Command::ToggleRecording => conductor.send(Asked::ToggleRecording).is_ok(),
+                Command::Quit => conductor.send(Asked::Quit).is_ok(),
+                Command::Restart(id) => rig.send(RigCommand::Restart(id)).await.is_ok(),
+                Command::Order(order) => rig.send(RigCommand::Order(order)).await.is_ok(),
+            };
+        }
+    });
+    asked
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::action::Order;
+    use crate::modality::ModalityId;
+
+    #[tokio::test]
+    async fn orders_reach_the_rig_while_the_conductor_is_busy() {
+        let (screen, from_screen) = mpsc::channel(1);
+        let (rig, mut at_rig) = mpsc::channel(1);
+        let mut asked = sorted(from_screen, rig);
+        for _ in 0..100 {
+            screen.send(Command::ToggleRecording).await.unwrap();
+        }
+        screen.send(Command::Order(Order::Disarm)).await.unwrap();
+        assert_eq!(at_rig.recv().await, Some(RigCommand::Order(Order::Disarm)));
+        screen.send(Command::Restart(ModalityId::new(3).unwrap())).await.unwrap();
+        assert_eq!(at_rig.recv().await, Some(RigCommand::Restart(ModalityId::new(3).unwrap())));
+        screen.send(Command::Quit).await.unwrap();
+        drop(screen);
+        let mut all = Vec::new();
+        while let Some(one) = asked.recv().await {
+            all.push(one);
+        }
+        assert_eq!((all.len(), all.last()), (101, Some(&Asked::Quit)));
+    }
+}

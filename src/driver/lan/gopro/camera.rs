@@ -1,0 +1,387 @@
+//! The task that speaks with a camera: keeps it awake, runs its shutter with the episodes, fetches its clips.
+//!
+//! What is wanted is the episode in progress, what is the case the shutter in the [`Books`]: at every change and at
+//! every beat the one is made to follow the other, so that an answer which did not come, or a lost connection, delays
+//! it and loses nothing.
+//!
+//! Which clip an episode has is known by what was newest on the card before its shutter was started. Where that is not
+//! known, or clips of ours may still come to be listed, no clip is said to be the episode's.
+//!
+//! Invariant: what goes wrong with a clip is said, and changes nothing of the episode.
+
+use std::collections::VecDeque;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use hyper::StatusCode;
+use tokio::sync::{mpsc, watch};
+use tokio::time::{Instant, MissedTickBehavior, interval, sleep};
+use tokio_util::task::AbortOnDropHandle;
+
+use super::super::http;
+use super::super::place::Server;
+use super::answer::{self, Name, State};
+use super::books::{Before, Books, Shutter};
+use super::clip::{self, Clip, Failure};
+use super::{ANSWER_LIMIT, LARGEST_ANSWER, TRIES, ask};
+use crate::driver::DriverError;
+use crate::time::Stamp;
+
+/// The episode in progress, if there is one; `None` until that was told.
+pub(super) type Told = Option<Option<PathBuf>>;
+
+/// How long things take.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Pace {
+    /// The camera switches itself off when it hears nothing for longer than this (Open GoPro, "keep alive").
+    pub(super) beat: Duration,
+    /// A clip is in the camera's list a moment after it was stopped, usually within 1.5 s.
+    pub(super) listed_within: Duration,
+    /// After this long it never will be.
+    pub(super) listed_at_the_latest: Duration,
+}
+
+impl Pace {
+    pub(super) const USUAL: Self = Self {
+        beat: Duration::from_secs(3),
+        listed_within: Duration::from_secs(4),
+        listed_at_the_latest: Duration::from_mins(1),
+    };
+}
+
+const LOOK_FOR_CLIP: Duration = Duration::from_millis(100);
+
+/// See the module's comment.
+#[derive(Debug)]
+pub(super) struct Camera {
+    name: String,
+    server: Server,
+    pace: Pace,
+    download: bool,
+    states: mpsc::Sender<Result<State, DriverError>>,
+    books: Books,
+    /// The shutter in the books is of an earlier connection: whether it still runs is to be seen.
+    is_inherited: bool,
+    wanted: Option<PathBuf>,
+    /// What is wanted is known.
+    is_told: bool,
+    /// A clip that is not listed yet, and until when it is looked for.
+    unlisted: Option<(Shutter, Instant)>,
+    /// Until then clips may come to be listed whose episodes are not known.
+    unclear_until: Option<Instant>,
+    /// What the camera refused was said.
+    is_said: bool,
+    /// Clips that are still to be fetched; the first is being fetched.
+    pending: VecDeque<Clip>,
+    fetching: Option<AbortOnDropHandle<Result<(), Failure>>>,
+}
+
+impl Camera {
+    pub(super) async fn new(
+        name: &str,
+        server: Server,
+        download: bool,
+        books: Books,
+        states: mpsc::Sender<Result<State, DriverError>>,
+        pace: Pace,
+    ) -> Self {
+        let mut camera = Self {
+            name: name.to_owned(),
+            server,
+            pace,
+            download,
+            states,
+            is_inherited: books.shutter().is_some(),
+            books,
+            wanted: None,
+            is_told: false,
+            unlisted: None,
+            unclear_until: None,
+            is_said: false,
+            pending: VecDeque::new(),
+            fetching: None,
+        };
+        if download {
+            camera.inherit().await;
+        }
+        camera
+    }
+
+    /// Goes on with what an earlier connection, or an earlier run, left to be fetched.
+    async fn inherit(&mut self) {
+        for note in self.books.notes().to_vec() {
+            let path = note.clone();
+            let clip = tokio::task::spawn_blocking(move || {
+                let clip = Clip::of_note(&path)?;
+                Some((clip.target().exists(), clip))
+            });
+            match clip.await.ok().flatten() {
+                Some((false, clip)) => self.pending.push_back(clip),
+                Some((true, _)) => self.books.forget(&note).await,
+                None => {
+                    tracing::warn!(device = self.name, "{} is gone: its clip is not fetched", note.display());
+                    self.books.forget(&note).await;
+                }
+            }
+        }
+    }
+
+    /// Runs until nobody tells it anything any more, or the camera does not answer.
+    pub(super) async fn run(mut self, mut told: watch::Receiver<Told>) {
+        let mut beat = interval(self.pace.beat);
+        beat.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut is_first = true;
+        loop {
+            tokio::select! {
+                biased;
+                changed = told.changed() => {
+                    if changed.is_err() {
+                        return;
+                    }
+                    let now = told.borrow_and_update().clone();
+                    if let Some(wanted) = now {
+                        (self.wanted, self.is_told, self.is_said) = (wanted, true, false);
+                        self.settle().await;
+                    }
+                }
+                _ = beat.tick() => {
+                    let state = self.look().await;
+                    let is_over = state.is_err();
+                    if !self.states.is_closed() && self.states.try_send(state).is_err() {
+                        tracing::debug!(device = self.name, "a state that nobody read");
+                    }
+                    if is_over {
+                        return;
+                    }
+                    // An episode in progress is told as soon as the camera is open.
+                    self.is_told |= !is_first;
+                    is_first = false;
+                    self.settle().await;
+                }
+                fetched = fetched(&mut self.fetching) => {
+                    self.fetching = None;
+                    self.fetched(fetched).await;
+                    self.fetch();
+                }
+            }
+        }
+    }
+
+    async fn look(&self) -> Result<State, DriverError> {
+        ask(&self.server, "/gopro/camera/keep_alive").await?;
+        let asked = Stamp::now();
+        let answer = ask(&self.server, "/gopro/camera/state").await?;
+        answer::state(&answer, asked).ok_or_else(|| self.server.place.lost("its state is not what a GoPro says"))
+    }
+
+    /// Makes the shutter follow the episodes.
+    async fn settle(&mut self) {
+        if !self.is_told || (self.is_inherited && !self.has_inherited().await) {
+            return;
+        }
+        if let Some(shutter) = self.books.shutter().cloned()
+            && self.wanted.as_ref() != Some(&shutter.episode)
+            && !self.stop(shutter).await
+        {
+            return;
+        }
+        match self.wanted.clone() {
+            Some(episode) if self.books.shutter().is_none() => self.start(episode).await,
+            Some(_) => {}
+            None => {
+                self.list().await;
+                self.fetch();
+            }
+        }
+    }
+
+    /// Learns whether the shutter of an earlier connection still runs. Is it known now?
+    async fn has_inherited(&mut self) -> bool {
+        let Ok(state) = self.look().await else { return false };
+        self.is_inherited = false;
+        if let (Some(shutter), false) = (self.books.shutter().cloned(), state.recording) {
+            self.unknown(&shutter, "its shutter was closed while nobody looked").await;
+            self.books.set_shutter(None).await;
+        }
+        true
+    }
+
+    async fn start(&mut self, episode: PathBuf) {
+        // The camera reads one card: the clip in progress comes first.
+        self.fetching = None;
+        self.list().await;
+        if let Some((shutter, _)) = self.unlisted.take() {
+            self.unknown(&shutter, "it was not listed when the next episode began").await;
+            self.unclear_until = Some(Instant::now() + self.pace.listed_at_the_latest);
+        }
+        let before = if self.unclear_until.is_some_and(|until| Instant::now() < until) {
+            Before::Unknown("clips of episodes before it were not listed yet when it began".to_owned())
+        } else {
+            match newest(&self.server).await {
+                Ok(Some(clip)) => Before::Clip(clip),
+                Ok(None) => Before::Nothing,
+                Err(reason) => Before::Unknown(format!("which clip was newest before it is not known: {reason}")),
+            }
+        };
+        self.books.set_shutter(Some(Shutter { episode, before })).await;
+        let Err(error) = ask(&self.server, "/gopro/camera/shutter/start").await else {
+            if self.is_said {
+                tracing::warn!(device = self.name, "records now, not from the beginning of the episode");
+            }
+            return;
+        };
+        // It may record already, by hand.
+        if self.look().await.is_ok_and(|state| state.recording) {
+            return;
+        }
+        self.books.set_shutter(None).await;
+        if !std::mem::replace(&mut self.is_said, true) {
+            tracing::error!(device = self.name, %error, "the camera does not record this episode; it is asked again");
+        }
+    }
+
+    /// Stops the shutter and notes its clip; `false` if it runs on.
+    async fn stop(&mut self, shutter: Shutter) -> bool {
+        if let Err(error) = ask(&self.server, "/gopro/camera/shutter/stop").await
+            && !self.look().await.is_ok_and(|state| !state.recording)
+        {
+            if !std::mem::replace(&mut self.is_said, true) {
+                tracing::error!(device = self.name, %error, "the camera records on; it is asked again to stop");
+            }
+            return false;
+        }
+        self.books.set_shutter(None).await;
+        self.is_said = false;
+        if let Before::Unknown(reason) = &shutter.before {
+            self.unknown(&shutter, reason).await;
+            self.unclear_until = Some(Instant::now() + self.pace.listed_at_the_latest);
+            return true;
+        }
+        let stopped = Instant::now();
+        self.unlisted = Some((shutter, stopped + self.pace.listed_at_the_latest));
+        loop {
+            self.list().await;
+            if self.unlisted.is_none() {
+                return true;
+            }
+            if stopped.elapsed() >= self.pace.listed_within {
+                tracing::warn!(device = self.name, "it does not list its new clip yet");
+                return true;
+            }
+            sleep(LOOK_FOR_CLIP).await;
+        }
+    }
+
+    /// Notes the clip that was just made, once the camera lists it.
+    async fn list(&mut self) {
+        let Some((shutter, until)) = &self.unlisted else { return };
+        match newest(&self.server).await {
+            Ok(Some(name)) if shutter.before != Before::Clip(name.clone()) => {
+                let episode = shutter.episode.clone();
+                self.unlisted = None;
+                self.note(name, episode).await;
+                return;
+            }
+            Ok(_) => {}
+            Err(reason) => tracing::debug!(device = self.name, %reason, "the newest clip is not known yet"),
+        }
+        if Instant::now() >= *until
+            && let Some((shutter, _)) = self.unlisted.take()
+        {
+            self.unknown(&shutter, "the camera listed no new one").await;
+        }
+    }
+
+    /// Writes beside the episode which clip belongs to it.
+    async fn note(&mut self, name: Name, episode: PathBuf) {
+        let info = ask(&self.server, &format!("/gopro/media/info?path={}/{}", name.folder, name.file)).await;
+        let size = info.ok().and_then(|info| answer::size(&info));
+        let clip = Clip::new(name, size, episode, &self.name);
+        let (noted, url) = (clip.clone(), clip.url(&self.server));
+        let (Name { file, folder }, said) = (clip.name.clone(), url.clone());
+        let written = tokio::task::spawn_blocking(move || noted.note(&url)).await;
+        if let Err(error) = written.unwrap_or_else(|error| Err(std::io::Error::other(error))) {
+            let note = clip.note_path();
+            tracing::error!(device = self.name, %error, "{} cannot be written: the clip is {said}", note.display());
+            return;
+        }
+        tracing::info!(device = self.name, clip = file, folder, size, "recorded");
+        if self.download {
+            self.books.remember(clip.note_path()).await;
+            self.pending.push_back(clip);
+        }
+    }
+
+    /// Says that an episode is without its clip.
+    async fn unknown(&self, shutter: &Shutter, reason: &str) {
+        let newest = newest(&self.server).await.ok().flatten();
+        let newest = newest.map(|Name { folder, file }| format!("; the newest on the card is {folder}/{file}"));
+        let (episode, newest) = (shutter.episode.display(), newest.unwrap_or_default());
+        tracing::error!(device = self.name, "which clip belongs to {episode} is not known: {reason}{newest}");
+    }
+
+    /// Goes on with the clips that are to be fetched.
+    fn fetch(&mut self) {
+        if self.fetching.is_some() || self.wanted.is_some() || self.books.shutter().is_some() || !self.is_told {
+            return;
+        }
+        if let Some(clip) = self.pending.front() {
+            let fetching = clip::fetch(clip.clone(), self.server.clone());
+            self.fetching = Some(AbortOnDropHandle::new(tokio::spawn(fetching)));
+        }
+    }
+
+    async fn fetched(&mut self, fetched: Result<(), Failure>) {
+        let Some(clip) = self.pending.pop_front() else { return };
+        let url = clip.url(&self.server);
+        match fetched {
+            Ok(()) => self.books.forget(&clip.note_path()).await,
+            Err(Failure::Stays(reason)) => {
+                tracing::error!(device = self.name, %reason, "{} stays on the camera: {url}", clip.name.file);
+            }
+            Err(Failure::Lost(reason)) => {
+                tracing::error!(device = self.name, %reason, "{} is not on the camera any more: {url}", clip.name.file);
+                self.books.forget(&clip.note_path()).await;
+            }
+        }
+    }
+}
+
+impl Drop for Camera {
+    /// Says what is left undone, however the task ends.
+    fn drop(&mut self) {
+        let then = if self.books.are_kept() { ", and is seen to when the camera is there again" } else { "" };
+        for clip in &self.pending {
+            let (file, url) = (&clip.name.file, clip.url(&self.server));
+            tracing::warn!(device = self.name, "{file} is still on the camera{then}: {url}");
+        }
+        if let Some((shutter, _)) = &self.unlisted {
+            let episode = shutter.episode.display();
+            tracing::error!(device = self.name, "which clip belongs to {episode} is not known: it was not listed yet");
+        }
+        if let Some(shutter) = self.books.shutter() {
+            tracing::warn!(device = self.name, "the camera may record on, for {}{then}", shutter.episode.display());
+        }
+    }
+}
+
+async fn fetched(fetching: &mut Option<AbortOnDropHandle<Result<(), Failure>>>) -> Result<(), Failure> {
+    match fetching {
+        Some(fetching) => fetching.await.unwrap_or_else(|error| Err(Failure::Stays(error.to_string()))),
+        None => std::future::pending().await,
+    }
+}
+
+/// The newest clip on the card; `None` where there is none.
+async fn newest(server: &Server) -> Result<Option<Name>, String> {
+    let mut tries = 1;
+    loop {
+        match http::answer(server, "/gopro/media/last_captured", LARGEST_ANSWER, ANSWER_LIMIT).await {
+            Ok((StatusCode::NOT_FOUND | StatusCode::NO_CONTENT, _)) => return Ok(None),
+            Ok((status, body)) if status.is_success() => return answer::newest(&body),
+            Err(DriverError::Retry(_)) if tries < TRIES => tries += 1,
+            Ok((status, _)) => return Err(format!("the camera answers {status}")),
+            Err(error) => return Err(error.to_string()),
+        }
+    }
+}

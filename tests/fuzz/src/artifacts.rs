@@ -1,0 +1,138 @@
+//! What follows from a registry, read back by readers that are not ours: rules, descriptors and unit.
+
+use std::collections::BTreeSet;
+use std::fmt::Write as _;
+use std::path::Path;
+
+use rapid::modality::ModalityKind;
+use rapid::registry::artifacts::{ArtifactKind, artifacts};
+use rapid::registry::{CanAdapter, DeviceSpec, NodeSpec, Opens, ProcessSpec, Registry};
+use yaml_rust2::{Yaml, YamlLoader};
+
+use crate::rules::{self, Token};
+
+/// All of them.
+pub(crate) fn check(registry: &Registry) {
+    let unit_without_names = |text: &str| text.replace(&registry.rig.name, "");
+    // A harmless registry that has as much to open: of all that is in a registry only that may change the unit.
+    let mut harmless = Registry::builtin();
+    let on_usb =
+        |device: &DeviceSpec| matches!(&device.node, NodeSpec::Process(program) if program.opens == Opens::Usb);
+    if let (true, Some(first)) = (registry.devices.iter().any(on_usb), harmless.devices.first_mut()) {
+        first.node = NodeSpec::Process(ProcessSpec {
+            program: "/usr/bin/true".into(),
+            args: Vec::new(),
+            opens: Opens::Usb,
+            kind: ModalityKind::Bytes,
+            shape: Vec::new(),
+        });
+    }
+    let bus = |device: &DeviceSpec| {
+        matches!(&device.node, NodeSpec::Can(can) if can.adapter == CanAdapter::SocketCan).then(|| device.node.clone())
+    };
+    if let (Some(bus), Some(last)) = (registry.devices.iter().find_map(bus), harmless.devices.last_mut()) {
+        last.node = bus;
+    }
+    let expected = unit_without_names(&text_of_unit(&harmless).replace(&harmless.rig.name, ""));
+    for artifact in artifacts(registry) {
+        let text = &artifact.contents;
+        match artifact.kind {
+            ArtifactKind::Rules => check_rules(registry, text),
+            ArtifactKind::Unit => assert_eq!(unit_without_names(text), expected, "the unit says more than its name"),
+            ArtifactKind::Descriptor => check_descriptor(registry, &artifact.path, text),
+        }
+    }
+}
+
+fn text_of_unit(registry: &Registry) -> String {
+    artifacts(registry).into_iter().find(|artifact| artifact.kind == ArtifactKind::Unit).expect("a unit").contents
+}
+
+/// At most one rule a device, with the keys we know and no others, that matches its serial number
+/// and not another.
+fn check_rules(registry: &Registry, text: &str) {
+    const KEYS: [&str; 6] = ["SUBSYSTEM==", "SYMLINK+=", "GROUP=", "MODE=", "TAG+=", "RUN{builtin}+="];
+    // Of the device itself, or of one above it.
+    const OF_USB: [&str; 5] = ["ENV{DEVTYPE}==", "ATTR{idVendor}==", "ATTR{idProduct}==", "ATTR{serial}==", "KERNEL=="];
+    const OF_OTHERS: [&str; 5] =
+        ["ATTR{index}==", "ATTRS{idVendor}==", "ATTRS{idProduct}==", "ATTRS{serial}==", "KERNELS=="];
+    let rules = rules::parse(text).unwrap_or_else(|line| panic!("udev cannot read {line:?} in:\n{text}"));
+    let mut named = BTreeSet::new();
+    for rule in &rules {
+        let value = |key: &str| rule.iter().find(|token| token.key == key).map(|token| token.value.as_str());
+        if let Some(command) = value("RUN") {
+            check_command(registry, rule, command);
+            continue;
+        }
+        let link = value("SYMLINK").expect("every rule gives a name");
+        assert!(named.insert(link.to_owned()), "two rules for {link}");
+        let device = registry.devices.iter().find(|device| format!("rapid/{}", device.name) == link);
+        let device = device.unwrap_or_else(|| panic!("a rule for {link}, which is no device"));
+        let (own, serial_key) =
+            if value("SUBSYSTEM") == Some("usb") { (OF_USB, "ATTR{serial}") } else { (OF_OTHERS, "ATTRS{serial}") };
+        for Token { key, operator, .. } in rule {
+            let match_or_set = format!("{key}{operator}");
+            let known = KEYS.contains(&match_or_set.as_str()) || own.contains(&match_or_set.as_str());
+            assert!(known, "{match_or_set} in a rule");
+        }
+        let keys: BTreeSet<_> = rule.iter().map(|token| &token.key).collect();
+        assert_eq!(keys.len(), rule.len(), "a key twice in {rule:?}");
+        assert_eq!(value("RUN{builtin}"), Some("uaccess"));
+        let serial = device.identity.serial();
+        assert_eq!(value(serial_key).is_some(), serial.is_some());
+        if let (Some(pattern), Some(serial)) = (value(serial_key), serial) {
+            assert!(rules::matches(pattern, serial), "{pattern:?} does not match {serial:?}");
+            for other in
+                [format!("{serial}x"), format!("x{serial}"), serial.replace(['*', '?', '['], "x"), String::new()]
+            {
+                assert!(other == serial || !rules::matches(pattern, &other), "{pattern:?} matches {other:?}");
+            }
+        }
+    }
+}
+
+/// A CAN interface is brought up, and nothing else: the words are ours and a number of the registry.
+fn check_command(registry: &Registry, rule: &[Token], command: &str) {
+    const KEYS: [&str; 8] = [
+        "ACTION==",
+        "SUBSYSTEM==",
+        "ATTR{type}==",
+        "ATTRS{idVendor}==",
+        "ATTRS{idProduct}==",
+        "ATTRS{serial}==",
+        "KERNELS==",
+        "RUN+=",
+    ];
+    for Token { key, operator, .. } in rule {
+        assert!(KEYS.contains(&format!("{key}{operator}").as_str()), "{key}{operator} in a rule");
+    }
+    let commands = registry.devices.iter().filter_map(|device| {
+        let NodeSpec::Can(can) = &device.node else { return None };
+        Some(format!("/usr/sbin/ip link set dev $name up type can bitrate {} restart-ms 100", can.bitrate))
+    });
+    assert!(commands.into_iter().any(|known| known == command), "udev would run {command:?}");
+}
+
+/// One document with the keys we know, and the values of the registry.
+fn check_descriptor(registry: &Registry, path: &Path, text: &str) {
+    let name = path.file_stem().unwrap_or_default().to_string_lossy();
+    let device = registry.named(&name).expect("a descriptor of a device");
+    let documents = YamlLoader::load_from_str(text).unwrap_or_else(|error| panic!("{error} in:\n{text}"));
+    let [document] = documents.as_slice() else { panic!("{} documents in:\n{text}", documents.len()) };
+    let keys = |yaml: &Yaml| {
+        let mut line = String::new();
+        for key in yaml.as_hash().expect("a map").keys() {
+            let _ = write!(line, "{} ", key.as_str().expect("a text"));
+        }
+        line
+    };
+    assert_eq!(keys(document), "module slot sensors bring_up identity path topic bit ");
+    if device.identity.usb().is_none() {
+        assert_eq!(document["identity"], Yaml::Null, "of a device on the network");
+    } else {
+        assert_eq!(keys(&document["identity"]), "vid pid serial port ");
+    }
+    assert_eq!(document["identity"]["serial"].as_str(), device.identity.serial());
+    assert_eq!(document["topic"].as_str(), Some(device.topic.as_str()));
+    assert_eq!(document["module"].as_str(), Some(device.name.as_str()));
+}

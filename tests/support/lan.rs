@@ -1,0 +1,157 @@
+//! Devices on the network: servers on 127.0.0.1, the entries that name them, and what a run tells of them.
+
+#![allow(dead_code, reason = "each test binary uses its own part of this module")]
+
+use std::io::{Read, Write};
+use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use rapid::driver::sim;
+use rapid::registry::scenario::SimSource;
+use rustix::process::Signal;
+use serde_json::Value;
+
+use crate::support::{Running, events, until};
+
+/// The arguments of a run.
+pub(crate) const RUN: [&str; 4] = ["--config", "devices.toml", "--headless", "--json"];
+pub(crate) const WIDTH: u32 = 64;
+pub(crate) const HEIGHT: u32 = 48;
+
+/// A picture of a simulated camera, different for each number.
+pub(crate) fn picture(number: u32) -> Vec<u8> {
+    let source = SimSource::Camera { width: WIDTH, height: HEIGHT, fps: 30, seed: 7, bytes: 0 };
+    sim::frame(&source, number).expect("a picture")
+}
+
+/// Ports of this machine that nobody is at.
+pub(crate) fn free_ports<const N: usize>() -> [u16; N] {
+    let held = [(); N].map(|()| TcpListener::bind("127.0.0.1:0").expect("a port"));
+    held.map(|listener| listener.local_addr().expect("an address").port())
+}
+
+/// A server whose connections are each given to `answer`, until it is dropped: then all of them end.
+pub(crate) struct Server {
+    stop: Arc<AtomicBool>,
+    connections: Arc<Mutex<Vec<TcpStream>>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Server {
+    pub(crate) fn start(port: u16, answer: impl Fn(TcpStream) + Send + Sync + 'static) -> Self {
+        Self::start_at(([127, 0, 0, 1], port).into(), answer)
+    }
+
+    pub(crate) fn start_at(address: SocketAddr, answer: impl Fn(TcpStream) + Send + Sync + 'static) -> Self {
+        let mut listener = None;
+        // The port of a server that was just killed may still be in use for a moment.
+        until("the port", || {
+            listener = TcpListener::bind(address).ok();
+            listener.is_some()
+        });
+        let listener = listener.expect("bound");
+        listener.set_nonblocking(true).expect("a socket");
+        let (stop, connections) = (Arc::new(AtomicBool::new(false)), Arc::new(Mutex::new(Vec::new())));
+        let thread = std::thread::spawn({
+            let (stop, connections, answer) = (Arc::clone(&stop), Arc::clone(&connections), Arc::new(answer));
+            move || {
+                while !stop.load(Ordering::Relaxed) {
+                    let Ok((stream, _)) = listener.accept() else {
+                        std::thread::sleep(Duration::from_millis(5));
+                        continue;
+                    };
+                    stream.set_nonblocking(false).expect("a socket");
+                    connections.lock().expect("no panic").push(stream.try_clone().expect("a socket"));
+                    let answer = Arc::clone(&answer);
+                    std::thread::spawn(move || answer(stream));
+                }
+            }
+        });
+        Self { stop, connections, thread: Some(thread) }
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+        for connection in self.connections.lock().expect("no panic").drain(..) {
+            let _ = connection.shutdown(std::net::Shutdown::Both);
+        }
+    }
+}
+
+/// The path of a request, which is read to its end; `None` of a connection without one.
+pub(crate) fn request(stream: &mut TcpStream) -> Option<String> {
+    let mut text = Vec::new();
+    while !text.ends_with(b"\r\n\r\n") {
+        let mut byte = [0];
+        stream.read_exact(&mut byte).ok()?;
+        text.push(byte[0]);
+    }
+    let text = String::from_utf8(text).expect("ASCII");
+    Some(text.lines().next()?.split(' ').nth(1)?.to_owned())
+}
+
+/// A camera that sends pictures 50 times a second, the boundary as most of them write it.
+pub(crate) fn camera(mut stream: TcpStream) {
+    if request(&mut stream).is_none() {
+        return;
+    }
+    let mut send = |bytes: &[u8]| stream.write_all(bytes).is_ok();
+    if !send(b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=--frame\r\n\r\n") {
+        return;
+    }
+    for number in 0.. {
+        let picture = picture(number);
+        let head = format!("--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {}\r\n\r\n", picture.len());
+        if !(send(head.as_bytes()) && send(&picture) && send(b"\r\n")) {
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+/// An entry of such a camera.
+pub(crate) fn camera_entry(name: &str, bit: u32, port: u16) -> String {
+    format!(
+        "[device.{name}]\nnode = \"lan\"\nbit = {bit}\n[device.{name}.lan]\nprotocol = \"mjpeg\"\nhost = \"127.0.0.1\"\n\
+         port = {port}\npath = \"/video\"\nwidth = {WIDTH}\nheight = {HEIGHT}\nfps = 50\n"
+    )
+}
+
+pub(crate) const RIG: &str = "[rig]\ncooldown = \"100ms\"\n";
+
+/// What was told of a device: its states, and who told of its removals.
+pub(crate) fn life(running: &Running, device: &str) -> Vec<String> {
+    life_of(&running.told(), device)
+}
+
+pub(crate) fn life_of(told: &[Value], device: &str) -> Vec<String> {
+    let of = told.iter().filter(|event| event["device"] == device);
+    of.filter_map(|event| match event["event"].as_str()? {
+        "state" => event["state"].as_str().map(str::to_owned),
+        "detach" => Some(format!("by {}", event["witness"].as_str()?)),
+        _ => None,
+    })
+    .collect()
+}
+
+pub(crate) fn wait_for(running: &Running, device: &str, word: &str, times: usize) {
+    until(&format!("{device} {word} {times} times"), || {
+        life(running, device).iter().filter(|told| *told == word).count() >= times
+    });
+}
+
+/// Ends a run; all that it told.
+pub(crate) fn stop(running: Running) -> Vec<Value> {
+    running.signal(Signal::INT);
+    let (code, output, errors) = running.end();
+    assert_eq!(code, Some(0), "{errors}");
+    events(&output)
+}

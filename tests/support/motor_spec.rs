@@ -1,0 +1,34 @@
+//! The entry of a bus of motors, which those who drive one change as they need it.
+
+use std::time::Duration;
+
+use rapid::registry::{DamiaoSpec, MotorKind, MotorMode, MotorSpec};
+
+/// A motor in MIT mode that listens to `slave` and answers with 0x10 more.
+pub(crate) fn motor(slave: u16) -> MotorSpec {
+    MotorSpec {
+        name: format!("joint_{slave}"),
+        slave,
+        master: 0x10 + slave,
+        kind: MotorKind::Dm4310,
+        mode: MotorMode::Mit { kp: 10.0, kd: 1.0 },
+        position: [-2.0, 2.0],
+        velocity: 20.0,
+        torque: 5.0,
+        slew: 5.0,
+        max_mos: 80.0,
+        max_rotor: 100.0,
+    }
+}
+
+/// These motors, at 200 Hz.
+pub(crate) fn bus(motors: Vec<MotorSpec>) -> DamiaoSpec {
+    DamiaoSpec {
+        motors,
+        hz: 200,
+        deadman: None,
+        disable_after: Duration::from_secs(1),
+        timeout: Duration::from_millis(400),
+        silent_after: Duration::from_millis(50),
+    }
+}

@@ -1,0 +1,42 @@
+//! How the mask beat, as a sampler in the guest saw it.
+
+use serde_json::Value;
+
+use crate::outcome::Outcome;
+
+/// A sampler that looked this often in a tenth of a second had the processor, and so could the publisher.
+const OFTEN: u64 = 10;
+
+/// How the mask beat in a span.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Rhythm {
+    /// Longest time in which a sampler that looks every 0.5 ms saw no new publication, ms.
+    pub longest_ms: f64,
+    /// Longest pause between two looks of the sampler itself, ms: what the guest's processors do to any program.
+    pub pause_ms: f64,
+    /// Publications.
+    pub publications: u64,
+    /// Tenths of a second in which the sampler looked often and saw no publication at all.
+    pub silent_tenths: usize,
+}
+
+impl Rhythm {
+    /// Between two moments (ns of the guest's CLOCK_MONOTONIC); `None` when the sampler saw nothing of it.
+    pub fn between(outcome: &Outcome, from: u64, until: u64) -> Option<Self> {
+        let number = |line: &Value, key: &str| line[key].as_u64().unwrap_or_default();
+        // A line belongs to the span if it ended in it: so does the silence in it.
+        let inside = |line: &&Value| line["action"] == "beat" && (from..until).contains(&number(line, "mono_ns"));
+        let mut rhythm = None;
+        for line in outcome.mask.iter().filter(inside) {
+            let Self { longest_ms, pause_ms, publications, silent_tenths } = rhythm.unwrap_or_default();
+            let is_silent = number(line, "looks") >= OFTEN && number(line, "publications") == 0;
+            rhythm = Some(Self {
+                longest_ms: longest_ms.max(number(line, "longest_ns") as f64 / 1e6),
+                pause_ms: pause_ms.max(number(line, "pause_ns") as f64 / 1e6),
+                publications: publications + number(line, "publications"),
+                silent_tenths: silent_tenths + usize::from(is_silent),
+            });
+        }
+        rhythm
+    }
+}
