@@ -7,9 +7,9 @@
 //! Invariant: between two cycles nothing is allocated, locked or logged, but for two things: text is made of
 //! what happened, and a sample is handed over by tokio's channel, which allocates room for some dozens where
 //! none is free, and whose reader is woken under a lock of the runtime.
-//! Invariant: however the thread ends, a panic included, [`Powered`] tells every motor to turn off. But after
-//! a panic it waits until each has said that it is off, [`OFF_WITHIN`] at most. A process that is killed sends
-//! nothing: then the motors' own time limit does it.
+//! Invariant: however the thread ends, a panic included, [`Powered`] tells every motor to turn off. Without a
+//! panic it also waits until each that was on has said that it is off, [`OFF_WITHIN`] at most. A process that
+//! is killed sends nothing: then the motors' own time limit does it.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -114,8 +114,8 @@ impl Drop for Powered {
         let panics = std::thread::panicking();
         let end = Stamp::now().after(OFF_WITHIN);
         let mut frame = CanFrame::default();
-        let (mut rounds, mut gone, mut off) = (0, false, panics);
-        while rounds < TURN_OFF || !(off || gone || Stamp::now() >= end) {
+        let (mut rounds, mut gone, mut all_off) = (0, false, panics);
+        while rounds < TURN_OFF || !(all_off || gone || Stamp::now() >= end) {
             rounds += 1;
             for off in self.bus.stop_frames() {
                 // A bus that is gone has no motors to stop.
@@ -137,9 +137,9 @@ impl Drop for Powered {
                     break;
                 }
             }
-            off = panics || self.bus.still_on().next().is_none();
+            all_off = panics || self.bus.still_on().next().is_none();
         }
-        if !off {
+        if !all_off {
             let motors = self.bus.still_on().collect::<Vec<_>>().join(", ");
             tracing::warn!(
                 motors,
@@ -225,15 +225,16 @@ impl Beat {
         }
         // What happened in the last cycle.
         self.tell();
-        let punctuality = self.tally.punctuality();
+        let Self { powered, samples, notices, tally, shared, .. } = self;
+        let counts = powered.bus.counts();
+        // Before the log, which may block, and before the channels close: who sees that they did may exit.
+        drop(powered);
+        let punctuality = tally.punctuality();
         tracing::info!("{punctuality}");
-        if let Some(mishaps) = self.tally.mishaps(&self.powered.bus.counts()) {
+        if let Some(mishaps) = tally.mishaps(&counts) {
             tracing::info!("of thread `control`: {mishaps}");
         }
-        let _ = self.shared.punctuality.set(punctuality);
-        // Before the channels close: who sees that they did may exit.
-        let Self { powered, samples, notices, .. } = self;
-        drop(powered);
+        let _ = shared.punctuality.set(punctuality);
         drop((samples, notices));
     }
 
