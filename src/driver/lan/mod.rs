@@ -57,7 +57,7 @@ impl Lan {
     #[must_use]
     pub fn obstacle(node: &DeviceNode) -> Option<(&'static str, impl Future<Output = ()> + Send + use<>)> {
         let mut carrier = Carrier::of(node);
-        carrier.is_down().then(|| (LINK_IS_DOWN, async move { carrier.up().await }))
+        carrier.is_down().then_some((LINK_IS_DOWN, async move { carrier.up().await }))
     }
 
     /// Opens the device of `spec` at `node`.

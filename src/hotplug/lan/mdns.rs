@@ -96,7 +96,7 @@ impl Browser {
             let Some(daemon) = daemon else { return };
             match daemon.browse(&domain) {
                 Ok(events) => {
-                    Service { domain, wanted, known: BTreeMap::new(), cut: BTreeMap::new() }.run(&daemon, events).await
+                    Service { domain, wanted, known: BTreeMap::new(), cut: BTreeMap::new() }.run(&daemon, events).await;
                 }
                 Err(error) => tracing::error!(%error, service = domain, "devices of this service are not found"),
             }

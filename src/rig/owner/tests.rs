@@ -11,7 +11,8 @@ use crate::action::Order;
 use crate::hotplug::HotplugError;
 use crate::registry::scenario::{SimDevice, SimSource};
 use crate::registry::{
-    DeviceNode, Framing, IdentitySpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbIdentity, UsbSpec, WhenStale,
+    DeviceNode, Framing, IdentitySpec, LanFind, LanProtocol, LanSpec, NodeSpec, Parse, RigSpec, SerialSpec,
+    UsbIdentity, UsbSpec, WhenStale,
 };
 use crate::rig::presence::{Claim, read_mask};
 use crate::status::Event;
@@ -61,7 +62,7 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
     }
 }
 
-#[derive(Clone, Copy)]
+#[derive(Clone)]
 enum Step {
     /// A unit of the model, which sends this many numbers, is told as attached at a port.
     Plug(&'static str, usize),
@@ -78,8 +79,14 @@ enum Step {
     Until(&'static str),
     /// The mask other processes read becomes this.
     Mask(u64),
+    /// A network adapter is told as attached, whose carrier is in a file of this folder.
+    Adapter(PathBuf),
+    /// Takes events until one that is logged holds this.
+    Logged(&'static str),
+    /// The link of the adapter is up again, this much later.
+    Link(PathBuf, Duration),
 }
-use Step::{Give, Mask, Plug, Pull, Removed, Restart, Resume, Silence, Until};
+use Step::{Adapter, Give, Link, Logged, Mask, Plug, Pull, Removed, Restart, Resume, Silence, Until};
 
 struct Bench {
     hotplug: UnboundedSender<Result<HotplugEvent, HotplugError>>,
@@ -134,6 +141,27 @@ impl Bench {
                     return;
                 }
             },
+            Adapter(folder) => {
+                let usb = UsbIdentity { vid: 1, pid: 2, port: "1".into(), ..UsbIdentity::default() };
+                self.tell(HotplugEvent::Added(Attachment {
+                    syspath: PathBuf::from("/test/1"),
+                    node: DeviceNode::Net(folder.display().to_string()),
+                    unit: usb.into(),
+                    driver: None,
+                }));
+            }
+            Logged(wanted) => loop {
+                let event = timeout(PATIENCE, self.events.recv()).await;
+                let event = event.unwrap_or_else(|_| panic!("no {wanted:?} after {:?}", self.told)).expect("event");
+                self.told.extend(word(&event.what));
+                if matches!(&event.what, What::Log { text, .. } if text.contains(wanted)) {
+                    return;
+                }
+            },
+            Link(folder, after) => {
+                sleep(*after).await;
+                std::fs::write(folder.join("carrier"), "1\n").expect("written");
+            }
             Mask(wanted) => {
                 let begun = Instant::now();
                 while read_mask(&self.path).expect("mask").mask.0 != *wanted {
@@ -357,6 +385,30 @@ async fn devices_are_told_of_the_episode_in_progress() {
     stop.cancel();
     running.await.expect("no panic").expect("no error");
     come_to(&second, (1, 1)).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_device_behind_an_adapter_is_not_opened_before_its_cable_is_in() {
+    let folder = tempfile::tempdir().expect("a folder");
+    std::fs::write(folder.path().join("carrier"), "0\n").expect("written");
+    let mut registry = registry(Duration::from_millis(100), Duration::from_millis(150));
+    for device in &mut registry.devices {
+        device.node = NodeSpec::Lan(LanSpec {
+            protocol: LanProtocol::Udp { port: 2368 },
+            find: LanFind::Adapter { host: None },
+            lease: Duration::from_secs(3),
+        });
+    }
+    let path = folder.path().to_owned();
+    let steps = [
+        Adapter(path.clone()),
+        Logged("the network link is down"),
+        // Several times as long as the first restarts would take.
+        Link(path, Duration::from_secs(2)),
+        // It is no interface of this machine.
+        Until("a absent"),
+    ];
+    assert_eq!(told_of(&registry, false, &steps).await[..4], ["a at 1", "a opening", "a gone stream", "a absent"]);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -62,9 +62,7 @@ pub(super) struct Camera {
     books: Books,
     /// The shutter in the books is of an earlier connection: whether it still runs is to be seen.
     is_inherited: bool,
-    wanted: Option<PathBuf>,
-    /// What is wanted is known.
-    is_told: bool,
+    wanted: Told,
     /// A clip that is not listed yet, and until when it is looked for.
     unlisted: Option<(Shutter, Instant)>,
     /// Until then clips may come to be listed whose episodes are not known.
@@ -94,7 +92,6 @@ impl Camera {
             is_inherited: books.shutter().is_some(),
             books,
             wanted: None,
-            is_told: false,
             unlisted: None,
             unclear_until: None,
             is_said: false,
@@ -138,11 +135,9 @@ impl Camera {
                     if changed.is_err() {
                         return;
                     }
-                    let now = told.borrow_and_update().clone();
-                    if let Some(wanted) = now {
-                        (self.wanted, self.is_told, self.is_said) = (wanted, true, false);
-                        self.settle().await;
-                    }
+                    self.wanted.clone_from(&told.borrow_and_update());
+                    self.is_said = false;
+                    self.settle().await;
                 }
                 _ = beat.tick() => {
                     let state = self.look().await;
@@ -154,8 +149,9 @@ impl Camera {
                         return;
                     }
                     // An episode in progress is told as soon as the camera is open.
-                    self.is_told |= !is_first;
-                    is_first = false;
+                    if !std::mem::take(&mut is_first) {
+                        self.wanted.get_or_insert(None);
+                    }
                     self.settle().await;
                 }
                 fetched = fetched(&mut self.fetching) => {
@@ -176,16 +172,17 @@ impl Camera {
 
     /// Makes the shutter follow the episodes.
     async fn settle(&mut self) {
-        if !self.is_told || (self.is_inherited && !self.has_inherited().await) {
+        let Some(wanted) = self.wanted.clone() else { return };
+        if self.is_inherited && !self.has_inherited().await {
             return;
         }
         if let Some(shutter) = self.books.shutter().cloned()
-            && self.wanted.as_ref() != Some(&shutter.episode)
+            && wanted.as_ref() != Some(&shutter.episode)
             && !self.stop(shutter).await
         {
             return;
         }
-        match self.wanted.clone() {
+        match wanted {
             Some(episode) if self.books.shutter().is_none() => self.start(episode).await,
             Some(_) => {}
             None => {
@@ -322,7 +319,7 @@ impl Camera {
 
     /// Goes on with the clips that are to be fetched.
     fn fetch(&mut self) {
-        if self.fetching.is_some() || self.wanted.is_some() || self.books.shutter().is_some() || !self.is_told {
+        if self.fetching.is_some() || self.wanted != Some(None) || self.books.shutter().is_some() {
             return;
         }
         if let Some(clip) = self.pending.front() {

@@ -491,7 +491,7 @@ async fn fetched(head: &'static str, size: Option<u64>, there: &[u8]) -> (Result
 
 #[tokio::test]
 async fn what_does_not_fit_what_is_there_begins_anew() {
-    let long = vec![7; 100];
+    let long = [7; 100];
     for (head, size, there) in [
         // Elsewhere than where it was asked to, or it does not say where.
         (

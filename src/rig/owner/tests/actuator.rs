@@ -92,7 +92,7 @@ async fn an_arm_at_the_start_is_given_once() {
         ),
     ];
     for (name, at_start, steps, expected) in table {
-        let steps: Vec<Step> = steps.into_iter().chain(end).collect();
+        let steps: Vec<Step> = steps.into_iter().chain(end.clone()).collect();
         assert_eq!(told_of(&arm(), at_start, &steps).await, expected, "{name}");
     }
 }
