@@ -153,10 +153,12 @@ impl Stream {
         let mut told = interval(ACTIONS_EVERY);
         told.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let mut controls = self.controls.clone();
-        if let Some(controls) = &mut controls
-            && let Err(error) = controls.begin(source)
-        {
-            return end(&error);
+        if let Some(controls) = &mut controls {
+            if let Err(error) = controls.begin(source) {
+                return end(&error);
+            }
+            // An order that is carried out at once is told before its first sample.
+            self.pass_on_notices(source).await;
         }
         let mut episode = self.episode.clone();
         if episode.borrow_and_update().is_some() {
