@@ -9,6 +9,7 @@
 mod asked;
 mod autopilot;
 mod conductor;
+mod screen;
 pub(crate) mod signals;
 
 use std::panic::AssertUnwindSafe;
@@ -27,8 +28,6 @@ use crate::action::Order;
 use crate::bus::{Bus, BusError, TopicId};
 use crate::driver;
 use crate::fault;
-use crate::headless::style::ColourChoice;
-use crate::headless::{self, HeadlessOptions};
 use crate::hotplug::lan::LanMonitor;
 use crate::hotplug::script::Script;
 use crate::hotplug::udev::UdevMonitor;
@@ -42,8 +41,8 @@ use crate::registry::Registry;
 use crate::registry::scenario::Scenario;
 use crate::rig::presence::{Claim, Presence, PresenceError};
 use crate::rig::{Rig, RigCommand, RigError};
-use crate::status::{Board, Command};
-use crate::tui::{self, TuiError};
+use crate::status::Board;
+use crate::tui::TuiError;
 use asked::Asked;
 use autopilot::Autopilot;
 pub use autopilot::PolicyOptions;
@@ -198,7 +197,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     };
     let screen_stop = CancellationToken::new();
     let (commands, from_screen) = mpsc::channel(16);
-    let screen = start_screen(options.screen, &board, commands, screen_stop.clone(), options.duration);
+    let screen = screen::start(options.screen, &board, commands, screen_stop.clone(), options.duration);
 
     let rig_stop = CancellationToken::new();
     let (rig_commands, rig_asked) = mpsc::channel(16);
@@ -268,48 +267,6 @@ const LAST_CHUNK: Duration = Duration::from_secs(5);
 /// back.
 const LAST_OUTPUT_IN_A_HURRY: Duration = Duration::from_secs(1);
 
-type ScreenTask = JoinHandle<Result<(), AppError>>;
-
-fn start_screen(
-    screen: Screen,
-    board: &Arc<Board>,
-    commands: mpsc::Sender<Command>,
-    stop: CancellationToken,
-    duration: Option<Duration>,
-) -> ScreenTask {
-    let board = Arc::clone(board);
-    if screen == Screen::Monitor {
-        return tokio::spawn(async move {
-            tokio::select! {
-                outcome = tui::run(board, commands, stop) => match outcome {
-                    // As good as SIGHUP, which comes with it or a little later.
-                    Err(error @ TuiError::Gone(_)) => {
-                        tracing::warn!(%error, "the run ends");
-                        Ok(())
-                    }
-                    outcome => Ok(outcome?),
-                },
-                never = fault::strike("screen") => never,
-            }
-        });
-    }
-    let options = HeadlessOptions {
-        json: screen == Screen::Json,
-        colour: ColourChoice::Auto,
-        progress: screen == Screen::Lines,
-        duration,
-    };
-    let run = headless::run(board, stop, options, std::io::stdout());
-    tokio::spawn(async move {
-        // Lines cannot ask for anything.
-        drop(commands);
-        tokio::select! {
-            outcome = run => outcome.map_err(AppError::Output),
-            never = fault::strike("screen") => never,
-        }
-    })
-}
-
 /// The tasks of a run, and what can be asked of it from outside.
 struct Running {
     rig: JoinHandle<(Rig, Result<(), RigError>)>,
@@ -320,7 +277,7 @@ struct Running {
     mask_ended: CancellationToken,
     kind: Screen,
     /// Until its outcome was taken.
-    screen: Option<ScreenTask>,
+    screen: Option<screen::ScreenTask>,
     screen_stop: CancellationToken,
     signals: Signals,
     asked: mpsc::UnboundedReceiver<Asked>,
@@ -333,14 +290,6 @@ async fn policy_ended(autopilot: &mut Option<Autopilot>) -> Result<(), AppError>
         Some(autopilot) => autopilot.ended().await,
         None => std::future::pending().await,
     }
-}
-
-/// Waits for the end of the screen, whose outcome is taken; for ever if it was taken before.
-async fn screen_ended(screen: &mut Option<ScreenTask>) -> Result<(), AppError> {
-    let Some(task) = screen else { return std::future::pending().await };
-    let ended = task.await;
-    *screen = None;
-    ended.unwrap_or(Err(AppError::Panicked("the screen")))
 }
 
 /// Takes everything down, in the order of the module's comment. The first error is the run's.
@@ -398,7 +347,7 @@ async fn finish(
     running.screen_stop.cancel();
     if running.screen.is_some() {
         let limit = if twice { LAST_OUTPUT_IN_A_HURRY } else { LAST_OUTPUT };
-        if let Ok(ended) = timeout(limit, screen_ended(&mut running.screen)).await {
+        if let Ok(ended) = timeout(limit, screen::ended(&mut running.screen)).await {
             keep_first(&mut outcome, ended);
         }
     }

@@ -1,6 +1,8 @@
 //! Programs in other languages that read devices for `rapid`: those of `examples/python`, with the wheels
 //! `make setup` installs, and of `examples/c`, with the machine's C compiler.
 
+#![allow(clippy::expect_used, reason = "what fails here fails a test")]
+
 mod support;
 
 use std::path::{Path, PathBuf};
@@ -116,14 +118,18 @@ fn c_library() -> PathBuf {
     if Path::new(env!("CARGO_BIN_EXE_rapid")).parent().is_some_and(|folder| folder.ends_with("release")) {
         build.arg("--release");
     }
-    let built = build.current_dir(env!("CARGO_MANIFEST_DIR")).output().expect("cargo");
-    assert!(built.status.success(), "{}", String::from_utf8_lossy(&built.stderr));
-    let files = events(&String::from_utf8_lossy(&built.stdout));
+    let said = build.current_dir(env!("CARGO_MANIFEST_DIR")).output().expect("cargo");
+    assert!(said.status.success(), "{}", String::from_utf8_lossy(&said.stderr));
+    let files = events(&String::from_utf8_lossy(&said.stdout));
     let files = files
         .iter()
         .filter(|line| line["target"]["name"] == "rapid_node")
         .filter_map(|line| line["filenames"].as_array());
-    let archive = files.flatten().filter_map(serde_json::Value::as_str).find(|file| file.ends_with(".a"));
+    let archive = files
+        .flatten()
+        .filter_map(serde_json::Value::as_str)
+        .map(Path::new)
+        .find(|file| file.extension().is_some_and(|end| end == "a"));
     archive.expect("cargo says where the archive is").into()
 }
 

@@ -11,7 +11,7 @@ use tokio::sync::broadcast::error::{RecvError, TryRecvError};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
 use tokio_util::sync::CancellationToken;
 
-use super::{AppError, Asked, Running, Screen, policy_ended, screen_ended};
+use super::{AppError, Asked, Running, Screen, policy_ended, screen};
 use crate::fault;
 use crate::record::{EpisodeRequest, RecordError, Recorder};
 use crate::status::{Board, EpisodeEnd, Event, SlotState, What};
@@ -58,7 +58,7 @@ impl Conductor {
                 () = running.mask_ended.cancelled() => return Err(AppError::Panicked("thread `mask`")),
                 // It ends by itself only when it cannot go on.
                 outcome = policy_ended(&mut running.autopilot) => return outcome,
-                outcome = screen_ended(&mut running.screen) => match outcome {
+                outcome = screen::ended(&mut running.screen) => match outcome {
                     Err(panicked @ AppError::Panicked(_)) => return Err(panicked),
                     // An episode is worth more than its log lines, and goes on without.
                     outcome if self.record && running.kind != Screen::Monitor => output = outcome,
