@@ -105,6 +105,7 @@ pub mod cli;
 pub mod commands;
 pub mod compare;
 pub mod control;
+pub mod disk;
 pub mod dispatch;
 pub mod driver;
 pub mod episode_format;

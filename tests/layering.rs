@@ -21,7 +21,19 @@ use proc_macro2::{Delimiter, TokenStream, TokenTree};
 /// Modules by layer, lowest first. A module sees those of lower layers.
 const LAYERS: &[&[&str]] = &[
     &["modality", "mask", "sample", "time", "action", "random", "provenance", "flash"],
-    &["registry", "status", "text", "outlet", "folder", "episode_format", "fault", "panics", "realtime", "control"],
+    &[
+        "registry",
+        "status",
+        "text",
+        "outlet",
+        "folder",
+        "disk",
+        "episode_format",
+        "fault",
+        "panics",
+        "realtime",
+        "control",
+    ],
     &["hotplug", "driver", "bus", "sync", "calibration"],
     &["rig", "record", "policy"],
     &["app", "lockstep", "compare", "tui", "headless", "logging"],

@@ -46,7 +46,7 @@ pub use file::Sink;
 pub use quality::{Quality, Spread};
 pub use recorder::{Recorder, RecorderConfig};
 pub use source::Source;
-pub use space::{Asker, Disk};
+pub use space::Asker;
 
 use crate::text;
 

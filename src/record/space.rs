@@ -19,17 +19,14 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use rustix::fs::{FallocateFlags, fallocate, fstat, fstatvfs, ftruncate};
+use rustix::fs::{FallocateFlags, fallocate, fstat, ftruncate};
 use rustix::io::Errno;
 
 use super::RecordError;
+use crate::disk::Disk;
 use crate::text;
 use crate::time::Stamp;
 
-/// The reserve unless the registry says another: this, or [`SHARE`] of a smaller disk.
-const RESERVE: u64 = 1 << 30;
-/// Part of a disk, as its divisor.
-const SHARE: u64 = 20;
 /// With less time than this left, it is said.
 const WARN_LEFT: Duration = Duration::from_mins(5);
 /// How often it is looked whether more must be set aside: at 300 MB/s half of [`ASIDE_MOST`] is
@@ -51,39 +48,6 @@ const LEFT_MOST: Duration = Duration::from_hours(100);
 
 /// Asks for the room on the disk of a file; only a test has another answer than the file system's.
 pub type Asker = Box<dyn FnMut(&File) -> io::Result<Disk> + Send>;
-
-/// A disk, in bytes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Disk {
-    /// What an ordinary user may still write.
-    pub free: u64,
-    /// Its size; 0 where the file system does not say.
-    pub size: u64,
-}
-
-impl Disk {
-    /// The disk that holds `file`.
-    ///
-    /// # Errors
-    /// When the file system does not answer.
-    pub fn of(file: &File) -> io::Result<Self> {
-        let said = fstatvfs(file)?;
-        Ok(Self {
-            free: said.f_bavail.saturating_mul(said.f_frsize),
-            size: said.f_blocks.saturating_mul(said.f_frsize),
-        })
-    }
-
-    /// Would `bytes` more leave so little that an episode being recorded is warned of, or closed?
-    /// `reserve` is the registry's `disk_reserve`.
-    pub(super) fn lacks_room_beside_an_episode(self, bytes: u64, reserve: Option<u64>) -> bool {
-        self.free < self.reserve(reserve).saturating_mul(2).saturating_add(bytes)
-    }
-
-    fn reserve(self, wanted: Option<u64>) -> u64 {
-        wanted.unwrap_or_else(|| RESERVE.min(self.size / SHARE))
-    }
-}
 
 /// What is known of the room an episode has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -15,7 +15,7 @@ use std::time::{Duration, Instant, SystemTime};
 use rustix::process::setpriority_process;
 
 use super::{Outcome, RecoverError, Recovered, recover};
-use crate::record::space::Disk;
+use crate::disk::Disk;
 use crate::status::{Board, Level, What};
 use crate::text;
 

@@ -3,6 +3,7 @@
 use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
 
 use super::*;
+use crate::disk::Disk;
 use crate::status::Event;
 use crate::time::WallClock;
 

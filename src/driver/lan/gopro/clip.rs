@@ -6,7 +6,7 @@
 //! Invariant: the camera's words become part of a path only if they are plain names.
 //! Invariant: a byte is written where it belongs or not at all, by one fetch at a time, however often fetching is
 //! begun, broken off and begun again.
-//! Invariant: [`RESERVE`] stays free on the disk, whatever the camera says of the clip's size.
+//! Invariant: an episode keeps its room on the disk, whatever the camera says of the clip's size.
 
 use std::fs::{File, OpenOptions};
 use std::io;
@@ -23,6 +23,7 @@ use tokio::time::timeout;
 use super::super::http::{self, Reply};
 use super::super::place::Server;
 use super::answer::{Name, is_plain};
+use crate::disk::Disk;
 
 const HEAD_LIMIT: Duration = Duration::from_secs(5);
 /// A camera that sends nothing for this long has stopped.
@@ -32,8 +33,6 @@ const TRIES: u32 = 3;
 const PAUSE: Duration = Duration::from_secs(1);
 /// Written to the disk at once, bytes.
 const BLOCK: usize = 1 << 20;
-/// What a clip leaves free on the disk, bytes: episodes need it more.
-const RESERVE: u64 = 1 << 30;
 /// A note has a few hundred bytes.
 const LARGEST_NOTE: u64 = 64 << 10;
 
@@ -266,10 +265,7 @@ impl Part {
 
     /// Is there room on the disk for so many bytes more?
     fn has_room(&self, bytes: u64) -> Result<(), Broken> {
-        match room(&self.path) {
-            Some(room) if bytes.saturating_add(RESERVE) > room => Err(stays(full(bytes))),
-            _ => Ok(()),
-        }
+        full(&self.file, bytes).map_or(Ok(()), |full| Err(stays(full)))
     }
 
     /// Writes what follows; the emptied block comes back.
@@ -279,8 +275,8 @@ impl Part {
             let Self { file, path, there } = self;
             let bytes = block.len() as u64;
             // Recordings eat the same disk.
-            if room(&path).is_some_and(|room| bytes.saturating_add(RESERVE) > room) {
-                return Err(io::Error::other(full(bytes)));
+            if let Some(full) = full(&file, bytes) {
+                return Err(io::Error::other(full));
             }
             file.write_all_at(&block, there)?;
             block.clear();
@@ -294,8 +290,12 @@ impl Part {
     }
 }
 
-fn full(bytes: u64) -> String {
-    format!("{} MB do not fit on the disk, of which {} MB stay free", bytes.div_ceil(1 << 20), RESERVE >> 20)
+/// Why so many bytes more do not fit on the disk of `file`; `None` if they do, or the disk does not say. The room that the
+/// registry may reserve for episodes is not known here: it is that of a rig which says nothing.
+fn full(file: &File, bytes: u64) -> Option<String> {
+    let disk = Disk::of(file).ok().filter(|disk| disk.lacks_room_beside_an_episode(bytes, None))?;
+    let (wanted, free, kept) = (bytes.div_ceil(1 << 20), disk.free >> 20, (2 * disk.reserve(None)) >> 20);
+    Some(format!("{wanted} MB do not fit on the disk: {free} MB are free, and {kept} MB of them are kept for episodes"))
 }
 
 fn announced(reply: &Reply) -> Option<u64> {
@@ -309,12 +309,6 @@ fn begins(reply: &Reply) -> Option<u64> {
 
 fn length(path: &Path) -> u64 {
     std::fs::metadata(path).map_or(0, |metadata| metadata.len())
-}
-
-/// Bytes that are free where `path` is to be.
-fn room(path: &Path) -> Option<u64> {
-    let disk = rustix::fs::statvfs(path.parent()?).ok()?;
-    disk.f_bavail.checked_mul(disk.f_frsize)
 }
 
 /// Tells every tenth.
