@@ -18,12 +18,12 @@ use crate::{Bench, Failure};
 const COUNTS: [usize; 3] = [4, 8, 16];
 const SLACK: Duration = Duration::from_secs(60);
 
-/// Tables of the kinds, in turn: a camera, a serial line, motors, a device on the network.
+/// Tables of the kinds, in turn: a camera, a serial line, a CAN bus, a device on the network.
 const KINDS: [&str; 4] = [
     "node = \"camera\"\n[device.NAME.camera]\nwidth = 640\nheight = 480\nfps = 30\n",
     "node = \"serial\"\n[device.NAME.serial]\nbaud = 115200\nparse = \"csv\"\nchannels = 6\n",
-    "node = \"can\"\n[device.NAME.can]\nprotocol = \"damiao\"\nmotors = [{ name = \"grip\", slave = 1, type = \"DM4310\", mode = \"position\", position = [-1, 1] }]\n",
-    "node = \"lan\"\n[device.NAME.lan]\nprotocol = \"iphone\"\nstream = \"pose\"\nhost = \"192.0.2.HOST\"\nprobe_port = 5555\n",
+    "node = \"can\"\n[device.NAME.can]\nprotocol = \"raw\"\n",
+    "node = \"lan\"\n[device.NAME.lan]\nprotocol = \"iphone\"\nstream = \"pose\"\nhost = \"192.0.2.HOST\"\nprobe_port = 5555\nport = PORT\n",
 ];
 
 /// One run.
@@ -41,7 +41,7 @@ pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     let idle = share(&none).unwrap_or_default();
     let mut figures = vec![Figure::new("many/0 devices, cpu of one core", "%", Some(idle)).note(format!(
         "{length} s, mask and recorder alone; devices below are simulated: of each four a camera of 640x480 at 30 Hz, a serial \
-         line, a motor and the pose of a phone at 100 Hz"
+         line, a CAN bus and the pose of a phone at 100 Hz"
     ))];
     let mut each = None;
     for count in COUNTS {
@@ -102,7 +102,12 @@ fn scenario(bench: &Bench, count: usize) -> Result<Vec<OsString>, Failure> {
         if !table.contains("HOST") {
             write!(registry, "vid = \"1209\"\npid = \"{number:04x}\"\n")?;
         }
-        registry.push_str(&table.replace("NAME", &name).replace("HOST", &(number + 1).to_string()));
+        registry.push_str(
+            &table
+                .replace("NAME", &name)
+                .replace("HOST", &(number + 1).to_string())
+                .replace("PORT", &(5_600 + number).to_string()),
+        );
         write!(played, "[[device]]\nname = \"{name}\"\nplugged = {}\n", count > 0)?;
     }
     let (config, scenario) = (folder.join("many.devices.toml"), folder.join("many.toml"));
