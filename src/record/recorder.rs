@@ -19,7 +19,7 @@ use super::writer::{Order, Reply, Writer};
 use crate::disk::Disk;
 use crate::registry::Registry;
 use crate::status::{Board, EpisodeWatch};
-use crate::time::WallClock;
+use crate::time::{Stamp, WallClock};
 
 type Opener = Box<dyn FnMut(File) -> Box<dyn Sink> + Send>;
 
@@ -36,6 +36,9 @@ pub struct RecorderConfig {
     pub disk: Asker,
     /// Reads the clocks.
     pub clock: Box<dyn FnMut() -> WallClock + Send>,
+    /// Says when an episode begins that is asked for now: now. A test sends what it means to lie at
+    /// the beginning from here, so that it lies there however long the machine takes.
+    pub begin: Box<dyn FnMut() -> Stamp + Send>,
 }
 
 impl RecorderConfig {
@@ -48,6 +51,7 @@ impl RecorderConfig {
             sink: Box::new(|file| Box::new(file)),
             disk: Box::new(Disk::of),
             clock: Box::new(WallClock::now),
+            begin: Box::new(Stamp::now),
         }
     }
 }

@@ -50,6 +50,65 @@ impl Script {
         self.0.1.notify_all();
     }
 
+    /// A sample of a device that says it lost `lost` ones so far.
+    fn sample_after(&self, lost: u64, bit: u8, epoch: u32, seq: u64, capture: u64, flags: u32) {
+        let (encoding, payload) = match bit {
+            CAM => (Encoding::Mjpeg, picture(seq)),
+            TOF => (Encoding::F64, [seq as f64, 0.5].iter().flat_map(|v| v.to_le_bytes()).collect()),
+            _ => (Encoding::Grey, vec![seq.to_le_bytes()[0]; 8]),
+        };
+        let header = SampleHeader {
+            seq,
+            lost,
+            capture_ns: capture,
+            recv_ns: capture + 5 * MS,
+            id: bit.into(),
+            epoch,
+            encoding: encoding as u32,
+            flags,
+            width: 4,
+            height: 2,
+        };
+        self.put((TopicId::Modality(id(bit)), header, payload));
+    }
+
+    fn mask(&self, mask: u64, sequence: u64, capture: u64) {
+        let payload = [mask, sequence].iter().flat_map(|v| v.to_le_bytes()).collect();
+        let header = SampleHeader {
+            seq: sequence,
+            capture_ns: capture,
+            recv_ns: capture,
+            encoding: Encoding::Mask as u32,
+            ..SampleHeader::default()
+        };
+        self.put((TopicId::Mask, header, payload));
+    }
+
+    /// What [`Bench::one_second`] tells of.
+    fn one_second(&self, t0: u64) {
+        for n in 0..500 {
+            let at = t0 + n * 2 * MS;
+            let cam = u64::from(!(300..600).contains(&(n * 2)));
+            let raw = u64::from(n >= 100) << RAW;
+            self.mask(cam | 0b10 | raw, n + 2, at);
+        }
+        for n in 0..33_u64 {
+            let (at, epoch) = (n * 30, if n < 15 { 1 } else { 2 });
+            if !(300..600).contains(&at) {
+                self.sample_after(0, CAM, epoch, if n < 15 { n } else { n - 10 }, t0 + at * MS, 0);
+            }
+        }
+        let mut seq = 100;
+        for n in 0..100 {
+            seq += if n == 50 { 8 } else { 1 };
+            if n != 20 {
+                self.sample_after(if n < 50 { 0 } else { 7 }, TOF, 1, seq, t0 + n * 10 * MS, 0);
+            }
+        }
+        self.sample_after(0, RAW, 1, 0, t0 + 230 * MS, 0);
+        self.sample_after(0, RAW, 1, 1, t0 + 400 * MS, FLAG_ERROR);
+    }
+
     /// Returns once everything put in has been handed over: whatever is asked of the recorder from
     /// now on comes after it.
     async fn taken(&self) {
@@ -146,7 +205,11 @@ pub(super) struct Bench {
     board: Arc<Board>,
     script: Script,
     recorder: Recorder,
+    /// Called with the first moment of the next episode, before anything else happens in it.
+    at_begin: Arc<Mutex<Option<AtBegin>>>,
 }
+
+type AtBegin = Box<dyn FnOnce(Stamp) + Send>;
 
 impl Bench {
     pub(super) fn new() -> Self {
@@ -164,8 +227,15 @@ impl Bench {
         let script = Script::default();
         let mut config = RecorderConfig::new(registry, Arc::clone(&board));
         change(&mut config);
+        let at_begin: Arc<Mutex<Option<AtBegin>>> = Arc::default();
+        let call = Arc::clone(&at_begin);
+        config.begin = Box::new(move || {
+            let begin = Stamp::now();
+            call.lock().unwrap().take().into_iter().for_each(|call| call(begin));
+            begin
+        });
         let recorder = Recorder::spawn(script.clone(), config).unwrap();
-        Self { folder: tempfile::tempdir().unwrap(), board, script, recorder }
+        Self { folder: tempfile::tempdir().unwrap(), board, script, recorder, at_begin }
     }
 
     fn request(&self, duration: Option<Duration>) -> EpisodeRequest {
@@ -179,41 +249,11 @@ impl Bench {
     }
 
     fn sample(&self, bit: u8, epoch: u32, seq: u64, capture: u64, flags: u32) {
-        self.sample_after(0, bit, epoch, seq, capture, flags);
-    }
-
-    /// A sample of a device that says it lost `lost` ones so far.
-    fn sample_after(&self, lost: u64, bit: u8, epoch: u32, seq: u64, capture: u64, flags: u32) {
-        let (encoding, payload) = match bit {
-            CAM => (Encoding::Mjpeg, picture(seq)),
-            TOF => (Encoding::F64, [seq as f64, 0.5].iter().flat_map(|v| v.to_le_bytes()).collect()),
-            _ => (Encoding::Grey, vec![seq.to_le_bytes()[0]; 8]),
-        };
-        let header = SampleHeader {
-            seq,
-            lost,
-            capture_ns: capture,
-            recv_ns: capture + 5 * MS,
-            id: bit.into(),
-            epoch,
-            encoding: encoding as u32,
-            flags,
-            width: 4,
-            height: 2,
-        };
-        self.script.put((TopicId::Modality(id(bit)), header, payload));
+        self.script.sample_after(0, bit, epoch, seq, capture, flags);
     }
 
     fn mask(&self, mask: u64, sequence: u64, capture: u64) {
-        let payload = [mask, sequence].iter().flat_map(|v| v.to_le_bytes()).collect();
-        let header = SampleHeader {
-            seq: sequence,
-            capture_ns: capture,
-            recv_ns: capture,
-            encoding: Encoding::Mask as u32,
-            ..SampleHeader::default()
-        };
-        self.script.put((TopicId::Mask, header, payload));
+        self.script.mask(mask, sequence, capture);
     }
 
     /// Half a second in which nothing is sent and these events are announced, `before` it begins and within.
@@ -235,10 +275,18 @@ impl Bench {
     /// `tof` loses seven samples itself and one of its is lost on the way, `raw` sends one damaged frame and has no bit in
     /// the mask at first.
     ///
-    /// Returns the file's name and `t0`, which lies a little after the beginning of the episode.
+    /// Returns the file's name and `t0`, which lies 1 ms after the beginning of the episode.
     pub(super) async fn one_second(&self) -> (PathBuf, Stamp) {
         self.mask(0b11, 1, Stamp::now().0);
         self.script.taken().await;
+        let script = self.script.clone();
+        let (tell, told) = std::sync::mpsc::channel();
+        let at_begin: AtBegin = Box::new(move |begin| {
+            let t0 = begin.after(Duration::from_millis(1));
+            script.one_second(t0.0);
+            tell.send(t0).unwrap();
+        });
+        *self.at_begin.lock().unwrap() = Some(at_begin);
         let finished = self.recorder.start(self.request(Some(Duration::from_secs(1)))).await.unwrap();
         let attach = What::Attach {
             device: "raw".to_owned(),
@@ -250,29 +298,7 @@ impl Bench {
         };
         self.board.announce(attach);
         self.board.announce(What::Log { level: Level::Info, text: "hello".to_owned() });
-        let t0 = Stamp::now().0;
-        for n in 0..500 {
-            let at = t0 + n * 2 * MS;
-            let cam = u64::from(!(300..600).contains(&(n * 2)));
-            let raw = u64::from(n >= 100) << RAW;
-            self.mask(cam | 0b10 | raw, n + 2, at);
-        }
-        for n in 0..33_u64 {
-            let (at, epoch) = (n * 30, if n < 15 { 1 } else { 2 });
-            if !(300..600).contains(&at) {
-                self.sample(CAM, epoch, if n < 15 { n } else { n - 10 }, t0 + at * MS, 0);
-            }
-        }
-        let mut seq = 100;
-        for n in 0..100 {
-            seq += if n == 50 { 8 } else { 1 };
-            if n != 20 {
-                self.sample_after(if n < 50 { 0 } else { 7 }, TOF, 1, seq, t0 + n * 10 * MS, 0);
-            }
-        }
-        self.sample(RAW, 1, 0, t0 + 230 * MS, 0);
-        self.sample(RAW, 1, 1, t0 + 400 * MS, FLAG_ERROR);
-        (finished, Stamp(t0))
+        (finished, told.recv().unwrap())
     }
 
     /// Waits until a file has its final name.

@@ -200,7 +200,7 @@ impl Writer {
             return Err(RecordError::Busy(session.name().to_owned()));
         }
         let clock = (self.config.clock)();
-        let begin = Stamp::now();
+        let begin = (self.config.begin)();
         let path = EpisodePath::create(&request.out, &request.task, clock.wall_ns(begin))?;
         let (finished, partial) = (path.finished.clone(), path.partial.clone());
         // Nothing was recorded into it, and it was made a moment ago.

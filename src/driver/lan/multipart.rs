@@ -16,6 +16,8 @@
 pub(super) const LONGEST_HEAD: usize = 8 << 10;
 /// A boundary has 70 characters at most (RFC 2046, 5.1.1).
 const LONGEST_BOUNDARY: usize = 70;
+/// A line that matters, bytes: twice a boundary leaves room for its dashes, and for the header that is looked for.
+const LONGEST_LINE: usize = 2 * LONGEST_BOUNDARY;
 
 /// What came of feeding bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -121,14 +123,14 @@ impl Multipart {
     fn take_unsized(&mut self, bytes: &[u8]) -> (usize, Cut) {
         let end = bytes.iter().position(|byte| *byte == b'\n').map(|at| at + 1);
         let count = end.unwrap_or(bytes.len());
+        // The boundary's own line, and the line end before it, are no part of the body.
+        if self.body.len() + count > self.largest.saturating_add(LONGEST_LINE + b"\r\n".len()) {
+            self.body.clear();
+            return (0, self.give_up());
+        }
         let piece = bytes.get(..count).unwrap_or_default();
         self.remember(piece);
         self.body.extend_from_slice(piece);
-        // The boundary's own line, and the line end before it, are no part of the body.
-        if self.body.len() > self.largest.saturating_add(2 * LONGEST_BOUNDARY) {
-            self.body.clear();
-            return (count, self.give_up(end.is_some()));
-        }
         if end.is_none() {
             return (count, Cut::Open);
         }
@@ -154,13 +156,13 @@ impl Multipart {
     fn take_line(&mut self, bytes: &[u8]) -> (usize, Cut) {
         let end = bytes.iter().position(|byte| *byte == b'\n').map(|at| at + 1);
         let count = end.unwrap_or(bytes.len());
-        self.remember(bytes.get(..count).unwrap_or_default());
         if self.state == State::Head {
             self.head += count;
             if self.head > LONGEST_HEAD {
-                return (count, self.give_up(end.is_some()));
+                return (0, self.give_up());
             }
         }
+        self.remember(bytes.get(..count).unwrap_or_default());
         if end.is_none() {
             return (count, Cut::Open);
         }
@@ -198,7 +200,10 @@ impl Multipart {
                 }
             };
         }
-        if let Some(value) = header(line, b"content-length") {
+        // Of a line that is too long only the beginning is remembered, or nothing.
+        if !self.line_is_long
+            && let Some(value) = header(line, b"content-length")
+        {
             // A length that is no number is none.
             self.length = std::str::from_utf8(value).ok().and_then(|digits| digits.parse().ok());
         }
@@ -212,12 +217,10 @@ impl Multipart {
         Cut::Part
     }
 
-    /// The part is let go, perhaps in the middle of a line.
-    fn give_up(&mut self, line_ended: bool) -> Cut {
+    /// The part is let go, perhaps in the middle of a line. Nothing of what made it too large is taken:
+    /// it may be the boundary that the next part begins with.
+    fn give_up(&mut self) -> Cut {
         self.state = State::Between;
-        if line_ended {
-            self.next_line();
-        }
         Cut::Malformed
     }
 
@@ -247,8 +250,7 @@ impl Multipart {
     }
 
     fn remember(&mut self, piece: &[u8]) {
-        // Twice a boundary leaves room for its dashes, and for the header that matters.
-        if self.line.len() + piece.len() > 2 * LONGEST_BOUNDARY {
+        if self.line.len() + piece.len() > LONGEST_LINE {
             self.line_is_long = true;
         } else {
             self.line.extend_from_slice(piece);

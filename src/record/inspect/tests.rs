@@ -49,7 +49,9 @@ async fn a_finished_episode_is_told_as_it_was() {
     assert!(raw.frames_stale > 10 && raw.frames_valid > 0);
     let masks: Vec<_> = said.mask.iter().map(|edge| edge.mask.as_str()).collect();
     assert_eq!(masks, ["0x03", "0x83", "0x82", "0x83"]);
-    let kinds: Vec<_> = said.events.iter().take(3).map(|event| event.kind.as_str()).collect();
+    // The recorder's own lines about losses come when they come.
+    let announced = said.events.iter().filter(|event| !event.text.contains("lost"));
+    let kinds: Vec<_> = announced.take(3).map(|event| event.kind.as_str()).collect();
     assert_eq!(kinds, ["recording", "attach", "log"]);
     let together: u64 = said.topics.iter().chain(said.modalities.iter().map(|m| &m.topic)).map(|t| t.messages).sum();
     assert_eq!(together, said.messages);

@@ -93,15 +93,17 @@ async fn an_episode_holds_what_was_captured_and_nothing_else() {
     let edges: Vec<i128> = masks.windows(2).filter(|w| w[0].1 != w[1].1).map(|w| w[1].1).collect();
     assert_eq!(edges, [0b1000_0011, 0b1000_0010, 0b1000_0011]);
 
-    // Events: in the file as they were announced, with the log line in its own channel too.
-    let kinds: Vec<String> = read.on("/rapid/event").map(|m| text(&m.4, "kind")).collect();
+    // Events: in the file as they were announced, with the log line in its own channel too. The recorder's own lines
+    // about losses come when they come.
+    let events: Vec<_> = read.on("/rapid/event").filter(|m| !text(&m.4, "text").contains("lost")).collect();
+    let kinds: Vec<String> = events.iter().map(|m| text(&m.4, "kind")).collect();
     assert!(kinds.starts_with(&["recording".into(), "attach".into(), "log".into()]), "{kinds:?}");
-    let attach = &read.on("/rapid/event").nth(1).unwrap().4;
+    let attach = &events[1].4;
     assert_eq!((text(attach, "device"), text(attach, "text").contains("S7")), ("raw".to_owned(), true));
     let json: serde_json::Value = serde_json::from_str(&text(attach, "json")).unwrap();
     assert_eq!((&json["event"], &json["serial"]), (&"attach".into(), &"S7".into()));
     let lines: Vec<String> = read.on("/rapid/log").map(|m| text(&m.4, "message")).collect();
-    assert_eq!(lines[0], "hello");
+    assert!(lines.iter().any(|line| line == "hello"), "{lines:?}");
     assert!(lines.iter().any(|line| line.starts_with("tof: ") && line.contains("lost")), "{lines:?}");
 
     check_frames(&read, begin);

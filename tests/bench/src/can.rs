@@ -95,9 +95,12 @@ fn whole(bench: &Bench, length: Duration, full: bool) -> Result<Run, Failure> {
         let events = futures::stream::iter([Ok(HotplugEvent::Added(attachment))]);
         Box::pin(events.chain(futures::stream::pending())) as rapid::hotplug::HotplugStream
     };
-    let sender = std::thread::spawn(move || send(length, full, |bytes| (&adapter).write(bytes)));
+    let line = adapter.try_clone()?;
+    let sender = std::thread::spawn(move || send(length, full, |bytes| (&line).write(bytes)));
     let passed = play(bench, &registry, plugged, length + 2 * MARGIN)?;
     let (sent, refused, cpu) = sender.join().map_err(|_| "the sender panicked")?;
+    // Hung up before, the line would lose what was not read yet.
+    drop(adapter);
     let bytes: usize = passed.iter().filter(|one| one.topic == topic).map(|one| one.bytes).sum();
     Ok(Run { sent, refused, received: bytes / CAN_RECORD, cpu })
 }
