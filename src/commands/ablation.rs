@@ -48,12 +48,14 @@ impl AblationError {
     }
 }
 
-/// Lists the configurations of the plan with the episodes recorded of each, and says what is next.
+/// Lists the configurations of the plan with the episodes recorded of each, and says what is next, with the
+/// registry by the name it was given here.
 ///
 /// # Errors
 /// When there is no plan, it does not go with the registry, or the episodes cannot be listed.
 pub fn ablation(
     registry: &Registry,
+    config: Option<&Path>,
     args: &AblationArgs,
     format: Format,
     out: &mut dyn Write,
@@ -73,7 +75,7 @@ pub fn ablation(
         not_counted.insert(Refused::Unreadable.word(), unreadable);
     }
     let next = wanted.iter().zip(&counts).find(|(_, count)| **count < plan.episodes).map(|(wanted, _)| wanted);
-    let command = next.map(|next| next_command(next, &plan, registry, &args.folder));
+    let command = next.map(|next| next_command(next, &plan, registry, config, &args.folder));
     match format {
         Format::Json => write_json(&plan, &wanted, &counts, &not_counted, next.zip(command.as_deref()), out)?,
         Format::Text => {

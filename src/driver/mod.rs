@@ -50,6 +50,9 @@ pub enum DriverError {
     /// The device is no longer there: wait for it to be attached again.
     #[error("unplugged")]
     Gone,
+    /// The adapter that leads to the device is there, and its link is down: wait for the link.
+    #[error("the network link is down")]
+    Unlinked,
     /// Trying again later may help.
     #[error("{0}")]
     Retry(String),
@@ -78,14 +81,11 @@ pub enum Driver {
 }
 
 impl Driver {
-    /// Says what is in the way of opening `node`, if anything is, with a future that ends when it is not: while a cable
+    /// Is the link that leads to the device behind `node` down? If so, a future that ends when it is not: while a cable
     /// is out, opening again and again leads nowhere.
     #[must_use]
-    pub fn obstacle(
-        spec: &DeviceSpec,
-        node: &DeviceNode,
-    ) -> Option<(&'static str, impl Future<Output = ()> + Send + use<>)> {
-        if matches!(spec.node, NodeSpec::Lan(_)) { lan::Lan::obstacle(node) } else { None }
+    pub fn unlinked(spec: &DeviceSpec, node: &DeviceNode) -> Option<impl Future<Output = ()> + Send + use<>> {
+        if matches!(spec.node, NodeSpec::Lan(_)) { lan::Lan::unlinked(node) } else { None }
     }
 
     /// Opens the node of `spec` and starts it.
@@ -124,7 +124,7 @@ impl Driver {
             return Ok(Self::Replay(Box::new(replay::Replay::open(Arc::clone(device)).await?)));
         }
         sim::check(spec, device)?;
-        let sim = sim::Sim::open(Arc::clone(device)).await?.with_controls(&spec.node);
+        let sim = sim::Sim::open(Arc::clone(device)).await?.as_node(&spec.node);
         Ok(Self::Sim(Box::new(sim)))
     }
 

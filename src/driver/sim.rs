@@ -6,8 +6,10 @@
 //!
 //! Invariant: the sequence goes on over a replug; a number that is skipped is told in `lost`.
 
+mod grid;
 mod joints;
 mod pictures;
+mod records;
 pub mod task;
 
 use std::collections::BTreeMap;
@@ -18,12 +20,15 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
+use self::grid::Grid;
 use self::joints::Joints;
 use self::pictures::{PICTURES, Pictures, Scene, encode, fill, write_picture};
+use self::records::Records;
 use super::{DriverError, Reading, unblock};
+use crate::modality::ModalityKind;
 use crate::provenance::{Format, Negotiated};
 use crate::registry::scenario::{self, SimDevice, SimSource, TaskPart};
-use crate::registry::{DeviceSpec, MOTOR_CHANNELS, NodeSpec};
+use crate::registry::{CAN_RECORD, DeviceSpec, MOTOR_CHANNELS, NodeSpec};
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
 use crate::time::{Stamp, nanoseconds};
 
@@ -59,6 +64,7 @@ pub struct Sim {
 enum Content {
     Pictures(Pictures),
     Values { channels: usize, seed: u64 },
+    Records { records: Records, seed: u64 },
     Task { part: TaskPart, trial: task::Shared },
 }
 
@@ -88,6 +94,7 @@ impl Sim {
         let capacity = match &content {
             Content::Pictures(pictures) => pictures.largest(),
             Content::Values { channels, .. } => channels * 8,
+            Content::Records { .. } => CAN_RECORD,
             Content::Task { .. } => task::SIDE * task::SIDE * 3,
         };
         let grid = Grid { begun: device.begun, rate: u64::from(rate.max(1)) };
@@ -108,10 +115,14 @@ impl Sim {
         })
     }
 
-    /// With the controls that `spec` sets: a simulated camera has those and no others. With its motors,
-    /// which are where they are told to be.
+    /// As `spec` has it. With the controls that it sets: a simulated camera has those and no others. With its
+    /// motors, which are where they are told to be. With bytes where it sends those.
     #[must_use]
-    pub(super) fn with_controls(mut self, spec: &NodeSpec) -> Self {
+    pub(super) fn as_node(mut self, spec: &NodeSpec) -> Self {
+        if let (Some(records), Content::Values { seed, .. }) = (Records::of(spec), &self.content) {
+            self.content = Content::Records { records, seed: *seed };
+            self.payload.reserve(CAN_RECORD);
+        }
         if let NodeSpec::Camera(camera) = spec {
             self.controls = camera.controls.iter().cloned().collect();
         }
@@ -183,6 +194,7 @@ impl Sim {
                     write_values(*channels, *seed, sequence, &mut self.payload);
                     self.joints.write(&mut self.payload);
                 }
+                Content::Records { records, seed } => records.write(*seed, sequence, captured, &mut self.payload),
                 Content::Task { part, trial } => {
                     let mut trial = trial.trial();
                     trial.advance_to(u32::try_from(point).unwrap_or(u32::MAX));
@@ -204,6 +216,7 @@ impl Sim {
         let (encoding, width, height) = match &self.content {
             Content::Pictures(pictures) => (Encoding::Mjpeg, pictures.width, pictures.height),
             Content::Values { channels, .. } => (Encoding::F64, u32::try_from(*channels).unwrap_or(u32::MAX), 0),
+            Content::Records { .. } => (Encoding::Bytes, 0, 0),
             Content::Task { part, .. } => task::layout(*part),
         };
         Reading { bytes: &self.payload, encoding, captured, flags: FLAG_DEVICE_TIME, width, height, lost }
@@ -244,7 +257,10 @@ impl Sim {
             SimSource::Camera { width, height, fps, .. } => {
                 format!("simulated camera, MJPG {width}x{height} at {fps} fps")
             }
-            SimSource::Serial { channels, hz, .. } => format!("simulated serial line, {channels} numbers at {hz} Hz"),
+            SimSource::Serial { channels, hz, .. } => match self.content {
+                Content::Records { records, .. } => format!("{} at {hz} Hz", records.describe()),
+                _ => format!("simulated serial line, {channels} numbers at {hz} Hz"),
+            },
             SimSource::Task { part: TaskPart::Arm, .. } => "arm of the simulated task".to_owned(),
             SimSource::Task { .. } => {
                 format!("camera of the simulated task, MJPG {0}x{0} at {1} fps", task::SIDE, task::STEP_HZ)
@@ -261,6 +277,7 @@ impl Sim {
                 Some(Format::Pictures { fourcc: "MJPG".to_owned(), width, height, fps: Some(fps.into()) })
             }
             SimSource::Serial { channels, hz, .. } => {
+                let channels = if matches!(self.content, Content::Records { .. }) { 0 } else { channels };
                 Some(Format::Messages { baud: None, channels, hz: Some(hz.into()) })
             }
             SimSource::Task { part: TaskPart::Arm, .. } => {
@@ -291,6 +308,8 @@ pub(super) fn check(spec: &DeviceSpec, device: &SimDevice) -> Result<(), DriverE
             }
             (format!("{width}x{height} pictures"), format!("{}x{}", camera.width, camera.height))
         }
+        // Bytes have no channels.
+        (SimSource::Serial { .. }, node) if node.modality_kind() == ModalityKind::Bytes => return Ok(()),
         (SimSource::Serial { channels, .. }, NodeSpec::Serial(serial)) => {
             if *channels == serial.channels {
                 return Ok(());
@@ -298,8 +317,7 @@ pub(super) fn check(spec: &DeviceSpec, device: &SimDevice) -> Result<(), DriverE
             (format!("{channels} numbers"), serial.channels.to_string())
         }
         (SimSource::Serial { channels, .. }, NodeSpec::Can(can)) => {
-            // Frames have no channels; something is sent all the same.
-            if can.channels() == 0 || *channels == can.channels() {
+            if *channels == can.channels() {
                 return Ok(());
             }
             (format!("{channels} numbers"), can.channels().to_string())
@@ -348,37 +366,6 @@ fn write_values(channels: usize, seed: u64, sequence: u32, payload: &mut Vec<u8>
             (TAU * (f64::from(sequence % 100_000) / 100.0 + phase)).sin()
         };
         payload.extend_from_slice(&value.to_le_bytes());
-    }
-}
-
-/// Points in time `1 / rate` apart, from the scenario's beginning; computed from the point's number
-/// so that a period that is no whole number of ns does not drift.
-#[derive(Debug, Clone, Copy)]
-struct Grid {
-    begun: Stamp,
-    rate: u64,
-}
-
-impl Grid {
-    fn stamp(self, point: u64) -> Stamp {
-        let after = u128::from(point) * 1_000_000_000 / u128::from(self.rate);
-        Stamp(self.begun.0.saturating_add(u64::try_from(after).unwrap_or(u64::MAX)))
-    }
-
-    /// The first point later than `now`.
-    fn first_after(self, now: Stamp) -> u64 {
-        let Some(elapsed) = now.0.checked_sub(self.begun.0) else { return 0 };
-        let estimate = u128::from(elapsed) * u128::from(self.rate) / 1_000_000_000;
-        let mut point = u64::try_from(estimate).unwrap_or(u64::MAX);
-        // The rounding in `stamp` puts a point up to 1 ns early: the estimate is at most one short.
-        while self.stamp(point) <= now && point < u64::MAX {
-            point += 1;
-        }
-        point
-    }
-
-    fn period(self) -> Duration {
-        Duration::from_nanos(1_000_000_000 / self.rate)
     }
 }
 

@@ -76,6 +76,8 @@ struct Modality {
     controls: Option<Controls>,
     /// What the actuator said last in this epoch.
     arming: Option<Arming>,
+    /// A removal was told and no attachment after it.
+    was_told_gone: bool,
     /// What was agreed with the device, or why it does not run.
     detail: String,
 }
@@ -107,6 +109,7 @@ impl Rig {
                     .filter(|_| seat.is_none())
                     .and_then(|_| Some(Controls::new(bus.actions()?, Arc::clone(&orders)))),
                 arming: None,
+                was_told_gone: false,
                 seat,
                 post,
                 spec,
@@ -207,15 +210,8 @@ impl Rig {
         if modality.slot.attached() == Some(&attachment) {
             return;
         }
-        let what = What::Attach {
-            device: modality.spec.name.clone(),
-            bit: id,
-            node: attachment.node.label(),
-            unit: attachment.unit.clone(),
-            driver: attachment.driver.as_deref().cloned(),
-        };
         modality.attached = Stamp::now();
-        self.board.announce(what);
+        self.tell_attach(id, &attachment);
         self.attend(id, &attachment);
         self.apply(id, Input::Attached(attachment));
     }
@@ -232,17 +228,6 @@ impl Rig {
         }
     }
 
-    /// Says who saw an unplug, unless another witness was first.
-    fn tell_detach(&mut self, id: ModalityId, witness: &str) {
-        let Some(modality) = self.modality(id) else { return };
-        if modality.slot.state() == SlotState::Absent {
-            return;
-        }
-        modality.detail = format!("unplugged, told by {witness}");
-        let (device, witness) = (modality.spec.name.clone(), witness.to_owned());
-        self.board.announce(What::Detach { device, bit: id, witness });
-    }
-
     fn stream_ended(&mut self, ended: Result<(Id, (End, String)), JoinError>) {
         let (task, end, reason) = match ended {
             Ok((task, (end, reason))) => (task, end, reason),
@@ -255,6 +240,10 @@ impl Rig {
         let Some(modality) = self.modality(id).filter(|modality| modality.slot.is_current(epoch)) else { return };
         match end {
             End::Gone => self.tell_detach(id, "stream"),
+            End::Unlinked => {
+                self.tell_detach(id, Witness::Link.word());
+                self.modality(id).into_iter().for_each(|modality| modality.detail.clone_from(&reason));
+            }
             End::Retry | End::Fatal => modality.detail = reason,
         }
         self.apply(id, Input::Ended(epoch, end));

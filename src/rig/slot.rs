@@ -56,6 +56,8 @@ pub enum Input<A> {
 pub enum End {
     /// The device is no longer there.
     Gone,
+    /// It is there and cannot be reached before a link is up again, which its next start waits for.
+    Unlinked,
     /// Starting again may help.
     Retry,
     /// Starting again cannot help.
@@ -194,6 +196,11 @@ impl<A: Clone> Slot<A> {
                 self.deadline = Some(now.after(wait));
             }
             End::Fatal => self.enter(SlotState::Failed),
+            // As often as somebody pulls the cable.
+            End::Unlinked => {
+                self.restarts.clear();
+                self.wait_until(now.after(FIRST_BACKOFF));
+            }
             End::Retry => match self.backoff(now) {
                 Some(backoff) => {
                     self.restarts.push(now);

@@ -46,8 +46,8 @@ use source::Source;
 /// What a stream tells the rig while it runs.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Report {
-    /// The node is not opened before this is out of the way.
-    Waits(&'static str),
+    /// The node is not opened before its link is up.
+    Unlinked,
     /// The node is open; what was agreed with the device, for people and for the recording.
     Opened(String, Box<Provenance>),
     /// Open for so long, and no sample yet.
@@ -112,8 +112,8 @@ impl Stream {
     pub(super) async fn run(self) -> (End, String) {
         let stopped = || (End::Gone, "stopped".to_owned());
         let open = async {
-            if let Some((what, is_over)) = Driver::obstacle(&self.spec, &self.attachment.node) {
-                self.report(Report::Waits(what)).await;
+            if let Some(is_over) = Driver::unlinked(&self.spec, &self.attachment.node) {
+                self.report(Report::Unlinked).await;
                 is_over.await;
             }
             timeout(OPEN_LIMIT, Source::open(&self)).await
@@ -331,6 +331,7 @@ async fn changed(mut episode: EpisodeWatch) {
 fn end(error: &DriverError) -> (End, String) {
     let how = match error {
         DriverError::Gone => End::Gone,
+        DriverError::Unlinked => End::Unlinked,
         DriverError::Retry(_) => End::Retry,
         DriverError::Fatal(_) => End::Fatal,
     };

@@ -58,7 +58,7 @@ pub enum What {
         device: String,
         /// Its bit.
         bit: ModalityId,
-        /// Who told first: `stream`, `kernel`, `udev`, `enumeration` or `script`.
+        /// Who told first: `stream`, `kernel`, `udev`, `enumeration`, `link`, `goodbye`, `lease` or `script`.
         witness: String,
     },
     /// A slot changed its state.

@@ -173,11 +173,21 @@ pub(super) fn belongs(
 }
 
 /// The command that records an episode of a configuration.
-pub(super) fn next_command(wanted: &Configuration, plan: &AblationPlan, registry: &Registry, folder: &Path) -> String {
+pub(super) fn next_command(
+    wanted: &Configuration,
+    plan: &AblationPlan,
+    registry: &Registry,
+    config: Option<&Path>,
+    folder: &Path,
+) -> String {
     let has_tag = |module: &&crate::registry::ModuleSpec| {
         module.tags.iter().any(|(key, value)| *key == plan.tag && *value == wanted.finger)
     };
-    let mut words = vec!["rapid".to_owned(), "--record".to_owned(), "--out".to_owned(), folder.display().to_string()];
+    let mut words = vec!["rapid".to_owned()];
+    if let Some(config) = config {
+        words.extend(["--config".to_owned(), config.display().to_string()]);
+    }
+    words.extend(["--record".to_owned(), "--out".to_owned(), folder.display().to_string()]);
     if let Some(task) = &plan.task {
         words.extend(["--task".to_owned(), task.clone()]);
     }
@@ -283,11 +293,14 @@ mod tests {
         let mut plan = plan(&["soft", "tactile", "it's"], &["vision", "vision+tactile"]);
         plan.task = Some("place block".into());
         let wanted = configurations(&plan, &registry()).unwrap();
-        let said = |at: usize| next_command(&wanted[at], &plan, &registry(), Path::new("out"));
+        let said = |at: usize| next_command(&wanted[at], &plan, &registry(), None, Path::new("out"));
         let begin = "rapid --record --out out --task 'place block'";
         assert_eq!(said(0), format!("{begin} --module soft_tip"));
         assert_eq!(said(2), format!("{begin} --tag finger=tactile"));
         assert_eq!(said(3), begin);
         assert_eq!(said(4), format!("{begin} --tag 'finger=it'\\''s'"));
+        let config = Some(Path::new("my rig.toml"));
+        let said = next_command(&wanted[3], &plan, &registry(), config, Path::new("out"));
+        assert_eq!(said, begin.replace("rapid", "rapid --config 'my rig.toml'"));
     }
 }

@@ -62,7 +62,7 @@ impl LinkError {
 
     pub(super) fn of_driver(error: DriverError) -> Self {
         match error {
-            DriverError::Gone => Self::Gone,
+            DriverError::Gone | DriverError::Unlinked => Self::Gone,
             DriverError::Retry(text) => Self::Retry(text),
             DriverError::Fatal(text) => Self::Fatal(text),
         }

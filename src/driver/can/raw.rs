@@ -131,7 +131,8 @@ impl Raw {
     }
 }
 
-fn write(received: &Received, payload: &mut Vec<u8>) {
+/// Appends a frame as [`CAN_RECORD`] bytes.
+pub(in crate::driver) fn write(received: &Received, payload: &mut Vec<u8>) {
     let Received { frame, arrival } = received;
     payload.extend_from_slice(&arrival.at.0.to_le_bytes());
     payload.extend_from_slice(&can_id(frame).to_le_bytes());

@@ -49,15 +49,12 @@ enum Protocol {
     Iphone(iphone::Phone),
 }
 
-/// Why a device behind an adapter is not there though its adapter is.
-const LINK_IS_DOWN: &str = "the network link is down";
-
 impl Lan {
-    /// Says what is in the way of the device at `node`, if anything is, with a future that ends when it is not.
+    /// Is the link to the device at `node` down? If so, a future that ends when it is not.
     #[must_use]
-    pub fn obstacle(node: &DeviceNode) -> Option<(&'static str, impl Future<Output = ()> + Send + use<>)> {
+    pub fn unlinked(node: &DeviceNode) -> Option<impl Future<Output = ()> + Send + use<>> {
         let mut carrier = Carrier::of(node);
-        carrier.is_down().then_some((LINK_IS_DOWN, async move { carrier.up().await }))
+        carrier.is_down().then_some(async move { carrier.up().await })
     }
 
     /// Opens the device of `spec` at `node`.
@@ -92,8 +89,8 @@ impl Lan {
     /// The next sample.
     ///
     /// # Errors
-    /// [`DriverError::Gone`] when the network adapter was unplugged, [`DriverError::Retry`] when its link went
-    /// down, or the device ended its stream or fell silent.
+    /// [`DriverError::Gone`] when the network adapter was unplugged, [`DriverError::Unlinked`] when its link went
+    /// down, [`DriverError::Retry`] when the device ended its stream or fell silent.
     pub async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
         let Self { protocol, carrier, .. } = self;
         let read = async {
@@ -107,7 +104,7 @@ impl Lan {
         tokio::select! {
             biased;
             reading = read => reading,
-            () = carrier.lost() => Err(DriverError::Retry(LINK_IS_DOWN.to_owned())),
+            () = carrier.lost() => Err(DriverError::Unlinked),
         }
     }
 

@@ -128,11 +128,34 @@ async fn simulated_motors_are_where_they_were_told_to_be() {
     assert!(check(arm, &sends(11)).is_err());
     let twelve = sends(12);
     check(arm, &twelve).unwrap();
-    let mut sim = Sim::open(twelve).await.unwrap().with_controls(&arm.node);
+    let mut sim = Sim::open(twelve).await.unwrap().as_node(&arm.node);
     assert!(sim.command(&[0.5]).is_err(), "a target is missing");
     sim.joints.order(crate::action::Order::Arm);
     sim.command(&[0.5, -0.25]).unwrap();
     let bytes = sim.read().await.unwrap().bytes.to_vec();
     let values: Vec<f64> = bytes.chunks(8).map(|value| f64::from_le_bytes(value.try_into().unwrap())).collect();
     assert_eq!((values.len(), values[0], values[6]), (12, 0.5, -0.25));
+}
+
+#[tokio::test]
+async fn what_sends_bytes_sends_them_as_the_real_one_does() {
+    let text = "[device.bus]\nvid = \"1d50\"\npid = \"606f\"\nnode = \"can\"\n[device.bus.can]\nprotocol = \"raw\"\n\
+                [device.lidar]\nnode = \"lan\"\n[device.lidar.lan]\nprotocol = \"udp\"\nport = 2368\nhost = \"10.0.0.9\"\n";
+    let registry = crate::registry::Registry::parse(text, None).unwrap().registry;
+    for (name, length) in [("bus", CAN_RECORD), ("lidar", 8)] {
+        let spec = registry.named(name).unwrap();
+        let source = device(SimSource::Serial { channels: 1, hz: 1000, seed: 0x0102_0304 });
+        check(spec, &source).unwrap();
+        let mut sim = Sim::open(source).await.unwrap().as_node(&spec.node);
+        for _ in 0..3 {
+            let sequence = sim.device.sequence.load(std::sync::atomic::Ordering::Relaxed);
+            let reading = sim.read().await.unwrap();
+            assert_eq!((reading.encoding, reading.width, reading.bytes.len()), (Encoding::Bytes, 0, length), "{name}");
+            let (head, data) = reading.bytes.split_at(length - 8);
+            assert_eq!(data, [sequence.to_le_bytes(), [4, 3, 2, 1]].concat(), "{name}");
+            if name == "bus" {
+                assert_eq!(head, [&reading.captured.0.to_le_bytes()[..], &[0x23, 1, 0, 0, 8, 0, 0, 0]].concat());
+            }
+        }
+    }
 }

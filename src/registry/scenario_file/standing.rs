@@ -14,7 +14,7 @@ pub(super) fn standing_for(spec: &DeviceSpec, name: &str) -> ScenarioDevice {
         NodeSpec::Camera(camera) => {
             SimSource::Camera { width: camera.width, height: camera.height, fps: camera.fps, seed, bytes: 0 }
         }
-        // Raw lines have no channels; something must be sent all the same.
+        // What sends bytes has no channels: a number of its messages a second is all that is said here.
         NodeSpec::Serial(serial) => SimSource::Serial { channels: serial.channels.max(1), hz: SERIAL_HZ, seed },
         NodeSpec::Process(_) => SimSource::Process,
         NodeSpec::Can(can) => SimSource::Serial { channels: can.channels().max(1), hz: SERIAL_HZ, seed },
@@ -23,7 +23,6 @@ pub(super) fn standing_for(spec: &DeviceSpec, name: &str) -> ScenarioDevice {
                 SimSource::Camera { width, height, fps, seed, bytes: 0 }
             }
             (_, [channels]) => SimSource::Serial { channels: *channels as usize, hz: SERIAL_HZ, seed },
-            // What sends bytes has no numbers; something must be sent all the same.
             _ => SimSource::Serial { channels: 1, hz: SERIAL_HZ, seed },
         },
     };

@@ -1,4 +1,4 @@
-//! What streams report, and what is told of them.
+//! What streams report, and what is told of them and of their devices.
 
 use std::sync::Arc;
 
@@ -6,11 +6,14 @@ use tokio::sync::mpsc;
 
 use super::Rig;
 use crate::action::{ActuatorNotice, Arming};
+use crate::driver::DriverError;
+use crate::hotplug::Witness;
 use crate::modality::ModalityId;
+use crate::registry::Attachment;
 use crate::rig::slot::Input;
 use crate::rig::stream::{Report, Reported};
 use crate::sample::Epoch;
-use crate::status::{Level, What};
+use crate::status::{Level, SlotState, What};
 
 impl Rig {
     /// What streams reported by now: of one that has ended, all of it.
@@ -25,13 +28,18 @@ impl Rig {
         // A report may arrive after the end of its stream, whose reason must stay.
         let Some(modality) = self.modality(id).filter(|modality| modality.slot.is_current(epoch)) else { return };
         match report {
-            Report::Waits(what) => {
-                what.clone_into(&mut modality.detail);
+            Report::Unlinked => {
+                self.tell_detach(id, Witness::Link.word());
+                let Some(modality) = self.modality(id) else { return };
+                let what = DriverError::Unlinked.to_string();
                 let text = format!("{}: {what}; it is opened when that is over", modality.spec.name);
+                modality.detail = what;
                 self.show(id);
                 self.board.announce(What::Log { level: Level::Warn, text });
             }
             Report::Opened(description, provenance) => {
+                self.tell_attach_again(id);
+                let Some(modality) = self.modality(id) else { return };
                 modality.detail = description;
                 let device = modality.spec.name.clone();
                 self.show(id);
@@ -70,6 +78,41 @@ impl Rig {
         }
         let (device, text) = (modality.spec.name.clone(), "it is commanded no more, until the next arm".to_owned());
         board.announce(What::Actuator { device, bit: id, arming: Arming::Disarmed, is_problem, text });
+    }
+
+    pub(super) fn tell_attach(&mut self, id: ModalityId, attachment: &Attachment) {
+        let Some(modality) = self.modality(id) else { return };
+        modality.was_told_gone = false;
+        let what = What::Attach {
+            device: modality.spec.name.clone(),
+            bit: id,
+            node: attachment.node.label(),
+            unit: attachment.unit.clone(),
+            driver: attachment.driver.as_deref().cloned(),
+        };
+        self.board.announce(what);
+    }
+
+    /// A device of which a removal was told, and not by hot-plug, is there again: its link is up, or it never
+    /// was gone.
+    pub(super) fn tell_attach_again(&mut self, id: ModalityId) {
+        let Some(modality) = self.modality(id).filter(|modality| modality.was_told_gone) else { return };
+        if let Some(attachment) = modality.slot.attached().cloned() {
+            self.tell_attach(id, &attachment);
+        }
+    }
+
+    /// Says who saw an unplug, unless another witness was first.
+    pub(super) fn tell_detach(&mut self, id: ModalityId, witness: &str) {
+        let Some(modality) = self.modality(id) else { return };
+        if modality.slot.state() == SlotState::Absent {
+            return;
+        }
+        modality.detail = format!("unplugged, told by {witness}");
+        if !std::mem::replace(&mut modality.was_told_gone, true) {
+            let (device, witness) = (modality.spec.name.clone(), witness.to_owned());
+            self.board.announce(What::Detach { device, bit: id, witness });
+        }
     }
 
     pub(super) fn announce_state(&mut self, id: ModalityId) {

@@ -408,7 +408,7 @@ async fn a_device_behind_an_adapter_is_not_opened_before_its_cable_is_in() {
         // It is no interface of this machine.
         Until("a absent"),
     ];
-    assert_eq!(told_of(&registry, false, &steps).await[..4], ["a at 1", "a opening", "a gone stream", "a absent"]);
+    assert_eq!(told_of(&registry, false, &steps).await[..4], ["a at 1", "a opening", "a gone link", "a absent"]);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

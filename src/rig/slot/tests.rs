@@ -50,6 +50,7 @@ fn every_transition_of_the_current_epoch() {
         (Absent, Input::Resumed(e), Absent, none.clone()),
         (Absent, Input::Ended(e, End::Gone), Absent, none.clone()),
         (Absent, Input::Ended(e, End::Retry), Absent, none.clone()),
+        (Absent, Input::Ended(e, End::Unlinked), Absent, none.clone()),
         (Absent, Input::Ended(e, End::Fatal), Absent, none.clone()),
         (Absent, Input::Restart, Absent, none.clone()),
         (Absent, Input::Timer, Absent, none.clone()),
@@ -60,6 +61,7 @@ fn every_transition_of_the_current_epoch() {
         (Opening, Input::Resumed(e), Opening, none.clone()),
         (Opening, Input::Ended(e, End::Gone), Absent, none.clone()),
         (Opening, Input::Ended(e, End::Retry), Backoff, none.clone()),
+        (Opening, Input::Ended(e, End::Unlinked), Backoff, none.clone()),
         (Opening, Input::Ended(e, End::Fatal), Failed, none.clone()),
         (Opening, Input::Restart, Opening, none.clone()),
         (Opening, Input::Timer, Opening, none.clone()),
@@ -70,6 +72,7 @@ fn every_transition_of_the_current_epoch() {
         (Streaming, Input::Resumed(e), Streaming, none.clone()),
         (Streaming, Input::Ended(e, End::Gone), Absent, none.clone()),
         (Streaming, Input::Ended(e, End::Retry), Backoff, none.clone()),
+        (Streaming, Input::Ended(e, End::Unlinked), Backoff, none.clone()),
         (Streaming, Input::Ended(e, End::Fatal), Failed, none.clone()),
         (Streaming, Input::Restart, Streaming, none.clone()),
         (Streaming, Input::Timer, Streaming, none.clone()),
@@ -80,6 +83,7 @@ fn every_transition_of_the_current_epoch() {
         (Stalled, Input::Resumed(e), Streaming, none.clone()),
         (Stalled, Input::Ended(e, End::Gone), Absent, none.clone()),
         (Stalled, Input::Ended(e, End::Retry), Backoff, none.clone()),
+        (Stalled, Input::Ended(e, End::Unlinked), Backoff, none.clone()),
         (Stalled, Input::Ended(e, End::Fatal), Failed, none.clone()),
         (Stalled, Input::Restart, Stalled, none.clone()),
         (Stalled, Input::Timer, Stalled, none.clone()),
@@ -90,6 +94,7 @@ fn every_transition_of_the_current_epoch() {
         (Backoff, Input::Resumed(e), Backoff, none.clone()),
         (Backoff, Input::Ended(e, End::Gone), Backoff, none.clone()),
         (Backoff, Input::Ended(e, End::Retry), Backoff, none.clone()),
+        (Backoff, Input::Ended(e, End::Unlinked), Backoff, none.clone()),
         (Backoff, Input::Ended(e, End::Fatal), Backoff, none.clone()),
         (Backoff, Input::Restart, Opening, start(2, 'a')),
         (Backoff, Input::Timer, Backoff, none.clone()),
@@ -100,11 +105,12 @@ fn every_transition_of_the_current_epoch() {
         (Failed, Input::Resumed(e), Failed, none.clone()),
         (Failed, Input::Ended(e, End::Gone), Failed, none.clone()),
         (Failed, Input::Ended(e, End::Retry), Failed, none.clone()),
+        (Failed, Input::Ended(e, End::Unlinked), Failed, none.clone()),
         (Failed, Input::Ended(e, End::Fatal), Failed, none.clone()),
         (Failed, Input::Restart, Opening, start(2, 'a')),
         (Failed, Input::Timer, Failed, none),
     ];
-    assert_eq!(table.len(), 6 * 10);
+    assert_eq!(table.len(), 6 * 11);
     for (from, input, to, effects) in table {
         let mut slot = slot_in(from);
         let got = slot.apply(input.clone(), ms(10));
@@ -123,6 +129,7 @@ fn an_older_epoch_changes_nothing_in_any_state() {
                 Input::Resumed(old),
                 Input::Ended(old, End::Gone),
                 Input::Ended(old, End::Retry),
+                Input::Ended(old, End::Unlinked),
                 Input::Ended(old, End::Fatal),
             ] {
                 let mut slot = slot_in(state);
@@ -213,6 +220,17 @@ fn restarts_back_off_and_give_up_after_five_in_a_minute() {
 }
 
 #[test]
+fn a_cable_may_be_pulled_as_often_as_one_likes() {
+    let mut slot = slot_in(Opening);
+    for n in 1..20 {
+        let now = 600 * u64::from(n);
+        slot.apply(Input::Ended(Epoch(n), End::Unlinked), ms(now));
+        assert_eq!((slot.state(), slot.deadline()), (Backoff, Some(ms(now + 500))));
+        assert_eq!(slot.apply(Input::Timer, ms(now + 500)), start(n + 1, 'a'));
+    }
+}
+
+#[test]
 fn a_stream_that_held_for_a_minute_begins_with_the_short_backoff_again() {
     let mut slot = slot_in(Backoff);
     slot.apply(Input::Timer, ms(500));
@@ -235,7 +253,7 @@ fn happens() -> impl Strategy<Value = Happens> {
     prop_oneof![
         proptest::char::range('a', 'd').prop_map(Happens::Attach),
         Just(Happens::Detach),
-        (0_u32..6, 0_u8..6).prop_map(|(age, kind)| Happens::Report(age, kind)),
+        (0_u32..6, 0_u8..7).prop_map(|(age, kind)| Happens::Report(age, kind)),
         Just(Happens::Restart),
         (0_u64..4000).prop_map(Happens::Wait),
     ]
@@ -285,6 +303,7 @@ proptest! {
                         2 => Input::Resumed(epoch),
                         3 => Input::Ended(epoch, End::Gone),
                         4 => Input::Ended(epoch, End::Retry),
+                        5 => Input::Ended(epoch, End::Unlinked),
                         _ => Input::Ended(epoch, End::Fatal),
                     }
                 }

@@ -127,6 +127,10 @@ fn packets(outcome: &Outcome, episode: &Recording) {
     assert_eq!(falls(&edges, 0), Vec::<u64>::new(), "the camera's bit");
     let told = outcome.file("first.jsonl");
     assert!(told.contains("the network link is down"), "nobody says why: {told}");
+    let witness = |event: &&str| event.contains("\"event\":\"detach\"") && event.contains("\"witness\":\"link\"");
+    assert_eq!(told.lines().filter(witness).count(), 1, "the pulled cable has its witness: {told}");
+    let comes = |line: &&str| line.contains("\"event\":\"attach\"") && line.contains("\"bit\":1");
+    assert_eq!(told.lines().filter(comes).count(), 3, "at the start, and with each return: {told}");
     assert!(!told.contains("\"state\":\"failed\""), "a cable that is out is no failure: {told}");
 
     // What the adapter sends between the kernel's taking of it and the socket's opening is nobody's: a hole at each return.
