@@ -259,6 +259,7 @@ impl Sim {
             }
             SimSource::Serial { channels, hz, .. } => match self.content {
                 Content::Records { records, .. } => format!("{} at {hz} Hz", records.describe()),
+                _ if self.joints.count() > 0 => format!("simulated motors, {} at {hz} Hz", self.joints.count()),
                 _ => format!("simulated serial line, {channels} numbers at {hz} Hz"),
             },
             SimSource::Task { part: TaskPart::Arm, .. } => "arm of the simulated task".to_owned(),

@@ -9,11 +9,13 @@ use ratatui::widgets::{Block, Clear, Padding, Paragraph};
 use super::theme::Theme;
 use crate::status::SlotState;
 
+/// Of the box with its border and padding.
+const WIDTH: u16 = 58;
 const KEYS: [(&str, &str); 10] = [
     ("space", "start an episode, end the one in progress"),
     ("up, down", "select a device"),
     ("r", "restart the selected device, if it failed"),
-    ("a, a", "arm the actuator: motors are enabled and follow actions"),
+    ("a, a", "arm the actuator: motors follow actions"),
     ("d", "disarm it: motors are disabled"),
     ("p", "pause the view; everything else goes on"),
     ("pgup, pgdn", "scroll the log; esc goes to its end"),
@@ -47,7 +49,7 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, theme: Theme) {
     }
     let height = u16::try_from(lines.len()).unwrap_or(u16::MAX).saturating_add(2).min(area.height);
     let [middle] = Layout::vertical([Constraint::Length(height)]).flex(Flex::Center).areas(area);
-    let [middle] = Layout::horizontal([Constraint::Length(58)]).flex(Flex::Center).areas(middle);
+    let [middle] = Layout::horizontal([Constraint::Length(WIDTH)]).flex(Flex::Center).areas(middle);
     let block = Block::bordered()
         .border_set(theme.border())
         .border_style(theme.faint())
@@ -55,4 +57,16 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, theme: Theme) {
         .padding(Padding::horizontal(1));
     frame.render_widget(Clear, middle);
     frame.render_widget(Paragraph::new(lines).block(block), middle);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_line_is_cut() {
+        let longest =
+            KEYS.iter().map(|(_, meaning)| meaning.len()).chain(STATES.iter().map(|(_, meaning)| meaning.len()));
+        assert!(longest.max().expect("lines") + 12 <= usize::from(WIDTH) - 4);
+    }
 }

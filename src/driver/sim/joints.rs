@@ -18,6 +18,11 @@ impl Joints {
         Self { positions: vec![0.0; count], ..Self::default() }
     }
 
+    /// How many.
+    pub(super) const fn count(&self) -> usize {
+        self.positions.len()
+    }
+
     /// Takes an action; false if it is not theirs.
     pub(super) fn command(&mut self, target: &[f64]) -> bool {
         if self.positions.is_empty() || self.positions.len() != target.len() {

@@ -37,7 +37,12 @@ pub(super) fn words(epoch: &Value) -> Vec<String> {
     let span = seconds("to_s").map_or_else(|| format!("from {from} s"), |to| format!("{from} to {to:.1} s"));
     let number = epoch.get("epoch").and_then(Value::as_u64).map_or("?".to_owned(), |epoch| epoch.to_string());
     let mut words = vec![format!("epoch {number}"), span];
-    words.push(format!("{}:{}", text("vid").unwrap_or("?"), text("pid").unwrap_or("?")));
+    if let Some(address) = text("address") {
+        words.extend(text("instance").map(|instance| format!("instance {instance}")));
+        words.push(format!("address {address}"));
+    } else {
+        words.push(format!("{}:{}", text("vid").unwrap_or("?"), text("pid").unwrap_or("?")));
+    }
     words.extend(text("serial").map(|serial| format!("serial {serial}")));
     words.extend(text("port").map(|port| format!("port {port}")));
     words.extend(text("firmware").map(|firmware| format!("firmware {firmware}")));
@@ -86,6 +91,8 @@ mod tests {
             "driver": {"name": "cdc_acm"}, "format": {"baud": 115_200, "channels": 3}, "latency_ns": 0,
         });
         assert_eq!(words(&serial).join("  "), "epoch 1  from 0.0 s  2e8a:000a  cdc_acm  115200 baud, 3 channels");
+        let lan = json!({"epoch": 1, "from_s": 0.0, "address": "10.0.0.9:80", "instance": "phone"});
+        assert_eq!(words(&lan).join("  "), "epoch 1  from 0.0 s  instance phone  address 10.0.0.9:80");
         assert_eq!(words(&json!([1])).join("  "), "epoch ?  from ? s  ?:?");
         assert_eq!(
             format(&json!({"fourcc": "GREY", "width": 8, "height": 4, "fps": 30.0})).unwrap(),
