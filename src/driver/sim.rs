@@ -118,7 +118,7 @@ impl Sim {
     /// As `spec` has it. With the controls that it sets: a simulated camera has those and no others. With its
     /// motors, which are where they are told to be. With bytes where it sends those.
     #[must_use]
-    pub(super) fn as_node(mut self, spec: &NodeSpec) -> Self {
+    pub(super) fn with_node(mut self, spec: &NodeSpec) -> Self {
         if let (Some(records), Content::Values { seed, .. }) = (Records::of(spec), &self.content) {
             self.content = Content::Records { records, seed: *seed };
             self.payload.reserve(CAN_RECORD);

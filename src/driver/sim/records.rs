@@ -32,9 +32,8 @@ impl Records {
     /// Number `sequence`, taken at `captured`: it begins with the number, or a frame's data does.
     pub(super) fn write(self, seed: u64, sequence: u32, captured: Stamp, payload: &mut Vec<u8>) {
         payload.clear();
-        let [a, b, c, d] = sequence.to_le_bytes();
-        let [e, f, g, h, ..] = seed.to_le_bytes();
-        let data = [a, b, c, d, e, f, g, h];
+        // The lower half of the seed behind the number: little-endian, as all numbers here.
+        let data = (u64::from(sequence) | seed << 32).to_le_bytes();
         match self {
             Self::Frames => {
                 let arrival = Arrival { at: captured, from_kernel: true };
