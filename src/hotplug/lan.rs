@@ -4,8 +4,8 @@
 //! nothing else on the network is. What was found is told as `Added` with the entry's name; it is told as
 //! `Removed`
 //!
-//! * at once when it says goodbye ([`Witness::Goodbye`]) or the link that leads to it is down
-//!   ([`Witness::Link`]),
+//! * at once when the link that leads to it is down ([`Witness::Link`]), and a second after it says goodbye
+//!   ([`Witness::Goodbye`]), in which another may say that it is there (RFC 6762, 10.1),
 //! * otherwise when nothing of it was heard for the entry's lease, or its address says that nobody is there and its
 //!   driver did not hear it either ([`Witness::Lease`]).
 //!
