@@ -1,10 +1,12 @@
 //! The program: puts the stages together, runs them, and takes them down in order.
 //!
-//! Taking down: the policy holds, the episode ends and streams stop, the recorder finishes its file, the programs of
-//! devices are waited for, the mask says 0 and its files go, the screen says what was recorded and gives the terminal back.
+//! Taking down: the episode ends, the policy holds and actuators are disarmed, the last samples of the episode arrive,
+//! streams stop, the recorder finishes its file, the programs of devices are waited for, the mask says 0 and its files
+//! go, the screen says what was recorded and gives the terminal back.
 //!
 //! Invariant: only this module sees every stage.
 //! Invariant: whatever ends the run, an episode in progress is finished first.
+//! Invariant: an episode ends at the moment its end was asked for, whatever closes slowly after that.
 
 mod asked;
 mod autopilot;
@@ -205,7 +207,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     let mut rig =
         Rig::new(&registry, &bus, presence, Arc::clone(&board)).following(recorder.episode()).arming(options.arm);
     let rig_ended = CancellationToken::new();
-    let hurry = rig.hurry();
+    let (hurry, rig_ending) = (rig.hurry(), rig.ending());
     let rig = tokio::spawn({
         let (stop, ended) = (rig_stop.clone(), rig_ended.clone().drop_guard());
         async move {
@@ -241,6 +243,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     let mut running = Running {
         rig,
         rig_commands,
+        rig_ending,
         rig_ended,
         rig_stop,
         hurry,
@@ -271,6 +274,8 @@ const LAST_OUTPUT_IN_A_HURRY: Duration = Duration::from_secs(1);
 struct Running {
     rig: JoinHandle<(Rig, Result<(), RigError>)>,
     rig_commands: mpsc::Sender<RigCommand>,
+    /// The rig ends by itself: it has begun to close its devices.
+    rig_ending: CancellationToken,
     rig_ended: CancellationToken,
     rig_stop: CancellationToken,
     hurry: CancellationToken,
@@ -300,17 +305,15 @@ async fn finish(
 ) -> Result<(), AppError> {
     // First of all nothing moves any more, whoever publishes actions. A chunk that is being computed is waited for
     // with the rest.
+    let _ = running.rig_commands.try_send(RigCommand::Order(Order::Disarm));
     let policy_ended = async {
         match &mut running.autopilot {
-            Some(autopilot) => {
-                let _ = running.rig_commands.try_send(RigCommand::Order(Order::Disarm));
-                let ended = timeout(LAST_CHUNK, autopilot.stop()).await;
-                ended.unwrap_or(Err(AppError::Stuck))
-            }
+            Some(autopilot) => timeout(LAST_CHUNK, autopilot.stop()).await.unwrap_or(Err(AppError::Stuck)),
             None => Ok(()),
         }
     };
-    keep_first(&mut outcome, policy_ended.await);
+    let (ended, ()) = tokio::join!(policy_ended, conductor.end_episode());
+    keep_first(&mut outcome, ended);
     running.rig_stop.cancel();
     let rig = running.rig;
     let take_down = async {

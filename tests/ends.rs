@@ -8,7 +8,7 @@ mod support;
 use std::fs::File;
 use std::io::Read;
 use std::process::{Child, Command, Stdio};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use rustix::process::{Pid, Signal, kill_process};
 use support::terminal::OnTerminal;
@@ -235,4 +235,86 @@ fn an_output_that_is_full_costs_the_output_and_not_the_episode() {
     assert!(said.contains("error: output: "), "{said}");
     let episode = whole_episode(&place, "full");
     assert!(episode.topic("/rapid/frame").count() >= 59, "30 Hz for 2 s");
+}
+
+/// Closing the camera takes this long.
+const SLOW: &str = r#"
+[[device]]
+name = "cam_wrist"
+[device.fault]
+close = "2s"
+[[device]]
+name = "motor_state"
+"#;
+const CLOSES_IN: Duration = Duration::from_secs(2);
+
+/// The end of the one episode in `out`, on the wall clock.
+fn end_of_episode(place: &Place, what: &str) -> SystemTime {
+    let episode = whole_episode(place, what);
+    let begin: u64 = episode.said("rapid", "begin_wall_ns").parse().expect("begin");
+    let seconds: f64 = episode.said("rapid/summary", "duration_s").parse().expect("length");
+    let ticks = episode.topic("/rapid/frame").count() as f64;
+    assert!((seconds * 30.0 - ticks).abs() <= 1.0, "{what}: {ticks} frames in {seconds} s");
+    SystemTime::UNIX_EPOCH + Duration::from_nanos(begin) + Duration::from_secs_f64(seconds)
+}
+
+/// What closes slowly after the end of an episode was asked for is no part of the episode: it ended before the device
+/// began to close, which was this long before the program ended.
+fn ended_before_its_devices_closed(place: &Place, exited: SystemTime, what: &str) {
+    let before = exited.duration_since(end_of_episode(place, what)).expect("an episode ends before its program");
+    assert!(before >= CLOSES_IN, "{what}: ended {before:?} before the program did, closing takes {CLOSES_IN:?}");
+}
+
+#[test]
+fn an_episode_ends_when_asked_however_slowly_its_devices_close() {
+    let signals = [Signal::INT, Signal::TERM, Signal::QUIT, Signal::HUP];
+    let ways = signals.map(|signal| (format!("{signal:?}"), Some(signal)));
+    for (what, signal) in ways.into_iter().chain([("duration".to_owned(), None)]) {
+        let place = Place::new();
+        place.write("slow.toml", SLOW);
+        let mut arguments = vec!["--sim", "slow.toml", "--headless", "--json", "--record", "--out", "out"];
+        if signal.is_none() {
+            arguments.extend(["--duration", "1s"]);
+        }
+        let running = place.start(&arguments, "\"event\":\"recording\"");
+        if let Some(signal) = signal {
+            running.signal(signal);
+        }
+        let (code, _, said) = running.end();
+        let exited = SystemTime::now();
+        assert_eq!(code, Some(0), "{what}: {said}");
+        ended_before_its_devices_closed(&place, exited, &what);
+    }
+}
+
+#[test]
+fn the_monitor_ends_an_episode_when_asked_however_slowly_its_devices_close() {
+    for (what, keys) in [("space, then q", &[" ", "q", "q"][..]), ("q twice", &["q", "q"]), ("hang-up", &[])] {
+        let place = Place::new();
+        place.write("slow.toml", SLOW);
+        let mut run = OnTerminal::start(&place, &["--sim", "slow.toml", "--record", "--out", "out"], "");
+        run.read_until("REC");
+        let mut shown = File::from(run.master.as_ref().expect("open").try_clone().expect("clone"));
+        let reading = (!keys.is_empty()).then(|| {
+            std::thread::spawn(move || {
+                let mut piece = [0; 4096];
+                while let Ok(1..) = shown.read(&mut piece) {}
+            })
+        });
+        for key in keys {
+            run.type_in(key);
+            if *key == " " {
+                until("a whole file", || place.files("out").iter().any(|file| file.ends_with(".mcap")));
+            }
+        }
+        if keys.is_empty() {
+            run.master = None;
+        }
+        until("the end", || run.child.try_wait().expect("wait").is_some());
+        let exited = SystemTime::now();
+        assert_eq!(run.child.wait().expect("wait").code(), Some(0), "{what}");
+        run.master = None;
+        reading.map(std::thread::JoinHandle::join).transpose().expect("the reader ends");
+        ended_before_its_devices_closed(&place, exited, what);
+    }
 }

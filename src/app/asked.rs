@@ -7,12 +7,13 @@ use tokio::sync::mpsc;
 
 use crate::rig::RigCommand;
 use crate::status::Command;
+use crate::time::Stamp;
 
 /// What the conductor is asked for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Asked {
-    /// Begin an episode, or end the one in progress.
-    ToggleRecording,
+    /// Begin an episode, or end the one in progress at this moment.
+    ToggleRecording(Stamp),
     /// End the run.
     Quit,
 }
@@ -28,7 +29,7 @@ pub(super) fn sorted(
         while let Some(command) = screen.recv().await {
             // Either is gone only when the run ends.
             let _ = match command {
-                Command::ToggleRecording => conductor.send(Asked::ToggleRecording).is_ok(),
+                Command::ToggleRecording => conductor.send(Asked::ToggleRecording(Stamp::now())).is_ok(),
                 Command::Quit => conductor.send(Asked::Quit).is_ok(),
                 Command::Restart(id) => rig.send(RigCommand::Restart(id)).await.is_ok(),
                 Command::Order(order) => rig.send(RigCommand::Order(order)).await.is_ok(),

@@ -8,13 +8,14 @@ use std::time::Duration;
 
 use tokio::sync::broadcast;
 use tokio::sync::broadcast::error::{RecvError, TryRecvError};
-use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
+use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until, timeout};
 use tokio_util::sync::CancellationToken;
 
 use super::{AppError, Asked, Running, Screen, policy_ended, screen};
 use crate::fault;
 use crate::record::{EpisodeRequest, RecordError, Recorder};
 use crate::status::{Board, EpisodeEnd, Event, SlotState, What};
+use crate::time::Stamp;
 
 /// An episode asked for at the start begins when every attached device delivers, at the latest
 /// after this time.
@@ -23,6 +24,9 @@ const SETTLE_LIMIT: Duration = Duration::from_secs(3);
 const SETTLE_LEAST: Duration = Duration::from_millis(100);
 /// How often it is looked whether they deliver.
 const SETTLE_LOOK: Duration = Duration::from_millis(20);
+
+/// The last samples of an episode have this long to arrive: the longest `latency` of a device is a second.
+const LAST_SAMPLES: Duration = Duration::from_secs(2);
 
 /// Does what the user asks for, from the first sample to the order to end.
 pub(super) struct Conductor {
@@ -54,6 +58,7 @@ impl Conductor {
                 biased;
                 () = running.signals.next() => return output,
                 // Its outcome is taken when everything is taken down.
+                () = running.rig_ending.cancelled() => return output,
                 () = running.rig_ended.cancelled() => return output,
                 () = running.mask_ended.cancelled() => return Err(AppError::Panicked("thread `mask`")),
                 // It ends by itself only when it cannot go on.
@@ -71,10 +76,10 @@ impl Conductor {
                 Some(asked) = running.asked.recv() => match asked {
                     // A slow disk takes its time to close a file: a signal does not wait for it. What was asked of
                     // the recorder is done all the same, and its end is taken when everything is taken down.
-                    Asked::ToggleRecording => tokio::select! {
+                    Asked::ToggleRecording(at) => tokio::select! {
                         biased;
                         () = running.signals.next() => return output,
-                        done = self.toggle() => done?,
+                        done = self.toggle(at) => done?,
                     },
                     Asked::Quit => return output,
                 },
@@ -99,16 +104,25 @@ impl Conductor {
         waited >= SETTLE_LIMIT || (waited >= SETTLE_LEAST && !opening)
     }
 
-    /// Ends the episode in progress, or begins one: also that which is to begin when all deliver.
-    async fn toggle(&mut self) -> Result<(), AppError> {
+    /// Ends the episode in progress at the moment `at`, or begins one: also that which is to begin when all deliver.
+    async fn toggle(&mut self, at: Stamp) -> Result<(), AppError> {
         self.begin_episode = false;
         // What became of an episode is announced as an event and shown by the screen.
-        let Err(RecordError::Idle) = self.recorder.stop().await else { return Ok(()) };
+        let Err(RecordError::Idle) = self.recorder.stop_at(at).await else { return Ok(()) };
         if let Err(error) = self.recorder.start(self.episode.clone()).await {
             // In the monitor, a full disk is no reason to leave: it is said and can be mended.
             tracing::error!(%error, "the episode was not begun");
         }
         Ok(())
+    }
+
+    /// Fixes the end of the episode in progress to this moment, and waits until its last samples are written: those
+    /// captured before that may still be on their way.
+    pub(super) async fn end_episode(&self) {
+        self.recorder.end(Stamp::now());
+        let mut episode = self.recorder.episode();
+        // A disk that stands still holds up the file, and nothing else.
+        let _ = timeout(LAST_SAMPLES, episode.wait_for(Option::is_none)).await;
     }
 
     /// Ends the episode in progress, if there is one; an error if its file is not whole.

@@ -203,7 +203,7 @@ impl Driver {
     pub async fn close(self) {
         match self {
             Self::Motors(driver) => driver.close().await,
-            Self::Sim(mut driver) => driver.record(false),
+            Self::Sim(driver) => driver.close().await,
             Self::Lan(driver) => driver.close().await,
             _ => {}
         }

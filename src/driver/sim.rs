@@ -159,6 +159,12 @@ impl Sim {
         }
     }
 
+    /// Ends its recording, and takes as long as the scenario says.
+    pub(super) async fn close(mut self) {
+        self.record(false);
+        tokio::time::sleep(self.device.faults.close).await;
+    }
+
     /// The next sample.
     ///
     /// # Errors

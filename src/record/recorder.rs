@@ -105,13 +105,31 @@ impl Recorder {
         self.ask(|reply| Order::Start(request, reply)).await
     }
 
-    /// Ends the episode in progress at this moment; returns once its file is closed. An episode
-    /// whose duration has already ended it is waited for all the same.
+    /// Fixes the end of the episode in progress, if there is one, to the moment `at`; an earlier end stays. Does
+    /// not wait: its last samples may still be on their way.
+    pub fn end(&self, at: Stamp) {
+        if let Some(orders) = &self.orders {
+            // Without its thread there is no episode.
+            let _ = orders.send(Order::End(at));
+        }
+    }
+
+    /// Ends the episode in progress at this moment; see [`Self::stop_at`].
+    ///
+    /// # Errors
+    /// Those of [`Self::stop_at`].
+    pub async fn stop(&self) -> Result<EpisodeReport, RecordError> {
+        self.stop_at(Stamp::now()).await
+    }
+
+    /// Ends the episode in progress at the moment `at`; returns once its file is closed. An episode
+    /// whose end is fixed already, by its duration or by [`Self::end`], is waited for all the same.
     ///
     /// # Errors
     /// When there is none: one that its duration or the disk ended is told by `What::Episode` alone.
-    pub async fn stop(&self) -> Result<EpisodeReport, RecordError> {
-        self.ask(Order::Stop).await
+    pub async fn stop_at(&self, at: Stamp) -> Result<EpisodeReport, RecordError> {
+        self.end(at);
+        self.ask(Order::Await).await
     }
 
     async fn ask<T>(&self, order: impl FnOnce(Reply<T>) -> Order) -> Result<T, RecordError> {

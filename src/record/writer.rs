@@ -45,8 +45,12 @@ pub(super) type Reply<T> = oneshot::Sender<Result<T, RecordError>>;
 
 /// What the thread is asked for.
 pub(super) enum Order {
+    /// Begin an episode now.
     Start(EpisodeRequest, Reply<PathBuf>),
-    Stop(Reply<EpisodeReport>),
+    /// Fix the end of the episode in progress to this moment: that at which it was asked for.
+    End(Stamp),
+    /// Answer when the file of the episode in progress is closed.
+    Await(Reply<EpisodeReport>),
 }
 
 /// The thread's own state.
@@ -175,11 +179,13 @@ impl Writer {
                     // Whoever asked may have gone.
                     let _ = reply.send(started);
                 }
-                Ok(Order::Stop(reply)) => match &mut self.session {
-                    Some(session) => {
-                        session.end_at(Stamp::now());
-                        self.waiting.push(reply);
+                Ok(Order::End(at)) => {
+                    if let Some(session) = &mut self.session {
+                        session.end_at(at);
                     }
+                }
+                Ok(Order::Await(reply)) => match &self.session {
+                    Some(_) => self.waiting.push(reply),
                     None => {
                         let _ = reply.send(Err(RecordError::Idle));
                     }

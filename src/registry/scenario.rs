@@ -60,6 +60,8 @@ pub struct SimFaults {
     pub latency: Duration,
     /// Its clock runs fast by so many parts in a million, slow if negative.
     pub clock_ppm: i64,
+    /// Closing it takes so long.
+    pub close: Duration,
 }
 
 /// What a simulated device sends.

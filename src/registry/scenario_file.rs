@@ -23,6 +23,7 @@
 //! delay = "200ms"             # samples arrive so long after their capture
 //! latency = "35ms"            # pictures show the light of `rapid calibrate` so long before their capture
 //! clock_ppm = 500             # its clock runs fast, or slow if negative
+//! close = "2s"                # closing it takes so long, as ending the recording of a GoPro does
 //!
 //! [[event]]                   # exactly one of plug, unplug, silence, resume
 //! at = "3s"
@@ -218,7 +219,7 @@ fn faults(section: &Section<'_>, problems: &mut Problems<'_>) -> SimFaults {
     let Some(table) = section.table(problems, "fault") else { return SimFaults::default() };
     let every = ["truncate_every", "duplicate_every", "lose_every"];
     let mut known = every.to_vec();
-    known.extend(["freeze_at", "delay", "latency", "clock_ppm"]);
+    known.extend(["freeze_at", "delay", "latency", "clock_ppm", "close"]);
     table.allow(problems, &known);
     // At least 2: of a device all of whose samples are lost none ever comes.
     let [truncate_every, duplicate_every, lose_every] =
@@ -231,6 +232,7 @@ fn faults(section: &Section<'_>, problems: &mut Problems<'_>) -> SimFaults {
         delay: table.duration(problems, "delay", Duration::ZERO..=Duration::from_secs(10)).unwrap_or_default(),
         latency: table.duration(problems, "latency", Duration::ZERO..=Duration::from_secs(1)).unwrap_or_default(),
         clock_ppm: table.integer(problems, "clock_ppm", -100_000..=100_000).map_or(0, |ppm| ppm.value),
+        close: table.duration(problems, "close", Duration::ZERO..=Duration::from_secs(10)).unwrap_or_default(),
     }
 }
 

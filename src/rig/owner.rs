@@ -55,6 +55,8 @@ pub struct Rig {
     episode: EpisodeWatch,
     /// To the actuator.
     orders: Arc<OrderSlot>,
+    /// Cancelled when devices begin to be closed.
+    ending: CancellationToken,
 }
 
 /// A slot and what belongs to it.
@@ -130,6 +132,7 @@ impl Rig {
             programs,
             episode: tokio::sync::watch::channel(None).1,
             orders,
+            ending: CancellationToken::new(),
         }
     }
 
@@ -176,6 +179,7 @@ impl Rig {
                 self.write_json();
             }
         };
+        self.ending.cancel();
         self.reports_so_far(&mut reported);
         self.stop_streams().await;
         for id in self.modalities.iter().map(|modality| modality.spec.id).collect::<Vec<_>>() {

@@ -86,6 +86,7 @@ impl Bench {
             autopilot: None,
             rig: never(),
             rig_commands: mpsc::channel(1).0,
+            rig_ending: CancellationToken::new(),
             rig_ended: CancellationToken::new(),
             rig_stop: CancellationToken::new(),
             hurry: CancellationToken::new(),
@@ -137,7 +138,7 @@ async fn keys_that_come_while_an_episode_ends_are_obeyed_one_after_the_other() {
     let keys = async {
         let press = async |count: usize| {
             for _ in 0..count {
-                bench.keys.send(Asked::ToggleRecording).unwrap();
+                bench.keys.send(Asked::ToggleRecording(Stamp::now())).unwrap();
             }
         };
         press(1).await;
@@ -162,7 +163,7 @@ async fn a_key_while_devices_settle_begins_the_one_episode() {
     let silent = Registry::builtin().devices[0].id;
     bench.board.set_slot(silent, SlotState::Opening, Epoch(1), "");
     let keys = async {
-        bench.keys.send(Asked::ToggleRecording).unwrap();
+        bench.keys.send(Asked::ToggleRecording(Stamp::now())).unwrap();
         until(&bench.board, "an episode", |file| file.is_some()).await;
         idle().await;
         bench.keys.send(Asked::Quit).unwrap();
@@ -177,7 +178,7 @@ async fn a_key_while_devices_settle_begins_the_one_episode() {
 async fn the_last_episode_whose_file_fails_is_an_error_of_the_run() {
     let mut bench = Bench::new(false, None, |file| Box::new(Lost(file)));
     for _ in 0..3 {
-        bench.conductor.toggle().await.unwrap();
+        bench.conductor.toggle(Stamp::now()).await.unwrap();
     }
     let error = bench.conductor.finish_episode().await.unwrap_err().to_string();
     assert!(error.contains("_002.mcap.partial") && error.contains("lost"), "{error}");

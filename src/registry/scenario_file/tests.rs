@@ -112,6 +112,7 @@ fn faults_are_those_of_the_device_above() {
         truncate_every = 10
         clock_ppm = -20
         latency = "35ms"
+        close = "2s"
         [[device]]
         name = "motor_state"
         "#,
@@ -122,6 +123,7 @@ fn faults_are_those_of_the_device_above() {
         truncate_every: Some(10),
         clock_ppm: -20,
         latency: Duration::from_millis(35),
+        close: Duration::from_secs(2),
         ..SimFaults::default()
     };
     assert_eq!(scenario.devices[0].faults, expected);

@@ -24,6 +24,12 @@ impl Rig {
         self
     }
 
+    /// Cancelled by [`Self::run`] before it closes the first device at its end.
+    #[must_use]
+    pub fn ending(&self) -> CancellationToken {
+        self.ending.clone()
+    }
+
     /// Cancelled, it kills the programs that are being ended.
     #[must_use]
     pub fn hurry(&self) -> CancellationToken {

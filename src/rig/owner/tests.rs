@@ -426,3 +426,45 @@ async fn a_stream_that_panics_is_started_again_and_its_bit_stays_clear() {
     let got = told(Duration::from_millis(100), Duration::MAX, &steps).await;
     assert_eq!(got, ["a at 1", "a opening", "a backoff", "a opening", "a backoff"]);
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_end_is_announced_before_a_device_that_is_slow_to_close() {
+    use crate::registry::scenario::SimFaults;
+    let registry = registry(Duration::ZERO, Duration::from_secs(1));
+    let name = format!("ending{}", std::process::id());
+    let path = PathBuf::from(format!("/dev/shm/rapid_test_mask_{name}"));
+    let board = Arc::new(Board::new(&registry));
+    let bus = Bus::open(&registry, Some(&name)).expect("bus");
+    let claim = Claim::new(&path, 2).expect("claim");
+    let presence = Presence::start(claim, bus.writer(TopicId::Mask).expect("mask"), Arc::clone(&board)).expect("mask");
+    let (hotplug, plugged) = unbounded();
+    let (_commands, asked) = mpsc::channel(4);
+    let mut rig = Rig::new(&registry, &bus, presence, Arc::clone(&board));
+    let ending = rig.ending();
+    let closes_in = Duration::from_secs(1);
+    let faults = SimFaults { close: closes_in, ..SimFaults::default() };
+    let source = SimSource::Serial { channels: CHANNELS, hz: 200, seed: 1 };
+    let unit = Arc::new(SimDevice::new("1", source, Stamp::now()).with_faults(faults));
+    let usb = UsbIdentity { vid: 1, pid: 2, serial: None, port: "1".into(), ..UsbIdentity::default() };
+    let syspath = PathBuf::from("/test/1");
+    let added =
+        HotplugEvent::Added(Attachment { syspath, node: DeviceNode::Sim(unit), unit: usb.into(), driver: None });
+    hotplug.unbounded_send(Ok(added)).expect("rig");
+    let running = tokio::spawn(async move {
+        let ended = rig.run(Box::pin(plugged), asked, CancellationToken::new()).await;
+        (ended, Stamp::now())
+    });
+    let begun = Instant::now();
+    while !board.mask().contains(registry.devices[0].id) {
+        assert!(begun.elapsed() < PATIENCE, "no sample");
+        sleep(Duration::from_millis(1)).await;
+    }
+    assert!(!ending.is_cancelled());
+    // Plugging can no longer be watched: the rig ends by itself.
+    drop(hotplug);
+    ending.cancelled().await;
+    let announced = Stamp::now();
+    let (ended, at) = running.await.expect("no panic");
+    ended.expect("no error");
+    assert!(at.since(announced) >= closes_in / 2, "{:?}", at.since(announced));
+}
