@@ -1,11 +1,21 @@
 //! An inbox: every topic of the rig, for one consumer.
+//!
+//! Any program of the same user may publish on a topic of ours; iceoryx2 names the publisher of every sample.
+//!
+//! Invariant: on the topic of a modality and of the mask, only samples of their one writer are handed over. What
+//! another program publishes there is counted and dropped.
+//! Invariant: actions of another program are handed over, as the actuator carries them out; they are counted once
+//! this process, which runs a policy, has published one.
 
+use std::cell::Cell;
 use std::time::Duration;
 
+use iceoryx2::identifiers::UniquePublisherId;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::subscriber::{Subscriber, SubscriberCreateError};
+use iceoryx2::unique_id_generator::unique_system_id::UniqueSystemId;
 
-use super::{BusError, EventFactory, Service, TopicFactory, TopicId, TopicSpec, topic_error};
+use super::{BusError, EventFactory, Service, TopicFactory, TopicId, TopicSpec, Writer, topic_error};
 use crate::sample::SampleHeader;
 
 /// A consumer of every topic. Samples wait in shared memory until they are drained.
@@ -20,6 +30,40 @@ struct Subscription {
     /// Samples that can wait here.
     depth: usize,
     subscriber: Subscriber<Service, [u8], SampleHeader>,
+    /// Of the topic's one writer.
+    writer: UniquePublisherId,
+    /// The writer has published since this inbox was opened.
+    is_written: Cell<bool>,
+    /// The last other publisher and its samples, since they were asked for.
+    other: Cell<Option<(UniquePublisherId, u64)>>,
+}
+
+/// Samples of another program on a topic of ours.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Foreign<'a> {
+    /// The topic's name.
+    pub topic: &'a str,
+    /// Process that published them.
+    pub process: u32,
+    /// How many, since they were asked for last.
+    pub samples: u64,
+}
+
+impl Subscription {
+    /// Is a sample of this publisher another program's?
+    fn is_foreign(&self, publisher: UniquePublisherId) -> bool {
+        if publisher == self.writer {
+            self.is_written.set(true);
+            return false;
+        }
+        // Actions come from outside, unless a policy runs here.
+        let is_foreign = self.id != TopicId::Action || self.is_written.get();
+        if is_foreign {
+            let samples = self.other.get().map_or(0, |(_, samples)| samples);
+            self.other.set(Some((publisher, samples.saturating_add(1))));
+        }
+        is_foreign
+    }
 }
 
 impl std::fmt::Debug for Inbox {
@@ -29,8 +73,13 @@ impl std::fmt::Debug for Inbox {
 }
 
 impl Inbox {
-    pub(super) fn open(topics: &[(TopicSpec, TopicFactory)], wake: &EventFactory<Service>) -> Result<Self, BusError> {
-        let subscribe = |(spec, factory): &(TopicSpec, TopicFactory)| {
+    /// `writers` are those of `topics`, in the same order.
+    pub(super) fn open<'a>(
+        topics: &[(TopicSpec, TopicFactory)],
+        writers: impl Iterator<Item = &'a Writer>,
+        wake: &EventFactory<Service>,
+    ) -> Result<Self, BusError> {
+        let subscribe = |((spec, factory), writer): (&(TopicSpec, TopicFactory), &Writer)| {
             let subscriber =
                 factory.subscriber_builder().buffer_size(spec.depth).create().map_err(|error| match error {
                     SubscriberCreateError::ExceedsMaxSupportedSubscribers => {
@@ -38,9 +87,17 @@ impl Inbox {
                     }
                     other => topic_error(&spec.name, &other),
                 })?;
-            Ok(Subscription { id: spec.id, name: spec.name.clone(), depth: spec.depth, subscriber })
+            Ok(Subscription {
+                id: spec.id,
+                name: spec.name.clone(),
+                depth: spec.depth,
+                subscriber,
+                writer: writer.id(),
+                is_written: Cell::new(false),
+                other: Cell::new(None),
+            })
         };
-        let topics = topics.iter().map(subscribe).collect::<Result<Vec<_>, BusError>>()?;
+        let topics = topics.iter().zip(writers).map(subscribe).collect::<Result<Vec<_>, BusError>>()?;
         let wake = wake.listener_builder().create().map_err(|error| topic_error(super::WAKE_SERVICE, &error))?;
         Ok(Self { topics, wake })
     }
@@ -66,7 +123,11 @@ impl Inbox {
             // it must not keep the others, or the caller, waiting.
             for _ in 0..topic.depth {
                 match topic.subscriber.receive() {
-                    Ok(Some(sample)) => take(topic.id, sample.user_header(), sample.payload()),
+                    Ok(Some(sample)) => {
+                        if !topic.is_foreign(sample.header().publisher_id()) || topic.id == TopicId::Action {
+                            take(topic.id, sample.user_header(), sample.payload());
+                        }
+                    }
                     Ok(None) => break,
                     Err(error) => {
                         let (topic, reason) = (topic.name.clone(), format!("{error:?}"));
@@ -77,5 +138,14 @@ impl Inbox {
             }
         }
         result
+    }
+
+    /// Hands over who else has published on our topics since the last call, as far as it was drained.
+    pub fn foreign(&self, take: &mut dyn FnMut(Foreign<'_>)) {
+        for topic in &self.topics {
+            let Some((publisher, samples)) = topic.other.take() else { continue };
+            let process = UniqueSystemId::from(publisher.value()).pid().value();
+            take(Foreign { topic: &topic.name, process: u32::try_from(process).unwrap_or(0), samples });
+        }
     }
 }

@@ -37,7 +37,7 @@ use crate::sample::SampleHeader;
 use service::Service;
 
 pub use actions::Actions;
-pub use inbox::Inbox;
+pub use inbox::{Foreign, Inbox};
 pub use ingress::{Given, Ingress, Watch};
 pub use orders::give as give_order;
 pub use topic::{TopicId, TopicSpec};
@@ -208,7 +208,7 @@ impl Bus {
     /// # Errors
     /// When more programs subscribe than the topics have room for.
     pub fn inbox(&self) -> Result<Inbox, BusError> {
-        Inbox::open(&self.topics, &self.wake)
+        Inbox::open(&self.topics, self.writers.iter().map(|(_, writer)| writer.as_ref()), &self.wake)
     }
 
     /// What the actuator is told; `None` without an actuator in the registry.

@@ -234,3 +234,69 @@ fn a_topic_filled_faster_than_it_is_emptied_does_not_hold_the_consumer() {
     assert_eq!(taken, (0..16).collect::<Vec<_>>());
     assert_eq!(sequences(&inbox).len(), 1);
 }
+
+/// Another publisher on a topic of `bus`, as a program of the same user has it.
+fn stranger(bus: &Bus, id: TopicId) -> iceoryx2::port::publisher::Publisher<Service, [u8], SampleHeader> {
+    let (_, factory) = bus.topics.iter().find(|(spec, _)| spec.id == id).expect("topic");
+    factory.publisher_builder().initial_max_slice_len(64).create().expect("publisher")
+}
+
+fn give(stranger: &iceoryx2::port::publisher::Publisher<Service, [u8], SampleHeader>, seq: u64) {
+    let mut sample = stranger.loan_slice_uninit(8).expect("loan");
+    *sample.user_header_mut() = SampleHeader { seq, encoding: 2, ..SampleHeader::default() };
+    sample.write_from_slice(&[0; 8]).send().expect("send");
+}
+
+fn foreign(inbox: &Inbox) -> Vec<(String, u32, u64)> {
+    let mut seen = Vec::new();
+    inbox.foreign(&mut |other| seen.push((other.topic.to_owned(), other.process, other.samples)));
+    seen
+}
+
+#[test]
+fn samples_of_another_publisher_are_not_handed_over_but_counted_with_their_process() {
+    let (registry, bus) = open("j", 16);
+    let motor = TopicId::Modality(registry.devices[0].id);
+    let inbox = bus.inbox().expect("inbox");
+    for id in [motor, TopicId::Mask] {
+        let (ours, other) = (bus.writer(id).expect("writer"), stranger(&bus, id));
+        for seq in 0..3 {
+            ours.publish(SampleHeader { seq, ..SampleHeader::default() }, &[1]).expect("publish");
+            give(&other, 100 + seq);
+        }
+        let got: Vec<u64> = sequences(&inbox).into_iter().map(|(_, seq, _)| seq).collect();
+        assert_eq!(got, [0, 1, 2], "{id:?}");
+        let topic = if id == motor { "/rapid/serial/motor" } else { "/rapid/mask" };
+        assert_eq!(foreign(&inbox), [(topic.to_owned(), std::process::id(), 3)]);
+        assert_eq!(foreign(&inbox), []);
+    }
+}
+
+#[test]
+fn actions_of_another_program_are_its_right_until_a_policy_of_ours_gives_some() {
+    let mut registry = registry(16);
+    registry.devices[0].action = Some(crate::registry::ActionSpec {
+        names: vec!["x".into()],
+        units: vec!["1".into()],
+        min: vec![0.0],
+        max: vec![1.0],
+    });
+    let bus = Bus::open(&registry, Some(&format!("busk{}", std::process::id()))).expect("bus");
+    let inbox = bus.inbox().expect("inbox");
+    let other = stranger(&bus, TopicId::Action);
+    give(&other, 1);
+    let taken = |inbox: &Inbox| sequences(inbox).into_iter().map(|(_, seq, _)| seq).collect::<Vec<_>>();
+    assert_eq!((taken(&inbox), foreign(&inbox)), (vec![1], vec![]));
+    let ours = bus.writer(TopicId::Action).expect("writer");
+    ours.publish(SampleHeader { seq: 2, ..SampleHeader::default() }, &[0; 8]).expect("publish");
+    assert_eq!((taken(&inbox), foreign(&inbox)), (vec![2], vec![]));
+    // The actuator carries it out: it is handed over all the same.
+    give(&other, 3);
+    let seen = foreign_after(&inbox, &[3]);
+    assert_eq!(seen, [("/action".to_owned(), std::process::id(), 1)]);
+}
+
+fn foreign_after(inbox: &Inbox, taken: &[u64]) -> Vec<(String, u32, u64)> {
+    assert_eq!(sequences(inbox).into_iter().map(|(_, seq, _)| seq).collect::<Vec<_>>(), taken);
+    foreign(inbox)
+}

@@ -1,5 +1,6 @@
 //! A topic's writer: one copy from the driver's buffer into shared memory.
 
+use iceoryx2::identifiers::UniquePublisherId;
 use iceoryx2::port::LoanError;
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::port::publisher::Publisher;
@@ -56,6 +57,11 @@ impl Writer {
             })
             .transpose()?;
         Ok(Self { topic: spec.name.clone(), max_bytes: spec.max_bytes, publisher, wake })
+    }
+
+    /// Names this writer in every sample it publishes.
+    pub(super) fn id(&self) -> UniquePublisherId {
+        self.publisher.id()
     }
 
     /// Publishes one sample and wakes the consumers.

@@ -134,6 +134,10 @@ impl Columns {
                 let word = pad(arming.word());
                 (device, Some(bit), if *is_problem { palette.warn(&word) } else { word }, text.clone())
             }
+            What::Publisher { .. } => {
+                let (level, text) = event.what.sentence().unwrap_or((Level::Warn, String::new()));
+                (&"bus".to_owned(), None, palette.level(level, &pad(level.word())), text)
+            }
             What::Log { level, text } => {
                 let word = palette.level(*level, &pad(level.word()));
                 (&"log".to_owned(), None, word, text.clone())

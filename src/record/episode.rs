@@ -12,6 +12,7 @@ use serde::Serialize;
 
 use super::RecordError;
 use super::lock::{self, Lock};
+use super::publishers::Publisher;
 use crate::folder::{Folder, FolderError, Links, Missing};
 use crate::status::Verdict;
 use crate::{text, time};
@@ -60,6 +61,15 @@ pub struct EpisodeReport {
     /// What it is worth.
     #[serde(flatten)]
     pub verdict: Verdict,
+}
+
+/// What the recorder knows of an episode, beside its samples, when its file is closed.
+#[derive(Default)]
+pub(super) struct Closing<'a> {
+    /// Why the episode is not whole although its file may be.
+    pub(super) reason: Option<String>,
+    /// Other programs that published on topics of ours.
+    pub(super) publishers: &'a [Publisher],
 }
 
 /// The folder of an episode's file, held open, and its two names in it; the file is locked until the

@@ -7,6 +7,7 @@ use serde_json::{Map, Value, json};
 
 use super::configuration::{self, Configuration};
 use super::provenance::Units;
+use super::publishers::{self, Publisher};
 use super::quality::{Quality, Spread};
 use crate::registry::{DeviceSpec, Registry, WhenStale};
 use crate::status::Verdict;
@@ -93,6 +94,8 @@ pub(super) struct Ending<'a> {
     pub(super) events_missed: u64,
     /// Publications of the mask lost.
     pub(super) masks_dropped: u64,
+    /// Other programs that published on topics of ours.
+    pub(super) publishers: &'a [Publisher],
     /// What each modality was like.
     pub(super) qualities: &'a [(&'a DeviceSpec, Quality)],
     /// Between the earliest and the latest sample of a frame.
@@ -113,7 +116,8 @@ pub(super) struct Ending<'a> {
 /// not. `verdict` is GOOD, SUSPECT or BAD. JSON: `reasons` `["..."]`, why it is not GOOD; `modalities`
 /// `{name: {samples, bytes, lost, dropped, damaged, ...}}`, the fields of [`Quality`]; `skew_ms` `{p50,
 /// p95, p99, max}` between the earliest and the latest sample of a frame, or null; `serials` and
-/// `provenance` as at the beginning, of whatever was attached or ran at some time; `policy` likewise.
+/// `provenance` as at the beginning, of whatever was attached or ran at some time; `policy` likewise;
+/// `publishers` `[{topic, process, command, samples}]` of other programs that published on our topics, absent if none did.
 pub(super) fn end(ending: &Ending<'_>) -> BTreeMap<String, String> {
     let modalities: Map<String, Value> =
         ending.qualities.iter().map(|(device, quality)| (device.name.clone(), json!(quality))).collect();
@@ -137,6 +141,8 @@ pub(super) fn end(ending: &Ending<'_>) -> BTreeMap<String, String> {
         ("provenance", ending.units.epochs(ending.begin).to_string()),
     ]);
     said.extend(ending.units.policy().map(|policy| (POLICY.to_owned(), policy.to_string())));
+    let others = (!ending.publishers.is_empty()).then(|| json!(ending.publishers).to_string());
+    said.extend(others.map(|others| (publishers::KEY.to_owned(), others)));
     said.extend(ending.cut_short.map(|reason| (CUT_SHORT.to_owned(), reason.to_owned())));
     said
 }

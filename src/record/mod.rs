@@ -22,6 +22,7 @@ mod lock;
 mod masks;
 mod metadata;
 mod provenance;
+mod publishers;
 mod quality;
 mod recorder;
 pub mod recover;

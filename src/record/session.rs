@@ -26,7 +26,7 @@ use super::announce::Announcer;
 use super::configuration::Configuration;
 use super::describe::describe;
 use super::encode::EventText;
-use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest};
+use super::episode::{Closing, EpisodePath, EpisodeReport, EpisodeRequest};
 use super::file::{EpisodeFile, Sink};
 use super::hole::Hole;
 use super::keep;
@@ -273,9 +273,9 @@ impl Session {
         self.failed = self.failed.take().or(ended.err());
     }
 
-    /// Writes what is left, ends the file and gives it its name. `reason` says why the episode is
-    /// not whole although its file may be.
-    pub(super) fn finish(mut self, now: Stamp, masks: &MaskHistory, reason: Option<String>) -> EpisodeReport {
+    /// Writes what is left, ends the file and gives it its name.
+    pub(super) fn finish(mut self, now: Stamp, masks: &MaskHistory, close: Closing<'_>) -> EpisodeReport {
+        let Closing { reason, publishers } = close;
         self.end_writeback();
         let end = self.end.unwrap_or(now).min(now).max(self.begin);
         let ticks = self.grid.ticks_before(end);
@@ -296,7 +296,7 @@ impl Session {
         let (masks_dropped, events_missed) = (self.masks_dropped, self.events_missed);
         let verdict = |file: FileState<'_>| {
             let losses = Losses::Apart;
-            judge(&Facts { modalities: &judged, masks_dropped, events_missed, seconds, losses, file })
+            judge(&Facts { modalities: &judged, masks_dropped, events_missed, publishers, seconds, losses, file })
         };
         let state = reason.as_deref().map_or(FileState::Whole, FileState::NotWhole);
         let ending = Ending {
@@ -305,6 +305,7 @@ impl Session {
             frames: self.next_tick,
             events_missed,
             masks_dropped,
+            publishers,
             qualities: &qualities,
             skew: self.measures.skew(),
             verdict: verdict(state),

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use crate::bus::{Inbox, TopicId};
+use crate::bus::{Foreign, Inbox, TopicId};
 use crate::sample::SampleHeader;
 
 /// A consumer's end of the bus.
@@ -18,6 +18,11 @@ pub trait Source: Send {
     /// # Errors
     /// When the bus cannot be read; the text says why.
     fn drain(&mut self, take: &mut dyn FnMut(TopicId, &SampleHeader, &[u8])) -> Result<(), String>;
+
+    /// Hands over who else has published on our topics since the last call; nobody, unless the source can say.
+    fn foreign(&mut self, take: &mut dyn FnMut(Foreign<'_>)) {
+        let _ = take;
+    }
 }
 
 impl Source for Inbox {
@@ -27,5 +32,9 @@ impl Source for Inbox {
 
     fn drain(&mut self, take: &mut dyn FnMut(TopicId, &SampleHeader, &[u8])) -> Result<(), String> {
         Self::drain(self, take).map_err(|error| error.to_string())
+    }
+
+    fn foreign(&mut self, take: &mut dyn FnMut(Foreign<'_>)) {
+        Self::foreign(self, take);
     }
 }

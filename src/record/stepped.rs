@@ -6,7 +6,7 @@
 use std::sync::Arc;
 
 use super::RecordError;
-use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest};
+use super::episode::{Closing, EpisodePath, EpisodeReport, EpisodeRequest};
 use super::file::Sink;
 use super::provenance::Attached;
 use super::session::{Beginning, Session};
@@ -87,6 +87,6 @@ impl Stepped {
     pub fn finish(&mut self, end: Stamp) -> Option<EpisodeReport> {
         let mut session = self.session.take()?;
         session.end_at(end);
-        Some(session.finish(end, &self.streams.masks, None))
+        Some(session.finish(end, &self.streams.masks, Closing::default()))
     }
 }

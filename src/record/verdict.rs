@@ -7,7 +7,8 @@
 //! 3. Nothing received from a modality that was there: BAD. So is an episode in which nothing at all
 //!    was received.
 //! 4. A file that is not whole is SUSPECT; one that the disk did not take is BAD.
-//! 5. Of two checks that one fault breaks, the one that names the fault is told: a frozen camera also
+//! 5. An episode in which another program published on a topic of ours is SUSPECT.
+//! 6. Of two checks that one fault breaks, the one that names the fault is told: a frozen camera also
 //!    repeats its pictures, a silent one also has a low rate.
 //!
 //! Invariant: pure.
@@ -17,6 +18,7 @@ mod tests;
 
 use std::time::Duration;
 
+use super::publishers::Publisher;
 use super::quality::Quality;
 use crate::registry::{Limits, VerdictSpec};
 use crate::status::{Grade, Verdict};
@@ -61,6 +63,8 @@ pub(super) struct Facts<'a> {
     pub(super) masks_dropped: u64,
     /// Events that are not in the file.
     pub(super) events_missed: u64,
+    /// Other programs that published on topics of ours.
+    pub(super) publishers: &'a [Publisher],
     /// Its length, seconds.
     pub(super) seconds: f64,
     /// Whether losses are told apart.
@@ -94,6 +98,7 @@ pub(super) fn judge(facts: &Facts<'_>) -> Verdict {
             found.push((Grade::Suspect, format!("{count} {what} are not in the file (limit 0)")));
         }
     }
+    found.extend(facts.publishers.iter().map(|publisher| (Grade::Suspect, publisher.reason())));
     // Stable: of one grade in the order above.
     found.sort_by_key(|(grade, _)| std::cmp::Reverse(*grade));
     let grade = found.first().map_or(Grade::Good, |(grade, _)| *grade);

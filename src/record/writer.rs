@@ -17,8 +17,9 @@ use tokio::sync::broadcast::{self, error::TryRecvError as EventError};
 use tokio::sync::{oneshot, watch};
 
 use super::RecordError;
-use super::episode::{EpisodePath, EpisodeReport, EpisodeRequest, PARTIAL};
+use super::episode::{Closing, EpisodePath, EpisodeReport, EpisodeRequest, PARTIAL};
 use super::provenance::Attached;
+use super::publishers::Publishers;
 use super::recorder::RecorderConfig;
 use super::session::{Beginning, Session};
 use super::source::Source;
@@ -60,6 +61,8 @@ pub(super) struct Writer {
     events: broadcast::Receiver<Event>,
     streams: Streams,
     attached: Attached,
+    /// Of the episode in progress, or of the time since the last one began.
+    publishers: Publishers,
     session: Option<Session>,
     /// Told of the session.
     episode: watch::Sender<Option<Arc<Episode>>>,
@@ -92,6 +95,7 @@ impl Writer {
             events,
             streams: Streams::new(),
             attached: Attached::default(),
+            publishers: Publishers::default(),
             session: None,
             episode,
             space: None,
@@ -141,6 +145,8 @@ impl Writer {
         if let Err(error) = drained {
             self.complain_about_bus(&error);
         }
+        let Self { publishers, config, .. } = self;
+        source.foreign(&mut |seen| publishers.note(seen).into_iter().for_each(|event| config.board.announce(event)));
         self.take_events();
         let open = self.take_orders();
         self.watch_clock(now);
@@ -233,6 +239,7 @@ impl Writer {
         self.config.board.set_recording(Some(session.status(begin)));
         self.config.board.announce(What::Recording { file: finished.clone() });
         self.session = Some(session);
+        self.publishers = Publishers::default();
         self.episode.send_replace(Some(Arc::new(Episode::new(&finished))));
         self.space = Some(space);
         (self.flushed, self.reported) = (begin, begin);
@@ -290,7 +297,8 @@ impl Writer {
     fn finish(&mut self, now: Stamp, reason: Option<String>) {
         let Some(session) = self.session.take() else { return };
         self.episode.send_replace(None);
-        let report = session.finish(now, &self.streams.masks, reason);
+        let closing = Closing { reason, publishers: self.publishers.list() };
+        let report = session.finish(now, &self.streams.masks, closing);
         if let Some(space) = self.space.take() {
             space.release();
         }

@@ -195,6 +195,15 @@ pub enum What {
         /// What happened, for people.
         text: String,
     },
+    /// Another program publishes on a topic of ours; once an episode for each topic and program.
+    Publisher {
+        /// The topic.
+        topic: String,
+        /// Its process.
+        process: u32,
+        /// The command line of the process.
+        command: String,
+    },
     /// A line of the log that has no event of its own.
     Log {
         /// Severity.
@@ -317,6 +326,10 @@ impl What {
             Self::Recovered { text, .. } => (Level::Warn, text.clone()),
             Self::Actuator { device, is_problem, text, .. } => {
                 (if *is_problem { Level::Warn } else { Level::Info }, format!("{device}: {text}"))
+            }
+            Self::Publisher { topic, process, command } => {
+                let text = format!("another program publishes on {topic}: process {process} ({command}); end it");
+                (Level::Warn, text)
             }
             Self::Log { level, text } => (*level, text.clone()),
         })

@@ -160,6 +160,11 @@ impl Collected {
                 3 => event.device = value.text(),
                 4 => event.text = value.text(),
                 5 if event.kind == "opened" && self.opened.len() < MAX_EVENTS => self.opened.push((at, value.text())),
+                5 if event.kind == "publisher" => {
+                    if let Some(judge) = &mut self.judge {
+                        judge.publisher(&value.text());
+                    }
+                }
                 5 if Gathered::takes(&event.kind) => self.policy.event(at, &event.kind, &value.text()),
                 _ => {}
             }

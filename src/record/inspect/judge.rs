@@ -9,6 +9,7 @@ use std::time::Duration;
 use serde_json::{Map, Value};
 
 use super::super::metadata::CUT_SHORT;
+use super::super::publishers::Publishers;
 use super::super::quality::{Frames, Measured, Measures, Seen, Spread};
 use super::super::session::SETTLE;
 use super::super::verdict::{Facts, FileState, Judged, Losses, judge};
@@ -49,6 +50,8 @@ pub(super) struct Judge {
     layout: BTreeMap<String, ModalityId>,
     /// Next number of each modality, and how many are missing.
     numbers: Vec<(Option<u32>, u64)>,
+    /// By the events of the file.
+    publishers: Publishers,
 }
 
 impl Judge {
@@ -71,7 +74,14 @@ impl Judge {
         let layout = objects(about, "layout")
             .filter_map(|(name, bit)| Some((name, ModalityId::new(u8::try_from(bit.as_u64()?).ok()?)?)));
         let layout = layout.collect();
-        let mut judge = Self { measures, begin_ns, limits, layout, numbers: vec![(None, 0); MAX_MODALITIES] };
+        let mut judge = Self {
+            measures,
+            begin_ns,
+            limits,
+            layout,
+            numbers: vec![(None, 0); MAX_MODALITIES],
+            publishers: Publishers::default(),
+        };
         for (device, _) in objects(about, "serials") {
             judge.plugged(&device, begin_ns, true);
         }
@@ -83,6 +93,11 @@ impl Judge {
         if let Some(id) = self.layout.get(device) {
             self.measures.plugged(*id, at_ns, there);
         }
+    }
+
+    /// Takes the event `publisher`, as JSON.
+    pub(super) fn publisher(&mut self, json: &str) {
+        self.publishers.event(json);
     }
 
     /// Takes the message of a sample.
@@ -174,7 +189,9 @@ impl Judge {
             })
             .collect();
         let said = |key: &str| ending.summary.get(key).and_then(|count| count.parse().ok()).unwrap_or(0);
+        let publishers = self.publishers.clone().or_summed_up(ending.summary);
         let facts = Facts {
+            publishers: publishers.list(),
             modalities: &judged,
             masks_dropped: said("masks_dropped"),
             events_missed: said("events_missed"),

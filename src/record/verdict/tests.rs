@@ -33,7 +33,15 @@ fn limits() -> VerdictSpec {
 
 /// Of an episode of ten seconds in which nothing went missing.
 fn facts<'a>(modalities: &'a [Judged<'a>], file: FileState<'a>) -> Facts<'a> {
-    Facts { modalities, masks_dropped: 0, events_missed: 0, seconds: 10.0, losses: Losses::Apart, file }
+    Facts {
+        modalities,
+        masks_dropped: 0,
+        events_missed: 0,
+        publishers: &[],
+        seconds: 10.0,
+        losses: Losses::Apart,
+        file,
+    }
 }
 
 fn verdict_on(quality: &Quality, file: FileState<'_>) -> Verdict {
@@ -143,7 +151,15 @@ fn a_device_that_is_plugged_in_and_does_not_run_is_missed_and_one_that_starts_is
         let modalities =
             [Judged { name: "cam", quality: &talks, limits }, Judged { name: "tof", quality: &quality, limits }];
         let (losses, file) = (Losses::Apart, FileState::Whole);
-        let said = judge(&Facts { modalities: &modalities, masks_dropped: 0, events_missed: 0, seconds, losses, file });
+        let said = judge(&Facts {
+            modalities: &modalities,
+            masks_dropped: 0,
+            events_missed: 0,
+            publishers: &[],
+            seconds,
+            losses,
+            file,
+        });
         (said.grade, said.why())
     };
     let never = |plugged| Quality { samples: 0, present: 0.0, plugged, opening: plugged, hz: None, ..good() };

@@ -1,0 +1,99 @@
+//! Other programs that published on topics of ours: which, and how many samples.
+//!
+//! A rig has one publisher a topic. On the topic of a modality or of the mask the samples of another are kept out of the
+//! episode ([`crate::bus::Inbox`]); on `/action`, while a policy runs, they are recorded, as the actuator carries them
+//! out. Either way the episode is SUSPECT, with the program as the reason: when a file is read, by the event
+//! `publisher`, and by the summary, which counts the samples.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use crate::bus::Foreign;
+use crate::status::What;
+use crate::text;
+
+/// Key of the metadata record at the end: JSON, a list of [`Publisher`].
+pub(super) const KEY: &str = "publishers";
+/// Programs kept apart: a program that is started over and over again must not fill the memory.
+const MOST: usize = 64;
+/// Characters of a command line that are kept.
+const COMMAND: usize = 200;
+
+/// A program that published on a topic of ours.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct Publisher {
+    /// The topic.
+    pub(super) topic: String,
+    /// Its process.
+    pub(super) process: u32,
+    /// Its command line.
+    pub(super) command: String,
+    /// Samples it published; 0 where nothing says.
+    #[serde(default)]
+    pub(super) samples: u64,
+}
+
+impl Publisher {
+    /// Why an episode is SUSPECT.
+    pub(super) fn reason(&self) -> String {
+        let Self { topic, process, command, samples } = self;
+        let count = match samples {
+            0 => String::new(),
+            1 => ", 1 sample".to_owned(),
+            samples => format!(", {samples} samples"),
+        };
+        format!("another program published on {topic}: process {process} ({command}){count}")
+    }
+}
+
+/// Those of an episode, or of the time without one.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Publishers(Vec<Publisher>);
+
+impl Publishers {
+    /// Counts samples. Gives the event of a program that was not known.
+    pub(super) fn note(&mut self, seen: Foreign<'_>) -> Option<What> {
+        let known = |known: &&mut Publisher| known.process == seen.process && known.topic == seen.topic;
+        if let Some(known) = self.0.iter_mut().find(known) {
+            known.samples = known.samples.saturating_add(seen.samples);
+            return None;
+        }
+        if self.0.len() == MOST {
+            return None;
+        }
+        let (topic, process, command) = (seen.topic.to_owned(), seen.process, command(seen.process));
+        let event = What::Publisher { topic: topic.clone(), process, command: command.clone() };
+        self.0.push(Publisher { topic, process, command, samples: seen.samples });
+        Some(event)
+    }
+
+    /// Takes the event `publisher` of a file, as JSON.
+    pub(super) fn event(&mut self, json: &str) {
+        if let Ok(publisher) = serde_json::from_str::<Publisher>(json)
+            && self.0.len() < MOST
+            && !self.0.iter().any(|known| known.process == publisher.process && known.topic == publisher.topic)
+        {
+            self.0.push(publisher);
+        }
+    }
+
+    /// Those that the summary of a file counts, or else those of its events.
+    pub(super) fn or_summed_up(self, summary: &BTreeMap<String, String>) -> Self {
+        let counted = summary.get(KEY).and_then(|json| serde_json::from_str(json).ok());
+        counted.map_or(self, Self)
+    }
+
+    /// The list.
+    pub(super) fn list(&self) -> &[Publisher] {
+        &self.0
+    }
+}
+
+/// The command line of a process, proc(5), for people.
+fn command(process: u32) -> String {
+    let words = std::fs::read(format!("/proc/{process}/cmdline")).unwrap_or_default();
+    let words = String::from_utf8_lossy(words.strip_suffix(b"\0").unwrap_or(&words)).replace('\0', " ");
+    let words: String = text::plain(&words).chars().take(COMMAND).collect();
+    if words.is_empty() { "ended".to_owned() } else { words }
+}
