@@ -10,8 +10,10 @@ export PATH := $(PATH):$(HOME)/.cargo/bin
 TARGET := $(or $(CARGO_TARGET_DIR),$(CURDIR)/target)
 CACHE := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/rapid
 DEMO_DIR := demo-episodes
-# A place of its own: otherwise it and the tests would wait for each other.
-CLIPPY := cargo clippy --locked --workspace --all-targets --target-dir '$(TARGET)/lint' -- -D warnings
+# Clippy's compiler builds what is tested: it makes the programs that rustc makes, and no dependency is compiled for the
+# lints alone. Both commands of `test` need the same environment: with another wrapper cargo builds the workspace again.
+LINTED := RUSTC_WORKSPACE_WRAPPER=clippy-driver CLIPPY_ARGS=-Dwarnings__CLIPPY_HACKERY__
+TESTS := RAPID_BIN='$(TARGET)/debug/rapid' RAPID_PYTHON='$(CACHE)/venv/bin/python' $(LINTED) cargo test --locked --workspace
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1|/p' Makefile | while IFS='|' read -r name what; do printf 'make %-12s %s\n' "$$name" "$$what"; done
@@ -26,25 +28,21 @@ demo: setup-build ## build, then the simulated rig: the monitor on a terminal, o
 	cargo build --release --locked
 	@if [ -t 0 ] && [ -t 1 ]; then exec '$(TARGET)/release/rapid' --sim; else scripts/demo.sh '$(TARGET)/release/rapid' $(DEMO_DIR); fi
 
-# `cargo test` builds the program as well, into this place: no build of its own goes before it. Clippy has the processor
-# when the tests, which mostly wait, leave it; what it finds is shown at the end.
-test: setup ## set up, format, all tests, lints
+# `cargo test` builds the program as well, into this place: no build of its own goes before it.
+test: setup ## set up, format, lints, all tests, and a look at what they left behind
 	cargo fmt --all --check
-	RAPID_BIN='$(TARGET)/debug/rapid' RAPID_PYTHON='$(CACHE)/venv/bin/python' cargo test --locked --workspace --no-run
-	@nice -n 19 $(CLIPPY) >'$(TARGET)/clippy.log' 2>&1 & clippy=$$!; \
-	RAPID_BIN='$(TARGET)/debug/rapid' RAPID_PYTHON='$(CACHE)/venv/bin/python' cargo test --locked --workspace --no-fail-fast && tested=0 || tested=$$?; \
-	wait $$clippy && linted=0 || linted=$$?; \
-	tail -n 40 '$(TARGET)/clippy.log'; exit $$((tested | linted))
+	$(TESTS) --no-run
+	scripts/leftovers.sh $(TESTS) --no-fail-fast
 
 lint: ## format and clippy
 	cargo fmt --all --check
-	$(CLIPPY)
+	cargo clippy --locked --workspace --all-targets -- -D warnings
 
 check: setup-build lint ## lints, documentation, licences, bans, sources and known vulnerabilities of the dependencies
 	RUSTDOCFLAGS='-D warnings' cargo doc --locked --workspace --no-deps
 	scripts/deny.sh
 
-bench: setup ## print figures beside their baselines (JSON=1; BENCH="--quick --only sync"); nothing passes or fails
+bench: setup ## print figures beside their baselines (JSON=1; BENCH="--quick --only sync"); fails if one is not measured
 	cargo build --release --locked --bin rapid --example unplug_latency
 	cargo build --release --locked -p vbench -p rapid-bench --bins
 	RAPID_BIN='$(TARGET)/release/rapid' '$(TARGET)/release/rapid-bench' $(if $(JSON),--json) $(BENCH)

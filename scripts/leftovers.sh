@@ -1,0 +1,40 @@
+#!/usr/bin/env bash
+# Runs a command and fails when it leaves something behind in /dev/shm or in the folder for temporary files.
+#
+#     leftovers.sh COMMAND...           leftovers.sh cargo test --workspace
+#
+# The command gets a TMPDIR of its own, in which nothing may be left. In /dev/shm and in /tmp/iceoryx2, which belong to all
+# programs, what counts are names of rapid and of its bus that were not there before and that no process has open or mapped.
+# What is left in TMPDIR is removed; the rest is named and stays. The exit code is the command's, or 1.
+set -euo pipefail
+[[ $# -ge 1 ]] || { echo "usage: leftovers.sh COMMAND..." >&2; exit 2; }
+
+# Files of ours in places that others use as well, one path a line.
+shared() { find /dev/shm /tmp/iceoryx2 \( -type f -o -type s -o -type p -o -type l \) \( -path '*/iox2_*' -o -name 'rapid*' -o -name 'test-*' \) 2>/dev/null | sort || true; }
+
+in_use() {
+    grep -qsF -- " $1" /proc/[0-9]*/maps && return 0
+    [[ -n $(find /proc/[0-9]*/fd -lname "$1" -print -quit 2>/dev/null) ]]
+}
+
+temporary=$(mktemp -d)
+readonly temporary
+# As /tmp is: tests that are two users enter it.
+chmod 1777 "$temporary"
+trap 'rm -rf "$temporary"' EXIT
+before=$(shared)
+
+code=0
+TMPDIR=$temporary "$@" || code=$?
+
+left=$(find "$temporary" -mindepth 1 -maxdepth 1 -printf '%p\n' | sort)
+while IFS= read -r path; do
+    if [[ -n $path && -e $path ]] && ! in_use "$path"; then left+=$'\n'$path; fi
+done < <(comm -13 <(printf '%s\n' "$before") <(shared))
+left=$(sed '/^$/d' <<<"$left")
+if [[ -n $left ]]; then
+    echo "left behind by: $*" >&2
+    sed 's/^/    /' <<<"$left" >&2
+    [[ $code != 0 ]] || code=1
+fi
+exit "$code"
