@@ -50,7 +50,7 @@ struct Run {
 }
 
 pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
-    let length = bench.choose(Duration::from_secs(10), Duration::from_secs(2));
+    let length = bench.length(10, 2);
     let (mut line, mut idle, mut socket, mut bare) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for run in 0..bench.runs {
         bench.progress(&format!("can: run {} of {}, {} s each", run + 1, bench.runs, length.as_secs()));

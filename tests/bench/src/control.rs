@@ -1,32 +1,29 @@
 //! How well a control loop keeps its grid while chunks are computed, against a bare thread at the same time.
 //!
-//! An action's header says when its tick was due (`capture_ns`) and when it was published (`recv_ns`).
+//! A recorded action says when its tick was due (`log_time`) and when it was published (`publish_time`).
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use rapid::bus::{Bus, TopicId};
-use rapid::registry::Registry;
-use rapid::time::Stamp;
+use rapid::time::{Stamp, realtime_ns};
 use serde_json::Value;
 
-use crate::beat::sleep_until;
+use crate::beat::{sleep, sleep_until};
 use crate::figure::Figure;
-use crate::load::kind;
+use crate::load::{self, kind};
 use crate::process::Running;
 use crate::stats::{Sorted, median};
-use crate::{Bench, Failure};
+use crate::{Bench, Failure, LIMIT};
 
 /// Ticks a second.
 const HZ: u32 = 30;
 /// More than usual: a chunk takes longer than a tick, and the next one is asked for as soon as it is there.
 const DENOISING_STEPS: &str = "25";
-const LIMIT: Duration = Duration::from_secs(30);
-/// The longest wait for what the bus brings.
-const WAIT: Duration = Duration::from_millis(20);
+/// The program's topic of actions.
+const ACTIONS: &str = "/action";
 
 /// What one run came to; times in ms.
 struct Run {
@@ -40,7 +37,7 @@ struct Run {
 }
 
 pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
-    let length = bench.choose(Duration::from_secs(20), Duration::from_secs(4));
+    let length = bench.length(20, 4);
     let folder = faster(bench)?;
     let mut runs = Vec::new();
     for run in 0..bench.runs {
@@ -86,47 +83,51 @@ fn faster(bench: &Bench) -> Result<PathBuf, Failure> {
     Ok(folder)
 }
 
-fn one(bench: &Bench, folder: &std::path::Path, length: Duration) -> Result<Run, Failure> {
+fn one(bench: &Bench, folder: &Path, length: Duration) -> Result<Run, Failure> {
+    let out = tempfile::Builder::new().prefix("control").tempdir_in(bench.scratch.path())?;
     let instance = format!("bench-control-{}", std::process::id());
     let mut command = Command::new(&bench.rapid);
     command.arg("--infer").arg(folder).args(["--denoising-steps", DENOISING_STEPS]);
-    command.args(["--sim", "task", "--headless", "--json", "--instance", &instance]);
+    command
+        .args(["--sim", "task", "--headless", "--json", "--instance", &instance, "--record", "--out"])
+        .arg(out.path());
     let mut program = Running::start(&mut command)?;
     program.wait_for(LIMIT, |line| kind(line).as_deref() == Some("act"))?;
 
-    let bus = Bus::open(&Registry::task(), Some(&instance))?;
-    let inbox = bus.inbox()?;
     let stop = Arc::new(AtomicBool::new(false));
     let bare = std::thread::spawn({
         let stop = Arc::clone(&stop);
         move || beat(&stop)
     });
-    // Number of the tick, and how late it was, ms.
-    let mut ticks: Vec<(u64, f64)> = Vec::new();
-    let begun = Instant::now();
-    while begun.elapsed() < length {
-        inbox.wait(WAIT)?;
-        inbox.drain(&mut |topic, header, _| {
-            if topic == TopicId::Action {
-                let late = Stamp(header.recv_ns).since(Stamp(header.capture_ns));
-                ticks.push((header.seq, late.as_secs_f64() * 1e3));
-            }
-        })?;
-    }
-    let seconds = begun.elapsed().as_secs_f64();
+    let begun = realtime_ns();
+    sleep(length);
+    let seconds = realtime_ns().saturating_sub(begun) as f64 / 1e9;
     stop.store(true, Ordering::Relaxed);
     let bare = bare.join().map_err(|_| "the bare thread panicked")?;
-    drop((inbox, bus));
     let usage = program.stop()?;
+    let ticks = ticks(&load::only_episode(out.path())?, begun)?;
     let (Some((first, _)), Some((last, _))) = (ticks.first(), ticks.last()) else {
-        return Err(format!("no action was published: {}", usage.output).into());
+        return Err(format!("no action was recorded: {}", usage.output).into());
     };
-    let missing = (last - first + 1).saturating_sub(ticks.len() as u64);
+    let missing = u64::from(last - first + 1).saturating_sub(ticks.len() as u64);
     let chunks: Vec<f64> = usage.output.lines().filter_map(latency_ms).collect();
     // Chunks are counted from the start of the loop, a little before the first tick seen here.
     let computing = (chunks.iter().sum::<f64>() / 10.0 / seconds).min(100.0);
     let late = Sorted::new(ticks.into_iter().map(|(_, late)| late));
     Ok(Run { late, bare: Sorted::new(bare), missing, chunks: chunks.len(), computing })
+}
+
+/// Number of each tick from `begun` (ns of the wall clock) on, and how late its action was published, ms.
+fn ticks(episode: &Path, begun: u64) -> Result<Vec<(u32, f64)>, Failure> {
+    let bytes = std::fs::read(episode)?;
+    let mut ticks = Vec::new();
+    for message in mcap::MessageStream::new(&bytes)? {
+        let message = message?;
+        if message.channel.topic == ACTIONS && message.log_time >= begun {
+            ticks.push((message.sequence, message.publish_time.saturating_sub(message.log_time) as f64 / 1e6));
+        }
+    }
+    Ok(ticks)
 }
 
 /// Wakes at every tick, and nothing else: how late each time, ms.

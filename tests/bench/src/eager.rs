@@ -7,7 +7,7 @@ use serde_json::Value;
 
 use crate::figure::Figure;
 use crate::stats::{Sorted, median};
-use crate::{Bench, Failure};
+use crate::{Absent, Bench, Failure};
 
 const SCRIPT: &str = "models/torch_latency.py";
 /// What makes the environment, and everything that is trained with it.
@@ -18,9 +18,10 @@ const REMEDY: &str = "`make train-test` makes it (5 GB)";
 pub(crate) fn figures(bench: &Bench, own: impl FnMut() -> Result<(Vec<f64>, Vec<f64>), Failure>) -> Vec<Figure> {
     const NAME: &str = "policy/PyTorch eager";
     let Some(python) = python() else {
-        return vec![Figure::missing(NAME, format!("there is no Python environment of the training: {REMEDY}"))];
+        let absent: Failure = Absent(format!("Python environment of the training: {REMEDY}")).into();
+        return vec![Figure::of_failure(NAME, &absent)];
     };
-    compare(bench, &python, own).unwrap_or_else(|error| vec![Figure::missing(NAME, error.to_string())])
+    compare(bench, &python, own).unwrap_or_else(|error| vec![Figure::of_failure(NAME, &error)])
 }
 
 /// One chunk of PyTorch, ms: the median by the wall, and by the processor's own time.

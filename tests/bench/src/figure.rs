@@ -1,11 +1,14 @@
 //! Figures: what was measured, beside its baseline and its target, as a table or as JSON.
 //!
-//! Invariant: a figure that could not be measured is shown with the reason; nothing here fails on a value.
+//! Invariant: a figure that could not be measured is shown with the reason, and says whether the machine lacks what it
+//! needs; nothing here fails on a value.
 
 use std::fmt::Write as _;
 
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
+
+use crate::{Absent, Failure};
 
 /// One figure; as JSON one object a line.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -29,18 +32,31 @@ pub(crate) struct Figure {
     /// Does the value meet the target? `None` without either.
     #[serde(default)]
     pub met: Option<bool>,
+    /// There is no value because the machine lacks what the note names.
+    #[serde(default)]
+    pub absent: bool,
 }
 
 impl Figure {
     /// A measured figure.
     pub(crate) fn new(name: impl Into<String>, unit: &str, value: Option<f64>) -> Self {
         let (name, unit) = (name.into(), unit.to_owned());
-        Self { name, unit, value, baseline: None, target: None, note: String::new(), met: None }
+        Self { name, unit, value, baseline: None, target: None, note: String::new(), met: None, absent: false }
     }
 
     /// A figure there is no value of.
     pub(crate) fn missing(name: impl Into<String>, why: impl Into<String>) -> Self {
         Self::new(name, "", None).note(why)
+    }
+
+    /// A figure there is no value of, as what was to measure it failed.
+    pub(crate) fn of_failure(name: impl Into<String>, why: &Failure) -> Self {
+        Self { absent: why.is::<Absent>(), ..Self::missing(name, why.to_string()) }
+    }
+
+    /// It has no value, and the machine is not the reason.
+    pub(crate) fn is_unmeasured(&self) -> bool {
+        self.value.is_none_or(f64::is_nan) && !self.absent
     }
 
     /// With its baseline.
@@ -73,6 +89,7 @@ impl Figure {
 
     fn verdict(&self) -> &'static str {
         match (self.value, self.met) {
+            (None, _) if self.absent => "not here",
             (None, _) => "not measured",
             (_, Some(true)) => "met",
             (_, Some(false)) => "MISSED",
@@ -197,5 +214,16 @@ load
       no /proc
 ";
         assert_eq!(table("load", &figures), expected);
+    }
+
+    #[test]
+    fn only_what_the_machine_lacks_may_go_unmeasured() {
+        let failed = |why: Failure| Figure::of_failure("a/all", &why);
+        assert!(failed("topic /rapid/arm: ExceedsMaxSupportedServers".into()).is_unmeasured());
+        assert!(Figure::new("a/b", "ms", None).is_unmeasured());
+        assert!(!Figure::new("a/b", "ms", Some(0.0)).is_unmeasured());
+        let absent = failed(Absent("KVM".to_owned()).into());
+        assert!(!absent.is_unmeasured());
+        assert_eq!((absent.verdict(), absent.note.as_str()), ("not here", "this machine has no KVM"));
     }
 }

@@ -29,7 +29,7 @@ const PERIOD: Duration = Duration::from_micros(16_667);
 const WARM_UP: Duration = Duration::from_millis(500);
 
 pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
-    let length = bench.choose(Duration::from_secs(10), Duration::from_secs(2));
+    let length = bench.length(10, 2);
     let (mut alone, mut bare, mut loaded) = (Vec::new(), Vec::new(), Vec::new());
     for run in 0..bench.runs {
         bench.progress(&format!("frame: run {} of {}", run + 1, bench.runs));

@@ -1,16 +1,14 @@
 //! From the start of the program to a policy that is loaded, and to its first action.
 
 use std::process::Command;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use crate::figure::Figure;
 use crate::load::kind;
 use crate::process::Running;
 use crate::start::{ms, to_mask};
 use crate::stats::Sorted;
-use crate::{Bench, Failure};
-
-const LIMIT: Duration = Duration::from_secs(30);
+use crate::{Bench, Failure, LIMIT};
 
 pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     let starts = bench.choose(20, 3);

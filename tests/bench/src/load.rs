@@ -4,7 +4,7 @@
 //! messages, and the simulated devices read by nobody but a loop.
 
 use std::ffi::OsString;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
@@ -110,6 +110,13 @@ pub(crate) fn kind(line: &str) -> Option<String> {
     Some(serde_json::from_str::<Value>(line).ok()?.get("event")?.as_str()?.to_owned())
 }
 
+/// The only episode of a folder.
+pub(crate) fn only_episode(folder: &Path) -> Result<PathBuf, Failure> {
+    let mut files = std::fs::read_dir(folder)?.flatten().map(|entry| entry.path());
+    let file = files.find(|path| path.extension().is_some_and(|extension| extension == "mcap"));
+    Ok(file.ok_or("rapid wrote no episode")?)
+}
+
 /// What `rapid inspect` says of an episode.
 pub(crate) struct Episode {
     /// Samples, masks included, that did not come from the driver into the file.
@@ -127,9 +134,7 @@ pub(crate) struct Episode {
 impl Episode {
     /// Reads the only episode of a folder.
     pub(crate) fn inspect(bench: &Bench, folder: &Path) -> Result<Self, Failure> {
-        let mut files = std::fs::read_dir(folder)?.flatten().map(|entry| entry.path());
-        let file = files.find(|path| path.extension().is_some_and(|extension| extension == "mcap"));
-        let file = file.ok_or("rapid wrote no episode")?;
+        let file = only_episode(folder)?;
         let output = Command::new(&bench.rapid).args(["--json", "inspect"]).arg(file).output()?;
         let said: Value = serde_json::from_slice(&output.stdout)?;
         let number = |value: &Value| value.as_f64().unwrap_or(0.0);

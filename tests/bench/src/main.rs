@@ -3,7 +3,8 @@
 //! One file a section; `stats` computes, `figure` shows, `process` starts and watches children. A section that cannot be
 //! measured says why and the next one follows.
 //!
-//! Invariant: no value makes the program fail; only wrong arguments do.
+//! Invariant: no value makes the program fail. Wrong arguments do, and so does a figure that was not measured for another
+//! reason than an environment that it names ([`Absent`]).
 
 mod beat;
 mod can;
@@ -41,7 +42,16 @@ use figure::Figure;
 /// What goes wrong in a section ends it, with its text as the reason.
 type Failure = Box<dyn std::error::Error>;
 
-/// Figures of rapid on this machine, each beside a baseline measured in the same run. Nothing passes or fails.
+/// The longest wait for something that the measured program does by itself: a watchdog, no figure.
+const LIMIT: Duration = Duration::from_mins(5);
+
+/// What a section needs and this machine lacks, with the remedy.
+#[derive(Debug, thiserror::Error)]
+#[error("this machine has no {0}")]
+struct Absent(String);
+
+/// Figures of rapid on this machine, each beside a baseline measured in the same run. No value passes or fails; a figure
+/// that could not be measured does fail, unless it names what the machine lacks.
 #[derive(Debug, Parser)]
 #[command(
     after_help = "Examples:\n  rapid-bench                     everything, some 30 minutes\n  rapid-bench --quick             \
@@ -55,6 +65,9 @@ struct Cli {
     /// Short runs, and few: the figures mean little
     #[arg(long)]
     quick: bool,
+    /// One run of a second or so of each measurement: shows that it measures, and the figures mean nothing
+    #[arg(long)]
+    smoke: bool,
     /// Only these sections
     #[arg(long, num_args = 1.., value_name = "SECTION")]
     only: Vec<Section>,
@@ -148,7 +161,7 @@ impl Section {
         }
     }
 
-    /// Trials in closed loop take a minute however few: of short runs only if they are named.
+    /// Trials in closed loop take a minute however few: of quick runs only if they are named.
     fn is_asked_for(self, cli: &Cli) -> bool {
         if cli.only.is_empty() { !(cli.quick && self == Self::Eval) } else { cli.only.contains(&self) }
     }
@@ -188,6 +201,7 @@ pub(crate) struct Bench {
     /// The policy's folder.
     bundle: PathBuf,
     quick: bool,
+    smoke: bool,
     runs: usize,
     load: Duration,
 }
@@ -207,15 +221,21 @@ impl Bench {
             programs,
             bundle: cli.bundle.clone(),
             scratch: tempfile::Builder::new().prefix("rapid-bench-").tempdir_in(scratch)?,
-            quick: cli.quick,
-            runs: cli.runs.unwrap_or(if cli.quick { 2 } else { 5 }).max(1),
-            load: Duration::from_secs(cli.load_seconds.unwrap_or(if cli.quick { 5 } else { 60 })),
+            quick: cli.quick || cli.smoke,
+            smoke: cli.smoke,
+            runs: cli.runs.unwrap_or(by_length(cli, 5, 2, 1)).max(1),
+            load: Duration::from_secs(cli.load_seconds.unwrap_or(by_length(cli, 60, 5, 1))),
         })
     }
 
     /// One of two, by the length of the runs asked for.
     fn choose<T>(&self, full: T, quick: T) -> T {
         if self.quick { quick } else { full }
+    }
+
+    /// Length of one measurement, from seconds of a full run and of a quick one.
+    fn length(&self, full: u64, quick: u64) -> Duration {
+        Duration::from_secs(if self.smoke { 1 } else { self.choose(full, quick) })
     }
 
     /// Tells on standard error how far a long measurement has come.
@@ -233,14 +253,27 @@ impl Bench {
     }
 }
 
+/// One of three, by the length of the runs asked for.
+fn by_length<T>(cli: &Cli, full: T, quick: T, smoke: T) -> T {
+    match (cli.smoke, cli.quick) {
+        (true, _) => smoke,
+        (false, true) => quick,
+        (false, false) => full,
+    }
+}
+
 fn main() -> ExitCode {
     let cli = Cli::parse();
     let done = match &cli.child {
-        Some(child) => child.run(),
+        Some(child) => child.run().map(|()| Vec::new()),
         None => run(&cli),
     };
     match done {
-        Ok(()) => ExitCode::SUCCESS,
+        Ok(unmeasured) if unmeasured.is_empty() => ExitCode::SUCCESS,
+        Ok(unmeasured) => {
+            let _ = writeln!(io::stderr(), "rapid-bench: not measured:\n  {}", unmeasured.join("\n  "));
+            ExitCode::FAILURE
+        }
         Err(error) => {
             let _ = writeln!(io::stderr(), "rapid-bench: {error}");
             ExitCode::FAILURE
@@ -248,24 +281,31 @@ fn main() -> ExitCode {
     }
 }
 
-fn run(cli: &Cli) -> Result<(), Failure> {
+/// Runs the sections; what was not measured and should have been, a line each.
+fn run(cli: &Cli) -> Result<Vec<String>, Failure> {
     let bench = Bench::new(cli)?;
     let sections: Vec<Section> = Section::ALL.into_iter().filter(|section| section.is_asked_for(cli)).collect();
     show(cli, "host", &host(&bench, "at the beginning"))?;
+    let mut unmeasured = Vec::new();
     for (place, section) in sections.iter().enumerate() {
         let name = section.name();
         bench.progress(&format!("{}/{} {name} ...", place + 1, sections.len()));
         let begun = Instant::now();
         let load = process::host_load(Duration::ZERO).map_or(0.0, |(average, _)| average);
         let figures = match section.measure(&bench) {
+            Ok(figures) if figures.is_empty() => vec![Figure::missing(format!("{name}/all"), "it gave no figures")],
             Ok(figures) => figures,
-            Err(error) => vec![Figure::missing(format!("{name}/all"), error.to_string())],
+            Err(error) => vec![Figure::of_failure(format!("{name}/all"), &error)],
         };
         bench.progress_done();
         let title = format!("{name}   ({:.0} s, load average before {load:.2})", begun.elapsed().as_secs_f64());
         show(cli, &title, &figures)?;
+        unmeasured.extend(figures.iter().filter(|figure| figure.is_unmeasured()).map(|figure| {
+            format!("{}: {}", figure.name, if figure.note.is_empty() { "it has no value" } else { &figure.note })
+        }));
     }
-    show(cli, "host", &host(&bench, "at the end"))
+    show(cli, "host", &host(&bench, "at the end"))?;
+    Ok(unmeasured)
 }
 
 fn show(cli: &Cli, title: &str, figures: &[Figure]) -> Result<(), Failure> {

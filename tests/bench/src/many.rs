@@ -35,7 +35,7 @@ struct Run {
 }
 
 pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
-    let (length, runs) = (bench.choose(20, 3), bench.choose(bench.runs.min(3), 1));
+    let (length, runs) = (bench.length(20, 3).as_secs(), bench.choose(bench.runs.min(3), 1));
     let none = (0..runs).map(|_| one(bench, 0, length)).collect::<Result<Vec<_>, _>>()?;
     let share = |runs: &[Run]| median(&runs.iter().map(|run| run.cpu).collect::<Vec<_>>());
     let idle = share(&none).unwrap_or_default();

@@ -14,12 +14,13 @@ use crate::beat::{self, Beat};
 use crate::figure::Figure;
 use crate::load;
 use crate::process::{Running, Usage};
+use crate::start::await_mask;
 use crate::stats::{Sorted, median, steps};
 use crate::{Bench, Failure};
 
 /// How often the reader looks: four times a period, so that it misses none unless it is held up itself.
 const LOOK: Duration = Duration::from_micros(500);
-/// After this time the program has started.
+/// From the first mask until the program has started.
 const SETTLE: Duration = Duration::from_secs(1);
 
 /// What a reader saw.
@@ -91,7 +92,7 @@ impl Seen {
 }
 
 pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
-    let length = bench.choose(Duration::from_secs(20), Duration::from_secs(2));
+    let length = bench.length(20, 2);
     let mut idle = Vec::new();
     for run in 0..bench.runs {
         bench.progress(&format!("mask, idle: run {} of {}, {} s each", run + 1, bench.runs, length.as_secs()));
@@ -100,6 +101,7 @@ pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
         command.args(["--headless", "--json", "--instance", &instance]);
         command.args(load::scenario(bench, "idle")?);
         let program = Running::start(&mut command)?;
+        await_mask(&mask_path(Some(&instance)))?;
         beat::sleep(SETTLE);
         let watch = Watch::start(&mask_path(Some(&instance)));
         let begun = Instant::now();

@@ -20,15 +20,13 @@ use self::adapter::{Adapter, spec};
 use crate::beat::sleep_until;
 use crate::figure::Figure;
 use crate::stats::{Sorted, median};
-use crate::{Bench, Failure};
+use crate::{Bench, Failure, LIMIT};
 
 const AXES: u16 = 6;
 const CYCLE: Duration = Duration::from_millis(5);
-/// An arm needs a few cycles.
-const ARMED_WITHIN: Duration = Duration::from_secs(5);
 
 pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
-    let length = bench.choose(Duration::from_secs(20), Duration::from_secs(4));
+    let length = bench.length(20, 4);
     let (mut runs, mut bare) = (Vec::new(), Vec::new());
     for run in 0..bench.runs {
         bench.progress(&format!("motors: run {} of {}, {} s each", run + 1, bench.runs, length.as_secs()));
@@ -77,7 +75,7 @@ fn drive(length: Duration) -> Result<Punctuality, Failure> {
         let begun = Instant::now();
         let mut ticks = tokio::time::interval(Duration::from_millis(100));
         motors.order(Order::Arm)?;
-        while begun.elapsed() < length + ARMED_WITHIN {
+        while begun.elapsed() < length + LIMIT {
             tokio::select! {
                 reading = motors.read() => drop(black_box(reading?.bytes.len())),
                 _ = ticks.tick() => {
@@ -85,7 +83,7 @@ fn drive(length: Duration) -> Result<Punctuality, Failure> {
                     motors.command(&[angle; AXES as usize], Stamp::now())?;
                 }
             }
-            if begun.elapsed() >= length && adapter.count("motor_enabled") > 0 {
+            if begun.elapsed() >= length && adapter.count("motor_enabled") >= usize::from(AXES) {
                 break;
             }
         }

@@ -5,9 +5,11 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
+use vbench::guest::{GuestError, Image};
+
 use crate::figure::{self, Figure};
 use crate::process::Running;
-use crate::{Bench, Failure};
+use crate::{Absent, Bench, Failure};
 
 /// A guest that boots, plugs and records takes minutes.
 const LIMIT: Duration = Duration::from_secs(1800);
@@ -16,33 +18,38 @@ const LIMIT: Duration = Duration::from_secs(1800);
 pub(crate) fn unplug(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     let unplugs = bench.choose("200", "20");
     let program = bench.programs.join("examples").join("unplug_latency");
-    Ok(run(bench, "unplug", &program, &[unplugs.into()], "cargo build --release --example unplug_latency"))
+    run(bench, &program, &[unplugs.into()], "cargo build --release --example unplug_latency")
 }
 
 /// Plugging and unplugging on the virtual bench.
 pub(crate) fn cycles(bench: &Bench) -> Result<Vec<Figure>, Failure> {
-    let cycles = bench.choose("50", "2");
-    Ok(vbench(bench, "cycles", "vbench-cycles", &[cycles.into()]))
+    let cycles = if bench.smoke { "1" } else { bench.choose("50", "2") };
+    vbench(bench, "vbench-cycles", &[cycles.into()])
 }
 
-/// Nine configurations, one after the other, on the virtual bench.
+/// Nine configurations, one after the other, on the virtual bench; the first of them to see that it works.
 pub(crate) fn sweep(bench: &Bench) -> Result<Vec<Figure>, Failure> {
-    Ok(vbench(bench, "sweep", "vbench-sweep", &[]))
+    let configurations = if bench.smoke { "1" } else { "9" };
+    vbench(bench, "vbench-sweep", &[configurations.into()])
 }
 
 /// A child process that does not listen, on the virtual bench.
 pub(crate) fn deaf(bench: &Bench) -> Result<Vec<Figure>, Failure> {
-    Ok(vbench(bench, "deaf", "vbench-deaf", &[]))
+    vbench(bench, "vbench-deaf", &[])
 }
 
-fn vbench(bench: &Bench, section: &str, name: &str, arguments: &[OsString]) -> Vec<Figure> {
-    run(bench, section, &bench.programs.join(name), arguments, "cargo build --release -p vbench --bins")
+fn vbench(bench: &Bench, name: &str, arguments: &[OsString]) -> Result<Vec<Figure>, Failure> {
+    match Image::locate() {
+        Err(error @ GuestError::NoImage(_)) => return Err(Absent(format!("guest image: {error}")).into()),
+        located => located?,
+    };
+    run(bench, &bench.programs.join(name), arguments, "cargo build --release -p vbench --bins")
 }
 
-fn run(bench: &Bench, section: &str, program: &Path, arguments: &[OsString], remedy: &str) -> Vec<Figure> {
-    let missing = |why: String| vec![Figure::missing(format!("{section}/all"), why)];
+fn run(bench: &Bench, program: &Path, arguments: &[OsString], remedy: &str) -> Result<Vec<Figure>, Failure> {
+    let name = program.file_name().unwrap_or_default().to_string_lossy();
     if !program.is_file() {
-        return missing(format!("{} is not there: {remedy}", program.display()));
+        return Err(format!("{} is not there: {remedy}", program.display()).into());
     }
     let begun = Instant::now();
     let mut told = 0;
@@ -50,24 +57,17 @@ fn run(bench: &Bench, section: &str, program: &Path, arguments: &[OsString], rem
         let seconds = begun.elapsed().as_secs();
         if seconds >= told + 10 {
             told = seconds;
-            bench.progress(&format!("{section}: {seconds} s"));
+            bench.progress(&format!("{name}: {seconds} s"));
         }
     };
     let rapid: PathBuf = bench.rapid.clone();
     let mut command = Command::new(program);
     command.arg("--json").args(arguments).env("RAPID_BIN", rapid);
-    let usage = match Running::start(&mut command).and_then(|running| running.finish(LIMIT, &mut progress)) {
-        Ok(usage) => usage,
-        Err(error) => return missing(error.to_string()),
-    };
+    let usage = Running::start(&mut command)?.finish(LIMIT, &mut progress)?;
     let figures = figure::read(&usage.output);
     if figures.is_empty() || !usage.success {
-        let name = program.file_name().unwrap_or_default().to_string_lossy();
-        return missing(format!(
-            "{name} --json gave {} figures and ended with success: {}",
-            figures.len(),
-            usage.success
-        ));
+        let (count, success) = (figures.len(), usage.success);
+        return Err(format!("{name} --json gave {count} figures and ended with success: {success}").into());
     }
-    figures
+    Ok(figures)
 }

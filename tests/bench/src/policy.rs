@@ -62,7 +62,7 @@ pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
         Figure::new("policy/observation to chunk, multiple of baseline", "x", ratio(&seen.answer)),
     ];
     figures.extend(eager::figures(bench, || subject.run(chunks / 2).map(|seen| (seen.sampler, seen.sampler_cpu))));
-    figures.push(heap::figure(bench).unwrap_or_else(|error| Figure::missing("policy/heap", error.to_string())));
+    figures.push(heap::figure(bench).unwrap_or_else(|error| Figure::of_failure("policy/heap", &error)));
     Ok(figures)
 }
 

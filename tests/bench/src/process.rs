@@ -18,7 +18,7 @@ use rustix::process::{Pid, Signal, WaitId, WaitIdOptions, kill_process, waitid};
 /// How often a child is looked at.
 const LOOK: Duration = Duration::from_millis(100);
 /// A child asked to end that does not is killed after this time.
-const END_LIMIT: Duration = Duration::from_secs(10);
+const END_LIMIT: Duration = Duration::from_mins(1);
 /// Length of a tick of `/proc/PID/stat`, s: USER_HZ is 100 on every Linux that `rapid` runs on.
 const TICK_S: f64 = 0.01;
 

@@ -1,5 +1,6 @@
 //! From the start of the program to the first mask, and the size of the program.
 
+use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
@@ -10,10 +11,8 @@ use crate::beat;
 use crate::figure::Figure;
 use crate::process::Running;
 use crate::stats::Sorted;
-use crate::{Bench, Failure};
+use crate::{Bench, Failure, LIMIT};
 
-/// Longest wait for the mask.
-const LIMIT: Duration = Duration::from_secs(10);
 /// Between two looks.
 const LOOK: Duration = Duration::from_micros(100);
 
@@ -52,15 +51,22 @@ pub(crate) fn to_mask(bench: &Bench, options: &[&str]) -> Result<f64, Failure> {
     command.args(options).args(["--headless", "--json", "--instance", &instance]);
     let begun = Instant::now();
     let program = Running::start(&mut command)?;
-    while !read_mask(&path).is_ok_and(|record| record.sequence >= 1) {
+    await_mask(&path)?;
+    let taken = ms(begun);
+    program.stop()?;
+    Ok(taken)
+}
+
+/// Waits until a mask is published at `path`.
+pub(crate) fn await_mask(path: &Path) -> Result<(), Failure> {
+    let begun = Instant::now();
+    while !read_mask(path).is_ok_and(|record| record.sequence >= 1) {
         if begun.elapsed() > LIMIT {
             return Err(format!("no mask within {LIMIT:?}").into());
         }
         beat::sleep(LOOK);
     }
-    let taken = ms(begun);
-    program.stop()?;
-    Ok(taken)
+    Ok(())
 }
 
 /// Time since then, ms.

@@ -31,7 +31,7 @@ const QUICK_SET_BYTES: usize = 16 << 20;
 
 pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     let feed = Feed::full_load()?;
-    let seconds = bench.choose(30, 5);
+    let seconds = bench.length(30, 5).as_secs();
     let (mut own, mut plain) = (Vec::new(), Vec::new());
     for run in 0..bench.runs {
         bench.progress(&format!("write: run {} of {}", run + 1, bench.runs));

@@ -4,6 +4,7 @@
 //! Invariant: spans of equal length are compared, of one guest: nothing happens, or one of the above.
 
 use crate::emu::spec::DeviceSpec;
+use crate::figure::Figure;
 use crate::outcome::Outcome;
 use crate::rhythm::Rhythm;
 use crate::scenario::Scenario;
@@ -15,9 +16,10 @@ const PROMPT_MS: u64 = 10_000;
 const DEAF_MS: u64 = 18_000;
 const CRASH_MS: u64 = 26_000;
 const FLOOD_MS: u64 = 34_000;
-/// The timeline begins some seconds after the recording. Between the first crash and the fifth are 7.5 s of waiting and
-/// four starts, which take seconds in the guest.
-const SECONDS: u32 = 75;
+/// Until the end of the last span.
+const SECONDS: u32 = 42;
+/// Between the first crash and the fifth are 7.5 s of waiting and four starts, which take seconds in the guest.
+const CRASHED: &str = r#"eval '[ "$(grep -c "crashes after 50 samples" $out/rapid.jsonl)" -ge 5 ]'"#;
 const REGISTRY: &str = r#"
 [rig]
 name = "vbench"
@@ -97,6 +99,7 @@ pub fn scenario() -> Scenario {
         .at(DEAF_MS, "unplug 1")
         .at(CRASH_MS, "plug 2")
         .at(FLOOD_MS, "plug 3")
+        .until(CRASHED)
 }
 
 /// The mask's rhythm in a span; `None` when the sampler saw nothing of it.
@@ -110,4 +113,25 @@ pub fn rhythm(outcome: &Outcome, span: Span) -> Option<Rhythm> {
     };
     let from = outcome.origins().first()?.mono_ns + offset * 1_000_000;
     Rhythm::between(outcome, from, from + SPAN_MS * 1_000_000)
+}
+
+/// The longest silence of the mask in each span, beside that of the idle one.
+pub fn figures(outcome: &Outcome) -> Vec<Figure> {
+    let idle = rhythm(outcome, Span::Idle).map(|rhythm| rhythm.longest_ms);
+    let spans = [
+        (Span::Idle, "mask_silence_idle", "longest silence of the mask in 7 s in which nothing happens"),
+        (Span::Prompt, "mask_silence_prompt_child", "in the 7 s after an unplug whose program ends on SIGTERM"),
+        (Span::Deaf, "mask_silence_deaf_child", "in the 7 s after an unplug whose program ignores SIGTERM"),
+        (Span::Crashing, "mask_silence_crashing_child", "in 7 s in which a program crashes again and again"),
+        (Span::Flooding, "mask_silence_flooding_child", "in 7 s in which a program floods its stderr"),
+    ];
+    let figure = |(span, name, note): (Span, &str, &str)| {
+        let rhythm = rhythm(outcome, span);
+        let pause = |rhythm: Rhythm| format!("; longest pause of the sampler {:.1} ms", rhythm.pause_ms);
+        let own = rhythm.map_or_else(String::new, pause);
+        let figure = Figure::new(name, "ms", rhythm.map(|rhythm| rhythm.longest_ms));
+        let figure = figure.baseline(idle.filter(|_| span != Span::Idle)).note(format!("{note}{own}"));
+        Figure { target: idle.filter(|_| span == Span::Deaf), ..figure }
+    };
+    spans.map(figure).to_vec()
 }

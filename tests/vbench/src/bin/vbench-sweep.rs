@@ -1,4 +1,5 @@
-//! `vbench-sweep [--json]`: the ablation of the paper's table, three fingers times three sets of modalities. First each is put
+//! `vbench-sweep [9|1] [--json]`: the ablation of the paper's table, three fingers times three sets of modalities, or the first
+//! of the nine configurations alone, which shows that it works. First each is put
 //! together by plugging while one `rapid` records, and nothing else is done; then each is recorded as an episode by the command
 //! that `rapid ablation` gives, until it says that none is missing. Gives the time that the software takes in each. A
 //! benchmark: it asserts nothing about its figures.
@@ -26,8 +27,8 @@ const MOTORS: &str = "/rapid/motors";
 const FINGERS: [&str; 3] = ["rigid", "finray", "silicone"];
 /// By their numbers in the emulator.
 const ENTRIES: [&str; 3] = ["cam_wrist", "motors", "tactile_tip"];
-/// As `rapid ablation` has them, the numbers of their devices, and their topics.
-const SETS: [(&str, &[usize], &[&str]); 3] = [
+/// As `rapid ablation` has them.
+const SETS: [Set; 3] = [
     ("vision", &[0], &[CAMERA]),
     ("vision+motors", &[0, 1], &[CAMERA, MOTORS]),
     ("vision+tactile", &[0, 2], &[CAMERA, TACTILE]),
@@ -40,20 +41,56 @@ motors = [{ name = "grip", slave = 0x05, master = 0x15, type = "DM4310", mode = 
 const SETTLE_S: u32 = 5;
 /// Between two configurations: longer than the cooldown of an entry, and less than any hand takes.
 const HANDS_S: u32 = 3;
-const USAGE: &str = "usage: vbench-sweep [--json]";
+const USAGE: &str = "usage: vbench-sweep [9|1] [--json]";
 
 type Failure = Box<dyn std::error::Error>;
 
-fn main() -> ExitCode {
-    let json = match std::env::args().nth(1).as_deref() {
-        None => false,
-        Some("--json") => true,
-        Some(_) => {
-            eprintln!("{USAGE}");
-            return ExitCode::from(2);
+/// Every finger with every set, in the order of `rapid ablation`: the sets of one finger follow one another.
+#[derive(Clone, Copy)]
+struct Plan {
+    fingers: &'static [&'static str],
+    sets: &'static [Set],
+    json: bool,
+}
+
+/// A set of modalities: its name for `rapid ablation`, the numbers of its devices, their topics.
+type Set = (&'static str, &'static [usize], &'static [&'static str]);
+
+impl Plan {
+    fn read(arguments: impl Iterator<Item = String>) -> Option<Self> {
+        let mut plan = Self { fingers: &FINGERS, sets: &SETS, json: false };
+        for word in arguments {
+            match word.as_str() {
+                "--json" => plan.json = true,
+                "9" => {}
+                "1" => plan = Self { fingers: &FINGERS[..1], sets: &SETS[..1], ..plan },
+                _ => return None,
+            }
         }
+        Some(plan)
+    }
+
+    fn configurations(&self) -> usize {
+        self.fingers.len() * self.sets.len()
+    }
+
+    /// The set of a configuration.
+    fn set(&self, place: usize) -> Set {
+        self.sets[place % self.sets.len()]
+    }
+
+    /// How often the configurations before this one had the device.
+    fn nth(&self, place: usize, device: usize) -> usize {
+        (0..place).filter(|before| self.set(*before).1.contains(&device)).count()
+    }
+}
+
+fn main() -> ExitCode {
+    let Some(plan) = Plan::read(std::env::args().skip(1)) else {
+        eprintln!("{USAGE}");
+        return ExitCode::from(2);
     };
-    match run(json) {
+    match run(plan) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("vbench-sweep: {error}");
@@ -62,13 +99,13 @@ fn main() -> ExitCode {
     }
 }
 
-fn run(json: bool) -> Result<(), Failure> {
-    let outcome = scenario().run()?;
+fn run(plan: Plan) -> Result<(), Failure> {
+    let outcome = scenario(plan).run()?;
     if outcome.code != 0 {
         return Err(outcome.diagnosis().into());
     }
-    let figures = figures(&outcome)?;
-    if json {
+    let figures = figures(plan, &outcome)?;
+    if plan.json {
         figures.iter().for_each(|figure| println!("{}", figure.json()));
         return Ok(());
     }
@@ -78,16 +115,16 @@ fn run(json: bool) -> Result<(), Failure> {
     Ok(())
 }
 
-fn scenario() -> Scenario {
+fn scenario(plan: Plan) -> Scenario {
     let mut registry = entries::registry(&[
         entries::camera(ENTRIES[0], CAMERA, 0, Some("CAM1"), (640, 480)),
         entries::can(ENTRIES[1], MOTORS, 1, "1d50:606f", "CAN1", BUS),
         entries::camera(ENTRIES[2], TACTILE, 2, Some("TAC1"), (320, 240)).replace("slot = \"top\"", "slot = \"tip\""),
     ]);
-    for finger in FINGERS {
+    for finger in plan.fingers {
         registry.push_str(&format!("\n[module.{finger}]\nslot = \"front\"\ntags = [\"finger={finger}\"]\n"));
     }
-    let sets: Vec<&str> = SETS.iter().map(|(set, ..)| *set).collect();
+    let sets: Vec<&str> = plan.sets.iter().map(|(set, ..)| *set).collect();
     let script = format!(
         r#"
 # apart DEVICE...: a configuration is taken apart, and a hand takes its time for the next.
@@ -138,10 +175,10 @@ exit 0
         cam = ENTRIES[0],
         motors = ENTRIES[1],
         tactile = ENTRIES[2],
-        calls = calls(),
-        fingers = FINGERS.join(","),
+        calls = calls(plan),
+        fingers = plan.fingers.join(","),
         sets = sets.join(","),
-        wanted = FINGERS.len() * SETS.len(),
+        wanted = plan.configurations(),
     );
     let camera =
         |serial, width, height| DeviceSpec::uvc(0x046d, 0x0825).serial(serial).mode(Format::Mjpg, width, height, &[30]);
@@ -155,14 +192,14 @@ exit 0
 }
 
 /// The part of the script that puts each configuration together once, the fingers outside.
-fn calls() -> String {
+fn calls(plan: Plan) -> String {
     let mut script = String::new();
-    for place in 0..FINGERS.len() * SETS.len() {
-        let (_, devices, _) = SETS[place % SETS.len()];
+    for place in 0..plan.configurations() {
+        let (_, devices, _) = plan.set(place);
         let numbers = devices.iter().map(ToString::to_string).collect::<Vec<_>>().join(" ");
         script.push_str(&format!("emu plug {numbers}\nsleep {SETTLE_S}\n"));
         for device in devices {
-            let (entry, nth) = (ENTRIES[*device], nth(place, *device) + 1);
+            let (entry, nth) = (ENTRIES[*device], plan.nth(place, *device) + 1);
             script.push_str(&format!("wait_for 60 states {nth} {entry} streaming || fail '{entry} does not stream'\n"));
         }
         script.push_str(&format!("apart {numbers}\n"));
@@ -170,39 +207,38 @@ fn calls() -> String {
     script
 }
 
-/// How often the configurations before this one had the device.
-fn nth(place: usize, device: usize) -> usize {
-    (0..place).filter(|before| SETS[before % SETS.len()].1.contains(&device)).count()
-}
-
-fn figures(outcome: &Outcome) -> Result<Vec<Figure>, Failure> {
-    let wanted = FINGERS.len() * SETS.len();
+fn figures(plan: Plan, outcome: &Outcome) -> Result<Vec<Figure>, Failure> {
+    let wanted = plan.configurations();
     let hot = outcome.episode()?;
     let nodes = nodes(outcome);
-    let hot = (0..wanted).map(|place| plugged(outcome, &hot, &nodes, place)).collect::<Result<Vec<Plugged>, _>>()?;
+    let hot =
+        (0..wanted).map(|place| plugged(plan, outcome, &hot, &nodes, place)).collect::<Result<Vec<Plugged>, _>>()?;
     let plug: Vec<f64> = hot.iter().map(|one| one.all_ms).collect();
     let system = Delays::of(hot.iter().map(|one| one.nodes_ms).collect());
     let files = episodes(outcome)?;
     if files.len() != wanted {
         return Err(format!("{} episodes of {wanted} configurations", files.len()).into());
     }
-    let start = files.iter().enumerate().map(|(place, file)| started(outcome, place, file));
+    let start = files.iter().enumerate().map(|(place, file)| started(plan, outcome, place, file));
     let start = start.collect::<Result<Vec<f64>, _>>()?;
     let done = json_lines(&outcome.file("plan.jsonl"));
     let done = done.iter().filter(|line| line["event"] == "configuration" && line["done"] == true).count();
-    let worst = |set: usize| plug.iter().skip(set).step_by(SETS.len()).copied().fold(0.0, f64::max);
+    let worst = |set: usize| plug.iter().skip(set).step_by(plan.sets.len()).copied().fold(0.0, f64::max);
     let total = (plug.iter().sum::<f64>() + start.iter().sum::<f64>()) / 1e3;
     let (plugs, starts) = (Delays::of(plug.clone()), Delays::of(start));
     let mut figures = vec![
-        Figure::new("sweep_plug_to_all_samples_p50", "ms", plugs.quantile(0.5)).baseline(system.quantile(0.5)).target(TARGET_MS).note(
-            "from the last plug of a configuration to the first recorded sample of its slowest modality, 9 configurations, \
+        Figure::new("sweep_plug_to_all_samples_p50", "ms", plugs.quantile(0.5))
+            .baseline(system.quantile(0.5))
+            .target(TARGET_MS)
+            .note(
+                "from the last plug of a configuration to the first recorded sample of its slowest modality, \
              one program throughout; baseline: until the guest's kernel and udev have made the last node",
-        ),
+            ),
         Figure::new("sweep_plug_to_all_samples_max", "ms", plugs.quantile(1.0))
             .baseline(system.quantile(1.0))
             .target(TARGET_MS),
     ];
-    for (place, (set, ..)) in SETS.iter().enumerate() {
+    for (place, (set, ..)) in plan.sets.iter().enumerate() {
         let name = format!("sweep_{}_max", set.replace('+', "_"));
         figures
             .push(Figure::new(name, "ms", Some(worst(place))).target(TARGET_MS).note("the slowest of three fingers"));
@@ -210,9 +246,9 @@ fn figures(outcome: &Outcome) -> Result<Vec<Figure>, Failure> {
     figures.extend([
         Figure::new("sweep_command_to_all_samples_p50", "ms", starts.quantile(0.5))
             .note("from the command that `rapid ablation` gives to the first recorded sample of the slowest modality"),
-        Figure::new("sweep_total", "s", Some(total)).target(45.0).note(format!("both, of all nine; {PAPER}")),
+        Figure::new("sweep_total", "s", Some(total)).target(45.0).note(format!("both, of all {wanted}; {PAPER}")),
         Figure::new("sweep_configurations_done", "", Some(done as f64))
-            .note("of 9, as `rapid ablation` counts them; devices.toml is the same before and after"),
+            .note(format!("of {wanted}, as `rapid ablation` counts them; devices.toml is the same before and after")),
     ]);
     Ok(figures)
 }
@@ -235,16 +271,25 @@ fn nodes(outcome: &Outcome) -> Vec<u64> {
     said.iter().filter(|line| is_ready(line)).filter_map(|line| line["real_ns"].as_u64()).collect()
 }
 
-fn plugged(outcome: &Outcome, episode: &Recording, nodes: &[u64], place: usize) -> Result<Plugged, Failure> {
-    let (set, devices, topics) = SETS[place % SETS.len()];
-    let plugs = devices.iter().filter_map(|device| outcome.actions("plug", *device).get(nth(place, *device)).copied());
-    let plug = plugs.map(|moment: Moment| moment.real_ns).max().ok_or("a plug is missing")?;
+fn plugged(
+    plan: Plan,
+    outcome: &Outcome,
+    episode: &Recording,
+    nodes: &[u64],
+    place: usize,
+) -> Result<Plugged, Failure> {
+    let (set, devices, topics) = plan.set(place);
+    let moments = |action: &str| -> Vec<u64> {
+        let nth = |device: &usize| outcome.actions(action, *device).get(plan.nth(place, *device)).copied();
+        devices.iter().filter_map(nth).map(|moment: Moment| moment.real_ns).collect()
+    };
+    let plug = moments("plug").into_iter().max().ok_or("a plug is missing")?;
     let first = |topic: &&str| {
         let received = episode.topic(topic).map(|message| message.publish_time);
         received.filter(|received| *received >= plug).min()
     };
-    // The next configuration is seconds away: what came after that is not of this one.
-    let limit = plug + u64::from(SETTLE_S) * 1_000_000_000;
+    // What came after it was taken apart is not of this one.
+    let limit = moments("unplug").into_iter().min().ok_or("an unplug is missing")?;
     let last = topics.iter().map(first).max().flatten().filter(|last| *last < limit);
     let all = topics.iter().all(|topic| first(topic).is_some());
     let last = last.filter(|_| all).ok_or_else(|| format!("configuration {place}, {set}: a modality sent nothing"))?;
@@ -254,13 +299,13 @@ fn plugged(outcome: &Outcome, episode: &Recording, nodes: &[u64], place: usize) 
 }
 
 /// From the command of an episode to the first sample of its slowest modality, ms.
-fn started(outcome: &Outcome, place: usize, file: &Path) -> Result<f64, Failure> {
+fn started(plan: Plan, outcome: &Outcome, place: usize, file: &Path) -> Result<f64, Failure> {
     let word = format!("command-{}", place + 1);
     let line = outcome.emu.iter().find(|line| line["action"] == "say" && line["word"] == word.as_str());
     let begun = line.and_then(|line| line["real_ns"].as_u64()).ok_or("a command is missing")?;
     let episode = Recording::open(file)?;
     let mut last = 0;
-    for topic in SETS[place % SETS.len()].2 {
+    for topic in plan.set(place).2 {
         let received = episode.topic(topic).map(|message| message.publish_time).min();
         last = last.max(received.ok_or_else(|| format!("{}: no sample of {topic}", file.display()))?);
     }
