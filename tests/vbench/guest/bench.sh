@@ -3,9 +3,14 @@
 set -u
 out=/tmp/bench/out
 
-# wait_for SECONDS COMMAND...: until the command succeeds.
+# Seconds after which a wait is given up, however few it names: a watchdog for what hangs. How fast anything comes is the
+# machine's affair and no scenario's.
+watchdog=300
+
+# wait_for SECONDS COMMAND...: until the command succeeds; SECONDS is what it may take on an idle machine.
 wait_for() {
-  local limit=$1 end=$((SECONDS + $1)); shift
+  local limit=$(($1 > watchdog ? $1 : watchdog)) end; shift
+  end=$((SECONDS + limit))
   until "$@" >/dev/null 2>&1; do
     [ $SECONDS -lt "$end" ] || { echo "bench: gave up after $limit s: $*"; return 1; }
     sleep 0.1
@@ -56,7 +61,8 @@ rapid_start() {
 
 # await_rapid SECONDS FRAGMENT...: until rapid has printed a line with all of them, or has ended without.
 await_rapid() {
-  local limit=$1 end=$((SECONDS + $1)); shift
+  local limit=$(($1 > watchdog ? $1 : watchdog)) end; shift
+  end=$((SECONDS + limit))
   until said "$out/rapid.jsonl" "$@"; do
     kill -0 "$rapid_pid" 2>/dev/null || { echo "bench: rapid ended before it said: $*"; rapid_wait; return 1; }
     [ $SECONDS -lt "$end" ] || { echo "bench: rapid did not say within $limit s: $*"; return 1; }

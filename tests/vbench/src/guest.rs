@@ -15,7 +15,7 @@ use thiserror::Error;
 
 const BUILD_SCRIPT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/image/build.sh");
 /// On top of the script's own limit: boot, copying, power off.
-const OVERHEAD: Duration = Duration::from_secs(90);
+const OVERHEAD: Duration = Duration::from_mins(5);
 /// `usbcore.autosuspend=-1`: resuming an emulated camera resets it, which can look like a replug.
 const KERNEL_ARGUMENTS: &str = "console=ttyS0 quiet loglevel=4 panic=-1 mitigations=off nokaslr audit=0 \
      random.trust_cpu=on no_timer_check tsc=reliable usbcore.autosuspend=-1";

@@ -21,6 +21,15 @@ pub enum EpisodeError {
     Recording(#[from] RecordingError),
 }
 
+/// What the emulator says of one stream of a camera.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Stream {
+    /// Frames that were sent whole.
+    pub sent: u64,
+    /// Beats at which none was sent: nobody read, or the machine was busy.
+    pub skipped: u64,
+}
+
 /// The end of a scenario. Its folder is deleted with it, unless a test is failing or `RAPID_VBENCH_KEEP` is set.
 #[derive(Debug)]
 pub struct Outcome {
@@ -64,6 +73,19 @@ impl Outcome {
     pub fn actions(&self, action: &str, device: usize) -> Vec<Moment> {
         let of_device = |line: &&Value| line["action"] == action && line["device"] == device;
         self.emu.iter().filter(of_device).filter_map(moment).collect()
+    }
+
+    /// Frames that a camera sent, and beats at which it sent none, in each of its streams that have ended.
+    pub fn streams(&self, device: usize) -> Vec<Stream> {
+        let of_device = |line: &&Value| line["device"] == device;
+        let lines: Vec<&Value> = self.emu.iter().filter(of_device).collect();
+        let edges = |action: &str| lines.iter().filter(|line| line["action"] == action).copied().collect::<Vec<_>>();
+        let number = |line: &Value, key: &str| line[key].as_u64().unwrap_or_default();
+        let stream = |(on, off): (&Value, &Value)| Stream {
+            sent: number(off, "sent") - number(on, "sent"),
+            skipped: number(off, "skipped") - number(on, "skipped"),
+        };
+        edges("stream_on").into_iter().zip(edges("stream_off")).map(stream).collect()
     }
 
     /// Each time the timeline's clock started.

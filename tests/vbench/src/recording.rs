@@ -2,14 +2,20 @@
 //!
 //! Invariant: reads the file with the public `mcap` crate and the documented schemas only, never with `rapid`'s own code.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeBounds;
 use std::path::{Path, PathBuf};
 
+use serde_json::Value;
 use thiserror::Error;
 
 use crate::emu::frame::{self, FrameId};
 use crate::proto;
+
+/// Topic of the mask.
+const MASKS: &str = "/rapid/mask";
+/// The metadata record that counts.
+const SUMMARY: &str = "rapid/summary";
 
 /// Why a recording could not be read.
 #[derive(Debug, Error)]
@@ -29,6 +35,8 @@ pub struct Recording {
     pub path: PathBuf,
     /// Its messages.
     pub messages: Vec<Message>,
+    /// Its metadata: a record's name, key and value.
+    pub metadata: BTreeMap<String, BTreeMap<String, String>>,
 }
 
 /// One message.
@@ -90,7 +98,29 @@ impl Recording {
                 data: message.data.into_owned(),
             });
         }
-        Ok(Self { path: path.into(), messages })
+        let mut metadata = BTreeMap::new();
+        for index in mcap::Summary::read(&bytes).map_err(bad)?.into_iter().flat_map(|summary| summary.metadata_indexes)
+        {
+            let record = mcap::read::metadata(&bytes, &index).map_err(bad)?;
+            metadata.insert(record.name, record.metadata);
+        }
+        Ok(Self { path: path.into(), messages, metadata })
+    }
+
+    /// Samples of a topic that `rapid` itself reports as lost: by the device's driver, or between driver and file. Masks, too.
+    pub fn reported_lost(&self, topic: &str) -> u64 {
+        let value = |record: &str, key: &str| self.metadata.get(record).and_then(|record| record.get(key));
+        let json = |record: &str, key: &str| -> Value {
+            value(record, key).and_then(|text| serde_json::from_str(text).ok()).unwrap_or_default()
+        };
+        if topic == MASKS {
+            return json(SUMMARY, "masks_dropped").as_u64().unwrap_or_default();
+        }
+        let modalities = json("rapid", "modalities");
+        let own = modalities.as_array().into_iter().flatten().find(|modality| modality["topic"] == topic);
+        let name = own.and_then(|modality| modality["name"].as_str()).unwrap_or_default();
+        let counted = &json(SUMMARY, "modalities")[name];
+        ["lost", "dropped"].iter().filter_map(|fault| counted[*fault].as_u64()).sum()
     }
 
     /// The messages of a topic.
@@ -126,7 +156,7 @@ impl Recording {
     /// Every change of a bit in `/rapid/mask` (`rapid.Mask`: mask is field 2), by time.
     pub fn mask_edges(&self) -> Vec<Edge> {
         let mut published: Vec<(u64, u64)> =
-            self.topic("/rapid/mask").map(|message| (message.log_time, proto::number(&message.data, 2))).collect();
+            self.topic(MASKS).map(|message| (message.log_time, proto::number(&message.data, 2))).collect();
         published.sort_unstable();
         let mut edges = Vec::new();
         for pair in published.windows(2) {
@@ -146,6 +176,16 @@ pub fn rises(edges: &[Edge], bit: u32) -> Vec<u64> {
 /// Times at which `bit` fell.
 pub fn falls(edges: &[Edge], bit: u32) -> Vec<u64> {
     edges.iter().filter(|edge| edge.bit == bit && !edge.rises).map(|edge| edge.log_time).collect()
+}
+
+/// How many numbers are missing between the first and the last, in whichever order they came; a number that is there twice
+/// is a panic.
+pub fn missing(numbers: impl IntoIterator<Item = u64>) -> u64 {
+    let mut numbers: Vec<u64> = numbers.into_iter().collect();
+    numbers.sort_unstable();
+    let holes = holes(numbers);
+    assert!(holes.iter().all(|(before, after)| before != after), "a number is there twice: {holes:?}");
+    holes.iter().map(|(before, after)| after - before - 1).sum()
 }
 
 /// Places where a sequence does not go up by exactly one, as (before, after).
@@ -180,7 +220,7 @@ mod tests {
     #[test]
     fn edges_are_found_bit_by_bit() {
         let messages = vec![mask(10, 0b01), mask(12, 0b01), mask(14, 0b10), mask(16, 0b10)];
-        let recording = Recording { path: PathBuf::new(), messages };
+        let recording = Recording { path: PathBuf::new(), messages, metadata: BTreeMap::new() };
         let expected = [Edge { bit: 0, rises: false, log_time: 14 }, Edge { bit: 1, rises: true, log_time: 14 }];
         assert_eq!(recording.mask_edges(), expected);
     }
@@ -189,5 +229,6 @@ mod tests {
     fn holes_are_jumps_and_repeats() {
         assert_eq!(holes([3, 4, 5]), []);
         assert_eq!(holes([3, 5, 5, 6]), [(3, 5), (5, 5)]);
+        assert_eq!(missing([5, 3, 4, 9]), 3);
     }
 }

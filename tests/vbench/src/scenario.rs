@@ -44,6 +44,7 @@ pub struct Scenario {
     files: Vec<(String, Vec<u8>)>,
     play: Play,
     timeline: Vec<(u64, String)>,
+    until: Vec<String>,
     watch_mask: bool,
     node_program: bool,
     action_program: bool,
@@ -68,10 +69,11 @@ impl Scenario {
             files: Vec::new(),
             play: Play::Script(String::new()),
             timeline: Vec::new(),
+            until: Vec::new(),
             watch_mask: false,
             node_program: false,
             action_program: false,
-            limit: Duration::from_secs(120),
+            limit: Duration::from_mins(10),
         }
     }
 
@@ -104,7 +106,8 @@ impl Scenario {
         self
     }
 
-    /// Runs `rapid` recording for this long; the timeline starts when these registry entries stream.
+    /// Runs `rapid` recording; the timeline starts when these registry entries stream, and so many seconds of it later the
+    /// recording ends, or when everything given to [`Scenario::until`] has come true, if that is later.
     #[must_use]
     pub fn record(mut self, seconds: u32, streaming: &[&str]) -> Self {
         self.play = Play::Record { seconds, streaming: streaming.iter().map(ToString::to_string).collect() };
@@ -115,6 +118,13 @@ impl Scenario {
     #[must_use]
     pub fn at(mut self, ms: u64, command: &str) -> Self {
         self.timeline.push((ms, command.into()));
+        self
+    }
+
+    /// The recording does not end before this is so: a condition in the words of `guest/bench.sh`.
+    #[must_use]
+    pub fn until(mut self, condition: &str) -> Self {
+        self.until.push(condition.into());
         self
     }
 
@@ -146,10 +156,10 @@ impl Scenario {
         self
     }
 
-    /// How long the guest's script may take.
+    /// How long the guest's script may take, at least: a watchdog, which ends what hangs.
     #[must_use]
     pub fn limit(mut self, limit: Duration) -> Self {
-        self.limit = limit;
+        self.limit = self.limit.max(limit);
         self
     }
 
@@ -215,9 +225,7 @@ impl Scenario {
                 if self.watch_mask {
                     line("\"${usbemu[@]}\" --watch-mask >$out/mask.jsonl & watch_pid=$!".into());
                 }
-                line(format!(
-                    "rapid_start --headless --record --duration {seconds}s --out $out/rec --config /tmp/bench/devices.toml --json"
-                ));
+                line("rapid_start --headless --record --out $out/rec --config /tmp/bench/devices.toml --json".into());
                 line(format!("await_rapid {READY_WITHIN_S} '\"event\":\"recording\"' || fail 'not recording'"));
                 for device in streaming {
                     line(format!(
@@ -229,7 +237,15 @@ impl Scenario {
                 for (ms, command) in &self.timeline {
                     line(format!("emu at {ms} {command}"));
                 }
-                line("rapid_wait\nemu_quit".into());
+                line(format!("emu at {}", u64::from(*seconds) * 1_000));
+                // The emulator takes as long as the timeline is.
+                line(format!("emu_done {}", seconds + READY_WITHIN_S));
+                for condition in &self.until {
+                    let why = words(&[format!("not so at the end: {condition}")]);
+                    line(format!("wait_for {READY_WITHIN_S} {condition} || fail {why}"));
+                }
+                // Of what came back in the last moment some is recorded as well.
+                line("sleep 1\nrapid_stop\nemu_quit".into());
                 if self.watch_mask {
                     line("kill $watch_pid".into());
                 }
@@ -277,12 +293,15 @@ mod tests {
             .spare(DeviceSpec::uvc(0x046d, 0x0825))
             .record(20, &["cam"])
             .at(5000, "plug 1")
+            .until("is streaming published cam")
             .guest_script(&["usbemu".into()], &["rapid".into()]);
         assert!(script.contains(r"serial=it'\''s"));
         assert!(script.contains("emu plug 0; wait_for 60 attached 3"));
         assert!(!script.contains("emu plug 1;"));
         let place = |text: &str| script.find(text).unwrap();
-        assert!(place("--duration 20s") < place("\"streaming\"") && place("\"streaming\"") < place("emu t0"));
-        assert!(place("emu t0") < place("emu at 5000 plug 1") && place("emu at 5000 plug 1") < place("rapid_wait"));
+        assert!(place("--record") < place("\"streaming\"") && place("\"streaming\"") < place("emu t0"));
+        assert!(place("emu t0") < place("emu at 5000 plug 1") && place("emu at 5000 plug 1") < place("emu at 20000"));
+        assert!(place("emu at 20000") < place("is streaming published cam"), "{script}");
+        assert!(place("is streaming published cam") < place("rapid_stop"), "{script}");
     }
 }

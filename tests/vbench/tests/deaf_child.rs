@@ -1,6 +1,6 @@
 //! Programs that ignore SIGTERM, crash or flood their stderr: the mask goes on as if nothing were.
 
-use vbench::deaf::{Span, rhythm, scenario};
+use vbench::deaf::{Span, figures, rhythm, scenario};
 use vbench::recording::falls;
 
 #[test]
@@ -13,6 +13,10 @@ fn programs_that_behave_badly_do_not_hold_up_the_mask() {
         let rhythm = rhythm(&outcome, span).expect("the sampler saw it");
         println!("{span:?}: {rhythm:?}");
         assert_eq!(rhythm.silent_tenths, 0, "{span:?}: {rhythm:?}");
+    }
+    // `make bench` measures by the same run.
+    for figure in figures(&outcome) {
+        assert!(figure.value.is_some(), "not measured: {figure}");
     }
     let edges = outcome.episode().unwrap_or_else(|error| panic!("{error}")).mask_edges();
     for (device, bit) in [(0, 0), (1, 1)] {
@@ -40,7 +44,7 @@ fn programs_that_behave_badly_do_not_hold_up_the_mask() {
         let states = outcome.rapid.iter().filter(of_it).filter_map(|line| line["state"].as_str());
         states.map(str::to_owned).collect::<Vec<_>>()
     };
-    // After the sixth it has failed, if the guest is fast enough.
+    // After the sixth it has failed, if the recording lasts as long.
     let mut crashes = ["opening", "streaming", "backoff"].repeat(6);
     crashes[17] = "failed";
     assert!(

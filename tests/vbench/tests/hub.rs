@@ -3,7 +3,7 @@
 //! `vhci_hcd` knows devices in ports of its root hub and none behind a hub of their own, so there is no emulated hub: all ports
 //! are emptied within a millisecond or so, which is what the kernel makes of a hub that left.
 
-use vbench::check::{assert_whole, episode, ms, only, recorded, rises_after};
+use vbench::check::{assert_accounted, assert_whole, episode, ms, only, recorded, rises_after};
 use vbench::emu::log::Moment;
 use vbench::emu::spec::{DeviceSpec, Format};
 use vbench::entries::{camera, registry, scalars};
@@ -39,7 +39,8 @@ fn a_pulled_hub_takes_all_bits_and_brings_them_back() {
             .at(4_000, "port 1 0")
             .at(4_000, "port 2 6")
             .at(4_000, "port 3 5")
-            .at(8_000, "hub in"),
+            .at(8_000, "hub in")
+            .until("is 0x0f published mask"),
     );
     let episode = episode(&outcome);
     let edges = episode.mask_edges();
@@ -98,25 +99,27 @@ fn a_pulled_hub_takes_all_bits_and_brings_them_back() {
                 numbers.collect::<Vec<_>>()
             };
             for numbers in [span(&|time| time < fell), span(&|time| time >= replugged)] {
-                println!("{name}: {} lines", numbers.len());
-                assert!(numbers.len() > 50, "{name}: only {} lines", numbers.len());
-                assert_eq!(holes(numbers), [], "{name}: a hole in the lines");
+                assert_accounted(&episode, topics[device], numbers);
             }
         }
     }
 
     // Nothing waited for anything: no tick and no publication of the mask is missing, the empty time included.
     let ticks: Vec<u64> = episode.topic("/rapid/frame").map(|message| proto::number(&message.data, 2)).collect();
-    assert!(ticks.len() > 300, "{} ticks in 20 s at 30 Hz", ticks.len());
+    assert!(!ticks.is_empty());
     assert_eq!(holes(ticks), [], "ticks are missing");
     let mut published: Vec<(u64, u64)> =
         episode.topic("/rapid/mask").map(|message| (proto::number(&message.data, 3), message.log_time)).collect();
     published.sort_unstable();
-    assert_eq!(holes(published.iter().map(|(sequence, _)| *sequence)), [], "publications of the mask are missing");
+    assert_accounted(&episode, "/rapid/mask", published.iter().map(|(sequence, _)| *sequence).collect());
     let empty_from = gone.iter().map(|(fell, _)| *fell).max().expect("four devices");
-    let while_empty = published.iter().filter(|(_, time)| (empty_from..back).contains(time)).count();
-    println!("{while_empty} masks published while nothing was plugged");
-    assert!(while_empty > 100, "only {while_empty} masks published while nothing was plugged");
+    // How often is the machine's affair; that it goes on through all of the time is not.
+    let quarter = (back - empty_from) / 4;
+    for begun in (0..4).map(|part| empty_from + part * quarter) {
+        let count = published.iter().filter(|(_, time)| (begun..begun + quarter).contains(time)).count();
+        println!("{count} masks published in {} ms while nothing was plugged", quarter / 1_000_000);
+        assert!(count > 0, "no mask for a quarter of the time in which nothing was plugged");
+    }
     for name in ["cam_wrist", "cam_side", "tof", "force"] {
         assert!(!outcome.states(name).contains(&"failed"), "{name}: {:?}", outcome.states(name));
     }

@@ -1,13 +1,13 @@
 //! `rapid` with devices behind USB network adapters: a GoPro that records by itself, a LiDAR whose packets are recorded.
 
 use serde_json::Value;
-use vbench::check::{episode, ms, play, rises_after};
+use vbench::check::{assert_accounted, episode, ms, play, rises_after};
 use vbench::emu::lan::{gopro, lidar};
 use vbench::emu::spec::DeviceSpec;
 use vbench::entries::{lan, registry};
 use vbench::outcome::Outcome;
 use vbench::proto;
-use vbench::recording::{Recording, falls, holes};
+use vbench::recording::{Recording, falls};
 use vbench::scenario::Scenario;
 
 const GOPRO: &str = "/rapid/gopro";
@@ -99,14 +99,12 @@ fn camera(outcome: &Outcome) {
 
 /// Every packet sent between the first and the last that were recorded is there; the bit follows the adapter.
 fn packets(outcome: &Outcome, episode: &Recording) {
-    let mut numbers: Vec<u64> = Vec::new();
+    let mut numbers: Vec<(u64, u64)> = Vec::new();
     for message in episode.topic(LIDAR) {
         let packet = proto::bytes(&message.data, 2);
-        numbers.push(lidar::number(packet).unwrap_or_else(|| panic!("{} bytes are no packet", packet.len())).into());
+        let number = lidar::number(packet).unwrap_or_else(|| panic!("{} bytes are no packet", packet.len()));
+        numbers.push((message.log_time, number.into()));
     }
-    numbers.sort_unstable();
-    println!("{} packets", numbers.len());
-    assert!(numbers.len() > 800, "{} packets", numbers.len());
     let edges = episode.mask_edges();
     let fell = falls(&edges, 1);
     let pulled = outcome.actions("unplug", 1)[0].real_ns;
@@ -133,7 +131,9 @@ fn packets(outcome: &Outcome, episode: &Recording) {
     assert_eq!(told.lines().filter(comes).count(), 3, "at the start, and with each return: {told}");
     assert!(!told.contains("\"state\":\"failed\""), "a cable that is out is no failure: {told}");
 
-    // What the adapter sends between the kernel's taking of it and the socket's opening is nobody's: a hole at each return.
-    let found = holes(numbers);
-    assert!(found.len() <= 2, "{found:?}");
+    // What the adapter sends between the kernel's taking of it and the socket's opening is nobody's: each stay by itself.
+    for (from, to) in [(0, pulled), (rose[0], down), (rose[1], u64::MAX)] {
+        let stay = numbers.iter().filter(|(time, _)| (from..to).contains(time)).map(|(_, number)| *number);
+        assert_accounted(episode, LIDAR, stay.collect());
+    }
 }

@@ -2,10 +2,10 @@
 //!
 //! Wall-clock times in a recording are compared with the emulator's: both run in one guest, on one clock.
 
-use vbench::check::{assert_whole, episode, ms, only, play, recorded, rises_after};
+use vbench::check::{assert_lines, assert_whole, episode, ms, only, play, recorded, rises_after};
 use vbench::emu::spec::{DeviceSpec, Format};
 use vbench::entries::{camera, registry, scalars};
-use vbench::recording::{falls, holes};
+use vbench::recording::{falls, missing};
 use vbench::scenario::Scenario;
 
 /// Two cameras of different formats and both serial kinds: nodes, udev properties, frames, and the way back.
@@ -23,7 +23,7 @@ done >$out/nodes
 "${usbemu[@]}" --read /dev/video2 45 >$out/yuyv.json
 for tty in ttyACM0 ttyUSB0; do
   stty -F /dev/$tty raw -echo
-  timeout 10 head -n 50 /dev/$tty >$out/$tty.csv
+  timeout 120 head -n 50 /dev/$tty >$out/$tty.csv
 done
 emu silent 0 1
 sleep 1
@@ -58,17 +58,26 @@ exit 0
     // A device without a serial descriptor has no short serial either.
     assert!(nodes.lines().any(|found| found == "video2  046d:0825 :capture:"), "{nodes}");
 
-    for (name, format, fps) in [("mjpg.json", "MJPG", 30.0), ("yuyv.json", "YUYV", 15.0), ("again.json", "MJPG", 30.0)]
-    {
+    // The second stream of the first camera is the silent one.
+    let (mjpg, yuyv) = (outcome.streams(0), outcome.streams(1));
+    for (name, format, fps, stream) in [
+        ("mjpg.json", "MJPG", 30.0, mjpg[0]),
+        ("yuyv.json", "YUYV", 15.0, yuyv[0]),
+        ("again.json", "MJPG", 30.0, mjpg[2]),
+    ] {
         let read: serde_json::Value = serde_json::from_str(&outcome.file(name)).unwrap();
-        println!("{name}: {read}");
+        println!("{name}: {read}, {stream:?}");
         assert_eq!(read["format"], format);
         assert_eq!([&read["damaged"], &read["holes"], &read["repeats"]], [0, 0, 0], "{read}");
-        // Never faster than asked; slower only on a machine too busy to tell anything.
-        let got = read["fps"].as_f64().unwrap();
-        assert!(got < fps * 1.2 && got > fps / 3.0, "{got} fps instead of {fps}");
+        // A frame is sent at its beat or within one after it; what a busy machine delays more is skipped and counted.
+        let beats = read["sent_in_ns"].as_f64().unwrap() * fps / 1e9;
+        let intervals = read["frames"].as_u64().unwrap() - 1;
+        assert!(intervals < stream.sent, "{stream:?}");
+        let most = (intervals + stream.skipped + 1) as f64;
+        assert!(beats > intervals as f64 - 1.0, "{intervals} frames within {beats} beats: faster than {fps} fps");
+        assert!(beats < most, "{intervals} frames took {beats} beats, of which {} were skipped", stream.skipped);
     }
-    assert!(outcome.file("silent.err").contains("no frame within 5 s"), "{}", outcome.file("silent.err"));
+    assert!(outcome.file("silent.err").contains("no frame within 15 s"), "{}", outcome.file("silent.err"));
 
     for tty in ["ttyACM0.csv", "ttyUSB0.csv"] {
         let text = outcome.file(tty);
@@ -76,7 +85,7 @@ exit 0
         let numbers: Vec<u64> =
             text.lines().skip(1).map(|line| line.split(',').next().unwrap().parse().unwrap()).collect();
         assert_eq!(numbers.len(), 49);
-        assert_eq!(holes(numbers), [], "{tty}");
+        assert_eq!(missing(numbers), 0, "{tty}");
     }
     assert_eq!(outcome.file("left"), "", "nodes outlived their devices");
     assert_eq!((outcome.actions("plug", 0).len(), outcome.actions("unplug", 0).len()), (2, 2));
@@ -103,7 +112,8 @@ fn unplugging_one_device_leaves_the_others_whole() {
             .registry(&registry)
             .record(20, &["cam_wrist", "cam_side", "tof"])
             .at(5_000, "unplug 1")
-            .at(9_000, "plug 1"),
+            .at(9_000, "plug 1")
+            .until("states 2 cam_side streaming"),
     );
     let episode = episode(&outcome);
     let edges = episode.mask_edges();
@@ -115,9 +125,7 @@ fn unplugging_one_device_leaves_the_others_whole() {
     assert_eq!(outcome.actions("stream_on", 0).len(), 1, "the wrist camera was started once");
     assert_eq!(outcome.actions("stream_off", 0).len(), 1, "the wrist camera was stopped once, at the end");
     assert_whole(&episode, WRIST, ..);
-    let rows: Vec<u64> = episode.rows(TOF).iter().map(|row| row[0] as u64).collect();
-    assert!(rows.len() > 500, "{} rows in 20 s at 100 Hz", rows.len());
-    assert_eq!(holes(rows), [], "the sensor's lines have a hole");
+    assert_lines(&episode, TOF);
 
     let fell = only(&falls(&edges, 1));
     assert!(fell >= unplugged, "the bit fell {} ms before the unplug", (unplugged - fell) / 1_000_000);
@@ -167,7 +175,8 @@ fn a_quick_replug_is_not_lost() {
             .at(3_300, "plug 0")
             .at(12_000, "unplug 0")
             .at(12_000, "port 0 5")
-            .at(12_300, "plug 0"),
+            .at(12_300, "plug 0")
+            .until("states 3 cam_wrist streaming"),
     );
     let episode = episode(&outcome);
     let edges = episode.mask_edges();
@@ -203,7 +212,9 @@ fn equal_units_keep_their_entries() {
             .registry(&registry)
             .record(20, &["cam_left", "cam_right"])
             .at(4_000, "unplug 1")
-            .at(8_000, "plug 1"),
+            .at(8_000, "plug 1")
+            // Which entry the unit has is not known here.
+            .until("is 0x03 published mask"),
     );
     let episode = episode(&outcome);
     let edges = episode.mask_edges();
@@ -236,7 +247,8 @@ fn silence_is_not_absence() {
             .registry(&registry(&[camera("cam_wrist", WRIST, 0, Some("CAM00A1"), (640, 480))]))
             .record(20, &["cam_wrist"])
             .at(4_000, "silent 0 1")
-            .at(9_000, "silent 0 0"),
+            .at(9_000, "silent 0 0")
+            .until("states 2 cam_wrist streaming"),
     );
     let episode = episode(&outcome);
     assert_eq!(falls(&episode.mask_edges(), 0), NONE, "silence cleared the bit");

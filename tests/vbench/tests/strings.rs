@@ -37,11 +37,12 @@ udevadm verify /etc/udev/rules.d/99-rapid.rules >$out/verify 2>&1; echo $? >$out
 for node in class/video4linux/video0 class/video4linux/video2 class/tty/ttyACM0; do
   udevadm test --action=add /sys/$node 2>&1 | grep 99-rapid
 done >$out/test
-rapid_start --headless --record --duration 5s --out $out/rec $config --json
+rapid_start --headless --record --out $out/rec $config --json
 for device in globs rule lines foreign; do
   await_rapid 60 '"event":"state"' "\"device\":\"$device\"" '"state":"streaming"' || fail "$device does not stream"
 done
-rapid_wait
+sleep 2
+rapid_stop
 test ! -e /tmp/owned || fail 'a command of a device was run'
 emu unplug 0
 wait_for 30 detached 0
@@ -158,7 +159,7 @@ fn recorded(outcome: &Outcome) {
     {
         let count = episode.topic(&format!("/rapid/{topic}")).count();
         println!("{topic}: {count} samples of {entry:?}");
-        assert!(count > 10, "{topic}: {count} samples in 5 s");
+        assert!(count > 0, "{topic}: no sample");
     }
     let bytes = std::fs::read(&episode.path).expect("the episode");
     let summary = mcap::Summary::read(&bytes).expect("an index").expect("a finished file has a summary");

@@ -137,7 +137,8 @@ impl Shared {
                 let after = state.function.live();
                 if before != after {
                     let action = if after.is_some() { "stream_on" } else { "stream_off" };
-                    self.log.say(action, Moment::now(), json!({"device": self.index}));
+                    let fields = json!({"device": self.index, "sent": state.sent, "skipped": state.skipped});
+                    self.log.say(action, Moment::now(), fields);
                 }
             }
             Request::Submit(Submit { seq, is_in: true, endpoint, length, .. }) => {

@@ -20,7 +20,7 @@ use super::order::Order;
 
 const VHCI: &str = "/sys/devices/platform/vhci_hcd.0";
 /// A port answers EBUSY until the kernel has finished with the device that left it.
-const PORT_FREE_WITHIN: Duration = Duration::from_secs(5);
+const PORT_FREE_WITHIN: Duration = Duration::from_mins(1);
 const HIGH_SPEED: u32 = 3;
 /// Room for a large frame, so that sending never waits for the kernel to fetch the first half.
 const SOCKET_BUFFER: usize = 1 << 20;
@@ -162,7 +162,7 @@ impl Device {
         let (state, timeout) = self
             .shared
             .changed
-            .wait_timeout_while(self.shared.lock(), Duration::from_secs(2), free)
+            .wait_timeout_while(self.shared.lock(), PORT_FREE_WITHIN, free)
             .unwrap_or_else(|poisoned| poisoned.into_inner());
         let epoch = state.epoch;
         drop(state);

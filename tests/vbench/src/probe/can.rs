@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 use rustix::net::addr::{SocketAddrArg, SocketAddrLen, SocketAddrOpaque};
+use rustix::net::sockopt::set_socket_recv_buffer_size_force;
 use rustix::net::{AddressFamily, Protocol, RecvFlags, SendFlags, SocketType, bind, recv, send, socket};
 use serde_json::{Value, json};
 
@@ -21,7 +22,10 @@ const CAN_FRAME: usize = 16;
 const ERROR: u32 = 1 << 29;
 const EXTENDED: u32 = 1 << 31;
 /// An answer comes within this, or there is none.
-const PATIENCE: Duration = Duration::from_secs(2);
+const PATIENCE: Duration = Duration::from_secs(6);
+
+/// For seconds of a full bus: a reader that is held up by a busy machine loses none.
+const ROOM: usize = 16 << 20;
 
 /// A raw socket on one interface.
 #[derive(Debug)]
@@ -53,6 +57,7 @@ impl Bus {
         // CAN_RAW; rustix does not name it.
         let raw = std::num::NonZeroU32::new(1).map(Protocol::from_raw);
         let socket = socket(AddressFamily::CAN, SocketType::RAW, raw)?;
+        set_socket_recv_buffer_size_force(&socket, ROOM)?;
         bind(&socket, &Address { family: AddressFamily::CAN.as_raw(), interface, _rest: [0; 4] })?;
         Ok(Self { socket })
     }

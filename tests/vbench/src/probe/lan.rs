@@ -4,18 +4,22 @@ use std::io::{self, ErrorKind};
 use std::net::UdpSocket;
 use std::time::Duration;
 
+use rustix::net::sockopt::set_socket_recv_buffer_size_force;
 use serde_json::Value;
 
 use super::tally::Tally;
 use crate::emu::lan::lidar;
 
+/// For seconds of packets: a reader that is held up by a busy machine loses none.
+const ROOM: usize = 16 << 20;
 /// Packets come more often than this, or there are none.
-const PATIENCE: Duration = Duration::from_secs(5);
+const PATIENCE: Duration = Duration::from_secs(30);
 
 /// Reads so many packets and counts them.
 pub fn count(port: u16, wanted: usize) -> io::Result<Value> {
     let socket = UdpSocket::bind(("0.0.0.0", port))?;
     socket.set_read_timeout(Some(PATIENCE))?;
+    set_socket_recv_buffer_size_force(&socket, ROOM)?;
     let mut tally = Tally::default();
     let mut bytes = [0; 2048];
     while tally.len() < wanted {

@@ -76,8 +76,8 @@ pub enum ReadError {
     /// A V4L2 call was refused.
     #[error("{0}: {1}")]
     Call(&'static str, #[source] Errno),
-    /// No frame for five seconds.
-    #[error("no frame within 5 s, after {0} frames")]
+    /// No frame for fifteen seconds.
+    #[error("no frame within 15 s, after {0} frames")]
     Silence(u32),
 }
 
@@ -141,8 +141,8 @@ struct Tally {
     bytes: usize,
     first: Option<u32>,
     last: Option<u32>,
-    first_ns: u64,
-    last_ns: u64,
+    first_sent_ns: u64,
+    last_sent_ns: u64,
     latency_ns: u64,
 }
 
@@ -161,17 +161,15 @@ impl Tally {
             Some(last) => self.holes += id.number - last - 1,
             None => {
                 self.first = Some(id.number);
-                self.first_ns = now_ns;
+                self.first_sent_ns = id.sent_ns;
             }
         }
         self.last = Some(id.number);
-        self.last_ns = now_ns;
+        self.last_sent_ns = id.sent_ns;
         self.latency_ns += now_ns.saturating_sub(id.sent_ns);
     }
 
     fn describe(&self, format: &Format) -> Value {
-        let seconds = (self.last_ns - self.first_ns) as f64 / 1e9;
-        let intervals = f64::from(self.frames.saturating_sub(1));
         json!({
             "format": String::from_utf8_lossy(&format.pixel_format.to_le_bytes()),
             "width": format.width,
@@ -183,7 +181,7 @@ impl Tally {
             "first": self.first,
             "last": self.last,
             "mean_bytes": self.bytes as u64 / u64::from(self.frames.max(1)),
-            "fps": if seconds > 0.0 { intervals / seconds } else { 0.0 },
+            "sent_in_ns": self.last_sent_ns - self.first_sent_ns,
             "mean_latency_ms": self.latency_ns as f64 / f64::from(self.frames.max(1)) / 1e6,
         })
     }
@@ -236,7 +234,7 @@ impl Camera {
     }
 
     fn next(&mut self, so_far: u32, take: impl FnOnce(&[u8]) -> ControlFlow<()>) -> Result<ControlFlow<()>, ReadError> {
-        let limit = Timespec { tv_sec: 5, tv_nsec: 0 };
+        let limit = Timespec { tv_sec: 15, tv_nsec: 0 };
         let ready = poll(&mut [PollFd::new(&self.node, PollFlags::IN)], Some(&limit));
         if ready.map_err(|e| ReadError::Call("poll", e))? == 0 {
             return Err(ReadError::Silence(so_far));
