@@ -24,7 +24,7 @@ use crate::sample::SampleHeader;
 pub use can::{
     CAN_BATCH, CAN_RECORD, CAN_RESTART_MS, CanAdapter, CanProtocol, CanSpec, MOTOR_CHANNELS, SLCAN_BITRATES,
 };
-pub use lan::{LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, Probe};
+pub use lan::{LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, Probe, own_side};
 pub use module::{ModuleError, ModuleSpec, mounted};
 pub use motors::{DamiaoSpec, MAX_MOTORS, MotorKind, MotorMode, MotorSpec};
 

@@ -6,7 +6,7 @@
 
 use serde::Serialize;
 use socketcan::CanInterface;
-use socketcan::nl::{CanState, InterfaceDetails};
+use socketcan::nl::{CanState, InterfaceDetails, NlError};
 
 use super::link::LinkError;
 use crate::registry::CAN_RESTART_MS;
@@ -119,7 +119,7 @@ fn read(details: &InterfaceDetails) -> Interface {
 /// The commands that do by hand what was not permitted.
 fn by_hand(name: &str, bitrate: u32, up: bool) -> String {
     let down = if up { format!("sudo ip link set {name} down && ") } else { String::new() };
-    format!("{down}sudo ip link set {name} up type can bitrate {bitrate} restart-ms {CAN_RESTART_MS}")
+    format!("{down}sudo ip link set {name} up type can bitrate {bitrate}")
 }
 
 fn not_set(name: &str, bitrate: u32, state: &Interface, error: &socketcan::Error) -> LinkError {
@@ -141,6 +141,12 @@ fn not_set(name: &str, bitrate: u32, state: &Interface, error: &socketcan::Error
         Some(libc::EINVAL | libc::ERANGE | libc::EDOM) => {
             LinkError::Fatal(format!("{is}: its controller cannot do {bitrate} bit/s ({error}): correct `bitrate`"))
         }
+        // socketcan 4.0 has this for every refusal of the kernel, whatever its reason.
+        _ if matches!(error, socketcan::Error::Nl(NlError::NoAck)) => LinkError::Retry(format!(
+            "{is}, and the kernel refuses to set it up at {bitrate} bit/s: only root may, and not every controller has \
+             every bit rate: run `rapid artifacts --install` once, whose udev rule does it at each plug; `{command}` \
+             says what is wrong"
+        )),
         _ => LinkError::Retry(format!("{is}, and setting it up failed: {error}")),
     }
 }
@@ -202,8 +208,12 @@ mod tests {
         let denied = socketcan::Error::from(std::io::Error::from_raw_os_error(libc::EPERM));
         let down = interface(false, None, CanState::Stopped, 0);
         let LinkError::Fatal(text) = not_set("can0", 1_000_000, &down, &denied) else { panic!("fatal") };
-        assert!(text.contains("`sudo ip link set can0 up type can bitrate 1000000 restart-ms 100`"), "{text}");
+        assert!(text.contains("`sudo ip link set can0 up type can bitrate 1000000`"), "{text}");
         assert!(text.contains("rapid artifacts --install"), "{text}");
+        // What the library makes of the kernel's refusals.
+        let refused = socketcan::Error::from(NlError::NoAck);
+        let LinkError::Retry(text) = not_set("can0", 1_000_000, &down, &refused) else { panic!("tried again") };
+        assert!(text.contains("rapid artifacts --install") && text.contains("`sudo ip link set can0 up"), "{text}");
         let other = interface(true, Some(500_000), CanState::ErrorActive, 0);
         let LinkError::Fatal(text) = not_set("can0", 1_000_000, &other, &denied) else { panic!("fatal") };
         assert!(text.contains("up at 500000 bit/s, not at 1000000"), "{text}");

@@ -11,7 +11,7 @@ use tokio::net::{TcpListener, TcpSocket, TcpStream};
 use tokio::time::timeout;
 
 use crate::driver::DriverError;
-use crate::registry::{DeviceNode, Heard};
+use crate::registry::{DeviceNode, Heard, own_side};
 
 /// A device on the same network answers within milliseconds.
 const CONNECT_LIMIT: Duration = Duration::from_secs(2);
@@ -100,16 +100,12 @@ impl Place {
 
     /// Listens at a port of ours, on the interface alone if there is one.
     pub(super) fn listen(&self, port: u16) -> Result<TcpListener, DriverError> {
-        let any = match self.peer() {
-            Some(peer) if peer.is_loopback() => peer,
-            Some(IpAddr::V6(_)) => IpAddr::from([0_u16; 8]),
-            _ => IpAddr::V4(Ipv4Addr::UNSPECIFIED),
-        };
+        let own = own_side(self.peer());
         let listen = || {
-            let socket = self.socket(any)?;
+            let socket = self.socket(own)?;
             // A connection that ended a moment ago still has the port.
             socket.set_reuseaddr(true)?;
-            socket.bind(SocketAddr::new(any, port))?;
+            socket.bind(SocketAddr::new(own, port))?;
             socket.listen(BACKLOG)
         };
         listen().map_err(|error| port_error(port, &error))

@@ -9,7 +9,7 @@
 
 use std::io;
 use std::mem::{size_of, zeroed};
-use std::net::{IpAddr, Ipv4Addr, Ipv6Addr};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::os::fd::{AsRawFd, FromRawFd, OwnedFd};
 use std::time::Duration;
 
@@ -20,6 +20,7 @@ use tokio::time::timeout;
 
 use super::place::{Place, port_error};
 use crate::driver::{DriverError, Reading};
+use crate::registry::own_side;
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
 use crate::time::{Stamp, realtime_ns};
 
@@ -151,8 +152,8 @@ fn stamp(kernel: Option<u64>, now: Stamp, wall: u64) -> (Stamp, u32) {
 }
 
 fn bind(place: &Place, port: u16) -> io::Result<OwnedFd> {
-    let is_v6 = matches!(place.peer(), Some(IpAddr::V6(_)));
-    let family = if is_v6 { libc::AF_INET6 } else { libc::AF_INET };
+    let own = SocketAddr::new(own_side(place.peer()), port);
+    let family = if own.is_ipv6() { libc::AF_INET6 } else { libc::AF_INET };
     let kind = libc::SOCK_DGRAM | libc::SOCK_NONBLOCK | libc::SOCK_CLOEXEC;
     // SAFETY: takes no pointers.
     let descriptor = unsafe { libc::socket(family, kind, 0) };
@@ -169,19 +170,23 @@ fn bind(place: &Place, port: u16) -> io::Result<OwnedFd> {
     }
     let port = port.to_be();
     #[expect(clippy::cast_possible_truncation, reason = "2 and 10")]
-    let (family_v4, family_v6) = (libc::AF_INET as libc::sa_family_t, libc::AF_INET6 as libc::sa_family_t);
-    let result = if is_v6 {
-        // SAFETY: all zeroes are a valid address.
-        let mut address: libc::sockaddr_in6 = unsafe { zeroed() };
-        (address.sin6_family, address.sin6_port) = (family_v6, port);
-        // SAFETY: a pointer to an address of this family and size, for the call.
-        unsafe { libc::bind(descriptor, (&raw const address).cast(), length_of::<libc::sockaddr_in6>()) }
-    } else {
-        // SAFETY: all zeroes are a valid address.
-        let mut address: libc::sockaddr_in = unsafe { zeroed() };
-        (address.sin_family, address.sin_port) = (family_v4, port);
-        // SAFETY: a pointer to an address of this family and size, for the call.
-        unsafe { libc::bind(descriptor, (&raw const address).cast(), length_of::<libc::sockaddr_in>()) }
+    let family = family as libc::sa_family_t;
+    let result = match own.ip() {
+        IpAddr::V6(own) => {
+            // SAFETY: all zeroes are a valid address.
+            let mut address: libc::sockaddr_in6 = unsafe { zeroed() };
+            (address.sin6_family, address.sin6_port, address.sin6_addr.s6_addr) = (family, port, own.octets());
+            // SAFETY: a pointer to an address of this family and size, for the call.
+            unsafe { libc::bind(descriptor, (&raw const address).cast(), length_of::<libc::sockaddr_in6>()) }
+        }
+        IpAddr::V4(own) => {
+            // SAFETY: all zeroes are a valid address.
+            let mut address: libc::sockaddr_in = unsafe { zeroed() };
+            (address.sin_family, address.sin_port) = (family, port);
+            address.sin_addr.s_addr = u32::from_ne_bytes(own.octets());
+            // SAFETY: a pointer to an address of this family and size, for the call.
+            unsafe { libc::bind(descriptor, (&raw const address).cast(), length_of::<libc::sockaddr_in>()) }
+        }
     };
     if result == 0 { Ok(socket) } else { Err(io::Error::last_os_error()) }
 }
@@ -262,7 +267,47 @@ fn address(from: &libc::sockaddr_storage) -> Option<IpAddr> {
 
 #[cfg(test)]
 mod tests {
+    use std::net::UdpSocket;
+
     use super::*;
+    use crate::registry::{DeviceNode, Heard};
+
+    /// Of UDP and of TCP.
+    #[tokio::test]
+    async fn a_socket_is_bound_to_what_the_entry_says() {
+        let (any, any_v6) = ([0; 4].into(), [0; 16].into());
+        for (host, expected) in [
+            ("127.0.0.1", None),
+            ("127.0.0.9", None),
+            ("::1", None),
+            // What they broadcast is to be heard as well.
+            ("192.0.2.201", Some(any)),
+            ("fd00::7", Some(any_v6)),
+        ] {
+            let host: IpAddr = host.parse().expect("an address");
+            let node = DeviceNode::Lan { address: SocketAddr::new(host, 2368), heard: Heard::default() };
+            let place = Place::new(&node, None).expect("a place");
+            let expected = expected.unwrap_or(host);
+            match bind(&place, 0) {
+                Ok(socket) => {
+                    assert_eq!(UdpSocket::from(socket).local_addr().expect("an address").ip(), expected, "{host}");
+                }
+                Err(error) => no_ipv6(host, &error),
+            }
+            match place.listen(0) {
+                Ok(listener) => {
+                    assert_eq!(listener.local_addr().expect("an address").ip(), expected, "{host}");
+                }
+                Err(error) => no_ipv6(host, &error),
+            }
+        }
+    }
+
+    /// A machine may be without it, a container often is.
+    fn no_ipv6(host: IpAddr, error: &dyn std::fmt::Display) {
+        assert!(host.is_ipv6() && UdpSocket::bind("[::1]:0").is_err(), "{host}: {error}");
+        println!("NOT CHECKED: {host}: this machine has no IPv6");
+    }
 
     #[test]
     fn the_kernels_time_becomes_ours_where_it_can_be_right() {

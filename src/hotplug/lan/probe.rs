@@ -14,7 +14,7 @@ use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
 
 use super::super::Witness;
 use super::watch::{LOOK_EVERY, Watch};
-use crate::registry::{Heard, Probe};
+use crate::registry::{Heard, Probe, own_side};
 use crate::time::Stamp;
 
 /// From one question to the next; also how long an answer may take.
@@ -93,9 +93,7 @@ async fn http(asked: SocketAddr) -> io::Result<Answer> {
 
 /// Hears a packet of the device at a port of ours, which is given back at once.
 async fn udp(asked: SocketAddr) -> io::Result<Answer> {
-    let any: SocketAddr =
-        if asked.is_ipv4() { ([0; 4], asked.port()).into() } else { ([0_u16; 8], asked.port()).into() };
-    let socket = UdpSocket::bind(any).await?;
+    let socket = UdpSocket::bind((own_side(Some(asked.ip())), asked.port())).await?;
     loop {
         let (_, from) = socket.recv_from(&mut [0; 1]).await?;
         if from.ip().to_canonical() == asked.ip().to_canonical() {

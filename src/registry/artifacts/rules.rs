@@ -96,12 +96,15 @@ fn rule(device: &DeviceSpec, usb: &UsbSpec, identity: &str) -> String {
     )
 }
 
-/// Brings up the CAN interface of a unit when it is plugged in.
+/// Brings up the CAN interface of a unit when it is plugged in. Not every driver returns from bus-off by itself, gs_usb
+/// among them: the kernels of today (seen with 6.1.192) refuse the whole command that asks for it ("Device doesn't
+/// support restart from Bus Off"). So that command is one of its own, and its failure leaves the other to be run.
 fn bring_up(usb: &UsbSpec, identity: &str, bitrate: u32) -> String {
     format!(
         "ACTION==\"add\", SUBSYSTEM==\"net\", ATTR{{type}}==\"{ARPHRD_CAN}\", ATTRS{{idVendor}}==\"{:04x}\", \
-         ATTRS{{idProduct}}==\"{:04x}\"{identity}, RUN+=\"/usr/sbin/ip link set dev $name up type can bitrate {bitrate} \
-         restart-ms {CAN_RESTART_MS}\"",
+         ATTRS{{idProduct}}==\"{:04x}\"{identity}, \
+         RUN+=\"/usr/sbin/ip link set dev $name type can restart-ms {CAN_RESTART_MS}\", \
+         RUN+=\"/usr/sbin/ip link set dev $name up type can bitrate {bitrate}\"",
         usb.vid, usb.pid,
     )
 }

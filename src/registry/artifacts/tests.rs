@@ -1,5 +1,6 @@
 use std::collections::BTreeSet;
 use std::path::Path;
+use std::process::Command;
 
 use proptest::prelude::*;
 use yaml_rust2::{Yaml, YamlLoader};
@@ -88,10 +89,11 @@ fn a_can_interface_is_brought_up_with_the_bit_rate_of_its_entry() {
         rule_lines(&rules),
         ["ACTION==\"add\", SUBSYSTEM==\"net\", ATTR{type}==\"280\", ATTRS{idVendor}==\"1d50\", \
           ATTRS{idProduct}==\"606f\", ATTRS{serial}==\"A '%k` $x\", \
-          RUN+=\"/usr/sbin/ip link set dev $name up type can bitrate 500000 restart-ms 100\""]
+          RUN+=\"/usr/sbin/ip link set dev $name type can restart-ms 100\", \
+          RUN+=\"/usr/sbin/ip link set dev $name up type can bitrate 500000\""]
     );
     let unit = text_of(&all, "rapid.service");
-    assert!(unit.contains("\nRestrictAddressFamilies=AF_UNIX AF_NETLINK AF_CAN\n"), "{unit}");
+    assert_eq!(families(&unit), ["AF_UNIX", "AF_NETLINK", "AF_CAN"], "{unit}");
     // An adapter that is a serial line is one like any other.
     let slcan = format!("{text}adapter = \"slcan\"\n");
     let line = text_of(&artifacts(&Registry::parse(&slcan, None).unwrap().registry), "99-rapid.rules");
@@ -113,6 +115,110 @@ fn the_service_may_open_usb_devices_only_where_a_program_does() {
         let user = format!("--groups {} rapid", groups.replace(' ', ","));
         assert!(lines.iter().any(|line| line.ends_with(&user)), "{unit}");
         assert_eq!(unit.contains("groupadd --system --force plugdev"), usb, "{unit}");
+    }
+}
+
+/// Entries of every kind that differs in what the service must be able to do: a name, the entry, and the kinds of
+/// sockets it needs besides those of udev and the journal.
+const KINDS: &[(&str, &str, &[&str])] = &[
+    ("camera", "vid = \"1\"\npid = \"1\"\nnode = \"camera\"", &[]),
+    ("serial", "vid = \"2\"\npid = \"1\"\nnode = \"serial\"\n[device.NAME.serial]\nchannels = 1", &[]),
+    ("program", "vid = \"3\"\npid = \"1\"\nnode = \"program\"", &[]),
+    ("hook", "vid = \"4\"\npid = \"1\"\nnode = \"camera\"\non_attach = [\"/bin/true\"]", &[]),
+    ("can", "vid = \"5\"\npid = \"1\"\nnode = \"can\"", &["AF_CAN"]),
+    ("slcan", "vid = \"6\"\npid = \"1\"\nnode = \"can\"\n[device.NAME.can]\nadapter = \"slcan\"", &[]),
+    ("gopro", "vid = \"7\"\npid = \"1\"\nnode = \"lan\"\n[device.NAME.lan]\nprotocol = \"gopro\"", &["AF_INET"]),
+    (
+        "adapter6",
+        "vid = \"8\"\npid = \"1\"\nnode = \"lan\"\n[device.NAME.lan]\nprotocol = \"mjpeg\"\nhost = \"fd00::8\"",
+        &["AF_INET6"],
+    ),
+    (
+        "lidar",
+        "node = \"lan\"\n[device.NAME.lan]\nprotocol = \"udp\"\nhost = \"192.168.1.201\"\nport = 2368",
+        &["AF_INET"],
+    ),
+    (
+        "web",
+        "node = \"lan\"\n[device.NAME.lan]\nprotocol = \"mjpeg\"\nhost = \"192.168.1.7\"\nprobe = \"http\"",
+        &["AF_INET"],
+    ),
+    ("v6", "node = \"lan\"\n[device.NAME.lan]\nprotocol = \"mjpeg\"\nhost = \"fd00::7\"", &["AF_INET6"]),
+    (
+        "phone",
+        "node = \"lan\"\n[device.NAME.lan]\nprotocol = \"iphone\"\nmdns = \"_iphonevio._tcp\"",
+        &["AF_INET", "AF_INET6"],
+    ),
+];
+
+/// A registry of the entries of these kinds.
+fn registry_of(kinds: &[&str]) -> Registry {
+    let entry = |(name, text, _): &(&str, &str, _)| format!("[device.{name}]\n{}\n", text.replace("NAME", name));
+    let wanted = KINDS.iter().filter(|(name, ..)| kinds.contains(name));
+    Registry::parse(&wanted.map(entry).collect::<String>(), None).expect("a registry").registry
+}
+
+/// The registries whose units differ: each kind alone, the usual rigs, and all kinds at once.
+fn rigs() -> Vec<Vec<&'static str>> {
+    let mut rigs: Vec<_> = KINDS.iter().map(|(name, ..)| vec![*name]).collect();
+    rigs.extend([vec!["camera", "can"], vec!["camera", "lidar"], vec!["camera", "can", "gopro", "phone"]]);
+    rigs.push(KINDS.iter().map(|(name, ..)| *name).collect());
+    rigs
+}
+
+fn families(unit: &str) -> Vec<String> {
+    let line = unit.lines().find_map(|line| line.strip_prefix("RestrictAddressFamilies=")).expect("the setting");
+    line.split(' ').map(str::to_owned).collect()
+}
+
+#[test]
+fn the_service_may_open_the_kinds_of_sockets_that_its_entries_need_and_no_others() {
+    for rig in rigs() {
+        let unit = text_of(&artifacts(&registry_of(&rig)), "rapid.service");
+        let needed = KINDS.iter().filter(|(name, ..)| rig.contains(name)).flat_map(|(.., needed)| *needed);
+        let expected: BTreeSet<&str> = needed.copied().chain(["AF_UNIX", "AF_NETLINK"]).collect();
+        let found = families(&unit);
+        assert_eq!(found.iter().map(String::as_str).collect::<BTreeSet<_>>(), expected, "{rig:?}");
+        assert_eq!(found.len(), expected.len(), "{rig:?}: {found:?}");
+        let is_network = expected.iter().any(|family| family.starts_with("AF_INET"));
+        assert_eq!(unit.contains("\nIPAddressDeny=any\n"), !is_network, "{rig:?}: {unit}");
+        // Interpreters and their like make code as they run; what we run ourselves does not.
+        let has_programs = rig.iter().any(|kind| ["program", "hook"].contains(kind));
+        assert_eq!(unit.contains("\nMemoryDenyWriteExecute=yes\n"), !has_programs, "{rig:?}: {unit}");
+    }
+}
+
+/// By `systemd-analyze security`: 0 is the best, 10 the worst. Reads the unit alone, no systemd has to run.
+#[test]
+fn the_exposure_of_every_unit_is_2_or_better() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("rapid.service");
+    for rig in rigs() {
+        std::fs::write(&path, text_of(&artifacts(&registry_of(&rig)), "rapid.service")).expect("written");
+        let judged = Command::new("systemd-analyze")
+            .args(["security", "--no-pager", "--offline=true", "--threshold=20"])
+            .arg(&path)
+            .output()
+            .expect("systemd-analyze is missing: run `make setup`");
+        let report = String::from_utf8_lossy(&judged.stdout);
+        let overall = report.lines().find_map(|line| line.split_once("Overall exposure level for rapid.service: "));
+        println!("exposure {} of {rig:?}", overall.map_or("?", |(_, figure)| figure));
+        let complaints: Vec<_> = report.lines().filter(|line| line.starts_with('\u{2717}')).collect();
+        let errors = String::from_utf8_lossy(&judged.stderr);
+        assert!(judged.status.success() && overall.is_some(), "{rig:?}: {errors}{complaints:#?}");
+        // An unknown setting or a misspelt value would be passed over with a warning.
+        assert_eq!(errors, "", "{rig:?}");
+    }
+}
+
+#[test]
+fn what_the_service_writes_is_for_its_group_to_read_and_for_nobody_else() {
+    for rig in rigs() {
+        let unit = text_of(&artifacts(&registry_of(&rig)), "rapid.service");
+        for setting in ["UMask=0027", "StateDirectoryMode=0750", "User=rapid"] {
+            assert!(unit.lines().any(|line| line == setting), "{setting} not in {unit}");
+        }
+        assert!(unit.contains("--user-group"), "the user's group is named after it: {unit}");
     }
 }
 

@@ -1,6 +1,6 @@
 //! `[device.NAME.lan]`: a device on the network, or behind a network adapter.
 
-use std::net::{IpAddr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::time::Duration;
 
 use crate::modality::ModalityKind;
@@ -118,6 +118,29 @@ impl LanFind {
     #[must_use]
     pub const fn is_adapter(&self) -> bool {
         matches!(self, Self::Adapter { .. })
+    }
+
+    /// Whether sockets of IPv4, and whether those of IPv6, are opened for such a device. Behind an adapter without a
+    /// `host` the addresses are IPv4; mDNS is spoken in both.
+    #[must_use]
+    pub const fn families(&self) -> [bool; 2] {
+        match self {
+            Self::Mdns { .. } => [true, true],
+            Self::Adapter { host: None } => [true, false],
+            Self::Adapter { host: Some(host) } | Self::Host { host, .. } => [host.is_ipv4(), host.is_ipv6()],
+        }
+    }
+}
+
+/// The address of ours at which a device at `peer` reaches us. One on this machine has a loopback address, and so has
+/// our side of it: nothing from outside gets there. Of any other it is every address: what a device broadcasts, as
+/// LiDARs do, is not heard at a single one.
+#[must_use]
+pub fn own_side(peer: Option<IpAddr>) -> IpAddr {
+    match peer {
+        Some(peer) if peer.to_canonical().is_loopback() => peer,
+        Some(IpAddr::V6(_)) => IpAddr::V6(Ipv6Addr::UNSPECIFIED),
+        Some(IpAddr::V4(_)) | None => IpAddr::V4(Ipv4Addr::UNSPECIFIED),
     }
 }
 

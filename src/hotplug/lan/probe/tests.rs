@@ -88,6 +88,22 @@ async fn packets_of_the_device_are_heard_and_the_port_is_given_back() {
 }
 
 #[tokio::test]
+async fn a_device_on_this_machine_is_not_listened_for_on_the_network() {
+    let asked = nobody();
+    let mut heard = Box::pin(ask(Probe::Udp, asked));
+    let is_held = || std::net::UdpSocket::bind(asked).is_err();
+    while !is_held() {
+        tokio::select! {
+            answer = &mut heard => panic!("{answer:?} although nothing is sent"),
+            () = sleep(Duration::from_millis(1)) => {}
+        }
+    }
+    let elsewhere = std::net::UdpSocket::bind((std::net::Ipv4Addr::new(127, 0, 0, 2), asked.port()));
+    assert!(elsewhere.is_ok(), "more than {asked} is bound: {elsewhere:?}");
+    drop(heard);
+}
+
+#[tokio::test]
 async fn a_refusal_says_nothing_while_the_driver_has_the_only_connection() {
     let listener = TcpListener::bind((LOCAL, 0)).await.expect("a port");
     let address = listener.local_addr().expect("an address");
