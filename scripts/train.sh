@@ -34,6 +34,8 @@ die() { printf 'train: %s\n' "$*" >&2; exit 1; }
 main() {
     local part="${1:-}" rapid
     rapid="$(realpath -m -- "${2:-target/release/rapid}")"
+    # What judges the episodes before they are learned from.
+    [[ $part = test ]] || export RAPID_BIN="${RAPID_BIN:-$rapid}"
     case "$part" in
         policy) environment; demonstrations "$rapid"; policy ;;
         ablation) environment; demonstrations "$rapid"; ablation "$rapid" ;;

@@ -485,6 +485,7 @@ fn verdict(run: &Run) {
     assert_eq!((&ended["verdict"], &ended["reasons"]), (&word.into(), &serde_json::json!(reasons)));
 
     let Inspection { verdict, recorded_verdict, modalities, .. } = &run.inspected;
+    let verdict = verdict.verdict().expect("an episode");
     assert_eq!((verdict.grade.word(), &verdict.reasons), (word, &reasons), "inspect says the same");
     assert_eq!(recorded_verdict.as_ref(), Some(verdict));
     let counted: Value = serde_json::from_str(run.episode.said("rapid/summary", "modalities")).expect("JSON");

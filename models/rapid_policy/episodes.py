@@ -21,6 +21,7 @@ from mcap.reader import make_reader
 from numpy.typing import NDArray
 from PIL import Image
 
+from .judgement import JudgementError, judge
 from .spec import Observation
 
 FRAMES = "/rapid/frame"
@@ -76,14 +77,18 @@ def episode_files(folder: Path) -> list[Path]:
 def read_episodes(
     files: Iterable[Path], observations: tuple[Observation, ...], actions: int
 ) -> tuple[list[Episode], list[str]]:
-    """All files that the recorder did not call BAD, and a line for each that it did."""
+    """All files that are GOOD or SUSPECT as they are now, and a line for each that is not."""
+    files = list(files)
+    try:
+        judged = judge(files)
+    except JudgementError as error:
+        raise EpisodeError(files[0].parent, str(error)) from error
     episodes, left_out = [], []
     for path in files:
-        episode = read_episode(path, observations, actions)
-        if episode.summary.get("verdict") == "BAD":
-            left_out.append(f"{path}: left out, the recorder calls it BAD: {episode.summary.get('reasons', '')}")
+        if judged[path].verdict in ("GOOD", "SUSPECT"):
+            episodes.append(read_episode(path, observations, actions))
         else:
-            episodes.append(episode)
+            left_out.append(f"{path}: left out, {judged[path]}")
     return episodes, left_out
 
 

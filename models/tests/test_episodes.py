@@ -75,6 +75,19 @@ class Recorded(unittest.TestCase):
         self.addCleanup(cut.unlink)
         with self.assertRaisesRegex(EpisodeError, "cut.mcap"):
             read_episodes([cut], self.spec.observations, 4)
+        # Its own record still says GOOD or SUSPECT; what is in it says BAD.
+        content = bytearray(self.path.read_bytes())
+        content[11] ^= 1
+        changed = self.folder / "changed.mcap"
+        changed.write_bytes(content)
+        self.addCleanup(changed.unlink)
+        foreign = self.folder / "foreign.mcap"
+        foreign.write_bytes(b"no episode")
+        self.addCleanup(foreign.unlink)
+        episodes, left_out = read_episodes([self.path, changed, foreign], self.spec.observations, 4)
+        self.assertEqual([e.path for e in episodes], [self.path])
+        self.assertRegex(left_out[0], "changed.mcap: left out, BAD: ")
+        self.assertRegex(left_out[1], "foreign.mcap: left out, no verdict: not an MCAP file")
         wrist, tactile, arm = self.spec.observations
         for wrong, message in (
             (replace(wrist, modality="cam_head"), "cam_head"),

@@ -11,9 +11,9 @@ use std::path::{Path, PathBuf};
 use serde_json::json;
 
 use self::plan::{Configuration, Recorded, Refused, configurations, next_command};
-use super::Format;
+use super::{Format, episodes};
 use crate::cli::AblationArgs;
-use crate::record::inspect::{InspectError, brief, episodes};
+use crate::record::inspect::{self, InspectError, Inspection};
 use crate::registry::ablation::AblationPlan;
 use crate::registry::{Registry, RegistryErrors};
 use crate::text;
@@ -116,21 +116,27 @@ fn plan_of(args: &AblationArgs) -> Result<AblationPlan, AblationError> {
     if plan.fingers.is_empty() || plan.modalities.is_empty() { Err(AblationError::NoPlan) } else { Ok(plan) }
 }
 
-/// What the episodes of a folder say of themselves, and how many cannot be read.
+/// What the episodes of a folder are, and how many files cannot be read.
 fn recorded(folder: &Path) -> Result<(Vec<Recorded>, usize), InspectError> {
     if !folder.exists() {
         return Ok((Vec::new(), 0));
     }
-    let files: Vec<PathBuf> = episodes(&[folder.to_owned()])?;
+    let files: Vec<PathBuf> = inspect::episodes(&[folder.to_owned()])?;
     let mut unreadable = 0;
     let mut found = Vec::new();
-    for file in files {
-        match brief(&file) {
-            Ok(said) => found.push(said),
+    episodes::each(&files, inspect::inspect, |_, inspected| {
+        match inspected {
+            Ok(episode) => found.push(of(episode)),
             Err(_) => unreadable += 1,
         }
-    }
+        Ok::<_, InspectError>(())
+    })?;
     Ok((found, unreadable))
+}
+
+fn of(episode: Inspection) -> Recorded {
+    let Inspection { task, tags, present_at_begin, verdict, .. } = episode;
+    Recorded { task, tags, present: present_at_begin, grade: verdict.grade() }
 }
 
 fn write_text(

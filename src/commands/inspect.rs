@@ -1,10 +1,11 @@
 //! `rapid inspect`: a report on one episode, or a line for each of many.
 
+use std::collections::BTreeSet;
 use std::io::{self, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use super::{Format, Outcome};
-use crate::record::inspect::{self, InspectError, Paint};
+use super::{Format, Outcome, episodes};
+use crate::record::inspect::{self, InspectError, Judgement, Paint};
 use crate::text;
 
 /// Why there is no report.
@@ -18,8 +19,8 @@ pub enum InspectFailure {
     Output(#[from] io::Error),
 }
 
-/// Tells of the episodes at `paths`. In a list, a file that cannot be read has a line like the others;
-/// then the outcome is not [`Outcome::Done`].
+/// Reports on the episodes at `paths`. In a list, a file that cannot be read has a line like the others;
+/// then the outcome is not [`Outcome::Done`]. One that is not an episode of rapid is no error.
 ///
 /// # Errors
 /// When the only file named cannot be read, or nothing can be written to `out`.
@@ -45,21 +46,40 @@ pub fn inspect(
         let places: Vec<_> = paths.iter().map(|path| path.display().to_string()).collect();
         writeln!(out, "no episodes in {}", text::plain(&places.join(", ")))?;
     }
-    let width = |file: &PathBuf| text::width(&file.file_name().unwrap_or_default().to_string_lossy());
-    let name = files.iter().map(width).max().unwrap_or(0);
+    // Files of several folders may have one name.
+    let folders: BTreeSet<Option<&Path>> = files.iter().map(|file| file.parent()).collect();
+    let names = if folders.len() > 1 { Names::Paths } else { Names::Files };
+    let name = files.iter().map(|file| text::width(&names.of(file))).max().unwrap_or(0);
     let mut outcome = Outcome::Done;
-    for file in &files {
-        // One after the other: a line is there as soon as its file has been read.
-        let listed = inspect::list(file);
-        if listed.verdict.is_none() {
+    episodes::each(&files, inspect::list, |file, listed| {
+        if matches!(listed.verdict, Judgement::Unreadable(_)) {
             outcome = Outcome::BadConfiguration;
         }
         match format {
-            Format::Json => write_json(out, &listed)?,
-            Format::Text => writeln!(out, "{}", inspect::render_list(&listed, name, paint))?,
+            Format::Json => write_json(out, &listed),
+            Format::Text => writeln!(out, "{}", inspect::render_list(&listed, &names.of(file), name, paint)),
         }
-    }
+    })?;
     Ok(outcome)
+}
+
+/// What the files of a list are called.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Names {
+    /// By their names: they lie in one folder.
+    Files,
+    /// By their paths.
+    Paths,
+}
+
+impl Names {
+    fn of(self, file: &Path) -> String {
+        let name = match self {
+            Self::Files => file.file_name().unwrap_or_default().to_string_lossy(),
+            Self::Paths => file.to_string_lossy(),
+        };
+        text::plain(&name).into_owned()
+    }
 }
 
 fn write_json(out: &mut impl Write, value: &impl serde::Serialize) -> io::Result<()> {

@@ -10,6 +10,7 @@ pub mod completions;
 pub mod demonstrate;
 pub mod devices;
 pub mod doctor;
+mod episodes;
 pub mod eval;
 pub mod inspect;
 pub mod mask;

@@ -13,6 +13,8 @@ pub(super) struct Opened {
     /// Which of those bytes.
     pub(super) records: Range<usize>,
     pub(super) trust: Trust,
+    /// Its check value is there and right; one of zero is that of no bytes alone.
+    pub(super) proven: bool,
 }
 
 impl Opened {
@@ -22,7 +24,7 @@ impl Opened {
     /// decompressed is in `unpacked`.
     pub(super) fn new(chunk: &[u8], whole: bool, unpacked: &mut Vec<u8>) -> Self {
         let doubt = if whole { Trust::Damaged } else { Trust::Torn };
-        let nothing = Self { unpacked: false, records: Self::NOTHING, trust: doubt };
+        let nothing = Self { unpacked: false, records: Self::NOTHING, trust: doubt, proven: false };
         let mut fields = Fields(chunk);
         let head = (|| {
             // Times of the first and the last message.
@@ -39,20 +41,27 @@ impl Opened {
         if compression.is_empty() {
             let sound = size == count && is_sound(packed, crc);
             let trust = if sound && fits(packed) { Trust::Sound } else { Trust::Damaged };
-            return Self { unpacked: false, records: begin..begin + packed.len(), trust };
+            let proven = trust == Trust::Sound && is_proven(packed, crc);
+            return Self { unpacked: false, records: begin..begin + packed.len(), trust, proven };
         }
         unpacked.clear();
         if size > MAX_RECORD || unpack(compression, packed, size, unpacked).is_none() {
             return nothing;
         }
         let trust = if is_sound(unpacked, crc) && fits(unpacked) { Trust::Sound } else { Trust::Damaged };
-        Self { unpacked: true, records: 0..unpacked.len(), trust }
+        let proven = trust == Trust::Sound && is_proven(unpacked, crc);
+        Self { unpacked: true, records: 0..unpacked.len(), trust, proven }
     }
 }
 
 /// Are `bytes` as they were written? A check value of zero says that there is none.
 pub(crate) fn is_sound(bytes: &[u8], crc: u32) -> bool {
-    crc == 0 || crc32fast::hash(bytes) == crc
+    crc == 0 || is_proven(bytes, crc)
+}
+
+/// Are `bytes` as they were written, by a check value that is there? That of no bytes is zero.
+fn is_proven(bytes: &[u8], crc: u32) -> bool {
+    crc32fast::hash(bytes) == crc
 }
 
 /// Do whole records fill these bytes?

@@ -6,6 +6,7 @@
 //! Invariant: no bytes make anything here panic, and memory holds one record of a file at a time.
 
 mod chunk;
+mod header;
 #[cfg(test)]
 pub(crate) mod testing;
 #[cfg(test)]
@@ -14,6 +15,7 @@ pub(crate) mod walk;
 pub(crate) mod wire;
 
 pub(crate) use chunk::is_sound;
+pub(crate) use header::Writer;
 
 use std::fs::File;
 use std::io;

@@ -14,10 +14,12 @@ use std::io::{self, Read};
 use std::ops::Range;
 
 use super::chunk::Opened;
+use super::header::{self, Writer};
 use super::wire::Fields;
 
 /// Opcodes: <https://mcap.dev/spec#records>.
 pub(crate) mod op {
+    pub(crate) const HEADER: u8 = 0x01;
     pub(crate) const FOOTER: u8 = 0x02;
     pub(crate) const SCHEMA: u8 = 0x03;
     pub(crate) const CHANNEL: u8 = 0x04;
@@ -66,6 +68,10 @@ pub(crate) struct Walked {
     pub(crate) oversized: u64,
     /// The file is whole: finished, nothing behind its end, every check value right, an index.
     pub(crate) sound: bool,
+    /// It is sound, and every check value is there: none is zero, which the format has for "not computed".
+    pub(crate) proven: bool,
+    /// Which program wrote it.
+    pub(crate) writer: Writer,
 }
 
 /// Is a record as it was written?
@@ -99,6 +105,8 @@ pub(crate) struct Walk<R> {
     crc: crc32fast::Hasher,
     /// Every check value so far was right.
     checked: bool,
+    /// Every check value so far was there and right.
+    proven: bool,
     /// Where the summary begins.
     summary: u64,
     buffer: Vec<u8>,
@@ -130,11 +138,20 @@ impl<R: Read> Walk<R> {
         let mut walk = Self {
             file,
             size,
-            walked: Walked { end: FileEnd::Unfinished, bytes: 0, damaged_chunks: 0, oversized: 0, sound: false },
+            walked: Walked {
+                end: FileEnd::Unfinished,
+                bytes: 0,
+                damaged_chunks: 0,
+                oversized: 0,
+                sound: false,
+                proven: false,
+                writer: Writer::Unknown,
+            },
             ended: false,
             data_ended: false,
             crc: crc32fast::Hasher::new(),
             checked: true,
+            proven: true,
             summary: 0,
             buffer: Vec::new(),
             unpacked: Vec::new(),
@@ -200,6 +217,7 @@ impl<R: Read> Walk<R> {
                     self.ended = true;
                     self.walked.end = end;
                     self.walked.sound = self.checked && end == FileEnd::Finished && self.walked.bytes == self.size;
+                    self.walked.proven = self.walked.sound && self.proven;
                 }
             }
         }
@@ -247,6 +265,7 @@ impl<R: Read> Walk<R> {
             _ if length > left => Next::End(FileEnd::Torn),
             op::FOOTER => self.footer(length)?,
             op::DATA_END => self.data_end(length)?,
+            op::HEADER if length <= header::LARGEST => self.header(length)?,
             op::SCHEMA | op::CHANNEL | op::MESSAGE | op::ATTACHMENT | op::METADATA | op::PRIVATE.. => {
                 // Messages and the like do not belong into the summary.
                 let shown = !self.data_ended || matches!(opcode, op::SCHEMA | op::CHANNEL);
@@ -270,6 +289,15 @@ impl<R: Read> Walk<R> {
         Ok(next)
     }
 
+    fn header(&mut self, length: u64) -> io::Result<Next> {
+        if !self.read(length)? {
+            return Ok(Next::End(FileEnd::Torn));
+        }
+        self.crc.update(&self.buffer);
+        self.walked.writer = header::writer(&self.buffer);
+        Ok(Next::Again)
+    }
+
     fn chunk(&mut self, length: u64) -> io::Result<Next> {
         let whole = self.read(length)?;
         self.crc.update(&self.buffer);
@@ -277,6 +305,7 @@ impl<R: Read> Walk<R> {
         let damaged = opened.trust == Trust::Damaged;
         self.walked.damaged_chunks += u64::from(damaged);
         self.checked &= !damaged;
+        self.proven &= opened.proven;
         self.chunk = Some(opened);
         (self.chunked, self.cut) = (true, !whole);
         Ok(Next::Again)
@@ -290,6 +319,7 @@ impl<R: Read> Walk<R> {
         }
         let crc = Fields(&self.buffer).u32();
         self.checked &= !self.data_ended && crc.is_some_and(|crc| crc == 0 || crc == data);
+        self.proven &= crc == Some(data);
         self.data_ended = true;
         self.summary = self.walked.bytes + HEAD + length;
         Ok(Next::Again)
@@ -305,6 +335,7 @@ impl<R: Read> Walk<R> {
         let summary = std::mem::take(&mut self.crc).finalize();
         self.checked &= self.data_ended
             && footer.is_some_and(|(begin, _, crc)| begin == self.summary && (crc == 0 || crc == summary));
+        self.proven &= footer.is_some_and(|(_, _, crc)| crc == summary);
         if !self.read(MAGIC.len() as u64)? {
             return Ok(Next::End(FileEnd::Torn));
         }

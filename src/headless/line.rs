@@ -116,8 +116,10 @@ impl Columns {
                 let mut rest = format!("{file}  {seconds:.1} s  {messages} messages  {size}  {dropped} dropped");
                 // Where an error has made a reason, that says it.
                 let why = if verdict.reasons.is_empty() { error.clone().unwrap_or_default() } else { verdict.why() };
-                rest.push_str("  ");
-                rest.push_str(&why);
+                for said in [verdict.sensors(), why] {
+                    rest.push_str("  ");
+                    rest.push_str(&said);
+                }
                 (&"episode".to_owned(), None, palette.grade(verdict.grade, &pad(verdict.grade.word())), rest)
             }
             What::DiskLow { .. } | What::ClockStep { .. } => {

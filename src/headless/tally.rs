@@ -217,12 +217,13 @@ impl Summary {
             let dropped = if episode.dropped > 0 { palette.warn(&dropped) } else { dropped };
             let grade = episode.verdict.grade;
             lines.push(format!(
-                "{}  {}  {:.1} s  {} messages  {}  {dropped}",
+                "{}  {}  {:.1} s  {} messages  {}  {dropped}  {}",
                 palette.grade(grade, &format!("{:7}", grade.word())),
                 palette.bold(&file),
                 episode.seconds,
                 episode.messages,
-                text::size(episode.bytes)
+                text::size(episode.bytes),
+                text::plain(&episode.verdict.sensors())
             ));
             // Where an error has made a reason, that says it.
             let reasons = &episode.verdict.reasons;

@@ -7,7 +7,9 @@ use crate::provenance::{KernelDriver, Negotiated};
 use crate::registry::UsbIdentity;
 use crate::sample::Epoch;
 use crate::status::literal::{TAKEN, WALL_NS, board, every_state, id, policy, recording, three_streaming};
-use crate::status::{Chunk, Grade, Level, PolicyStatus, Provenance, RecordingStatus, SlotState, Verdict, What};
+use crate::status::{
+    Chunk, Grade, Level, PolicyStatus, Provenance, RecordingStatus, Sensors, SlotState, Verdict, What,
+};
 
 /// An output that keeps what it is given.
 #[derive(Clone, Default)]
@@ -46,15 +48,17 @@ fn episode(dropped: u64, error: Option<&str>) -> What {
         bytes: 12_345_678,
         dropped,
         error: error.map(str::to_owned),
-        verdict: match (dropped, error) {
-            (0, None) => Verdict::default(),
-            (_, None) => Verdict {
-                grade: Grade::Suspect,
-                reasons: vec!["cam_wrist: 3 of 900 samples dropped on the way to the file (limit 0 %)".to_owned()],
-            },
-            (_, Some(error)) => {
-                Verdict { grade: Grade::Bad, reasons: vec![format!("the file could not be written: {error}")] }
-            }
+        verdict: {
+            let (grade, reasons) = match (dropped, error) {
+                (0, None) => (Grade::Good, Vec::new()),
+                (_, None) => {
+                    let reason = "cam_wrist: 3 of 900 samples dropped on the way to the file (limit 0 %)";
+                    (Grade::Suspect, vec![reason.to_owned()])
+                }
+                (_, Some(error)) => (Grade::Bad, vec![format!("the file could not be written: {error}")]),
+            };
+            let sensors = Some(Sensors { registered: 3, recorded: 2, without: vec!["tof".to_owned()] });
+            Verdict { grade, reasons, sensors }
         },
     }
 }
@@ -164,10 +168,10 @@ fn lines_for_people_have_their_columns() {
     22:13:20.000Z  tof        bit 12  absent        mask 0x05
     22:13:20.000Z  usb                unregistered  046d:0825  X   no entry has this serial
     22:13:20.000Z  episode            recording     out/a.mcap
-    22:13:20.000Z  episode            GOOD          out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped
-    22:13:20.000Z  episode            SUSPECT       out/a.mcap  30.0 s  1234 messages  12.3 MB  3 dropped  cam_wrist: 3 of 900 samples dropped on the way to the file (limit 0 %)
-    22:13:20.000Z  episode            BAD           out/a.mcap.partial  30.0 s  1234 messages  12.3 MB  3 dropped  the file could not be written: disk full
-    22:13:20.000Z  episode            BAD           out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped  the file could not be written: disk nearly full
+    22:13:20.000Z  episode            GOOD          out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped  2 of 3 sensors, without tof
+    22:13:20.000Z  episode            SUSPECT       out/a.mcap  30.0 s  1234 messages  12.3 MB  3 dropped  2 of 3 sensors, without tof  cam_wrist: 3 of 900 samples dropped on the way to the file (limit 0 %)
+    22:13:20.000Z  episode            BAD           out/a.mcap.partial  30.0 s  1234 messages  12.3 MB  3 dropped  2 of 3 sensors, without tof  the file could not be written: disk full
+    22:13:20.000Z  episode            BAD           out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped  2 of 3 sensors, without tof  the file could not be written: disk nearly full
     22:13:20.000Z  disk               warn          out: disk nearly full, 1.5 GB free: the episode will be closed in about 4 min
     22:13:20.000Z  clock              warn          the wall clock was set back by 3600.000 s; times of capture stay as they are
     22:13:20.000Z  policy             loaded        tactile-id  10 Hz  hash 0123456789ab  onnxruntime 1.22.0
@@ -337,7 +341,7 @@ fn the_summary_counts_from_its_beginning_and_means_while_present() {
     cam_wrist    0        150      30.0    50.0%        0        0 B
     cam_top      1        150      15.0   100.0%        1        0 B
     tof          2        150      15.0   100.0%        2        0 B
-    SUSPECT  out/a.mcap  30.0 s  1234 messages  12.3 MB  3 dropped
+    SUSPECT  out/a.mcap  30.0 s  1234 messages  12.3 MB  3 dropped  2 of 3 sensors, without tof
              cam_wrist: 3 of 900 samples dropped on the way to the file (limit 0 %)
     10.0 s in all
     "#);
@@ -359,7 +363,10 @@ async fn what_is_announced_before_the_end_is_printed_and_summed_up() {
     output.await.unwrap();
     let text = kept.text();
     assert!(text.contains("cam_wrist  bit 0   streaming     mask 0x05  /dev/video0\n"), "{text}");
-    assert!(text.contains("GOOD     out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped\n"), "{text}");
+    assert!(
+        text.contains("GOOD     out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped  2 of 3 sensors, without tof\n"),
+        "{text}"
+    );
     assert!(text.contains("cam_wrist    0          1"), "{text}");
 }
 

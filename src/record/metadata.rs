@@ -113,7 +113,8 @@ pub(super) struct Ending<'a> {
 /// The record at the end.
 ///
 /// `cut_short` says why the recorder ended the episode before its time, and is absent where it did
-/// not. `verdict` is GOOD, SUSPECT or BAD. JSON: `reasons` `["..."]`, why it is not GOOD; `modalities`
+/// not. `verdict` is GOOD, SUSPECT or BAD. JSON: `reasons` `["..."]`, why it is not GOOD; `sensors`
+/// `{registered, recorded, without}`; `modalities`
 /// `{name: {samples, bytes, lost, dropped, damaged, ...}}`, the fields of [`Quality`]; `skew_ms` `{p50,
 /// p95, p99, max}` between the earliest and the latest sample of a frame, or null; `serials` and
 /// `provenance` as at the beginning, of whatever was attached or ran at some time; `policy` likewise;
@@ -127,6 +128,7 @@ pub(super) fn end(ending: &Ending<'_>) -> BTreeMap<String, String> {
     let mut said = text_map([
         ("verdict", ending.verdict.grade.word().to_owned()),
         ("reasons", json!(ending.verdict.reasons).to_string()),
+        ("sensors", json!(ending.verdict.sensors).to_string()),
         ("duration_s", ending.seconds.to_string()),
         ("messages", ending.messages.to_string()),
         ("frames", ending.frames.to_string()),

@@ -18,21 +18,26 @@
 //!
 //! Invariant: every sample a frame names was written to the file before the frame.
 
+mod beginning;
+
 use std::io;
 use std::sync::Arc;
 use std::time::Duration;
 
+pub(super) use beginning::Beginning;
+
+use self::beginning::synchronised;
 use super::announce::Announcer;
 use super::configuration::Configuration;
 use super::describe::describe;
 use super::encode::EventText;
-use super::episode::{Closing, EpisodePath, EpisodeReport, EpisodeRequest};
-use super::file::{EpisodeFile, Sink};
+use super::episode::{Closing, EpisodePath, EpisodeReport};
+use super::file::EpisodeFile;
 use super::hole::Hole;
 use super::keep;
 use super::masks::MaskHistory;
 use super::metadata::{self, Ending};
-use super::provenance::{Attached, Units};
+use super::provenance::Units;
 use super::quality::{Frames, Measured, Measures, Seen};
 use super::verdict::{Facts, FileState, Judged, Losses, judge};
 use super::writeback::Writeback;
@@ -41,8 +46,8 @@ use crate::modality::ModalityId;
 use crate::registry::Registry;
 use crate::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
 use crate::status::{Board, Event, RecordingStatus, What};
-use crate::sync::{Grid, SyncModality, SyncSample, Synchronizer};
-use crate::time::{Stamp, WallClock};
+use crate::sync::{Grid, SyncSample, Synchronizer};
+use crate::time::Stamp;
 
 /// How long after its capture a sample may arrive and still belong to its frame. The slowest we
 /// know: a camera at 15 Hz stamps the start of exposure and delivers after exposure, transfer and
@@ -50,9 +55,6 @@ use crate::time::{Stamp, WallClock};
 pub(super) const SETTLE: Duration = Duration::from_millis(100);
 /// What has been received may still lie on the bus for this long.
 pub(super) const GRACE: Duration = Duration::from_millis(20);
-/// Samples of a modality that may arrive while those of a whole queue are being written.
-const RING_SLACK: usize = 1024;
-
 /// See the module's comment.
 pub(super) struct Session {
     registry: Arc<Registry>,
@@ -78,18 +80,6 @@ pub(super) struct Session {
     failed: Option<io::Error>,
 }
 
-/// What a session begins with.
-pub(super) struct Beginning<'a> {
-    pub(super) registry: Arc<Registry>,
-    pub(super) board: Arc<Board>,
-    pub(super) request: &'a EpisodeRequest,
-    pub(super) path: EpisodePath,
-    pub(super) sink: Box<dyn Sink>,
-    pub(super) attached: &'a Attached,
-    pub(super) clock: WallClock,
-    pub(super) begin: Stamp,
-}
-
 impl Session {
     /// Begins an episode and writes what stands at its beginning.
     pub(super) fn begin(beginning: Beginning<'_>, masks: &MaskHistory) -> io::Result<Self> {
@@ -111,18 +101,8 @@ impl Session {
         // Killed in the next moment, it is an episode all the same, of a known task and rig.
         file.flush()?;
         let writeback = Writeback::start(Arc::clone(&path.file), &path.folder);
-        let modalities: Vec<SyncModality> = registry
-            .devices
-            .iter()
-            .map(|device| SyncModality {
-                id: device.id,
-                when_stale: device.when_stale,
-                latency: device.latency,
-                capacity: device.depth.saturating_add(RING_SLACK),
-            })
-            .collect();
         Ok(Self {
-            sync: Synchronizer::new(&modalities, registry.rig.sync_window),
+            sync: Synchronizer::new(&synchronised(&registry), registry.rig.sync_window),
             grid: Grid::new(begin, registry.rig.observation_hz),
             end: request.duration.map(|duration| begin.after(duration)),
             registry,
@@ -295,8 +275,17 @@ impl Session {
             .collect();
         let (masks_dropped, events_missed) = (self.masks_dropped, self.events_missed);
         let verdict = |file: FileState<'_>| {
-            let losses = Losses::Apart;
-            judge(&Facts { modalities: &judged, masks_dropped, events_missed, publishers, seconds, losses, file })
+            let (losses, findings) = (Losses::Apart, [].as_slice());
+            judge(&Facts {
+                modalities: &judged,
+                masks_dropped,
+                events_missed,
+                publishers,
+                seconds,
+                losses,
+                file,
+                findings,
+            })
         };
         let state = reason.as_deref().map_or(FileState::Whole, FileState::NotWhole);
         let ending = Ending {

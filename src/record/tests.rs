@@ -6,6 +6,7 @@ mod room;
 mod session;
 
 use std::collections::{BTreeMap, VecDeque};
+use std::fmt::Write as _;
 use std::fs::File;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
@@ -18,10 +19,7 @@ use super::*;
 use crate::bus::TopicId;
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
-use crate::registry::{
-    CameraSpec, DeviceSpec, Framing, IdentitySpec, NodeSpec, Parse, PixelFormat, Registry, RigSpec, SerialSpec,
-    UsbIdentity, UsbSpec, VerdictSpec, WhenStale,
-};
+use crate::registry::{Registry, UsbIdentity};
 use crate::sample::{Encoding, FLAG_ERROR, SampleHeader};
 use crate::status::{Board, Grade, Level, What};
 use crate::time::Stamp;
@@ -147,30 +145,6 @@ fn id(bit: u8) -> ModalityId {
     ModalityId::new(bit).unwrap()
 }
 
-fn device(bit: u8, name: &str, node: NodeSpec) -> DeviceSpec {
-    let verdict = VerdictSpec::of(node.modality_kind(), Duration::from_millis(500), None);
-    DeviceSpec {
-        name: name.to_owned(),
-        id: id(bit),
-        identity: IdentitySpec::Usb(UsbSpec { vid: 1, pid: bit.into(), serial: None, port: None }),
-        node,
-        topic: format!("/rapid/{name}"),
-        mount: None,
-        stall_after: Duration::from_millis(500),
-        max_bytes: 1 << 16,
-        depth: 64,
-        when_stale: WhenStale::Hold,
-        latency: Duration::ZERO,
-        action: None,
-        hooks: crate::registry::Hooks::default(),
-        verdict,
-    }
-}
-
-fn camera(format: PixelFormat) -> NodeSpec {
-    NodeSpec::Camera(CameraSpec { width: 4, height: 2, fps: 30, format, controls: Vec::new() })
-}
-
 /// What a picture looks like from outside.
 fn picture(number: u64) -> Vec<u8> {
     let inside = number.to_le_bytes().repeat(100);
@@ -178,26 +152,23 @@ fn picture(number: u64) -> Vec<u8> {
 }
 
 pub(super) fn registry() -> Registry {
-    let serial = SerialSpec { baud: 115_200, framing: Framing::Line, parse: Parse::Csv, channels: 2 };
-    Registry {
-        rig: RigSpec {
-            name: "bench".to_owned(),
-            observation_hz: 30.0,
-            sync_window: Duration::from_millis(25),
-            cooldown: Duration::from_secs(2),
-            memory_budget: 1 << 29,
-            disk_reserve: None,
-        },
-        devices: vec![
-            device(CAM, "cam_wrist", camera(PixelFormat::Mjpg)),
-            device(TOF, "tof", NodeSpec::Serial(serial)),
-            device(NEVER, "never", camera(PixelFormat::Yuyv)),
-            device(RAW, "raw", camera(PixelFormat::Grey)),
-        ],
-        modules: Vec::new(),
-        path: None,
-        text: "[rig]\nname = \"bench\"\n".to_owned(),
+    let mut text = "[rig]\nname = \"bench\"\n".to_owned();
+    let cameras = [(CAM, "cam_wrist", "MJPG"), (NEVER, "never", "YUYV"), (RAW, "raw", "GREY")];
+    for (bit, name, format) in cameras {
+        // The bench sends what it likes, not the camera's rate.
+        let _ = write!(
+            text,
+            "[device.{name}]\nvid = \"0001\"\npid = \"{bit:04x}\"\nnode = \"camera\"\ntopic = \"/rapid/{name}\"\n\
+             bit = {bit}\n[device.{name}.camera]\nwidth = 4\nheight = 2\nfps = 30\nformat = \"{format}\"\n\
+             [device.{name}.verdict]\nrate = \"off\"\n"
+        );
     }
+    let _ = write!(
+        text,
+        "[device.tof]\nvid = \"0001\"\npid = \"{TOF:04x}\"\nnode = \"serial\"\ntopic = \"/rapid/tof\"\nbit = {TOF}\n\
+         [device.tof.serial]\nbaud = 115200\nparse = \"csv\"\nchannels = 2\n"
+    );
+    Registry::parse(&text, None).unwrap().registry
 }
 
 pub(super) struct Bench {

@@ -5,8 +5,9 @@
 //! 2. A modality that the mask says was not there is not missed, unless its device was plugged in all
 //!    the same: longer than a limit, or for half the episode and nothing came of it.
 //! 3. Nothing received from a modality that was there: BAD. So is an episode in which nothing at all
-//!    was received.
-//! 4. A file that is not whole is SUSPECT; one that the disk did not take is BAD.
+//!    was received: GOOD has at least one sample.
+//! 4. A file that is not whole, or not proven to be as it was written, is SUSPECT; one that the disk did not
+//!    take is BAD. What could not be measured is a [`Finding`] of whoever could not.
 //! 5. An episode in which another program published on a topic of ours is SUSPECT.
 //! 6. Of two checks that one fault breaks, the one that names the fault is told: a frozen camera also
 //!    repeats its pictures, a silent one also has a low rate.
@@ -21,7 +22,7 @@ use std::time::Duration;
 use super::publishers::Publisher;
 use super::quality::Quality;
 use crate::registry::{Limits, VerdictSpec};
-use crate::status::{Grade, Verdict};
+use crate::status::{Grade, Sensors, Verdict};
 
 /// A modality with its limits.
 #[derive(Debug, Clone)]
@@ -71,6 +72,24 @@ pub(super) struct Facts<'a> {
     pub(super) losses: Losses,
     /// Its file.
     pub(super) file: FileState<'a>,
+    /// What else speaks against it.
+    pub(super) findings: &'a [Finding],
+}
+
+/// What speaks against an episode and was found by something other than the checks here.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Finding {
+    /// How grave it is.
+    pub(super) grade: Grade,
+    /// A sentence for people.
+    pub(super) reason: String,
+}
+
+impl Finding {
+    /// The finding that something is SUSPECT.
+    pub(super) fn suspect(reason: impl Into<String>) -> Self {
+        Self { grade: Grade::Suspect, reason: reason.into() }
+    }
 }
 
 /// Less than this many expected samples, or less than this long, says nothing about a rate.
@@ -85,12 +104,13 @@ pub(super) fn judge(facts: &Facts<'_>) -> Verdict {
         FileState::NotWhole(why) => found.push((Grade::Suspect, format!("the file is not whole: {why}"))),
         FileState::Failed(why) => found.push((Grade::Bad, format!("the file could not be written: {why}"))),
     }
+    found.extend(facts.findings.iter().map(|finding| (finding.grade, finding.reason.clone())));
     for judged in facts.modalities {
         let of_it = modality(judged, facts);
         found.extend(of_it.into_iter().map(|(grade, text)| (grade, format!("{}: {text}", judged.name))));
     }
     let silent = facts.modalities.iter().all(|judged| judged.quality.samples == 0);
-    if silent && !facts.modalities.is_empty() && !found.iter().any(|(grade, _)| *grade == Grade::Bad) {
+    if silent && !found.iter().any(|(grade, _)| *grade == Grade::Bad) {
         found.push((Grade::Bad, "nothing was received from any modality".to_owned()));
     }
     for (count, what) in [(facts.masks_dropped, "publications of the mask"), (facts.events_missed, "events")] {
@@ -102,7 +122,15 @@ pub(super) fn judge(facts: &Facts<'_>) -> Verdict {
     // Stable: of one grade in the order above.
     found.sort_by_key(|(grade, _)| std::cmp::Reverse(*grade));
     let grade = found.first().map_or(Grade::Good, |(grade, _)| *grade);
-    Verdict { grade, reasons: found.into_iter().map(|(_, text)| text).collect() }
+    let without: Vec<String> = facts
+        .modalities
+        .iter()
+        .filter(|judged| judged.quality.samples == 0)
+        .map(|judged| judged.name.to_owned())
+        .collect();
+    let registered = facts.modalities.len();
+    let sensors = Sensors { registered, recorded: registered - without.len(), without };
+    Verdict { grade, reasons: found.into_iter().map(|(_, text)| text).collect(), sensors: Some(sensors) }
 }
 
 /// What speaks against a modality.

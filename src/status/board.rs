@@ -234,7 +234,7 @@ impl Board {
             recording: lock(&self.recording).clone(),
             policy: lock(&self.policy).clone(),
             last_episode,
-            last_verdict: last_verdict.unwrap_or_default(),
+            last_verdict,
             log: lock(&self.log).iter().cloned().collect(),
         }
     }

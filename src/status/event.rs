@@ -295,7 +295,8 @@ impl What {
             Self::Episode { file, seconds, error: Some(error), verdict, .. } => {
                 let word = if self.is_cut_short() { "cut short" } else { "not whole" };
                 let grade = verdict.grade.word();
-                (Level::Error, format!("{grade} {} is {word} after {seconds:.1} s: {error}", file.display()))
+                let (file, sensors) = (file.display(), with_comma(verdict));
+                (Level::Error, format!("{grade} {file} is {word} after {seconds:.1} s{sensors}: {error}"))
             }
             Self::Episode { file, seconds, error: None, verdict, .. } => {
                 let level = match verdict.grade {
@@ -305,7 +306,7 @@ impl What {
                 };
                 let (file, word) = (file.display(), verdict.grade.word());
                 let why = if verdict.reasons.is_empty() { String::new() } else { format!(": {}", verdict.why()) };
-                (level, format!("{word} {file} finished, {seconds:.1} s{why}"))
+                (level, format!("{word} {file} finished, {seconds:.1} s{}{why}", with_comma(verdict)))
             }
             Self::DiskLow { folder, free, seconds } => {
                 let (free, left) = (text::size(*free), text::about(Duration::from_secs(*seconds)));
@@ -334,6 +335,11 @@ impl What {
             Self::Log { level, text } => (*level, text.clone()),
         })
     }
+}
+
+/// Which sensors took part, behind a comma; nothing if unknown.
+fn with_comma(verdict: &Verdict) -> String {
+    verdict.sensors.as_ref().map(|sensors| format!(", {sensors}")).unwrap_or_default()
 }
 
 #[cfg(test)]

@@ -53,7 +53,7 @@ pub(crate) fn snapshot(devices: Vec<DeviceStatus>) -> Snapshot {
         recording: None,
         policy: None,
         last_episode: None,
-        last_verdict: super::Verdict::default(),
+        last_verdict: None,
         log: Vec::new(),
     }
 }

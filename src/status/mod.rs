@@ -29,7 +29,7 @@ pub use board::{Board, EpisodeEnd};
 pub use episode::{Episode, EpisodeWatch};
 pub use event::{Event, Provenance, What};
 pub use policy::{Chunk, ObservedSamples, PolicyStatus};
-pub use verdict::{Grade, Verdict};
+pub use verdict::{Grade, Sensors, Verdict};
 
 /// What the device of a modality is doing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize)]
@@ -169,7 +169,7 @@ pub struct Snapshot {
     #[serde(serialize_with = "text::lossy_option")]
     pub last_episode: Option<PathBuf>,
     /// The verdict on it.
-    pub last_verdict: Verdict,
+    pub last_verdict: Option<Verdict>,
     /// The newest log lines, oldest first.
     pub log: Vec<LogLine>,
 }

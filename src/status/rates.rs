@@ -152,7 +152,7 @@ mod tests {
                 room: None,
             }),
             last_episode: None,
-            last_verdict: crate::status::Verdict::default(),
+            last_verdict: None,
             log: Vec::new(),
         }
     }

@@ -61,8 +61,11 @@ fn under_way(recording: &RecordingStatus, area: Rect, model: &Model, theme: Them
 
 fn idle(area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
     let mut first = Line::from(vec![Span::styled("space", theme.title()), Span::raw(" starts an episode")]);
-    let Some(last) = &model.shown().last_episode else { return vec![first] };
-    let Verdict { grade, reasons } = &model.shown().last_verdict;
+    let shown = model.shown();
+    let Some((last, verdict)) = shown.last_episode.as_ref().zip(shown.last_verdict.as_ref()) else {
+        return vec![first];
+    };
+    let Verdict { grade, reasons, .. } = verdict;
     let word = Span::styled(format!("{} ", grade.word()), theme.grade(*grade));
     let label = Span::styled("last ", theme.faint());
     let width = usize::from(area.width);
@@ -70,6 +73,12 @@ fn idle(area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
         let room = width.saturating_sub(first.width() + 3 + label.width() + word.width());
         first.spans.extend([Span::raw("   "), label, word, Span::raw(file(last, room, theme))]);
         return vec![first];
+    }
+    let sensors = theme.safe(&verdict.sensors());
+    if !sensors.is_empty() {
+        let room = width.saturating_sub(first.width() + 3);
+        first.push_span(Span::raw("   "));
+        first.push_span(Span::styled(text::cut(&sensors, room, theme.ellipsis()).into_owned(), theme.faint()));
     }
     // The reasons beside the name as far as there is room; the log has all of them.
     let room = width.saturating_sub(label.width() + word.width());

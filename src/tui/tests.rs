@@ -13,7 +13,7 @@ use super::*;
 use crate::status::literal::{
     TAKEN, board, device, every_state, line, recording, sixty_four, snapshot, three_streaming,
 };
-use crate::status::{Grade, Level, RecordingStatus, SlotState, Snapshot, Verdict};
+use crate::status::{Grade, Level, RecordingStatus, Sensors, SlotState, Snapshot, Verdict};
 use crate::time::Stamp;
 use theme::{Charset, Colours};
 
@@ -74,6 +74,8 @@ fn an_empty_rig() {
 fn three_devices_stream() {
     let mut end = three_streaming();
     end.last_episode = Some("episodes/2023-11-14_place-block_006.mcap".into());
+    let sensors = Some(Sensors { registered: 3, recorded: 3, without: Vec::new() });
+    end.last_verdict = Some(Verdict { grade: Grade::Good, reasons: Vec::new(), sensors });
     end.log = vec![line(0, Level::Info, "cam_wrist is streaming"), line(1, Level::Info, "tof is streaming")];
     assert_snapshot!("three_80x24", draw(&measured(&end), (80, 24), THEME));
     assert_snapshot!("three_120x40", draw(&measured(&end), (120, 40), THEME));
@@ -84,13 +86,14 @@ fn the_last_verdict_stands_beside_its_file_with_as_many_reasons_as_there_is_room
     let mut end = three_streaming();
     end.last_episode = Some("episodes/2023-11-14_place-block_006.mcap".into());
     for (grade, colour) in [(Grade::Suspect, Color::Yellow), (Grade::Bad, Color::Red)] {
-        end.last_verdict = Verdict {
+        end.last_verdict = Some(Verdict {
             grade,
             reasons: vec![
                 "cam_wrist: frozen for 5.0 s: 151 samples byte for byte the same (limit 2.0 s)".to_owned(),
                 "tof: 3 of 213 samples lost by the device (limit 1 %)".to_owned(),
             ],
-        };
+            sensors: Some(Sensors { registered: 3, recorded: 2, without: vec!["tof".to_owned()] }),
+        });
         let screen = draw(&measured(&end), (80, 24), THEME);
         assert_eq!(style_of(screen.buffer(), grade.word()).fg, Some(colour));
         assert_eq!(style_of(screen.buffer(), "cam_wrist: fro").fg, Some(colour));

@@ -10,7 +10,7 @@ use crate::bus::TopicId;
 use crate::record::{RecorderConfig, Sink, Source};
 use crate::registry::Registry;
 use crate::sample::{Epoch, SampleHeader};
-use crate::status::{Level, Verdict};
+use crate::status::{Grade, Level, Verdict};
 
 /// How long a condition may take to come true.
 const PATIENCE: Duration = Duration::from_secs(30);
@@ -192,7 +192,7 @@ fn ended(error: Option<&str>) -> What {
         bytes: 1,
         dropped: 0,
         error: error.map(str::to_owned),
-        verdict: Verdict::default(),
+        verdict: Verdict { grade: Grade::Good, reasons: Vec::new(), sensors: None },
     }
 }
 

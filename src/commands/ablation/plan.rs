@@ -2,17 +2,26 @@
 //!
 //! Pure.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use crate::cli::Count;
-use crate::record::inspect::Brief;
 use crate::registry::ablation::AblationPlan;
 use crate::registry::{DeviceSpec, Mount, NodeSpec, Registry, did_you_mean};
 use crate::status::Grade;
 
-/// What an episode says of itself.
-pub(super) type Recorded = Brief;
+/// What a recorded file says of itself, and what it is worth.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Recorded {
+    /// The task in the user's words.
+    pub(super) task: String,
+    /// Tags of the user and of the modules.
+    pub(super) tags: BTreeMap<String, String>,
+    /// Modalities that were present when it began, if it says so.
+    pub(super) present: Option<BTreeSet<String>>,
+    /// The word of its verdict; none if it is not an episode of rapid.
+    pub(super) grade: Option<Grade>,
+}
 
 /// A word of the plan that means nothing on this rig.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -124,6 +133,7 @@ fn word_means(word: &str, plan: &AblationPlan, registry: &Registry) -> Vec<Strin
 /// Why an episode counts for no configuration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Refused {
+    NotOurs,
     Grade,
     Task,
     Finger,
@@ -134,6 +144,7 @@ pub(super) enum Refused {
 impl Refused {
     pub(super) const fn word(self) -> &'static str {
         match self {
+            Self::NotOurs => "not of rapid",
             Self::Grade => "of a verdict that does not count",
             Self::Task => "of another task",
             Self::Finger => "of no finger of the plan",
@@ -151,9 +162,10 @@ pub(super) fn belongs(
     wanted: &[Configuration],
     count: Count,
 ) -> Result<usize, Refused> {
+    let grade = episode.grade.ok_or(Refused::NotOurs)?;
     let counts = match count {
-        Count::Good => episode.grade == Grade::Good,
-        Count::Suspect => episode.grade != Grade::Bad,
+        Count::Good => grade == Grade::Good,
+        Count::Suspect => grade != Grade::Bad,
         Count::Any => true,
     };
     if !counts {
@@ -229,9 +241,8 @@ mod tests {
         Recorded {
             task: "t".into(),
             tags: [("finger".to_owned(), finger.to_owned())].into(),
-            modules: Vec::new(),
             present: Some(present.iter().map(|name| (*name).to_owned()).collect()),
-            grade,
+            grade: Some(grade),
         }
     }
 
@@ -279,6 +290,7 @@ mod tests {
             (episode("soft", &["cam_wrist"], Bad), Count::Any, Ok(2)),
             (episode("hard", &["cam_wrist"], Good), Count::Suspect, Err(Refused::Finger)),
             (episode("soft", &["tactile_tip"], Good), Count::Suspect, Err(Refused::Sensors)),
+            (Recorded { grade: None, ..episode("soft", &["cam_wrist"], Good) }, Count::Any, Err(Refused::NotOurs)),
             (Recorded { present: None, ..episode("soft", &[], Good) }, Count::Suspect, Err(Refused::Sensors)),
         ] {
             assert_eq!(belongs(&said, &plan, &wanted, count), expected, "{said:?}");

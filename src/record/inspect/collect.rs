@@ -1,16 +1,17 @@
 //! Gathering an [`Inspection`] from the records of a file, in the order they lie in it.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
+use super::super::configuration;
 use super::super::metadata::POLICY;
 use super::super::walk::{Walked, op};
-use super::super::wire::{Fields, protobuf};
-use super::judge::{Ending, Judge, recorded_verdict};
+use super::super::wire::{Fields, protobuf, whole_protobuf};
+use super::judge::{Counted, Ending, Judge, recorded_verdict, without_metadata};
 use super::policy::Gathered;
 use super::units;
-use super::{EventReport, Inspection, Lateness, MaskEdge, ModalityReport, TopicReport};
-use crate::episode_format::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, RECOVERED, SUMMARY};
+use super::{EventReport, Inspection, Judgement, Lateness, MaskEdge, ModalityReport, TopicReport};
+use crate::episode_format::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, RECOVERED, SUMMARY, Writer};
 use crate::mask::{MASK_TOPIC, PhysicalMask};
 use crate::modality::ModalityId;
 
@@ -25,6 +26,10 @@ pub(super) struct Collected {
     summary: BTreeMap<String, String>,
     repaired: bool,
     messages: u64,
+    /// Records that are not what their kind has to be.
+    unread: u64,
+    /// A topic or a record of metadata that only this program writes.
+    is_ours: bool,
     first: Option<u64>,
     last: u64,
     /// Time and value of the first mask and of every change.
@@ -58,16 +63,17 @@ struct Channel {
 }
 
 impl Collected {
-    /// Takes a record; one that cannot be read is passed over.
+    /// Takes a record; one that cannot be understood is counted.
     pub(super) fn record(&mut self, opcode: u8, record: &[u8]) {
         let fields = Fields(record);
-        // `None` is a record that is shorter than it says.
-        let _ = match opcode {
+        // `None` is a record that is shorter than it says, or has no channel.
+        let read = match opcode {
             op::CHANNEL => self.channel(fields),
             op::METADATA => self.metadata(fields),
             op::MESSAGE => self.message(fields),
-            _ => None,
+            _ => Some(()),
         };
+        self.unread += u64::from(read.is_none());
     }
 
     fn channel(&mut self, mut fields: Fields<'_>) -> Option<()> {
@@ -75,6 +81,7 @@ impl Collected {
         let (topic, _encoding) = (fields.string()?, fields.string()?);
         let metadata = fields.map()?;
         let modality = metadata.get("bit").and_then(|bit| bit.parse().ok()).and_then(ModalityId::new);
+        self.is_ours |= [MASK_TOPIC, FRAME_TOPIC, EVENT_TOPIC, LOG_TOPIC].contains(&topic);
         // The summary repeats the channels.
         self.channels.entry(id).or_insert_with(|| Channel {
             topic: topic.to_owned(),
@@ -87,6 +94,7 @@ impl Collected {
 
     fn metadata(&mut self, mut fields: Fields<'_>) -> Option<()> {
         let name = fields.string()?;
+        self.is_ours |= [ABOUT, SUMMARY, RECOVERED].contains(&name);
         let map = fields.map()?;
         match name {
             ABOUT => {
@@ -108,6 +116,9 @@ impl Collected {
         self.messages += 1;
         self.first = Some(self.first.map_or(captured, |first| first.min(captured)));
         self.last = self.last.max(captured);
+        if self.judge.is_some() && whole_protobuf(fields.0).any(|field| field.is_none()) {
+            self.unread += 1;
+        }
         if let (Some(id), Some(judge)) = (channel.id, &mut self.judge) {
             judge.sample(id, sequence, captured, received, fields.0);
         }
@@ -181,6 +192,7 @@ impl Collected {
     pub(super) fn report(mut self, path: &Path, size: u64, walked: Walked) -> Inspection {
         let said = |map: &BTreeMap<String, String>, key: &str| map.get(key).cloned().unwrap_or_default();
         let begin_ns = said(&self.about, "begin_wall_ns").parse().ok().or(self.first).unwrap_or(0);
+        let is_ours = walked.writer == Writer::Rapid || self.is_ours;
         let told = said(&self.summary, "duration_s").parse().ok().filter(|seconds: &f64| seconds.is_finite());
         let seconds = told.unwrap_or_else(|| from(begin_ns, self.last)).max(0.0);
         let mut events = std::mem::take(&mut self.events);
@@ -196,8 +208,16 @@ impl Collected {
         let policy =
             std::mem::take(&mut self.policy).report(end_ns, [self.summary.get(POLICY), self.about.get(POLICY)]);
         let (mut modalities, topics) = self.topics(begin_ns, seconds);
-        let ending = Ending { file: walked, seconds, summary: &self.summary, repaired: self.repaired };
-        let verdict = judge.as_ref().map(|judge| judge.judge(&mut modalities, &ending)).unwrap_or_default();
+        let (messages, frames, unread) = (self.messages, self.frames, self.unread);
+        let counted = Counted { messages, frames, unread };
+        let ending = Ending { file: walked, seconds, summary: &self.summary, repaired: self.repaired, counted };
+        let verdict = match &judge {
+            Some(judge) => Judgement::Episode(judge.judge(&mut modalities, &ending)),
+            // What is damaged and has no name of its writer may be an episode.
+            None if !is_ours && (walked.sound || walked.writer == Writer::Another) => Judgement::NotOurs,
+            None => Judgement::Episode(without_metadata(&ending)),
+        };
+        let (modules, present_at_begin) = configured(&self.about);
         let count = modalities.len();
         let mask = self
             .masks
@@ -218,6 +238,8 @@ impl Collected {
             rig: said(&self.about, "rig"),
             task: said(&self.about, "task"),
             tags: serde_json::from_str(&said(&self.about, "tags")).unwrap_or_default(),
+            modules,
+            present_at_begin,
             begin_ns,
             seconds,
             messages: self.messages,
@@ -326,4 +348,20 @@ impl Channel {
 fn from(begin_ns: u64, at_ns: u64) -> f64 {
     let distance = begin_ns.abs_diff(at_ns) as f64 / 1e9;
     if at_ns < begin_ns { -distance } else { distance }
+}
+
+/// The modules and the modalities that were there when the episode began.
+fn configured(about: &BTreeMap<String, String>) -> (Vec<String>, Option<BTreeSet<String>>) {
+    #[derive(serde::Deserialize)]
+    struct Configuration {
+        modules: Vec<String>,
+        present: BTreeSet<String>,
+    }
+    let json = |key: &str| about.get(key).map(String::as_str).unwrap_or_default();
+    if let Ok(known) = serde_json::from_str::<Configuration>(json(configuration::KEY)) {
+        return (known.modules, Some(known.present));
+    }
+    // Written before there were configurations: what was attached.
+    let serials = serde_json::from_str::<BTreeMap<String, Option<String>>>(json("serials")).ok();
+    (Vec::new(), serials.map(|serials| serials.into_keys().collect()))
 }

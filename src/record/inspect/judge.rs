@@ -1,7 +1,11 @@
 //! The verdict on a file, by what it holds.
 //!
 //! What the file does not hold is taken from the recorder's summary where there is one: which of the
-//! missing samples the device lost, and which samples the driver called damaged.
+//! missing samples the device lost, which samples the driver called damaged, and what the recorder found.
+//!
+//! GOOD is earned. The file is finished, every byte of it is under a check value that is there and right, its
+//! metadata `rapid` and `rapid/summary` were read, the registry in it was understood, what the recorder counted is in
+//! it, and no check of `record::verdict` speaks against it. Whatever of this is missing is a reason.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -10,12 +14,13 @@ use serde_json::{Map, Value};
 
 use super::super::metadata::CUT_SHORT;
 use super::super::publishers::Publishers;
-use super::super::quality::{Frames, Measured, Measures, Seen, Spread};
+use super::super::quality::{Frames, Measured, Measures, Quality, Seen, Spread};
 use super::super::session::SETTLE;
-use super::super::verdict::{Facts, FileState, Judged, Losses, judge};
+use super::super::verdict::{Facts, FileState, Finding, Judged, Losses, judge};
 use super::super::walk::{FileEnd, Walked};
 use super::super::wire::{Proto, protobuf};
 use super::ModalityReport;
+use crate::episode_format::{ABOUT, SUMMARY};
 use crate::mask::PhysicalMask;
 use crate::modality::{MAX_MODALITIES, ModalityId, ModalityKind};
 use crate::registry::{Registry, VerdictSpec};
@@ -38,6 +43,19 @@ pub(super) struct Ending<'a> {
     pub(super) summary: &'a BTreeMap<String, String>,
     /// It was made of one that was not whole.
     pub(super) repaired: bool,
+    /// What was counted in it.
+    pub(super) counted: Counted,
+}
+
+/// What was counted in a file.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Counted {
+    /// Messages on all topics.
+    pub(super) messages: u64,
+    /// Ticks of the frame index.
+    pub(super) frames: u64,
+    /// Records that could not be understood.
+    pub(super) unread: u64,
 }
 
 /// Measures an episode while its file is read.
@@ -45,13 +63,21 @@ pub(super) struct Ending<'a> {
 pub(super) struct Judge {
     measures: Measures,
     begin_ns: u64,
-    limits: Vec<Option<VerdictSpec>>,
-    /// Modalities by name.
-    layout: BTreeMap<String, ModalityId>,
+    /// The registered modalities, ascending by bit.
+    modalities: Vec<Registered>,
+    /// The limits are not those of the registry in the file, which is not understood.
+    usual_limits: bool,
     /// Next number of each modality, and how many are missing.
     numbers: Vec<(Option<u32>, u64)>,
     /// By the events of the file.
     publishers: Publishers,
+}
+
+/// A modality of the registry in the file.
+#[derive(Debug)]
+struct Registered {
+    name: String,
+    measured: Measured,
 }
 
 impl Judge {
@@ -60,28 +86,18 @@ impl Judge {
         let number = |key: &str| about.get(key)?.parse::<u64>().ok();
         let begin_ns = number("begin_wall_ns")?;
         let hz = about.get("observation_hz")?.parse().ok()?;
-        let modalities = registered(about).or_else(|| listed(about))?;
-        let latency = Duration::from_nanos(modalities.iter().map(|measured| measured.latency_ns).max().unwrap_or(0));
+        let (modalities, usual_limits) = match registered(about) {
+            Some(modalities) => (modalities, false),
+            None => (listed(about)?, true),
+        };
+        let all: Vec<Measured> = modalities.iter().map(|modality| modality.measured.clone()).collect();
+        let latency = Duration::from_nanos(all.iter().map(|measured| measured.latency_ns).max().unwrap_or(0));
         let window = Duration::from_nanos(number("sync_window_ns")?);
         let wait = window.saturating_add(SETTLE).saturating_add(latency);
-        let mut limits = vec![None; MAX_MODALITIES];
-        for measured in &modalities {
-            if let Some(place) = limits.get_mut(measured.id.index()) {
-                *place = Some(measured.limits);
-            }
-        }
-        let measures = Measures::new(&modalities, Frames { begin_ns, hz, wait });
-        let layout = objects(about, "layout")
-            .filter_map(|(name, bit)| Some((name, ModalityId::new(u8::try_from(bit.as_u64()?).ok()?)?)));
-        let layout = layout.collect();
-        let mut judge = Self {
-            measures,
-            begin_ns,
-            limits,
-            layout,
-            numbers: vec![(None, 0); MAX_MODALITIES],
-            publishers: Publishers::default(),
-        };
+        let measures = Measures::new(&all, Frames { begin_ns, hz, wait });
+        let numbers = vec![(None, 0); MAX_MODALITIES];
+        let publishers = Publishers::default();
+        let mut judge = Self { measures, begin_ns, modalities, usual_limits, numbers, publishers };
         for (device, _) in objects(about, "serials") {
             judge.plugged(&device, begin_ns, true);
         }
@@ -90,8 +106,8 @@ impl Judge {
 
     /// Takes that a device was plugged in, or out.
     pub(super) fn plugged(&mut self, device: &str, at_ns: u64, there: bool) {
-        if let Some(id) = self.layout.get(device) {
-            self.measures.plugged(*id, at_ns, there);
+        if let Some(known) = self.modalities.iter().find(|known| known.name == device) {
+            self.measures.plugged(known.measured.id, at_ns, there);
         }
     }
 
@@ -163,52 +179,153 @@ impl Judge {
     pub(super) fn judge(&self, modalities: &mut [ModalityReport], ending: &Ending<'_>) -> Verdict {
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saturates, as wanted")]
         let end_ns = self.begin_ns.saturating_add((ending.seconds * 1e9).round() as u64);
-        let counted: Option<Value> =
-            ending.summary.get("modalities").and_then(|counted| serde_json::from_str(counted).ok());
+        let counted = Recorded::of(ending.summary);
+        let qualities: Vec<(&Registered, Quality)> =
+            self.modalities.iter().filter_map(|known| Some((known, self.quality(known, &counted, end_ns)?))).collect();
         for report in modalities.iter_mut() {
-            let Some(id) = ModalityId::new(report.bit) else { continue };
-            let Some(mut quality) = self.measures.quality(id, end_ns) else { continue };
-            let missing = self.numbers.get(id.index()).map_or(0, |(_, missing)| *missing);
-            let said = |key: &str| counted.as_ref()?.get(&report.name)?.get(key)?.as_u64();
-            quality.lost = said("lost").unwrap_or(0);
-            quality.dropped = said("dropped").unwrap_or(missing);
-            quality.damaged = quality.truncated.max(said("damaged").unwrap_or(0));
+            let of_it = |known: &Registered| known.measured.id.bit() == report.bit;
+            let Some((_, quality)) = qualities.iter().find(|(known, _)| of_it(known)) else { continue };
             report.topic.hz = quality.hz.unwrap_or(0.0);
             report.topic.longest_gap = quality.longest_gap;
-            report.topic.missing = missing;
-            report.quality = Some(quality);
+            report.topic.missing = self.numbers.get(usize::from(report.bit)).map_or(0, |(_, missing)| *missing);
+            report.quality = Some(*quality);
         }
-        // A modality with two schemas has two channels and is still one.
-        let mut bits = std::collections::BTreeSet::new();
-        let judged: Vec<Judged<'_>> = modalities
+        let judged: Vec<Judged<'_>> = qualities
             .iter()
-            .filter(|report| bits.insert(report.bit))
-            .filter_map(|report| {
-                let limits = self.limits.get(usize::from(report.bit)).copied().flatten()?;
-                Some(Judged { name: &report.name, quality: report.quality.as_ref()?, limits })
-            })
+            .map(|(known, quality)| Judged { name: &known.name, quality, limits: known.measured.limits })
             .collect();
-        let said = |key: &str| ending.summary.get(key).and_then(|count| count.parse().ok()).unwrap_or(0);
+        let count = |key: &str| counted.count(key).unwrap_or(0);
         let publishers = self.publishers.clone().or_summed_up(ending.summary);
+        let mut findings = self.not_judged(modalities, ending);
+        findings.extend(counted.differences(&qualities, ending));
         let facts = Facts {
             publishers: publishers.list(),
             modalities: &judged,
-            masks_dropped: said("masks_dropped"),
-            events_missed: said("events_missed"),
+            masks_dropped: count("masks_dropped"),
+            events_missed: count("events_missed"),
             seconds: ending.seconds,
             // A repaired file's summary counts what is there.
-            losses: if counted.is_some() && ending.summary.contains_key("lost") {
-                Losses::Apart
-            } else {
-                Losses::Together
-            },
+            losses: if counted.count("lost").is_some() { Losses::Apart } else { Losses::Together },
             file: file_state(ending),
+            findings: &findings,
         };
         judge(&facts)
+    }
+
+    /// What a modality was like: what the file holds, and what the recorder alone could count.
+    fn quality(&self, known: &Registered, counted: &Recorded<'_>, end_ns: u64) -> Option<Quality> {
+        let id = known.measured.id;
+        let mut quality = self.measures.quality(id, end_ns)?;
+        let missing = self.numbers.get(id.index()).map_or(0, |(_, missing)| *missing);
+        quality.lost = counted.of_modality(&known.name, "lost").unwrap_or(0);
+        quality.dropped = counted.of_modality(&known.name, "dropped").unwrap_or(missing);
+        quality.damaged = quality.truncated.max(counted.of_modality(&known.name, "damaged").unwrap_or(0));
+        Some(quality)
+    }
+
+    /// What of the file could not be judged.
+    fn not_judged(&self, channels: &[ModalityReport], ending: &Ending<'_>) -> Vec<Finding> {
+        let mut findings = Vec::new();
+        if self.usual_limits {
+            findings.push(Finding::suspect(
+                "this version does not understand the registry in the file: judged by the usual limits",
+            ));
+        }
+        let passed_over = ending.counted.unread.saturating_add(ending.file.oversized);
+        if passed_over > 0 {
+            findings.push(Finding::suspect(format!("{passed_over} records in the file cannot be understood")));
+        }
+        let has_channel = |known: &&Registered| !channels.iter().any(|of| of.bit == known.measured.id.bit());
+        for known in self.modalities.iter().filter(has_channel) {
+            findings.push(Finding::suspect(format!("{}: the file has no channel for it", known.name)));
+        }
+        let is_known = |of: &&ModalityReport| !self.modalities.iter().any(|known| known.measured.id.bit() == of.bit);
+        for channel in channels.iter().filter(is_known) {
+            findings.push(Finding::suspect(format!("{}: not in the registry of the file", channel.name)));
+        }
+        findings
+    }
+}
+
+/// The verdict on an episode whose metadata cannot be read.
+pub(super) fn without_metadata(ending: &Ending<'_>) -> Verdict {
+    let reason =
+        format!("its metadata record {ABOUT:?} is missing or cannot be read, so that nothing in it can be judged");
+    let reasons = match file_state(ending) {
+        FileState::NotWhole(why) => vec![reason, format!("the file is not whole: {why}")],
+        FileState::Whole | FileState::Failed(_) => vec![reason],
+    };
+    Verdict { grade: Grade::Bad, reasons, sensors: None }
+}
+
+/// What the recorder counted.
+struct Recorded<'a> {
+    summary: &'a BTreeMap<String, String>,
+    modalities: Option<Value>,
+}
+
+impl<'a> Recorded<'a> {
+    fn of(summary: &'a BTreeMap<String, String>) -> Self {
+        let modalities = summary.get("modalities").and_then(|counted| serde_json::from_str(counted).ok());
+        Self { summary, modalities }
+    }
+
+    fn count(&self, key: &str) -> Option<u64> {
+        self.summary.get(key)?.parse().ok()
+    }
+
+    fn of_modality(&self, modality: &str, key: &str) -> Option<u64> {
+        self.modalities.as_ref()?.get(modality)?.get(key)?.as_u64()
+    }
+
+    /// In what a finished file is not what its recorder says that it wrote.
+    fn differences(&self, qualities: &[(&Registered, Quality)], ending: &Ending<'_>) -> Vec<Finding> {
+        // Without a summary the file is not whole, and that of a repaired one counts what is there.
+        if self.summary.is_empty() || ending.repaired {
+            return Vec::new();
+        }
+        let mut missing: Vec<String> = Vec::new();
+        let mut findings = Vec::new();
+        let mut same = |recorded: Option<u64>, counted: u64, key: &str, what: &str| match recorded {
+            None => missing.push(key.to_owned()),
+            Some(recorded) if recorded != counted => {
+                let reason = format!("the recorder wrote {recorded} {what}, the file has {counted}");
+                findings.push(Finding::suspect(reason));
+            }
+            Some(_) => {}
+        };
+        same(self.count("messages"), ending.counted.messages, "messages", "messages");
+        same(self.count("frames"), ending.counted.frames, "frames", "frames");
+        for (known, quality) in qualities {
+            let key = format!("modalities.{}.samples", known.name);
+            same(
+                self.of_modality(&known.name, "samples"),
+                quality.samples,
+                &key,
+                &format!("samples of {}", known.name),
+            );
+        }
+        let length = self.summary.get("duration_s").and_then(|seconds| seconds.parse::<f64>().ok());
+        if length.is_none_or(|seconds| !seconds.is_finite()) {
+            missing.push("duration_s".to_owned());
+        }
+        let counts = ["masks_dropped", "events_missed"].into_iter().filter(|key| self.count(key).is_none());
+        missing.extend(counts.map(str::to_owned));
+        for (known, _) in qualities {
+            let counts =
+                ["lost", "dropped", "damaged"].into_iter().filter(|key| self.of_modality(&known.name, key).is_none());
+            missing.extend(counts.map(|key| format!("modalities.{}.{key}", known.name)));
+        }
+        if !missing.is_empty() {
+            let missing = missing.join(", ");
+            findings.push(Finding::suspect(format!("its record {SUMMARY:?} does not say {missing}")));
+        }
+        findings
     }
 }
 
 const DAMAGED: &str = "parts of it are damaged";
+const UNPROVEN: &str = "check values are missing in it, so that damage would not show";
 
 fn file_state<'a>(ending: &Ending<'a>) -> FileState<'a> {
     let Ending { file: walked, summary, repaired, .. } = ending;
@@ -220,6 +337,7 @@ fn file_state<'a>(ending: &Ending<'a>) -> FileState<'a> {
             Some(why) => FileState::NotWhole(why),
             // Whoever wrote the footer: what the recorder ends, it sums up.
             None if summary.is_empty() => FileState::NotWhole("the recorder has not finished it"),
+            None if !walked.proven => FileState::NotWhole(UNPROVEN),
             None => FileState::Whole,
         },
         FileEnd::Finished => FileState::NotWhole(DAMAGED),
@@ -239,32 +357,38 @@ fn objects(about: &BTreeMap<String, String>, key: &str) -> impl Iterator<Item = 
 pub(super) fn recorded_verdict(summary: &BTreeMap<String, String>) -> Option<Verdict> {
     let word = summary.get("verdict")?;
     let grade = [Grade::Good, Grade::Suspect, Grade::Bad].into_iter().find(|grade| grade.word() == word)?;
-    let reasons = summary.get("reasons").and_then(|reasons| serde_json::from_str(reasons).ok()).unwrap_or_default();
-    Some(Verdict { grade, reasons })
+    let reasons = serde_json::from_str(summary.get("reasons")?).ok()?;
+    let sensors = summary.get("sensors").and_then(|sensors| serde_json::from_str(sensors).ok());
+    Some(Verdict { grade, reasons, sensors })
 }
 
 /// The modalities by the registry in the file.
-fn registered(about: &BTreeMap<String, String>) -> Option<Vec<Measured>> {
+fn registered(about: &BTreeMap<String, String>) -> Option<Vec<Registered>> {
     let text = about.get("registry").filter(|text| text.len() <= LONGEST_REGISTRY)?;
     let registry = Registry::parse(text, None).ok()?.registry;
     // Nothing is reserved: how large payloads are, a file is not believed.
-    let measured = registry.devices.iter().map(|device| Measured {
-        id: device.id,
-        limits: device.verdict,
-        latency_ns: nanoseconds(device.latency),
+    let measured = registry.devices.iter().map(|device| Registered {
+        name: device.name.clone(),
+        measured: Measured { id: device.id, limits: device.verdict, latency_ns: nanoseconds(device.latency) },
     });
     Some(measured.collect())
 }
 
 /// The modalities by their list, where this version does not understand the registry.
-fn listed(about: &BTreeMap<String, String>) -> Option<Vec<Measured>> {
+fn listed(about: &BTreeMap<String, String>) -> Option<Vec<Registered>> {
     let list: Vec<Value> = serde_json::from_str(about.get("modalities")?).ok()?;
     let measured = |entry: &Value| {
+        let name = entry.get("name")?.as_str()?.to_owned();
         let id = ModalityId::new(u8::try_from(entry.get("bit")?.as_u64()?).ok()?)?;
         let kind: ModalityKind = serde_json::from_value(entry.get("kind")?.clone()).ok()?;
         // Files of earlier versions have no latencies.
         let latency_ns = entry.get("latency_ns").and_then(Value::as_u64).unwrap_or(0);
-        Some(Measured { id, limits: VerdictSpec::of(kind, STALL_AFTER, None), latency_ns })
+        let measured = Measured { id, limits: VerdictSpec::of(kind, STALL_AFTER, None), latency_ns };
+        Some(Registered { name, measured })
     };
-    Some(list.iter().filter_map(measured).collect())
+    let mut modalities: Vec<Registered> = list.iter().map(measured).collect::<Option<_>>()?;
+    modalities.sort_by_key(|modality| modality.measured.id);
+    // A hostile list may name one twice.
+    modalities.dedup_by_key(|modality| modality.measured.id);
+    Some(modalities)
 }

@@ -7,8 +7,8 @@ use serde::Serialize;
 
 use super::super::episode::PARTIAL;
 use super::render::{clean, colour, grade_colour, size};
-use super::{FileEnd, InspectError, Inspection, Paint, inspect};
-use crate::status::Verdict;
+use super::{FileEnd, InspectError, Inspection, Judgement, Paint, inspect};
+use crate::status::Grade;
 use crate::text;
 
 /// An episode of a list. As JSON, one object a line.
@@ -17,9 +17,9 @@ pub struct Listed {
     /// The file.
     #[serde(serialize_with = "text::lossy")]
     pub file: PathBuf,
-    /// The verdict; absent if the file could not be read.
+    /// What it is worth.
     #[serde(flatten)]
-    pub verdict: Option<Verdict>,
+    pub verdict: Judgement,
     /// Length in seconds.
     pub seconds: f64,
     /// Bytes of the file.
@@ -74,7 +74,7 @@ fn is_episode(path: &Path) -> bool {
 pub fn list(file: &Path) -> Listed {
     match inspect(file) {
         Ok(Inspection { file, bytes, end, verdict, task, seconds, messages, .. }) => {
-            Listed { file, verdict: Some(verdict), seconds, bytes, messages, task, end: Some(end), error: None }
+            Listed { file, verdict, seconds, bytes, messages, task, end: Some(end), error: None }
         }
         Err(error) => {
             // The file is named beside it.
@@ -82,7 +82,7 @@ pub fn list(file: &Path) -> Listed {
             let text = text.strip_prefix(&format!("{}: ", file.display())).unwrap_or(&text).to_owned();
             Listed {
                 file: file.to_owned(),
-                verdict: None,
+                verdict: Judgement::Unreadable(text.clone()),
                 seconds: 0.0,
                 bytes: 0,
                 messages: 0,
@@ -94,21 +94,26 @@ pub fn list(file: &Path) -> Listed {
     }
 }
 
-/// The episode in a line without its end; `name` columns are those of the longest file name.
+/// The episode, called `name`, in a line without its end; `columns` are those of the longest name.
 #[must_use]
-pub fn render_list(listed: &Listed, name: usize, paint: Paint) -> String {
-    let file = clean(&listed.file.file_name().unwrap_or_default().to_string_lossy());
-    let Some(Verdict { grade, reasons }) = &listed.verdict else {
-        let word = colour(paint, grade_colour(None), &format!("{:7}", "?"));
-        return format!("{word}  {file:name$}  {}", clean(listed.error.as_deref().unwrap_or_default()));
+pub fn render_list(listed: &Listed, name: &str, columns: usize, paint: Paint) -> String {
+    let name = text::left(&clean(name), columns, "...");
+    let (word, shade) = match &listed.verdict {
+        Judgement::Episode(verdict) => (verdict.grade.word(), grade_colour(Some(verdict.grade))),
+        Judgement::NotOurs => ("-", grade_colour(Some(Grade::Suspect))),
+        Judgement::Unreadable(_) => ("?", grade_colour(None)),
     };
-    let word = colour(paint, grade_colour(Some(*grade)), &format!("{:7}", grade.word()));
-    let mut line = format!("{word}  {file:name$}  {:>8.1} s  {:>8}", listed.seconds, size(listed.bytes));
+    let mut line = format!("{}  {name}", colour(paint, shade, &format!("{word:7}")));
+    if let Judgement::Episode(verdict) = &listed.verdict {
+        let _ = write!(line, "  {:>8.1} s  {:>8}  {}", listed.seconds, size(listed.bytes), clean(&verdict.sensors()));
+    }
+    let reasons = listed.verdict.reasons();
     if let Some(first) = reasons.first() {
         let _ = write!(line, "  {}", clean(first));
     }
     if reasons.len() > 1 {
         let _ = write!(line, " (and {} more)", reasons.len() - 1);
     }
+    line.truncate(line.trim_end().len());
     line
 }

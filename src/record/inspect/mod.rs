@@ -1,13 +1,15 @@
 //! What a recorded file holds: counts, rates, gaps, lateness and presence of every modality, and the
-//! verdict on it, by the same code as the recorder's.
+//! verdict on it, by the same code as the recorder's. Every command that has to know what an episode is worth
+//! asks [`inspect`].
 //!
 //! Reads any file the recorder wrote, finished or not, from its beginning to where it ends.
 //!
+//! Invariant: GOOD is proven: see [`judge`]. What cannot be read or judged is never GOOD.
 //! Invariant: no file makes this panic, and memory does not grow with a file's payloads.
 
-mod brief;
 mod collect;
 mod judge;
+mod judgement;
 mod list;
 mod policy;
 mod render;
@@ -15,7 +17,7 @@ mod render;
 mod tests;
 mod units;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};
 
@@ -29,7 +31,7 @@ use crate::text;
 use collect::Collected;
 
 pub use super::walk::FileEnd;
-pub use brief::{Brief, brief};
+pub use judgement::Judgement;
 pub use list::{Listed, episodes, list, render_list};
 pub use policy::{HoldReport, PolicyReport};
 pub use render::{Paint, render};
@@ -65,7 +67,7 @@ pub struct Inspection {
     pub end: FileEnd,
     /// What it is worth, by what it holds.
     #[serde(flatten)]
-    pub verdict: Verdict,
+    pub verdict: Judgement,
     /// What the recorder said when it was finished.
     pub recorded_verdict: Option<Verdict>,
     /// Bytes at its end that could not be understood.
@@ -86,6 +88,10 @@ pub struct Inspection {
     pub task: String,
     /// Tags of the user.
     pub tags: BTreeMap<String, String>,
+    /// Modules that were mounted.
+    pub modules: Vec<String>,
+    /// Modalities that were present when it began; unknown in a file that does not say so.
+    pub present_at_begin: Option<BTreeSet<String>>,
     /// Beginning, ns since 1970.
     pub begin_ns: u64,
     /// Length in seconds: what the recorder says, else up to the last message.

@@ -2,10 +2,10 @@
 
 use std::fmt::Write;
 
-use super::{FileEnd, Inspection, Lateness, ModalityReport, PolicyReport, TopicReport};
+use super::{FileEnd, Inspection, Judgement, Lateness, ModalityReport, PolicyReport, TopicReport};
 use super::{policy, units};
 use crate::record::Spread;
-use crate::status::{Grade, Verdict};
+use crate::status::Grade;
 use crate::text;
 
 /// Whether the terminal shows colours.
@@ -131,19 +131,19 @@ fn write_policy(out: &mut String, policy: &PolicyReport, width: usize) -> std::f
 }
 
 fn write_verdict(out: &mut String, inspection: &Inspection, paint: Paint) -> std::fmt::Result {
-    let Verdict { grade, reasons } = &inspection.verdict;
-    if inspection.modalities.iter().all(|modality| modality.quality.is_none()) {
-        return Ok(());
+    let Judgement::Episode(verdict) = &inspection.verdict else {
+        return writeln!(out, "{}", colour(paint, YELLOW, &clean(&inspection.verdict.reasons().join("; "))));
+    };
+    let mut line = colour(paint, grade_colour(Some(verdict.grade)), verdict.grade.word());
+    if verdict.sensors.is_some() {
+        write!(line, "   {}", clean(&verdict.sensors()))?;
     }
-    let word = colour(paint, grade_colour(Some(*grade)), grade.word());
-    match &inspection.recorded_verdict {
-        Some(recorded) if recorded != &inspection.verdict => {
-            let other = colour(paint, grade_colour(Some(recorded.grade)), recorded.grade.word());
-            writeln!(out, "{word}   when it was recorded: {other} {}", clean(&recorded.why()))?;
-        }
-        _ => writeln!(out, "{word}")?,
+    if let Some(recorded) = inspection.recorded_verdict.as_ref().filter(|recorded| !recorded.says_as(verdict)) {
+        let other = colour(paint, grade_colour(Some(recorded.grade)), recorded.grade.word());
+        write!(line, "   when it was recorded: {other} {}", clean(&recorded.why()))?;
     }
-    for reason in reasons {
+    writeln!(out, "{line}")?;
+    for reason in &verdict.reasons {
         writeln!(out, "  {}", clean(reason))?;
     }
     Ok(())

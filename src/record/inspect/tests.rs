@@ -5,7 +5,7 @@ use proptest::prelude::*;
 use super::*;
 use crate::episode_format::testing;
 use crate::record::tests::Bench;
-use crate::status::{Chunk, Grade, What};
+use crate::status::{Chunk, Grade, Sensors, What};
 
 fn of(bytes: &[u8]) -> Option<Inspection> {
     inspect_from(&mut &*bytes, bytes.len() as u64, Path::new("x.mcap")).unwrap()
@@ -37,8 +37,8 @@ async fn a_finished_episode_is_told_as_it_was() {
     // The absence is neither a gap nor a loss of rate.
     assert!((0.02..0.1).contains(&cam.topic.longest_gap), "{}", cam.topic.longest_gap);
     assert!((30.0..36.0).contains(&cam.topic.hz), "{}", cam.topic.hz);
-    assert_eq!(said.recorded_verdict.as_ref(), Some(&said.verdict), "the recorder says the same");
-    assert!(said.verdict.reasons.iter().any(|reason| reason.starts_with("tof: 7 of ")), "{:?}", said.verdict);
+    assert_eq!(said.recorded_verdict.as_ref(), said.verdict.verdict(), "the recorder says the same");
+    assert!(said.verdict.reasons().iter().any(|reason| reason.starts_with("tof: 7 of ")), "{:?}", said.verdict);
     let frame = said.topics.iter().find(|topic| topic.topic == "/rapid/frame").unwrap();
     assert_eq!((frame.messages, frame.lateness), (30, None));
     assert_eq!(cam.topic.lateness, Some(Lateness { p50: 5.0, p99: 5.0, max: 5.0 }));
@@ -227,10 +227,7 @@ fn the_report_on_a_screen() {
         file: PathBuf::from("/data/20261121_place-block_001.mcap"),
         bytes: 7_400_000,
         end: FileEnd::Torn,
-        verdict: Verdict {
-            grade: Grade::Suspect,
-            reasons: vec!["the file is not whole: its last record is cut".to_owned()],
-        },
+        verdict: Judgement::Episode(suspect()),
         recorded_verdict: None,
         unread_bytes: 512,
         damaged_chunks: 0,
@@ -241,6 +238,8 @@ fn the_report_on_a_screen() {
         rig: "bench".to_owned(),
         task: "place \x1b[31mblock".to_owned(),
         tags: BTreeMap::from([("finger".to_owned(), "soft".to_owned())]),
+        modules: Vec::new(),
+        present_at_begin: None,
         begin_ns: 0,
         seconds: 10.0,
         messages: 5300,
@@ -327,7 +326,10 @@ async fn a_folder_is_a_line_for_each_of_its_episodes() {
     let name = file.file_name().unwrap().to_str().unwrap();
     assert_eq!(names, ["20231114_t_001.mcap", name, "99990101_t_001.mcap.partial", name]);
 
-    let lines: Vec<_> = files.iter().map(|file| render_list(&list(file), 30, Paint::Plain)).collect();
+    let lines: Vec<_> = files
+        .iter()
+        .map(|file| render_list(&list(file), &file.file_name().unwrap().to_string_lossy(), 30, Paint::Plain))
+        .collect();
     assert!(
         lines[0].starts_with("?        20231114_t_001.mcap") && lines[0].ends_with("not an MCAP file"),
         "{lines:?}"
@@ -341,9 +343,19 @@ async fn a_folder_is_a_line_for_each_of_its_episodes() {
     let json = serde_json::to_value(list(&files[1])).unwrap();
     assert_eq!((&json["verdict"], &json["end"], json.get("error")), (&"BAD".into(), &"finished".into(), None));
     let json = serde_json::to_value(list(&files[0])).unwrap();
-    assert_eq!((json.get("verdict"), &json["error"]), (None, &"not an MCAP file".into()));
+    let why = "not an MCAP file";
+    assert_eq!((&json["verdict"], &json["error"]), (&serde_json::Value::Null, &why.into()));
+    assert_eq!(json["reasons"], serde_json::json!([why]));
     assert!(matches!(episodes(&[folder.join("none")]).map(|files| files.len()), Ok(1)), "said when it is read");
     drop(bench);
+}
+
+fn suspect() -> Verdict {
+    Verdict {
+        grade: Grade::Suspect,
+        reasons: vec!["the file is not whole: its last record is cut".to_owned()],
+        sensors: Some(Sensors { registered: 2, recorded: 1, without: vec!["tof".to_owned()] }),
+    }
 }
 
 /// What was measured of a modality, for a report on a screen.

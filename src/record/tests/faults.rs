@@ -128,7 +128,7 @@ async fn a_file_that_failed_gets_no_end_that_makes_it_look_whole() {
     assert_eq!(verdict.grade, Grade::Bad);
     let said = inspect::inspect(&file).unwrap();
     assert_eq!((said.end, said.recorded_verdict), (inspect::FileEnd::Unfinished, None));
-    assert_ne!(said.verdict.grade, Grade::Good);
+    assert_ne!(said.verdict.grade().unwrap(), Grade::Good);
     let repaired = recover::recover(&file, &mut |_, _| std::ops::ControlFlow::Continue(())).unwrap();
     assert!(matches!(repaired.outcome, recover::Outcome::Repaired(_)), "{repaired:?}");
 }
@@ -156,12 +156,13 @@ async fn a_footer_without_our_summary_makes_no_episode_whole() {
     let said = inspect::inspect(&partial).unwrap();
     let reason = "the file is not whole: the recorder has not finished it";
     assert_eq!(said.end, inspect::FileEnd::Finished);
-    assert!(said.verdict.reasons.iter().any(|said| said == reason), "{:?}", said.verdict);
+    assert!(said.verdict.reasons().contains(&reason), "{:?}", said.verdict);
     let said = recover::recover(&partial, &mut |_, _| std::ops::ControlFlow::Continue(())).unwrap();
     let recover::Outcome::Repaired(repaired) = said.outcome else { panic!("{said:?}") };
     // Nothing of it is left out, and nothing of it is kept.
     assert!(repaired.original.is_none() && !partial.exists());
-    let reasons = inspect::inspect(&repaired.to).unwrap().verdict.reasons;
+    let said = inspect::inspect(&repaired.to).unwrap();
+    let reasons = said.verdict.reasons();
     assert!(reasons.iter().any(|said| said.contains("it was repaired")), "{reasons:?}");
 }
 
@@ -245,7 +246,7 @@ async fn a_panic_leaves_a_finished_file_and_says_so() {
     // Whoever reads the file is told what the recorder said.
     let said = inspect::inspect(&finished).unwrap();
     assert!(said.recorded_verdict.as_ref().unwrap().reasons.iter().any(|said| said.contains("scripted panic")));
-    assert_eq!(Some(said.verdict), said.recorded_verdict);
+    assert_eq!(said.verdict.verdict(), said.recorded_verdict.as_ref());
     assert_eq!(read(&finished).on("/rapid/tof").count(), 1);
     assert!(matches!(bench.recorder.start(bench.request(None)).await, Err(RecordError::Ended)));
 }

@@ -54,8 +54,12 @@ async fn a_disk_that_fills_up_is_told_once_and_ends_the_episode_with_a_whole_fil
     let read = read(&finished);
     assert_eq!(read.metadata["rapid/summary"]["cut_short"], error);
     let said = inspect::inspect(&finished).unwrap();
-    assert!(said.verdict.grade > Grade::Good && said.verdict.why().contains(&error), "{:?}", said.verdict);
-    assert_eq!(Some(said.verdict), said.recorded_verdict);
+    assert!(
+        said.verdict.verdict().unwrap().grade > Grade::Good && said.verdict.verdict().unwrap().why().contains(&error),
+        "{:?}",
+        said.verdict
+    );
+    assert_eq!(said.verdict.verdict(), said.recorded_verdict.as_ref());
     assert_eq!(read.on("/rapid/tof").count(), 1);
     assert_eq!(read.on("/rapid/event").filter(|message| text(&message.4, "kind") == "disk_low").count(), 1);
     assert_eq!(bench.board.snapshot().last_episode, Some(finished));

@@ -1,0 +1,72 @@
+"""What recorded files are worth: the judgement of `rapid inspect`, which is that of the recorder and the monitor.
+
+Only the standard library is used, so that whoever picks episodes can ask without an environment for training.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+# As many files as one command line names: their paths may be long.
+AT_ONCE = 200
+# Exit code of `rapid inspect` when a file of a list cannot be read.
+UNREADABLE = 2
+
+
+class JudgementError(Exception):
+    """`rapid inspect` cannot be asked; says why and what to do."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """The verdict on one file."""
+
+    verdict: str | None
+    """GOOD, SUSPECT, BAD; None of a file that is not an episode of rapid or cannot be read."""
+    reasons: tuple[str, ...]
+    """Why it is not GOOD."""
+
+    def __str__(self) -> str:
+        return f"{self.verdict or 'no verdict'}: {'; '.join(self.reasons)}"
+
+
+def program() -> str:
+    """The program that judges: RAPID_BIN, otherwise `rapid` of the PATH."""
+    named = os.environ.get("RAPID_BIN")
+    found = shutil.which(named or "rapid")
+    if found is None:
+        what = f"RAPID_BIN={named} is no program" if named else "no program `rapid` in the PATH"
+        raise JudgementError(f"{what}: build it (cargo build --release) and set RAPID_BIN=/path/to/target/release/rapid")
+    return found
+
+
+def judge(files: Iterable[Path]) -> dict[Path, Judgement]:
+    """Every file read whole and judged, by its path."""
+    files, rapid = list(files), program()
+    judged: dict[Path, Judgement] = {}
+    for first in range(0, len(files), AT_ONCE):
+        judged.update(_ask(rapid, files[first : first + AT_ONCE]))
+    return judged
+
+
+def _ask(rapid: str, files: list[Path]) -> dict[Path, Judgement]:
+    # A file named twice makes a list, in which one that cannot be read has a line like the others.
+    names = [str(file) for file in (files if len(files) > 1 else files * 2)]
+    command = [rapid, "inspect", "--json", "--", *names]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode not in (0, UNREADABLE):
+        raise JudgementError(f"{rapid} inspect: exit code {done.returncode}: {done.stderr.strip()}")
+    try:
+        lines = [json.loads(line) for line in done.stdout.splitlines()]
+        judged = [Judgement(line["verdict"], tuple(line["reasons"])) for line in lines]
+    except (ValueError, KeyError, TypeError) as error:
+        raise JudgementError(f"{rapid} inspect: an answer that is not understood ({error}); is it this version?") from error
+    if len(judged) != len(names):
+        raise JudgementError(f"{rapid} inspect: {len(judged)} answers for {len(names)} files: {done.stderr.strip()}")
+    return dict(zip((Path(name) for name in names), judged, strict=True))
