@@ -11,13 +11,14 @@ use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::ops::Range;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use mcap::records::{MessageHeader, Metadata};
 use mcap::write::NoSeek;
 use mcap::{Attachment, McapError, WriteOptions, Writer};
 
 use super::encode::{self, EventText};
+use super::guard::Guard;
 use super::schema::{self, PROTOBUF, SampleSchema, Schema};
 use crate::action::ACTION_TOPIC;
 use crate::episode_format::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, SUMMARY};
@@ -55,6 +56,10 @@ pub(super) struct EpisodeFile {
     #[expect(dead_code, reason = "held to be dropped")]
     shut: Shut,
     writer: Writer<NoSeek<BufWriter<Latch>>>,
+    /// Bytes that the sink took.
+    written: Arc<AtomicU64>,
+    /// None where nobody else can reach the file.
+    guard: Option<Guard>,
     clock: WallClock,
     message: Vec<u8>,
     tracks: Vec<Option<Track>>,
@@ -86,6 +91,7 @@ impl Drop for Shut {
 struct Latch {
     sink: Box<dyn Sink>,
     shut: Arc<AtomicBool>,
+    written: Arc<AtomicU64>,
 }
 
 impl Latch {
@@ -103,7 +109,9 @@ impl Latch {
 
 impl Write for Latch {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        self.take(|sink| sink.write(bytes))
+        let taken = self.take(|sink| sink.write(bytes))?;
+        self.written.fetch_add(taken as u64, Ordering::Relaxed);
+        Ok(taken)
     }
 
     fn flush(&mut self) -> io::Result<()> {
@@ -137,8 +145,8 @@ impl EpisodeFile {
         begin: Stamp,
         metadata: BTreeMap<String, String>,
     ) -> io::Result<Self> {
-        let shut = Shut::default();
-        let mut writer = writer(Latch { sink, shut: Arc::clone(&shut.0) })?;
+        let (shut, written) = (Shut::default(), Arc::<AtomicU64>::default());
+        let mut writer = writer(Latch { sink, shut: Arc::clone(&shut.0), written: Arc::clone(&written) })?;
         writer.write_metadata(&Metadata { name: ABOUT.to_owned(), metadata }).map_err(io_error)?;
         let wall_ns = clock.wall_ns(begin);
         writer
@@ -171,6 +179,8 @@ impl EpisodeFile {
         let mut file = Self {
             shut,
             writer,
+            written,
+            guard: None,
             clock,
             message: Vec::new(),
             tracks,
@@ -200,6 +210,12 @@ impl EpisodeFile {
             }
         }
         Ok(file)
+    }
+
+    /// Looks at every flush and at the end whether another program has damaged the file.
+    pub(super) fn guarded(mut self, guard: Guard) -> Self {
+        self.guard = Some(guard);
+        self
     }
 
     /// Is this, byte for byte, the newest sample of the modality? Compared with what was written, of which a
@@ -263,8 +279,13 @@ impl EpisodeFile {
     /// Hands everything written so far to the kernel: from then on it survives the end of this
     /// process. It does not wait for the disk, which may take seconds: what the kernel has not written
     /// back yet a loss of power can take.
+    ///
+    /// # Errors
+    /// When the disk does not take it, or another program has damaged what was written so far.
     pub(super) fn flush(&mut self) -> io::Result<()> {
-        self.writer.flush().map_err(io_error)
+        self.writer.flush().map_err(io_error)?;
+        let written = self.written.load(Ordering::Relaxed);
+        self.guard.as_mut().map_or(Ok(()), |guard| guard.look(written))
     }
 
     /// Ends the file with the summary and waits for the disk. A file that is dropped instead, or
@@ -275,7 +296,9 @@ impl EpisodeFile {
         self.writer.finish().map_err(io_error)?;
         let buffered = self.writer.into_inner().into_inner();
         let mut latch = buffered.into_inner().map_err(io::IntoInnerError::into_error)?;
-        latch.sync()
+        latch.sync()?;
+        let written = self.written.load(Ordering::Relaxed);
+        self.guard.map_or(Ok(()), |guard| guard.verify(written))
     }
 
     fn write(&mut self, channel_id: u16, sequence: u64, log_time: u64, published: Stamp) -> io::Result<()> {

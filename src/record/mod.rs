@@ -15,6 +15,7 @@ mod describe;
 pub mod encode;
 mod episode;
 mod file;
+mod guard;
 mod hole;
 pub mod inspect;
 mod keep;

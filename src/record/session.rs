@@ -33,6 +33,7 @@ use super::describe::describe;
 use super::encode::EventText;
 use super::episode::{Closing, EpisodePath, EpisodeReport};
 use super::file::EpisodeFile;
+use super::guard::Guard;
 use super::hole::Hole;
 use super::keep;
 use super::masks::MaskHistory;
@@ -88,7 +89,7 @@ impl Session {
         let mask = masks.at(begin).map_or(PhysicalMask::default(), |(_, mask, _)| *mask);
         let configuration = Configuration::of(&registry, &request.modules, &request.tags, mask);
         let said = metadata::beginning(&registry, &request.task, &configuration, &units, clock, begin);
-        let mut file = EpisodeFile::begin(sink, &registry, clock, begin, said)?;
+        let mut file = EpisodeFile::begin(sink, &registry, clock, begin, said)?.guarded(Guard::begin(&path));
         let settle = SETTLE + registry.devices.iter().map(|device| device.latency).max().unwrap_or_default();
         let mut measures = Measures::new(&Measured::all(&registry), Frames::of(&registry, begin, settle));
         for device in registry.devices.iter().filter(|device| attached.has(&device.name)) {

@@ -4,6 +4,7 @@ mod episode;
 mod faults;
 mod room;
 mod session;
+mod tampering;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fmt::Write as _;

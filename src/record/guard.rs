@@ -1,0 +1,124 @@
+//! Whether the file of the episode in progress is still what the recorder wrote.
+//!
+//! 1. The file is only appended to, so that its size is what was written, unless another program cut it or wrote
+//!    behind it: then the size stays wrong, and every look sees it.
+//! 2. A file without a name whose name means another file was replaced.
+//! 3. The kernel reports that another program had the file open for writing (inotify(7), `IN_CLOSE_WRITE`): what it
+//!    did within the file is not visible from outside. Such a file, and one that another program has open, is read
+//!    back once it is finished, and all its check values must be right. Others are not read back.
+//!
+//! A removed file is no damage: it is written again when the episode ends (`keep`).
+//!
+//! Invariant: between two samples nothing here runs: a look belongs to a flush.
+
+use std::fs::File;
+use std::io::{self, BufReader};
+use std::mem::MaybeUninit;
+use std::os::fd::{AsRawFd, OwnedFd};
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use rustix::fs::inotify::{self, CreateFlags, ReadFlags, Reader, WatchFlags};
+use rustix::fs::{OFlags, fcntl_getfl, fcntl_setfl, fstat, stat};
+
+use super::episode::EpisodePath;
+use super::walk::walk;
+
+/// Room for the events of one look; more are read by another read.
+const EVENT_BYTES: usize = 1024;
+
+/// See the module's comment.
+pub(super) struct Guard {
+    file: Arc<File>,
+    partial: PathBuf,
+    /// None where the system gives no inotify: then damage within the file is found by whoever reads it.
+    events: Option<OwnedFd>,
+    /// Another program had the file open for writing, which was reported.
+    was_open: bool,
+    /// Another program has the file open, for reading or for writing.
+    is_open: bool,
+}
+
+impl Guard {
+    /// Guards the file of an episode, of which nothing is written yet.
+    pub(super) fn begin(path: &EpisodePath) -> Self {
+        let append = fcntl_getfl(&path.file).and_then(|flags| fcntl_setfl(&path.file, flags | OFlags::APPEND));
+        if let Err(error) = append {
+            tracing::debug!(%error, "the file is not only appended to");
+        }
+        let events = inotify::init(CreateFlags::NONBLOCK | CreateFlags::CLOEXEC).and_then(|events| {
+            let watched = WatchFlags::OPEN | WatchFlags::CLOSE_WRITE | WatchFlags::CLOSE_NOWRITE;
+            inotify::add_watch(&events, itself(&path.file), watched)?;
+            Ok(events)
+        });
+        let events = events.map_err(|error| tracing::debug!(%error, "other programs' writes are not watched")).ok();
+        Self { file: Arc::clone(&path.file), partial: path.partial.clone(), events, was_open: false, is_open: false }
+    }
+
+    /// Is the file what was written, `written` bytes of which the kernel has?
+    ///
+    /// # Errors
+    /// When another program cut, extended or replaced it; the text says so.
+    pub(super) fn look(&mut self, written: u64) -> io::Result<()> {
+        let is = fstat(&self.file)?;
+        let size = u64::try_from(is.st_size).unwrap_or(0);
+        if size < written {
+            let text =
+                format!("another program cut it while it was recorded: {} of {written} bytes are gone", written - size);
+            return Err(io::Error::other(text));
+        }
+        if size > written {
+            let text = format!("another program wrote {} bytes into it while it was recorded", size - written);
+            return Err(io::Error::other(text));
+        }
+        let named = if is.st_nlink == 0 { stat(&self.partial).ok() } else { None };
+        if named.is_some_and(|named| (named.st_dev, named.st_ino) != (is.st_dev, is.st_ino)) {
+            let text = "another program put another file in its place while it was recorded, which is left alone";
+            return Err(io::Error::other(text));
+        }
+        self.take_events();
+        Ok(())
+    }
+
+    /// Is the finished file sound, as far as there is reason for doubt?
+    ///
+    /// # Errors
+    /// When it is not; the text says so.
+    pub(super) fn verify(mut self, written: u64) -> io::Result<()> {
+        self.look(written)?;
+        if !self.was_open && !self.is_open {
+            return Ok(());
+        }
+        let file = File::open(itself(&self.file))?;
+        let walked = walk(&mut BufReader::new(file), written, &mut |_, _| {})?;
+        if walked.is_some_and(|walked| walked.sound) {
+            return Ok(());
+        }
+        Err(io::Error::other("another program wrote into it while it was recorded: its check values are not right"))
+    }
+
+    fn take_events(&mut self) {
+        let Some(events) = &self.events else { return };
+        let mut buffer = [MaybeUninit::uninit(); EVENT_BYTES];
+        let mut reader = Reader::new(events, &mut buffer);
+        // Empty, or broken: then there is nothing to be learned.
+        while let Ok(event) = reader.next() {
+            let what = event.events();
+            self.is_open = (self.is_open || what.contains(ReadFlags::OPEN))
+                && !what.intersects(ReadFlags::CLOSE_NOWRITE | ReadFlags::CLOSE_WRITE);
+            let wrote = what.intersects(ReadFlags::CLOSE_WRITE | ReadFlags::QUEUE_OVERFLOW);
+            if wrote && !std::mem::replace(&mut self.was_open, true) {
+                let file = self.partial.display();
+                tracing::warn!(
+                    %file,
+                    "another program had the episode open for writing; its check values are verified when it ends"
+                );
+            }
+        }
+    }
+}
+
+/// A path to an open file, whatever became of its names, proc(5).
+fn itself(file: &File) -> String {
+    format!("/proc/self/fd/{}", file.as_raw_fd())
+}
