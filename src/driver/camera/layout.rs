@@ -1,5 +1,7 @@
 //! How a picture lies in a buffer, and where in the stream it stands: pure.
 
+use std::time::Duration;
+
 use crate::registry::PixelFormat;
 use crate::sample::{Encoding, FLAG_ERROR};
 use crate::time::Stamp;
@@ -93,7 +95,10 @@ impl Frame {
 #[derive(Debug, Default)]
 pub(super) struct Progress {
     last_sequence: Option<u32>,
+    /// The last capture time passed on.
     last_stamp: Stamp,
+    /// The last one of the kernel that was believed.
+    last_kernel: Stamp,
     lost: u64,
 }
 
@@ -121,12 +126,17 @@ impl Progress {
         self.last_sequence = Some(sequence);
     }
 
-    /// The kernel's capture time, if it can be true: not later than now and later than the one
-    /// before (some cameras' own clocks, which the kernel may translate, jump). Otherwise the moment
-    /// of arrival.
+    /// The kernel's capture time, if it can be true: not later than now and later than the one of the kernel
+    /// before (some cameras' own clocks, which the kernel may translate, jump). Otherwise the moment of arrival.
+    /// Capture times passed on always increase: one that would not is moved behind the last and is no longer the kernel's.
+    ///
+    /// A moment of arrival lies after the capture times of the next pictures where a picture takes longer than the time
+    /// between two. It therefore refuses none of the kernel's: the camera is back on them as soon as they pass it.
     pub(super) fn stamp(&mut self, frame: &Frame, arrived: Stamp) -> (Stamp, bool) {
-        let kernel = frame.stamp.filter(|stamp| *stamp <= arrived && *stamp > self.last_stamp);
-        self.last_stamp = kernel.unwrap_or(arrived);
-        (self.last_stamp, kernel.is_some())
+        let kernel = frame.stamp.filter(|stamp| *stamp <= arrived && *stamp > self.last_kernel);
+        self.last_kernel = kernel.unwrap_or(self.last_kernel);
+        let least = self.last_stamp.after(Duration::from_nanos(1));
+        self.last_stamp = kernel.unwrap_or(arrived).max(least);
+        (self.last_stamp, kernel == Some(self.last_stamp))
     }
 }

@@ -1,3 +1,5 @@
+use proptest::prelude::*;
+
 use super::super::layout::{Frame, Layout, Progress};
 use super::*;
 use crate::sample::FLAG_ERROR;
@@ -141,4 +143,56 @@ fn the_kernels_time_is_used_where_it_can_be_true() {
     assert_eq!(progress.stamp(&frame(2, Some(500)), Stamp(130)), (Stamp(130), false), "in the future");
     assert_eq!(progress.stamp(&frame(3, Some(90)), Stamp(140)), (Stamp(140), false), "before the last");
     assert_eq!(progress.stamp(&frame(4, Some(145)), Stamp(150)), (Stamp(145), true));
+}
+
+/// What a kernel says wrongly of a picture.
+#[derive(Debug, Clone, Copy)]
+enum Wrong {
+    Nothing,
+    Later,
+    Earlier,
+}
+
+proptest! {
+    /// Pictures every 33 ms that arrive `delay` after their capture, the stamps of `wrong` among the first being wrong:
+    /// capture times increase, and every stamp of the kernel is used from `delay` after the last wrong one on.
+    #[test]
+    fn a_wrong_stamp_costs_no_more_than_its_delay(
+        delay in 0..200_u64,
+        wrong in proptest::collection::vec(
+            prop_oneof![Just(Wrong::Nothing), Just(Wrong::Nothing), Just(Wrong::Later), Just(Wrong::Earlier)], 1..12),
+    ) {
+        const FRAME: u64 = 33;
+        const BEGIN: u64 = 10_000;
+        let mut progress = Progress::default();
+        let mut last = Stamp(0);
+        let mut safe_from = 0;
+        for number in 0..40_u64 {
+            let captured = BEGIN + number * FRAME;
+            let arrived = captured + delay;
+            let (said, is_wrong) = match wrong.get(usize::try_from(number).unwrap()) {
+                Some(Wrong::Later) => (arrived + 1000, true),
+                Some(Wrong::Earlier) => (captured.saturating_sub(BEGIN / 2), true),
+                Some(Wrong::Nothing) | None => (captured, false),
+            };
+            let (stamp, is_kernels) = progress.stamp(&frame(0, Some(said)), Stamp(arrived));
+            prop_assert!(stamp > last, "{stamp:?} after {last:?}");
+            last = stamp;
+            if is_wrong {
+                // Moved on by a nanosecond a picture at the most.
+                safe_from = arrived + 40;
+            } else if captured > safe_from {
+                prop_assert_eq!((stamp, is_kernels), (Stamp(captured), true), "picture {}", number);
+            }
+        }
+    }
+}
+
+#[test]
+fn one_bad_first_stamp_does_not_shift_a_camera_whose_pictures_take_longer_than_a_frame() {
+    let mut progress = Progress::default();
+    assert_eq!(progress.stamp(&frame(0, Some(999)), Stamp(100)), (Stamp(100), false), "in the future");
+    let used: Vec<bool> =
+        (1..10).map(|number| progress.stamp(&frame(0, Some(number * 33)), Stamp(100 + number * 33)).1).collect();
+    assert_eq!(used, [false, false, false, true, true, true, true, true, true]);
 }
