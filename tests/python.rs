@@ -9,7 +9,7 @@
 
 mod support;
 
-use std::io::{BufRead, BufReader, Read};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::path::Path;
 use std::process::{Child, ChildStdout, Command, Stdio};
 use std::sync::Arc;
@@ -21,7 +21,7 @@ use rapid::bus::{Bus, TopicId};
 use rapid::mask::{MaskRecord, PhysicalMask};
 use rapid::registry::Registry;
 use rapid::sample::{Encoding, SampleHeader};
-use support::python;
+use support::{python, until};
 
 /// What the simulated wrist camera would send.
 const PAYLOAD: &[u8] = b"\xff\xd8\xff\xe0 a picture";
@@ -196,10 +196,20 @@ fn the_mask_reader_of_the_readme_runs() {
         realtime_ns: 1_700_000_000_123_456_789,
         sequence: 42,
     };
-    std::fs::write(&file, record.to_bytes()).expect("the record");
     let code = readme_example("struct.unpack").replace(rapid::mask::MASK_PATH, &file.to_string_lossy());
     assert!(!code.contains(rapid::mask::MASK_PATH));
-    let ended = Command::new(python()).args(["-c", &code]).output().expect("python");
+    // A write is in progress when it begins to read, and ends while it looks.
+    let unfinished = MaskRecord { generation: 3, mask: PhysicalMask(0b111), sequence: 41, ..record };
+    std::fs::write(&file, unfinished.to_bytes()).expect("the record");
+    let mut python = Command::new(python());
+    let mut running = python.args(["-c", &code]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("python");
+    let open = |pid: u32| {
+        let descriptors = std::fs::read_dir(format!("/proc/{pid}/fd")).into_iter().flatten().flatten();
+        descriptors.filter_map(|entry| std::fs::read_link(entry.path()).ok()).any(|path| path == file)
+    };
+    until("a look at the mask", || open(running.id()) || running.try_wait().expect("python").is_some());
+    std::fs::File::options().write(true).open(&file).expect("the file").write_all(&record.to_bytes()).expect("the end");
+    let ended = running.wait_with_output().expect("python");
     assert!(ended.status.success(), "{ended:?}");
     assert_eq!(String::from_utf8_lossy(&ended.stdout).trim(), "42 0b101 True False True");
 }

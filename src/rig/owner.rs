@@ -12,7 +12,7 @@ use tokio::time::{Instant, MissedTickBehavior, interval, sleep, timeout};
 use tokio_util::sync::CancellationToken;
 
 use super::attendant::Post;
-use super::presence::{JsonDevice, Presence};
+use super::presence::{PERIOD, Presence};
 use super::programs::Programs;
 use super::slot::{Effects, End, Input, Slot};
 use super::stream::{Controls, Numbers, Reported, Stream};
@@ -174,10 +174,10 @@ impl Rig {
                 },
                 () = sleep(deadline.since(Stamp::now())) => self.deadlines_passed(),
                 _ = json.tick() => self.json_is_stale = true,
+                // The mask it belongs to is not published yet.
+                () = sleep(PERIOD), if self.json_is_stale => {}
             }
-            if std::mem::take(&mut self.json_is_stale) {
-                self.write_json();
-            }
+            self.json_is_stale = self.json_is_stale && !self.write_json();
         };
         self.ending.cancel();
         self.reports_so_far(&mut reported);
@@ -223,6 +223,7 @@ impl Rig {
     fn removed(&mut self, syspath: &Path, witness: Witness) {
         let detached = self.assigner.detach(syspath);
         for id in detached.freed {
+            self.set_bit(id, false);
             self.tell_detach(id, witness.word());
             self.apply(id, Input::Detached);
             self.dismiss(id);
@@ -242,13 +243,18 @@ impl Rig {
         };
         let Some((id, epoch)) = self.tasks.remove(&task) else { return };
         let Some(modality) = self.modality(id).filter(|modality| modality.slot.is_current(epoch)) else { return };
+        if let End::Retry | End::Fatal = end {
+            modality.detail.clone_from(&reason);
+        }
+        // Whatever ended it, nothing of it comes any more.
+        self.set_bit(id, false);
         match end {
             End::Gone => self.tell_detach(id, "stream"),
             End::Unlinked => {
                 self.tell_detach(id, Witness::Link.word());
                 self.modality(id).into_iter().for_each(|modality| modality.detail.clone_from(&reason));
             }
-            End::Retry | End::Fatal => modality.detail = reason,
+            End::Retry | End::Fatal => {}
         }
         self.apply(id, Input::Ended(epoch, end));
     }
@@ -267,6 +273,16 @@ impl Rig {
         deadlines.min().unwrap_or_else(|| Stamp::now().after(Duration::from_hours(1)))
     }
 
+    /// Publishes the mask with this bit, if that changes it. Comes before everything else that an unplug brings with it:
+    /// what is announced allocates and locks.
+    fn set_bit(&mut self, id: ModalityId, present: bool) {
+        let mask = self.mask.with(id, present);
+        if mask != self.mask {
+            self.mask = mask;
+            self.presence.publish(mask);
+        }
+    }
+
     /// Applies an input to a slot, does what it says, and publishes the mask if it changed.
     fn apply(&mut self, id: ModalityId, input: Input<Attachment>) {
         let now = Stamp::now();
@@ -275,12 +291,7 @@ impl Rig {
         let ran = modality.slot.is_current(epoch);
         let Effects { stop, start } = modality.slot.apply(input, now);
         let (state, present) = (modality.slot.state(), modality.slot.is_present());
-        // The mask comes before everything else that an unplug brings with it.
-        let mask = self.mask.with(id, present);
-        if mask != self.mask {
-            self.mask = mask;
-            self.presence.publish(mask);
-        }
+        self.set_bit(id, present);
         let Some(modality) = self.modality(id) else { return };
         if stop.is_some() {
             modality.stop.cancel();
@@ -339,19 +350,6 @@ impl Rig {
         let board = Arc::clone(&self.board);
         let Some(modality) = self.modality(id) else { return };
         board.set_slot(id, modality.slot.state(), modality.slot.epoch(), &modality.detail);
-    }
-
-    fn write_json(&self) {
-        let device = |modality: &Modality| JsonDevice {
-            name: modality.spec.name.clone(),
-            bit: modality.spec.id,
-            online: modality.slot.is_present(),
-            usb_connected: modality.slot.attached().is_some(),
-            state: modality.slot.state(),
-        };
-        let devices: Vec<_> = self.modalities.iter().map(device).collect();
-        let sequence = self.board.mask_sequence();
-        self.presence.write_json(self.mask, sequence, &devices);
     }
 
     /// Tells every stream to end and gives them a moment to close their devices.

@@ -32,6 +32,8 @@ pub(super) struct Control {
     inbox: Inbox,
     actions: Option<Arc<Writer>>,
     board: Arc<Board>,
+    /// How many are registered: digits of the mask.
+    devices: usize,
     ask: SyncSender<Exchange>,
     told: Receiver<Exchange>,
     /// Here, unless it is with the policy.
@@ -63,6 +65,7 @@ impl Control {
             actions: actions.filter(|_| !options.dry_run),
             inbox,
             board,
+            devices: registry.devices.len(),
             ask,
             told,
             exchange: Some(exchange),
@@ -176,7 +179,7 @@ impl Control {
                 let chunk = Chunk {
                     tick: request.tick,
                     observed_ns: request.stamp.0,
-                    mask: request.mask.hex(0),
+                    mask: request.mask.hex(self.devices),
                     seed: request.seed,
                     latency_ms,
                     used: answered.is_ok(),

@@ -1,15 +1,16 @@
-//! What streams report, and what is told of them and of their devices.
+//! What streams report, and what is told of them and of their devices, also in the file for people.
 
 use std::sync::Arc;
 
 use tokio::sync::mpsc;
 
-use super::Rig;
+use super::{Modality, Rig};
 use crate::action::{ActuatorNotice, Arming};
 use crate::driver::DriverError;
 use crate::hotplug::Witness;
 use crate::modality::ModalityId;
 use crate::registry::Attachment;
+use crate::rig::presence::JsonDevice;
 use crate::rig::slot::Input;
 use crate::rig::stream::{Report, Reported};
 use crate::sample::Epoch;
@@ -120,5 +121,19 @@ impl Rig {
         let Some(modality) = self.modality(id) else { return };
         let (device, detail, state) = (modality.spec.name.clone(), modality.detail.clone(), modality.slot.state());
         board.announce(What::State { device, bit: id, state, mask: mask.hex(count), detail });
+    }
+
+    /// Writes the file for people, with mask and sequence of one publication; `false` if the mask of now is still to be
+    /// published.
+    pub(super) fn write_json(&self) -> bool {
+        let device = |modality: &Modality| JsonDevice {
+            name: modality.spec.name.clone(),
+            bit: modality.spec.id,
+            online: modality.slot.is_present(),
+            usb_connected: modality.slot.attached().is_some(),
+            state: modality.slot.state(),
+        };
+        let devices: Vec<_> = self.modalities.iter().map(device).collect();
+        self.presence.write_json(self.mask, &devices)
     }
 }

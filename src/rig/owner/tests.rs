@@ -468,3 +468,82 @@ async fn the_end_is_announced_before_a_device_that_is_slow_to_close() {
     ended.expect("no error");
     assert!(at.since(announced) >= closes_in / 2, "{:?}", at.since(announced));
 }
+
+/// Plugs a device and pulls it out, over and over: what other threads see at the moment of each announcement, and what
+/// the file for people says after each change.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_mask_comes_before_the_announcement_and_its_file_says_one_publication() {
+    const ROUNDS: usize = 60;
+    let registry = registry(Duration::ZERO, Duration::from_secs(1));
+    let name = format!("order{}", std::process::id());
+    let path = PathBuf::from(format!("/dev/shm/rapid_test_mask_{name}"));
+    let board = Arc::new(Board::new(&registry));
+    let bus = Bus::open(&registry, Some(&name)).expect("bus");
+    let inbox = bus.inbox().expect("inbox");
+    let claim = Claim::new(&path, 2).expect("claim");
+    let presence = Presence::start(claim, bus.writer(TopicId::Mask).expect("mask"), Arc::clone(&board)).expect("mask");
+    let wanted = presence.wanted();
+    let mut events = board.events();
+    let watching = std::thread::spawn(move || {
+        let (mut seen, mut too_early) = (0, 0);
+        while seen < ROUNDS {
+            match events.try_recv() {
+                Ok(Event { what: What::Detach { bit, .. }, .. }) => {
+                    too_early += usize::from(wanted().contains(bit));
+                    seen += 1;
+                }
+                Ok(_) => {}
+                Err(_) => std::hint::spin_loop(),
+            }
+        }
+        too_early
+    });
+    let (hotplug, plugged) = unbounded();
+    let (_commands, asked) = mpsc::channel(4);
+    let stop = CancellationToken::new();
+    let mut rig = Rig::new(&registry, &bus, presence, Arc::clone(&board));
+    let running = tokio::spawn({
+        let stop = stop.clone();
+        async move { rig.run(Box::pin(plugged), asked, stop).await }
+    });
+    let mut published = HashMap::new();
+    let mut said = Vec::new();
+    for round in 0..ROUNDS {
+        let source = SimSource::Serial { channels: CHANNELS, hz: 200, seed: 1 };
+        let unit = Arc::new(SimDevice::new("1", source, Stamp::now()));
+        let usb = UsbIdentity { vid: 1, pid: 2, serial: None, port: "1".into(), ..UsbIdentity::default() };
+        let syspath = PathBuf::from("/test/1");
+        for is_there in [true, false] {
+            let event = if is_there {
+                let (node, unit) = (DeviceNode::Sim(Arc::clone(&unit)), usb.clone().into());
+                HotplugEvent::Added(Attachment { syspath: syspath.clone(), node, unit, driver: None })
+            } else {
+                HotplugEvent::Removed { syspath: syspath.clone(), witnessed: Stamp::now(), witness: Witness::Kernel }
+            };
+            hotplug.unbounded_send(Ok(event)).expect("rig");
+            let begun = Instant::now();
+            while board.mask().contains(registry.devices[0].id) != is_there {
+                assert!(begun.elapsed() < PATIENCE, "round {round}: the mask stays");
+                sleep(Duration::from_millis(1)).await;
+            }
+            sleep(Duration::from_millis(1)).await;
+            let text = std::fs::read_to_string(crate::rig::presence::json_path(&path)).unwrap_or_default();
+            let document: serde_json::Value = serde_json::from_str(&text).unwrap_or_default();
+            said.extend(document["sequence"].as_u64().zip(document["mask"].as_str().map(str::to_owned)));
+        }
+        let mut take = |topic: TopicId, header: &crate::sample::SampleHeader, payload: &[u8]| {
+            if topic == TopicId::Mask {
+                published.insert(header.seq, payload[0]);
+            }
+        };
+        inbox.drain(&mut take).expect("drain");
+    }
+    stop.cancel();
+    running.await.expect("no panic").expect("no error");
+    assert_eq!(watching.join().expect("the watch ends"), 0, "of {ROUNDS} removals were announced before the mask");
+    assert!(said.len() > ROUNDS, "{} documents", said.len());
+    for (sequence, mask) in said {
+        let was = published.get(&sequence).map(|mask| format!("0x{mask:02x}"));
+        assert!(was.is_none_or(|was| was == mask), "publication {sequence} was not of {mask}");
+    }
+}

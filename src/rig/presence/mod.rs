@@ -43,6 +43,7 @@ pub struct Presence {
     shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
     ended: CancellationToken,
+    path: PathBuf,
     json: PathBuf,
     json_failed: AtomicBool,
 }
@@ -84,13 +85,21 @@ impl Presence {
             .name("mask".to_owned())
             .spawn(move || beat.run())
             .map_err(|error| PresenceError::Io { path: path.clone(), error })?;
-        Ok(Self { shared, thread: Some(thread), ended, json: json_path(&path), json_failed: AtomicBool::new(false) })
+        let json = json_path(&path);
+        Ok(Self { shared, thread: Some(thread), ended, path, json, json_failed: AtomicBool::new(false) })
     }
 
     /// Cancelled when the thread has ended: before this is dropped, by a panic.
     #[must_use]
     pub fn ended(&self) -> CancellationToken {
         self.ended.clone()
+    }
+
+    /// The mask that is to be published, at any moment.
+    #[cfg(test)]
+    pub(super) fn wanted(&self) -> impl Fn() -> PhysicalMask + Send + use<> {
+        let shared = Arc::clone(&self.shared);
+        move || PhysicalMask(shared.mask.load(Ordering::Acquire))
     }
 
     /// Publishes `mask` at once, and from then on at every beat. Does not wait.
@@ -101,17 +110,23 @@ impl Presence {
         }
     }
 
-    /// Writes the file for people, whole. Why it cannot be is logged, once until it can again.
-    pub fn write_json(&self, mask: PhysicalMask, sequence: u64, devices: &[JsonDevice]) {
+    /// Writes the file for people, whole, with the sequence of the last publication if that was of `mask`; `false` if
+    /// `mask` is still to be published. Why it cannot be written is logged, once until it can again.
+    pub fn write_json(&self, mask: PhysicalMask, devices: &[JsonDevice]) -> bool {
         // The thread's panic has freed the name for another rapid.
         if self.ended.is_cancelled() {
-            return;
+            return true;
         }
-        let written = json::write(&self.json, mask, sequence, devices);
+        let Ok(published) = read_mask(&self.path) else { return true };
+        if published.mask != mask {
+            return false;
+        }
+        let written = json::write(&self.json, mask, published.sequence, devices);
         let failed_before = self.json_failed.swap(written.is_err(), Ordering::Relaxed);
         if let (Err(error), false) = (written, failed_before) {
             tracing::warn!(%error, "the mask's JSON file is not written");
         }
+        true
     }
 }
 
