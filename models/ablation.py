@@ -60,7 +60,7 @@ class Configuration:
 
 
 CONFIGURATIONS = (
-    Configuration("vision only", lambda: Spec("vision", (wrist(), arm()), mask_aware=False), ALL, 0.5),
+    Configuration("vision only", lambda: Spec("vision", (wrist(required=True), arm()), mask_aware=False), ALL, 0.5),
     # With a single picture to take away it is the arm's own state that remains.
     Configuration("vision + mask", lambda: Spec("vision-mask", (wrist(dropout=0.3), arm())), ALL, 0.5),
     Configuration("vision + mask + diff", tactile_id, ALL, 1.0, shipped=True),
@@ -71,7 +71,7 @@ CONFIGURATIONS = (
 
 def unmasked(name: str) -> Spec:
     """Both pictures, neither ever taken away: such a policy cannot do without one."""
-    return Spec(name, (wrist(), tactile(required=True), arm()), mask_aware=False)
+    return Spec(name, (wrist(required=True), tactile(required=True), arm()), mask_aware=False)
 
 
 def main() -> None:

@@ -48,7 +48,8 @@ pub struct Cli {
 }
 
 /// `rapid --version`; `-V` says the first line alone.
-const LONG_VERSION: &str = concat!(env!("CARGO_PKG_VERSION"), "\n", env!("RAPID_BUILT_WITH"));
+const LONG_VERSION: &str =
+    concat!(env!("CARGO_PKG_VERSION"), "\n", env!("RAPID_BUILT_WITH"), "\n", env!("RAPID_BUILT_WITH_CXX"));
 
 const EXAMPLES: &str = "\
 Without a command, rapid runs the rig and shows the monitor: it finds the sensors that devices.toml \
@@ -64,7 +65,7 @@ Examples:
   rapid recover episodes                after a crash: makes the unfinished episodes whole
 
 Exit codes: 0 done, 1 failed while running, 2 bad configuration or arguments,
-            3 a device or a policy that is needed is not there, 130 interrupted twice";
+            3 a device that is needed is not there, 130 interrupted twice";
 
 const RECOVER: &str = "\
 A run that may record does this by itself, in the background, for what it finds in its --out folder.

@@ -94,8 +94,8 @@
 //! * Capture times are `CLOCK_MONOTONIC`; the wall clock is derived from it once an episode.
 //! * A screen sees [`status::Snapshot`]s and sends [`status::Command`]s; it holds no handle into a
 //!   stage.
-//! * Bytes from devices and files never make the program panic. `unsafe` stands in [`driver`] and
-//!   [`bus`] alone.
+//! * Bytes from devices and files never make the program panic. `unsafe` stands in [`driver`],
+//!   [`bus`] and the loader of onnxruntime alone.
 
 pub mod action;
 pub mod app;

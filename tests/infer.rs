@@ -39,15 +39,16 @@ fps = 30
 [device.arm]
 vid = "1209"
 pid = "7a03"
-node = "serial"
+node = "can"
 bit = 2
-[device.arm.serial]
-channels = 4
-[device.arm.action]
-names = ["x", "y", "z", "grip"]
-units = ["m", "m", "m", "1"]
-min = [-1.1, -1.0, 0.03, 0.0]
-max = [1.0, 1.0, 0.9, 1.0]
+[device.arm.can]
+protocol = "damiao"
+motors = [
+    { name = "x", slave = 1, type = "DM4310", kp = 20, kd = 1, position = [-1.1, 1.0] },
+    { name = "y", slave = 2, type = "DM4310", kp = 20, kd = 1, position = [-1.0, 1.0] },
+    { name = "z", slave = 3, type = "DM4310", kp = 20, kd = 1, position = [0.03, 0.9] },
+    { name = "grip", slave = 4, type = "DM4310", kp = 20, kd = 1, position = [0.0, 1.0] },
+]
 "#;
 
 /// The tactile sensor is pulled out for a second.
@@ -83,23 +84,32 @@ fn holds(events: &[Value]) -> Vec<&Value> {
     of(events, "hold").filter(|hold| hold["reason"] != "the next actions are still being computed").collect()
 }
 
-/// A copy of the policy in `place` whose `policy.json` says `to` in place of `from`.
+/// A copy of the policy in `place` that looks at the first four numbers of the motors, of which there are six each.
+fn sliced(place: &Place) -> String {
+    changed(place, "\"modality\"", "\"modality\"")
+}
+
+/// The same, and its `policy.json` says `to` in place of `from`.
 fn changed(place: &Place, from: &str, to: &str) -> String {
     let folder = place.path("policy");
-    std::fs::create_dir(&folder).expect("folder");
+    std::fs::create_dir_all(&folder).expect("folder");
     for file in ["encoder.onnx", "denoiser.onnx"] {
         std::fs::copy(Path::new(BUNDLE).join(file), folder.join(file)).expect("graph");
     }
     let text = std::fs::read_to_string(Path::new(BUNDLE).join("policy.json")).expect("policy.json");
     assert!(text.contains(from), "{from}");
-    std::fs::write(folder.join("policy.json"), text.replacen(from, to, 1)).expect("policy.json");
+    let (state, slice) = ("\"modality\": \"arm\",", "\"modality\": \"arm\", \"slice\": [0, 4],");
+    assert!(text.contains(state), "{state}");
+    let text = text.replacen(from, to, 1).replacen(state, slice, 1);
+    std::fs::write(folder.join("policy.json"), text).expect("policy.json");
     folder.display().to_string()
 }
 
 #[test]
 fn a_pulled_sensor_is_left_out_at_the_next_tick_and_actions_go_on() {
     let place = Place::new();
-    let (code, said, stderr) = infer(&place, BUNDLE, PULLED, &["--record", "--duration", "8s", "--out", "out"]);
+    let (code, said, stderr) =
+        infer(&place, &sliced(&place), PULLED, &["--record", "--duration", "8s", "--out", "out"]);
     assert_eq!(code, Some(0), "{stderr}");
     let policy = of(&said, "policy").next().expect("the policy says what it is");
     assert_eq!((&policy["policy"], &policy["dry_run"]), (&"tactile-id".into(), &false.into()));
@@ -151,12 +161,12 @@ fn without_what_it_requires_it_does_not_start_unless_it_may_wait() {
     let place = Place::new();
     let arm_later = "[[device]]\nname = \"cam_wrist\"\n[[device]]\nname = \"tactile_tip\"\n[[device]]\nname = \"arm\"\n\
                      plugged = false\n[[event]]\nat = \"5s\"\nplug = \"arm\"\n";
-    let (code, said, stderr) = infer(&place, BUNDLE, arm_later, &["--duration", "20s"]);
+    let (code, said, stderr) = infer(&place, &sliced(&place), arm_later, &["--duration", "20s"]);
     assert_eq!(code, Some(3), "{stderr}");
     assert!(stderr.contains("the policy needs arm") && stderr.contains("--wait"), "{stderr}");
     assert_eq!(of(&said, "policy").count(), 0);
 
-    let (code, said, stderr) = infer(&place, BUNDLE, arm_later, &["--duration", "10s", "--wait"]);
+    let (code, said, stderr) = infer(&place, &sliced(&place), arm_later, &["--duration", "10s", "--wait"]);
     assert_eq!(code, Some(0), "{stderr}");
     let waits = |said: &Value| said["event"] == "log" && said["text"] == "the policy waits for arm";
     assert!(said.iter().any(waits) && of(&said, "act").count() > 0, "{said:?}");
@@ -167,7 +177,7 @@ fn a_dry_run_computes_and_moves_nothing() {
     let place = Place::new();
     let all = "[[device]]\nname = \"cam_wrist\"\n[[device]]\nname = \"tactile_tip\"\n[[device]]\nname = \"arm\"\n";
     let more = ["--dry-run", "--record", "--duration", "4s", "--out", "out"];
-    let (code, said, stderr) = infer(&place, BUNDLE, all, &more);
+    let (code, said, stderr) = infer(&place, &sliced(&place), all, &more);
     assert_eq!(code, Some(0), "{stderr}");
     assert!(of(&said, "chunk").count() > 0 && of(&said, "act").count() > 0);
     let files = place.files("out");
@@ -203,11 +213,75 @@ fn a_policy_that_is_none_or_not_for_this_rig_is_refused_by_name() {
     let (code, _, stderr) = infer(&place, &bundle, "", &[]);
     assert_eq!(code, Some(2), "{stderr}");
     assert!(stderr.contains("tactile_top"), "{stderr}");
-    let (code, _, stderr) = infer(&place, BUNDLE, "", &["--ort-lib", "/nowhere/libonnxruntime.so", "--duration", "5s"]);
+    let (code, _, stderr) =
+        infer(&place, &sliced(&place), "", &["--ort-lib", "/nowhere/libonnxruntime.so", "--duration", "5s"]);
     assert_eq!(code, Some(1), "{stderr}");
     assert!(stderr.contains("/nowhere/libonnxruntime.so"), "{stderr}");
     let text = place.write("libonnxruntime.so", "no library").display().to_string();
-    let (code, _, stderr) = infer(&place, BUNDLE, "", &["--ort-lib", &text, "--duration", "5s"]);
+    let (code, _, stderr) = infer(&place, &sliced(&place), "", &["--ort-lib", &text, "--duration", "5s"]);
     assert_eq!(code, Some(1), "{stderr}");
     assert!(stderr.contains(&format!("{text} (--ort-lib): it cannot be loaded: ")), "{stderr}");
+}
+
+/// A device that does not move is no actuator, whatever the registry says.
+#[test]
+fn what_does_not_move_is_refused_before_anything_starts() {
+    let place = Place::new();
+    let still = "[device.arm]\nvid = \"1209\"\npid = \"7a03\"\nnode = \"serial\"\nbit = 2\n[device.arm.serial]\nchannels = 4\n\
+                 [device.arm.action]\nnames = [\"x\", \"y\", \"z\", \"grip\"]\nunits = [\"m\", \"m\", \"m\", \"1\"]\n\
+                 min = [-1.1, -1.0, 0.03, 0.0]\nmax = [1.0, 1.0, 0.9, 1.0]\n";
+    let (cameras, _) = REGISTRY.split_once("[device.arm]").expect("an arm");
+    let registry = place.write("still.toml", &format!("{cameras}{still}")).display().to_string();
+    for arguments in [&["check"][..], &["--infer", BUNDLE, "--sim", "--duration", "2s"]] {
+        let output = place.run(&[arguments, &["--config", &registry]].concat());
+        let said = [output.stdout, output.stderr].concat();
+        let said = String::from_utf8_lossy(&said);
+        assert_eq!(output.status.code(), Some(2), "{said}");
+        assert!(said.contains("[device.arm] node \"serial\" takes no actions: nothing would move"), "{said}");
+    }
+    // Without the table there is no actuator at all.
+    let (without, _) = still.split_once("[device.arm.action]").expect("a table");
+    let registry = place.write("without.toml", &format!("{cameras}{without}")).display().to_string();
+    let output = place.run(&["--infer", BUNDLE, "--sim", "--config", &registry, "--duration", "2s"]);
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(2), "{said}");
+    assert!(said.contains("actuator \"arm\" takes no actions"), "{said}");
+}
+
+/// The policy that the program carries fits the simulated task, and says so on any other rig.
+#[test]
+fn the_policy_inside_is_there_from_any_folder_and_names_the_rig_it_fits() {
+    let place = Place::new();
+    let arguments = ["--json", "--infer", "--sim", "task", "--duration", "4s", "--record", "--out", "out"];
+    let output = place.run(&arguments);
+    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    let said = events(&String::from_utf8_lossy(&output.stdout));
+    let policy = of(&said, "policy").next().expect("the policy says what it is");
+    assert_eq!((&policy["policy"], &policy["folder"]), (&"tactile-id".into(), &"inside rapid".into()));
+    assert!(of(&said, "act").count() > 0, "{said:?}");
+    let folder = rapid::policy::bundle::Bundle::load(Path::new(BUNDLE)).expect("the same as a folder");
+    assert_eq!(policy["hash"], folder.hash);
+
+    let builtin = place.write("builtin.toml", rapid::registry::BUILTIN).display().to_string();
+    let output = place.run(&["--infer", "--config", &builtin, "--sim", "--duration", "2s"]);
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(2), "{said}");
+    assert!(said.contains("for the simulated task alone: rapid --infer --sim task"), "{said}");
+}
+
+/// It was trained with each of its cameras taken away.
+#[test]
+fn the_policy_goes_on_without_the_wrist_camera_and_holds_without_both() {
+    let place = Place::new();
+    let pulled = "[[device]]\nname = \"cam_wrist\"\n[[device]]\nname = \"tactile_tip\"\n[[device]]\nname = \"arm\"\n\
+                  [[event]]\nat = \"4s\"\nunplug = \"cam_wrist\"\n[[event]]\nat = \"8s\"\nunplug = \"tactile_tip\"\n";
+    let (code, said, stderr) = infer(&place, &sliced(&place), pulled, &["--duration", "12s"]);
+    assert_eq!(code, Some(0), "{stderr}");
+    assert!(of(&said, "chunk").any(|chunk| chunk["mask"] == "0x06"), "it is asked without the wrist camera");
+    let [hold] = holds(&said)[..] else { panic!("{:?}", holds(&said)) };
+    assert_eq!(
+        (&hold["reason"], &hold["device"]),
+        (&"no picture that the policy observes is there".into(), &"cam_wrist".into())
+    );
+    assert!(of(&said, "chunk").all(|chunk| chunk["mask"] != "0x04"), "nothing is asked without both");
 }

@@ -75,7 +75,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("iceoryx2_bb_elementary_traits", &["bus"]),
     ("iceoryx2_cal", &["bus"]),
     ("jpeg_encoder", &["driver/sim"]),
-    ("libc", &["registry", "hotplug", "driver", "rig", "app"]),
+    ("libc", &["registry", "hotplug", "driver", "rig", "app", "policy/library"]),
     ("lz4", &["episode_format"]),
     ("mcap", &["record"]),
     ("mdns_sd", &["hotplug/lan"]),
@@ -111,7 +111,7 @@ const ANYWHERE: &str = "*";
 const ABOVE_NOUNS: &str = "layers 1 and up";
 
 /// Where `unsafe` may stand: at the borders to the kernel and to shared memory.
-const UNSAFE_HOMES: &[&str] = &["driver", "bus"];
+const UNSAFE_HOMES: &[&str] = &["driver", "bus", "policy/library/loader"];
 
 /// What makes one thread wait for another.
 const LOCKS: &[&str] = &["Mutex", "RwLock", "Condvar", "ReentrantMutex", "Semaphore", "Barrier"];

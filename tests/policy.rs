@@ -11,7 +11,10 @@ mod allocations;
 mod onnx;
 
 use allocations::allocations;
-use onnx::{ACTION, CONDITION_SHARE, Change, HORIZON, SAMPLE_SHARE, SIDE, STEPS, TIMESTEP_SHARE, write_bundle};
+use onnx::{
+    ACTION, CONDITION_SHARE, Change, HORIZON, Message, SAMPLE_SHARE, SIDE, STEPS, TIMESTEP_SHARE, encoder_with,
+    external, within, write_bundle, write_graphs,
+};
 use rapid::policy::bundle::{Bundle, ImageSpec, ObservationInput};
 use rapid::policy::graphs::LoadedGraph;
 use rapid::policy::library::Environment;
@@ -229,4 +232,70 @@ fn a_jpeg_costs_the_decoders_buffers_and_no_more() {
     let once = allocations(&mut write);
     assert!((1..=40).contains(&once), "{once} allocations for a picture");
     assert_eq!(allocations(|| (0..50).for_each(|_| write())), 50 * once);
+}
+
+/// Wherever a tensor can stand in a model, its numbers must lie in the model: the SHA-256 covers no other file.
+#[test]
+fn a_tensor_whose_numbers_lie_in_another_file_is_refused_by_name_wherever_it_stands() {
+    // Fields of messages: ModelProto graph 7, training 20, function 25; GraphProto node 1, initializer 5, sparse 15;
+    // NodeProto attribute 5; AttributeProto tensor 5, graph 6, tensors 10, graphs 11, sparse 22 and 23;
+    // SparseTensorProto values 1, indices 2; FunctionProto node 7, attribute 11; TrainingInfoProto graphs 1 and 2.
+    let paths: &[(&str, &[u64])] = &[
+        ("initializer", &[7, 5]),
+        ("values of a sparse initializer", &[7, 15, 1]),
+        ("indices of a sparse initializer", &[7, 15, 2]),
+        ("constant", &[7, 1, 5, 5]),
+        ("constants", &[7, 1, 5, 10]),
+        ("sparse constant", &[7, 1, 5, 22, 1]),
+        ("sparse constants", &[7, 1, 5, 23, 2]),
+        ("initializer of a subgraph", &[7, 1, 5, 6, 5]),
+        ("initializer of one of many subgraphs", &[7, 1, 5, 11, 5]),
+        ("constant of a subgraph of a subgraph", &[7, 1, 5, 6, 1, 5, 6, 1, 5, 5]),
+        ("constant of a function", &[25, 7, 5, 5]),
+        ("default of a function", &[25, 11, 5]),
+        ("subgraph of a function", &[25, 7, 5, 6, 5]),
+        ("initial training", &[20, 1, 5]),
+        ("training", &[20, 2, 5]),
+    ];
+    for (what, path) in paths {
+        let (model, inside) = path.split_first().expect("a path");
+        let tensor = inside.iter().rev().fold(external("far"), |message, field| within(*field, &message));
+        let folder = tempfile::tempdir().expect("folder");
+        write_graphs(folder.path(), &encoder_with(*model, &tensor), &[]);
+        let error = Bundle::load(folder.path()).expect_err(what).to_string();
+        let wanted = "encoder.onnx: the numbers of tensor \"far\" lie in another file, \"weights.bin\"";
+        assert!(error.contains(wanted) && error.contains("fix: store them in the graph"), "{what}: {error}");
+    }
+    // The flag without a file, a file without the flag, and no name but that of the node.
+    let mut flag = Message::default();
+    flag.number(14, 1);
+    let mut file = Message::default();
+    file.message(13, &within(2, &Message::default()));
+    for tensor in [flag, file] {
+        let mut node = within(5, &within(5, &tensor));
+        node.bytes(2, b"output");
+        let folder = tempfile::tempdir().expect("folder");
+        write_graphs(folder.path(), &encoder_with(7, &within(1, &node)), &[]);
+        let error = Bundle::load(folder.path()).expect_err("external").to_string();
+        assert!(error.contains("the numbers of tensor \"output\" lie in another file"), "{error}");
+    }
+}
+
+#[test]
+fn a_model_that_cannot_be_read_to_its_end_is_refused() {
+    let mut cut = onnx::encoder();
+    cut.pop();
+    let mut ort = onnx::encoder();
+    ort.splice(0..0, *b"\x0a\x06\x0a\x04ORTM");
+    for (model, what) in [(cut, "cut"), (ort, "onnxruntime's own format"), (b"no graph".to_vec(), "text")] {
+        let folder = tempfile::tempdir().expect("folder");
+        write_graphs(folder.path(), &model, &[]);
+        let error = Bundle::load(folder.path()).expect_err(what).to_string();
+        assert!(error.contains("encoder.onnx is not an ONNX model"), "{what}: {error}");
+    }
+    // A graph in a graph in a graph: deeper than any stack.
+    let nested = (0..20_000).fold(Message::default(), |inside, _| within(1, &within(5, &within(6, &inside))));
+    let folder = tempfile::tempdir().expect("folder");
+    write_graphs(folder.path(), &encoder_with(7, &nested), &[]);
+    Bundle::load(folder.path()).expect("nothing in it lies elsewhere");
 }

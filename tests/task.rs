@@ -3,6 +3,16 @@
 #![allow(clippy::expect_used, reason = "what fails here fails a test")]
 mod support;
 
+use std::sync::Arc;
+
+use rapid::lockstep::timing::Timing;
+use rapid::lockstep::{Lockstep, STEP};
+use rapid::record::EpisodeRequest;
+use rapid::record::stepped::Stepped;
+use rapid::registry::Registry;
+use rapid::registry::scenario::Scenario;
+use rapid::status::Board;
+use rapid::time::{Stamp, WallClock};
 use serde_json::Value;
 use support::{Episode, Place, events};
 
@@ -51,6 +61,68 @@ fn demonstrations_are_whole_episodes_and_the_same_seed_gives_the_same_one() {
     for (message, frame) in &frames {
         assert_eq!(frame.mask, 0b111);
         assert!(frame.modalities.iter().all(|one| one.valid && one.age_ns.unwrap_or(0) == 0), "{}", message.log_time);
+    }
+}
+
+/// Whatever the phases of its sensors are, and wherever between two of their samples an episode begins.
+#[test]
+fn the_frames_of_the_rig_are_valid_whatever_the_phases_are() {
+    let place = Place::new();
+    let registry = Arc::new(Registry::task());
+    for seed in 0..12 {
+        let board = Arc::new(Board::new(&registry));
+        let mut recorder = Stepped::new(Arc::clone(&registry), board, WallClock::now());
+        let timings = Timing::draw(seed, &[true; 3]);
+        let scenario = Scenario::task(&registry, seed);
+        let mut rig = Lockstep::new(&registry, scenario, Stamp::now(), &timings).expect("a rig");
+        for _ in 0..3 {
+            rig.rest(&mut recorder).expect("a rest");
+        }
+        let out = place.path(&seed.to_string());
+        std::fs::create_dir(&out).expect("folder");
+        let request =
+            EpisodeRequest { out, task: "phases".into(), tags: Vec::new(), modules: Vec::new(), duration: None };
+        recorder.begin(&request, rig.now()).expect("an episode");
+        for _ in 0..30 {
+            rig.step(0.0, &mut recorder).expect("a step");
+            recorder.advance(rig.now());
+        }
+        let report = recorder.finish(rig.now()).expect("a report");
+        let frames = Episode::read(&report.file).frames().into_iter().map(|(_, frame)| frame).collect::<Vec<_>>();
+        assert_eq!(frames.len(), 30);
+        // The sample before the first tick is not of the episode, nor that after the last one.
+        for frame in &frames[1..29] {
+            let valid = frame.modalities.iter().all(|one| one.valid);
+            assert!(valid, "seed {seed}, frame {}: {timings:?}: {:?}", frame.index, frame.modalities);
+        }
+    }
+    assert!(STEP.as_millis() == 100);
+}
+
+/// The same of a run in real time: at each tick a sample of every device lies in the window, however late it came.
+#[test]
+fn a_run_in_real_time_captures_a_sample_for_every_tick() {
+    let place = Place::new();
+    let window = Registry::task().rig.sync_window.as_nanos();
+    for out in ["a", "b", "c"] {
+        said(&place, &["--sim", "task", "--headless", "--record", "--duration", "2s", "--out", out]);
+        let episode = Episode::read(&place.path(out).join(&place.files(out)[0]));
+        let frames = episode.frames();
+        assert!(frames.len() >= 19, "{}", frames.len());
+        for topic in ["/rapid/camera/wrist", "/rapid/camera/tactile", "/rapid/serial/arm"] {
+            let captured: Vec<u64> = episode.topic(topic).map(|sample| sample.log_time).collect();
+            // Where a busy machine lost some, and before the first and after the last one, no tick can have one.
+            let pairs = captured.windows(2).filter(|pair| pair[1] - pair[0] < 150_000_000);
+            let mut seen = 0;
+            for pair in pairs {
+                for (tick, _) in frames.iter().filter(|(tick, _)| (pair[0]..pair[1]).contains(&tick.log_time)) {
+                    let nearest = (tick.log_time - pair[0]).min(pair[1] - tick.log_time);
+                    assert!(u128::from(nearest) <= window, "{topic}: {nearest} ns");
+                    seen += 1;
+                }
+            }
+            assert!(seen > 0, "{topic}: {} samples", captured.len());
+        }
     }
 }
 

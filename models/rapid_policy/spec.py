@@ -102,9 +102,9 @@ class Spec:
 PICTURE = (3, 96, 96)
 
 
-def wrist(dropout: float = 0.0) -> Observation:
+def wrist(dropout: float = 0.0, required: bool = False) -> Observation:
     """The camera at the wrist, which cannot see a texture."""
-    return Observation("wrist", "image", "cam_wrist", PICTURE, dropout=dropout)
+    return Observation("wrist", "image", "cam_wrist", PICTURE, required, dropout=dropout)
 
 
 def tactile(dropout: float = 0.0, required: bool = False) -> Observation:

@@ -65,7 +65,7 @@ class Windows(unittest.TestCase):
 
     def test_what_is_missing_breaks_a_segment(self):
         episode = made_up(30)
-        episode.present["cam_wrist"][10] = False
+        episode.present["arm"][10] = False
         episode.acted[20] = False
         self.assertEqual(segments(Dataset(tactile_id(), [episode])), [(0, 10), (11, 20), (21, 30)])
 

@@ -10,7 +10,10 @@ const POLICY: &str = "Options of a policy";
 
 pub(super) const EVAL: &str = "\
 Conditions: full, no-tactile (the tactile sensor is not there), hot-unplug (it is pulled out while the
-block is carried), hot-replug (pulled out on the way to the block, and plugged in again).
+block is carried), hot-replug (pulled out on the way to the block, and plugged in again), no-wrist (the
+camera that shows where the block lies is not there).
+Each trial draws from its seed when each sensor captures (anywhere in the period of 100 ms) and how long
+after that its sample is seen (5 to 50 ms); the policy begins when the last of them has been seen.
 Trials run faster than real time; the same seed gives the same trial.
 
 Examples:
@@ -23,7 +26,7 @@ Examples:
 #[command(next_help_heading = POLICY)]
 #[expect(clippy::struct_excessive_bools, reason = "each is a switch of the command line")]
 pub struct PolicyArgs {
-    /// Run a policy, headless [default: models/tactile-id here, in ~/.local/share/rapid or /usr/share/rapid]
+    /// Run the policy in this folder, headless [default: the one inside rapid, for `--sim task`]
     #[arg(long, value_name = "BUNDLE", num_args = 0..=1, value_hint = ValueHint::DirPath)]
     pub infer: Option<Option<PathBuf>>,
     /// Show and record what it would do; nothing moves
@@ -49,7 +52,7 @@ pub struct PolicyArgs {
 /// What `rapid eval` tries.
 #[derive(Debug, Clone, Args)]
 pub struct EvalArgs {
-    /// Policy [default: models/tactile-id here, or in ~/.local/share/rapid or /usr/share/rapid]
+    /// Folder of a policy [default: the one inside rapid]
     #[arg(value_hint = ValueHint::DirPath)]
     pub bundle: Option<PathBuf>,
     /// Trials a condition

@@ -19,7 +19,7 @@ pub struct CompareOptions {
     /// The episode.
     pub file: PathBuf,
     /// Folder of the policy.
-    pub bundle: PathBuf,
+    pub bundle: Option<PathBuf>,
     /// A larger difference of a policy's own episode is a failure.
     pub tolerance: Option<f64>,
     /// Steps of denoising instead of the bundle's own.
@@ -87,7 +87,7 @@ pub fn run(
     stop: &dyn Fn() -> bool,
     out: &mut dyn Write,
 ) -> Result<(), CompareFailure> {
-    let bundle = Bundle::load(&options.bundle)?;
+    let bundle = Bundle::open(options.bundle.as_deref())?;
     let environment = Environment::open(options.library.as_deref())?;
     let mut progress = Progress { bar: None, wanted: format == Format::Text, stop };
     let compared = compare::compare(&options.file, &bundle, &environment, options.denoising_steps, &mut progress)?;

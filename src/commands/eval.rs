@@ -21,8 +21,8 @@ use crate::text;
 /// What is evaluated.
 #[derive(Debug, Clone)]
 pub struct EvalOptions {
-    /// Folder of the policy.
-    pub bundle: PathBuf,
+    /// Folder of the policy; without one that inside the program.
+    pub bundle: Option<PathBuf>,
     /// Trials a condition.
     pub trials: usize,
     /// Number of the first trial.
@@ -64,9 +64,10 @@ struct Row {
 }
 
 /// Score and status in the paper's table (25 trials each), and those of its baseline with a static
-/// configuration.
+/// configuration. A condition that is not in the table has neither.
 const fn paper(condition: Condition, configuration: Configuration) -> (Option<f64>, &'static str) {
     match (condition, configuration) {
+        (Condition::NoWrist, _) => (None, "-"),
         (Condition::Full, _) => (Some(0.92), "Normal"),
         (Condition::NoTactile, _) => (Some(0.52), "Degraded"),
         (_, Configuration::Static) => (None, "Crash"),
@@ -86,7 +87,7 @@ pub fn run(
     stop: &dyn Fn() -> bool,
     out: &mut dyn Write,
 ) -> Result<(), EvalError> {
-    let bundle = Bundle::load(&options.bundle)?;
+    let bundle = Bundle::open(options.bundle.as_deref())?;
     let registry = Registry::task();
     bundle.check_registry(&registry)?;
     let actuators: Vec<_> =

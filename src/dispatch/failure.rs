@@ -60,12 +60,12 @@ pub(super) enum Failure {
     /// The policy is wrong, or not for this rig.
     #[error(transparent)]
     Bundle(BundleErrors),
-    /// There is no policy to run.
+    /// The policy inside the program, on another rig than its own.
     #[error(
-        "no policy: looked for {}\n    fix: name the folder of one, or make one with `make train`",
-        .0.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ")
+        "{0}\nThe policy inside rapid is for the simulated task alone: rapid --infer --sim task\n    fix: name the folder \
+         of a policy that was trained on this rig: rapid --infer FOLDER (models/README.md says how one is made)"
     )]
-    NoPolicy(Vec<PathBuf>),
+    OtherRig(BundleErrors),
     #[error(transparent)]
     Compare(#[from] CompareFailure),
     #[error(transparent)]
@@ -113,6 +113,7 @@ impl Failure {
             | Self::Arguments(_)
             | Self::Module(_)
             | Self::Bundle(_)
+            | Self::OtherRig(_)
             | Self::Eval(EvalError::Bundle(_))
             | Self::Compare(
                 CompareFailure::Bundle(_)
@@ -133,7 +134,7 @@ impl Failure {
             Self::Ablation(error) if error.is_bad_argument() => 2,
             Self::Register(error) if error.is_bad_argument() => 2,
             Self::Recover(outcome) if outcome.is_bad_argument() => 2,
-            Self::NoPolicy(_) | Self::App(AppError::Required(_)) | Self::Order(commands::arm::OrderError::Nobody) => 3,
+            Self::App(AppError::Required(_)) | Self::Order(commands::arm::OrderError::Nobody) => 3,
             _ => 1,
         }
     }

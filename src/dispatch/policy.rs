@@ -25,12 +25,13 @@ pub(super) fn at_the_controls(
     registry: &Registry,
 ) -> Result<Option<PolicyOptions>, Failure> {
     let Some(named) = args.infer else { return Ok(None) };
-    let bundle = Bundle::load(&find(named)?).map_err(Failure::Bundle)?;
-    bundle.check_registry(registry).map_err(Failure::Bundle)?;
+    let bundle = Bundle::open(named.as_deref()).map_err(Failure::Bundle)?;
+    let unfit = |errors| if bundle.inside { Failure::OtherRig(errors) } else { Failure::Bundle(errors) };
+    bundle.check_registry(registry).map_err(unfit)?;
     let actuator = registry.actuator().map(|(device, action)| (device.name.as_str(), action.names.len()));
     // What moves nothing needs nothing to move.
     if !args.dry_run {
-        bundle.check_actuators(actuator.as_slice()).map_err(Failure::Bundle)?;
+        bundle.check_actuators(actuator.as_slice()).map_err(unfit)?;
     }
     Ok(Some(PolicyOptions {
         bundle,
@@ -47,7 +48,7 @@ pub(super) fn at_the_controls(
 pub(super) fn eval(args: EvalArgs, format: Format) -> Result<(), Failure> {
     let configuration = if args.static_config { Configuration::Static } else { Configuration::Dynamic };
     let options = EvalOptions {
-        bundle: find(args.bundle)?,
+        bundle: args.bundle,
         trials: args.trials,
         seed: args.seed,
         conditions: if args.condition.is_empty() { Condition::ALL.to_vec() } else { args.condition },
@@ -67,7 +68,7 @@ pub(super) fn compare(
 ) -> Result<(), Failure> {
     let options = CompareOptions {
         file,
-        bundle: find(bundle)?,
+        bundle,
         tolerance: args.tolerance,
         denoising_steps: args.denoising_steps,
         library: args.ort_lib,
@@ -97,17 +98,6 @@ pub(super) fn demonstrate(global: &Global, args: &RunArgs, source: &Source) -> R
     let format = if global.json { Format::Json } else { Format::Text };
     let (seed, episodes) = (args.seed, args.episodes);
     interruptible(move |stop| commands::demonstrate::run(&request, seed, episodes, format, stop, &mut io::stdout()))
-}
-
-/// Where the policy is that was named, or the usual one.
-pub(super) fn find(named: Option<PathBuf>) -> Result<PathBuf, Failure> {
-    const USUAL: &str = "models/tactile-id";
-    let data = std::env::var_os("XDG_DATA_HOME").map(PathBuf::from).filter(|path| path.is_absolute());
-    let home = || std::env::var_os("HOME").map(|home| PathBuf::from(home).join(".local/share"));
-    let places =
-        [Some(PathBuf::new()), data.or_else(home).map(|data| data.join("rapid")), Some("/usr/share/rapid".into())];
-    let places: Vec<PathBuf> = places.into_iter().flatten().map(|place| place.join(USUAL)).collect();
-    named.or_else(|| places.iter().find(|place| place.exists()).cloned()).ok_or(Failure::NoPolicy(places))
 }
 
 /// Does work that ends between two pieces of it when it is interrupted, and prints what it has.

@@ -80,12 +80,12 @@ pub fn demonstrate(
 ) -> Result<Demonstration, CollectError> {
     let begun = Stamp::now();
     let mut recorder = Stepped::new(Arc::clone(registry), Arc::clone(board), WallClock::now());
-    let mut rig = Lockstep::new(registry, Scenario::task(registry, seed), begun)?;
+    let mut rig = Lockstep::new(registry, Scenario::task(registry, seed), begun, &[])?;
     let mut expert = Expert::new(seed);
     let texture = rig.trial().trial().world.texture;
     for _ in 0..SETTLE {
         rig.deliver(&mut recorder)?;
-        rig.pass(&mut recorder);
+        rig.rest(&mut recorder)?;
     }
     let mut request = request.clone();
     let word = if texture == Texture::Triangular { "triangular" } else { "hexagonal" };
@@ -99,8 +99,7 @@ pub fn demonstrate(
             (expert.act(&trial.world), trial.world.is_done())
         };
         rig.act(steps.into(), action, &mut recorder);
-        rig.trial().trial().step(SHAKE);
-        rig.pass(&mut recorder);
+        rig.step(SHAKE, &mut recorder)?;
         recorder.advance(rig.now());
         steps += 1;
         tail -= u32::from(done);

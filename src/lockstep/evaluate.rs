@@ -1,12 +1,13 @@
 //! Closed-loop trials of a policy on the simulated task, with a sensor that is pulled out.
 //!
 //! The policy is asked at a tick and its answer is there at the next one, as in a run in real time, where
-//! a chunk takes a tenth of a tick.
+//! a chunk takes a tenth of a tick. Every trial has sensors of another phase and latency ([`Timing`]).
 
 use std::time::Duration;
 
 use serde::Serialize;
 
+use super::timing::Timing;
 use super::{Lockstep, STEP, Taker};
 use crate::bus::TopicId;
 use crate::driver::DriverError;
@@ -30,27 +31,30 @@ use crate::time::Stamp;
 const WINDOWS: u64 = 0x7769_6e64_6f77;
 /// The device that is pulled out.
 const PULLED: &str = task::PARTS[1].0;
+const WRIST: &str = task::PARTS[0].0;
 /// Steps in which everything is plugged in and seen, before the policy begins.
 const SETTLE: u32 = 3;
 
-/// What happens to the tactile sensor (paper, table "Hot-plug robustness").
+/// What happens to the sensors (paper, table "Hot-plug robustness", and one more).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Condition {
     /// Nothing.
     Full,
-    /// It is not there.
+    /// The tactile sensor is not there.
     NoTactile,
     /// It is pulled out at a step of 30 to 74: the block is touched at 35 to 45, the ways to the bins part
     /// at 60 to 70.
     HotUnplug,
     /// It is pulled out at a step of 10 to 29 and plugged in again 15 to 29 steps later.
     HotReplug,
+    /// The wrist camera is not there: nothing shows where the block lies. Not in the paper's table.
+    NoWrist,
 }
 
 impl Condition {
     /// All of them, in the order of the paper's table.
-    pub const ALL: [Self; 4] = [Self::Full, Self::NoTactile, Self::HotUnplug, Self::HotReplug];
+    pub const ALL: [Self; 5] = [Self::Full, Self::NoTactile, Self::HotUnplug, Self::HotReplug, Self::NoWrist];
 
     /// As it is written on the command line.
     #[must_use]
@@ -60,6 +64,7 @@ impl Condition {
             Self::NoTactile => "no-tactile",
             Self::HotUnplug => "hot-unplug",
             Self::HotReplug => "hot-replug",
+            Self::NoWrist => "no-wrist",
         }
     }
 
@@ -69,7 +74,7 @@ impl Condition {
         let mut random = Random::new(seed, WINDOWS);
         let mut step = |low: u32, high: u32| low + u32::try_from(random.below(u64::from(high - low))).unwrap_or(0);
         match self {
-            Self::Full | Self::NoTactile => (None, None),
+            Self::Full | Self::NoTactile | Self::NoWrist => (None, None),
             Self::HotUnplug => (Some(step(30, 75)), None),
             Self::HotReplug => {
                 let out = step(10, 30);
@@ -80,10 +85,13 @@ impl Condition {
 
     fn scenario(self, registry: &Registry, seed: u64) -> Scenario {
         let mut scenario = Scenario::task(registry, seed);
-        if self == Self::NoTactile {
-            for device in scenario.devices.iter_mut().filter(|device| device.name == PULLED) {
-                device.plugged = false;
-            }
+        let away = match self {
+            Self::NoTactile => Some(PULLED),
+            Self::NoWrist => Some(WRIST),
+            Self::Full | Self::HotUnplug | Self::HotReplug => None,
+        };
+        for device in scenario.devices.iter_mut().filter(|device| Some(device.name.as_str()) == away) {
+            device.plugged = false;
         }
         let (out, back) = self.windows(seed);
         // Between two ticks: at the tick of that step the bit is clear.
@@ -189,7 +197,8 @@ impl Bench<'_> {
         self.carry_out(condition, seed, None).map(|(trial, _)| trial)
     }
 
-    /// Runs trial `seed` and records it, from the policy's first tick on.
+    /// Runs trial `seed` with sensors that are locked to the ticks, and records it from the policy's first tick on: what
+    /// it sees is all in the file.
     ///
     /// # Errors
     /// When the simulation fails, or the file cannot be made.
@@ -210,7 +219,11 @@ impl Bench<'_> {
         recording: Option<Recording<'_>>,
     ) -> Result<(Trial, Option<EpisodeReport>), TrialError> {
         let begun = recording.as_ref().map_or(Stamp(1_000_000_000), |recording| recording.begun);
-        let mut rig = Lockstep::new(self.registry, condition.scenario(self.registry, seed), begun)?;
+        let scenario = condition.scenario(self.registry, seed);
+        let plugged = |name: &str| scenario.devices.iter().any(|device| device.name == name && device.plugged);
+        let there: Vec<bool> = self.registry.devices.iter().map(|device| plugged(&device.name)).collect();
+        let timings = if recording.is_some() { Vec::new() } else { Timing::draw(seed, &there) };
+        let mut rig = Lockstep::new(self.registry, scenario, begun, &timings)?;
         self.model.reset();
         let (recorder, told) = match recording {
             Some(Recording { recorder, request, library, .. }) => (Some(recorder), Some((request, library))),
@@ -221,7 +234,7 @@ impl Bench<'_> {
         let mut chunk = vec![0.0; self.model.chunk_len()];
         for _ in 0..SETTLE {
             rig.deliver(&mut witness)?;
-            rig.pass(&mut witness);
+            rig.rest(&mut witness)?;
         }
         if let (Some(recorder), Some((request, library))) = (&mut witness.recorder, told) {
             recorder.begin(request, rig.now())?;
@@ -247,8 +260,7 @@ impl Bench<'_> {
             if let Some(action) = action {
                 rig.act(tick, action, &mut witness);
             }
-            rig.trial().trial().step(0.0);
-            rig.pass(&mut witness);
+            rig.step(0.0, &mut witness)?;
             let skipped = take(answer, &mut witness.pilot, request.tick, &chunk, &mut failure);
             if let Some(recorder) = &mut witness.recorder {
                 if let Some(skipped) = skipped {

@@ -8,7 +8,9 @@
 
 pub mod collect;
 pub mod evaluate;
+pub mod timing;
 
+use std::collections::VecDeque;
 use std::time::Duration;
 
 use crate::bus::TopicId;
@@ -25,6 +27,7 @@ use crate::rig::slot::{Effects, Input, Slot};
 use crate::sample::{Encoding, Epoch, FLAG_DEVICE_TIME, SampleHeader};
 use crate::status::{Event, Provenance, SlotState, What};
 use crate::time::{Stamp, nanoseconds};
+use timing::Timing;
 
 /// The mask is published this often (paper, appendix "Physical Mask Data Format": 500 Hz).
 const MASK_PERIOD: Duration = Duration::from_millis(2);
@@ -49,6 +52,8 @@ pub struct Lockstep {
     mask: PhysicalMask,
     mask_sequence: u64,
     now: Stamp,
+    /// When the step in progress began; `None` until the first.
+    stepping: Option<Stamp>,
     payload: Vec<u8>,
 }
 
@@ -59,32 +64,52 @@ struct Lane {
     slot: Slot<Attachment>,
     running: Option<(Epoch, TaskPart)>,
     sequence: u64,
+    latency: Duration,
+    /// When it captures next, plugged in or not.
+    due: Stamp,
+    /// Captured and not yet seen, oldest first.
+    transit: VecDeque<Captured>,
+}
+
+/// A sample on its way.
+#[derive(Debug)]
+struct Captured {
+    epoch: Epoch,
+    part: TaskPart,
+    at: Stamp,
+    payload: Vec<u8>,
 }
 
 impl Lockstep {
-    /// A rig at the moment `begun`, at which `scenario` begins: nothing has been sent yet.
+    /// A rig at the moment `begun`, at which `scenario` begins: nothing has been sent yet. `timings` are those of
+    /// the devices in the order of the registry; one without is [locked](Timing::LOCKED) to the steps.
     ///
     /// # Errors
     /// When the scenario is not of the simulated task.
-    pub fn new(registry: &Registry, scenario: Scenario, begun: Stamp) -> Result<Self, DriverError> {
+    pub fn new(registry: &Registry, scenario: Scenario, begun: Stamp, timings: &[Timing]) -> Result<Self, DriverError> {
         let scene = scenario.devices.iter().find_map(|device| match &device.source {
             SimSource::Task { scene, .. } => Some(Shared::of(scene)),
             _ => None,
         });
-        let lane = |spec: &DeviceSpec| Lane {
+        let timings = timings.iter().copied().chain(std::iter::repeat(Timing::LOCKED));
+        let lane = |(spec, timing): (&DeviceSpec, Timing)| Lane {
             spec: spec.clone(),
             slot: Slot::new(registry.rig.cooldown),
             running: None,
             sequence: 0,
+            latency: timing.latency,
+            due: begun.after(timing.phase),
+            transit: VecDeque::new(),
         };
         Ok(Self {
             trial: scene.unwrap_or_else(|| Err(DriverError::Fatal("a scenario without the simulated task".into())))?,
             timeline: Timeline::new(scenario, begun),
             assigner: Assigner::new(registry),
-            lanes: registry.devices.iter().map(lane).collect(),
+            lanes: registry.devices.iter().zip(timings).map(lane).collect(),
             mask: PhysicalMask::EMPTY,
             mask_sequence: 0,
             now: begun,
+            stepping: None,
             payload: Vec::new(),
         })
     }
@@ -107,33 +132,75 @@ impl Lockstep {
         self.mask
     }
 
-    /// Lets a tenth of a second pass in which the mask is published and cables are plugged and pulled.
-    /// What the devices send at its end is sent by [`Self::deliver`].
-    pub fn pass(&mut self, taker: &mut dyn Taker) {
+    /// Lets a tenth of a second pass in which nothing moves, the mask is published, and cables are plugged and
+    /// pulled. What is captured or seen at its end is left to [`Self::deliver`].
+    ///
+    /// # Errors
+    /// When a picture cannot be made.
+    pub fn rest(&mut self, taker: &mut dyn Taker) -> Result<(), DriverError> {
         let end = self.now.after(STEP);
+        let mut publish = self.now;
         while self.now < end {
-            self.now = self.now.after(MASK_PERIOD).min(end);
+            if publish <= self.now {
+                publish = publish.after(MASK_PERIOD);
+            }
+            let moments = self.lanes.iter().flat_map(Lane::moments);
+            self.now = moments.fold(publish.min(end), Stamp::min).max(self.now);
             self.plug(taker);
-            self.publish(taker);
+            if publish <= self.now {
+                self.publish(taker);
+            }
+            if self.now < end {
+                self.sense(taker)?;
+            }
         }
+        Ok(())
     }
 
-    /// Lets every device that runs send one sample, captured now.
+    /// Moves the arm for one step and lets a tenth of a second pass; who captures meanwhile sees it on its way.
+    ///
+    /// # Errors
+    /// When a picture cannot be made.
+    pub fn step(&mut self, shake: f64, taker: &mut dyn Taker) -> Result<(), DriverError> {
+        self.trial.trial().step(shake);
+        self.stepping = Some(self.now);
+        self.rest(taker)
+    }
+
+    /// Plugs and pulls what is due now, and lets every device that runs send what is captured or seen now.
     ///
     /// # Errors
     /// When a picture cannot be made.
     pub fn deliver(&mut self, taker: &mut dyn Taker) -> Result<(), DriverError> {
         self.plug(taker);
+        self.sense(taker)
+    }
+
+    /// Captures what is due, and hands over what is seen by now.
+    fn sense(&mut self, taker: &mut dyn Taker) -> Result<(), DriverError> {
+        let Self { lanes, trial, now, stepping, .. } = self;
+        let (now, stepping) = (*now, *stepping);
+        for lane in &mut *lanes {
+            while lane.due <= now {
+                let at = lane.due;
+                lane.due = at.after(STEP);
+                let Some((epoch, part)) = lane.running else { continue };
+                let share = stepping.map_or(1.0, |begun| at.since(begun).as_secs_f64() / STEP.as_secs_f64());
+                let mut payload = Vec::new();
+                trial.trial().sample_part_way(part, share, &mut payload)?;
+                lane.transit.push_back(Captured { epoch, part, at, payload });
+            }
+        }
         for index in 0..self.lanes.len() {
-            let Some(lane) = self.lanes.get_mut(index) else { continue };
-            let Some((epoch, part)) = lane.running else { continue };
-            self.trial.trial().sample(part, &mut self.payload)?;
-            let header = header(lane, epoch, part, self.now);
-            lane.sequence += 1;
-            let id = lane.spec.id;
-            taker.take(TopicId::Modality(id), &header, &self.payload);
-            if lane.slot.state() == SlotState::Opening {
-                self.apply(id, Input::Started(epoch), taker);
+            while let Some(lane) = self.lanes.get_mut(index) {
+                let Some(sample) = lane.seen_by(now) else { break };
+                let header = header(lane, &sample);
+                lane.sequence += 1;
+                let (id, opening) = (lane.spec.id, lane.slot.state() == SlotState::Opening);
+                taker.take(TopicId::Modality(id), &header, &sample.payload);
+                if opening {
+                    self.apply(id, Input::Started(sample.epoch), taker);
+                }
             }
         }
         Ok(())
@@ -204,6 +271,7 @@ impl Lockstep {
         let Effects { stop, start } = lane.slot.apply(input, now);
         if stop.is_some() {
             lane.running = None;
+            lane.transit.clear();
         }
         let opened = start.and_then(|(epoch, attachment)| {
             let DeviceNode::Sim(device) = &attachment.node else { return None };
@@ -259,15 +327,29 @@ impl Lockstep {
     }
 }
 
-fn header(lane: &Lane, epoch: Epoch, part: TaskPart, now: Stamp) -> SampleHeader {
-    let (encoding, width, height) = task::layout(part);
+impl Lane {
+    /// When it captures next, and when what it has captured is seen.
+    fn moments(&self) -> impl Iterator<Item = Stamp> {
+        let seen = self.transit.front().map(|sample| sample.at.after(self.latency));
+        std::iter::once(self.due).chain(seen)
+    }
+
+    /// The oldest sample on its way that is seen by `now`.
+    fn seen_by(&mut self, now: Stamp) -> Option<Captured> {
+        let seen = self.transit.front().is_some_and(|sample| sample.at.after(self.latency) <= now);
+        if seen { self.transit.pop_front() } else { None }
+    }
+}
+
+fn header(lane: &Lane, sample: &Captured) -> SampleHeader {
+    let (encoding, width, height) = task::layout(sample.part);
     SampleHeader {
         seq: lane.sequence,
         lost: 0,
-        capture_ns: now.0,
-        recv_ns: now.0,
+        capture_ns: sample.at.0,
+        recv_ns: sample.at.after(lane.latency).0,
         id: u32::from(lane.spec.id.bit()),
-        epoch: epoch.0,
+        epoch: sample.epoch.0,
         encoding: encoding as u32,
         flags: FLAG_DEVICE_TIME,
         width,

@@ -17,8 +17,10 @@ mod action;
 mod devices;
 #[cfg(test)]
 pub(crate) mod example;
+mod external;
 mod files;
 mod graphs;
+mod inside;
 mod json;
 mod keys;
 mod observations;

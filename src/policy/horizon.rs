@@ -16,6 +16,7 @@
 //! * A required modality missing: hold at once, for a robot must not go on blindly with what was
 //!   decided when it could see. Another one missing: go on if the policy knows of the mask; if it
 //!   does not, hold until it is back, unless told to go on ([`WithoutMask`]).
+//! * None of several pictures present: hold likewise. In training one of them was always there.
 //! * No action left: hold.
 //!
 //! Invariant: pure: time comes in as ticks of the control grid, rising. One call a tick to
@@ -29,7 +30,7 @@ mod told;
 
 use std::time::Duration;
 
-use super::bundle::Bundle;
+use super::bundle::{Bundle, ObservationInput};
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::registry::Registry;
@@ -64,7 +65,7 @@ pub struct Executor {
     n_action_steps: u64,
     action_start: u64,
     max_observation_age: Duration,
-    holds_without_mask: bool,
+    needs: Needs,
     modalities: Vec<Modality>,
     min: Vec<f32>,
     max: Vec<f32>,
@@ -87,12 +88,22 @@ pub struct Executor {
     counts: Counts,
 }
 
+/// What must be there beside the modalities that are required.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Needs {
+    Nothing,
+    /// One picture at least, of several.
+    APicture,
+    All,
+}
+
 #[derive(Debug)]
 struct Modality {
     name: String,
     /// `None` if the registry does not know it: then it is never there.
     id: Option<ModalityId>,
     required: bool,
+    is_picture: bool,
 }
 
 impl Executor {
@@ -103,6 +114,14 @@ impl Executor {
             name: observation.modality.clone(),
             id: registry.named(&observation.modality).map(|device| device.id),
             required: observation.required,
+            is_picture: matches!(observation.input, ObservationInput::Image(_)),
+        };
+        let modalities: Vec<Modality> = bundle.observations.iter().map(modality).collect();
+        let pictures = modalities.iter().filter(|modality| modality.is_picture).count();
+        let needs = match (without_mask, bundle.mask_aware) {
+            (WithoutMask::Hold, false) => Needs::All,
+            (WithoutMask::Hold, true) if pictures > 1 => Needs::APicture,
+            _ => Needs::Nothing,
         };
         let values = bundle.action.len();
         Self {
@@ -110,8 +129,8 @@ impl Executor {
             n_action_steps: bundle.n_action_steps as u64,
             action_start: bundle.action_start as u64,
             max_observation_age: bundle.max_observation_age,
-            holds_without_mask: !bundle.mask_aware && without_mask == WithoutMask::Hold,
-            modalities: bundle.observations.iter().map(modality).collect(),
+            needs,
+            modalities,
             min: bundle.action.min.clone(),
             max: bundle.action.max.clone(),
             chunk: vec![0.0; bundle.horizon * values],
@@ -253,10 +272,15 @@ impl Executor {
         let absent = |modality: &Modality| !modality.id.is_some_and(|id| mask.contains(id));
         let first =
             |required| self.modalities.iter().position(|modality| modality.required == required && absent(modality));
-        first(true).map(|at| (at, HoldReason::RequiredMissing)).or_else(|| {
-            let at = first(false).filter(|_| self.holds_without_mask)?;
-            Some((at, HoldReason::NotMaskAware))
-        })
+        if let Some(at) = first(true) {
+            return Some((at, HoldReason::RequiredMissing));
+        }
+        if let Some(at) = first(false).filter(|_| self.needs == Needs::All) {
+            return Some((at, HoldReason::NotMaskAware));
+        }
+        let mut pictures = self.modalities.iter().filter(|modality| modality.is_picture);
+        let at = self.modalities.iter().position(|modality| modality.is_picture)?;
+        (self.needs == Needs::APicture && pictures.all(absent)).then_some((at, HoldReason::NoPicture))
     }
 
     fn act(&mut self, index: usize, age: u64) -> Step<'_> {

@@ -5,20 +5,22 @@
 //! nothing is left behind. Another library is taken when it is named, by `--ort-lib` or, as other
 //! programs with onnxruntime do it, by `ORT_DYLIB_PATH`.
 //!
+//! The C++ library that it needs comes first, see [`loader`].
+//!
 //! Invariant: nothing is unpacked, loaded or started before [`Environment::open`] is called.
 //! Invariant: a library that was named is taken or the error says why not; no other one is taken
 //! instead.
 
-use std::fs::File;
+mod loader;
+
+use std::ffi::CString;
 use std::io;
 use std::os::fd::AsRawFd as _;
+use std::os::unix::ffi::OsStrExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use ort::logging::LogLevel;
-use rustix::fs::{MemfdFlags, memfd_create};
-use rustix::io::Errno;
-
 /// The packed library; empty in a build without.
 static INSIDE: &[u8] = include_bytes!(env!("RAPID_ONNXRUNTIME"));
 /// The variable that names another library.
@@ -76,6 +78,14 @@ pub enum Cause {
     /// There is no such file.
     #[error("there is no such file")]
     Missing,
+    /// Something that it needs is not on this machine.
+    #[error("it needs {library}, which this machine does not have{}", install(*package))]
+    Needs {
+        /// The name of a library.
+        library: String,
+        /// Debian's package with it, if known.
+        package: Option<&'static str>,
+    },
     /// It cannot be loaded, in the loader's words.
     #[error("it cannot be loaded: {0}")]
     Unloadable(String),
@@ -148,38 +158,35 @@ fn choose(named: Option<&Path>, variable: Option<PathBuf>) -> Origin {
     }
 }
 
+fn install(package: Option<&str>) -> String {
+    package.map_or_else(String::new, |package| format!(": apt install {package} on Debian and Ubuntu"))
+}
+
 fn load(origin: &Origin) -> Result<ort::environment::Environment, Cause> {
     match origin {
         Origin::Option(path) | Origin::Variable(path) => {
             if !path.exists() {
                 return Err(Cause::Missing);
             }
+            // One of another make may need none.
+            let _ = loader::load_libstdcxx();
             // `ort` looks for a relative path beside the program first.
             start(&std::path::absolute(path).unwrap_or_else(|_| path.clone()))
         }
         Origin::Inside if INSIDE.is_empty() => Err(Cause::LeftOut),
         Origin::Inside => {
-            let memory = unpack(INSIDE).map_err(Cause::Memory)?;
+            loader::load_libstdcxx()?;
+            let memory = loader::unpack(c"libonnxruntime.so", INSIDE).map_err(Cause::Memory)?;
             // The loader maps the memory; the descriptor is not needed any longer.
             start(Path::new(&format!("/proc/self/fd/{}", memory.as_raw_fd())))
         }
     }
 }
 
-/// Memory with a descriptor, and the library in it.
-fn unpack(packed: &[u8]) -> io::Result<File> {
-    // Sealed against being run as a program, which it is not: a kernel that allows no programs in
-    // such memory (sysctl vm.memfd_noexec) still allows this. Kernels before 6.3 know neither.
-    let memory = match memfd_create("libonnxruntime.so", MemfdFlags::CLOEXEC | MemfdFlags::NOEXEC_SEAL) {
-        Err(Errno::INVAL) => memfd_create("libonnxruntime.so", MemfdFlags::CLOEXEC),
-        other => other,
-    }?;
-    let mut memory = File::from(memory);
-    zstd::stream::copy_decode(packed, &mut memory)?;
-    Ok(memory)
-}
-
 fn start(path: &Path) -> Result<ort::environment::Environment, Cause> {
+    // Before `ort` does it, whose error does not say what is missing.
+    let name = CString::new(path.as_os_str().as_bytes()).map_err(|_| Cause::Missing)?;
+    loader::load_onnxruntime(&name)?;
     let builder = ort::init_from(path).map_err(|error| match error {
         ort::LoadDynamicError::BadVersion { version_str, .. } => Cause::TooOld(version_str),
         ort::LoadDynamicError::Dlopen { error, .. } => Cause::Unloadable(error.to_string()),
@@ -242,7 +249,7 @@ mod tests {
     #[test]
     fn the_library_inside_is_whole_and_is_loaded_once() {
         assert!(!INSIDE.is_empty(), "built without onnxruntime, which `make setup` fetches");
-        let memory = unpack(INSIDE).unwrap();
+        let memory = loader::unpack(c"libonnxruntime.so", INSIDE).unwrap();
         assert!(memory.metadata().unwrap().len() > 10_000_000);
         drop(memory);
         let first = Environment::open(None).unwrap();

@@ -5,6 +5,8 @@
 //!
 //! Invariant: an answer belongs to the request that is out; there is one at most.
 
+use std::time::Duration;
+
 use super::bundle::Bundle;
 use super::horizon::{Counts, Executor, Refused, Situation, Step, WithoutMask};
 use super::observer::Observer;
@@ -14,6 +16,10 @@ use crate::modality::ModalityId;
 use crate::registry::Registry;
 use crate::sample::SampleHeader;
 use crate::time::Stamp;
+
+/// The first tick is this much later than the capture of the newest sample that it waited for: what a device and
+/// the bus take.
+pub const FIRST_TICK_AFTER: Duration = Duration::from_millis(10);
 
 /// See the module's comment.
 #[derive(Debug)]

@@ -37,11 +37,16 @@ pub(crate) struct Change<'a> {
 
 /// Writes the bundle: pictures `wrist` and `tactile`, numbers `state`; the mask has the pictures.
 pub(crate) fn write_bundle(folder: &Path, changes: &[Change<'_>]) {
-    let [encoder, denoiser] = [encoder(), denoiser()];
+    write_graphs(folder, &encoder(), changes);
+}
+
+/// The same with another encoder.
+pub(crate) fn write_graphs(folder: &Path, encoder: &[u8], changes: &[Change<'_>]) {
+    let denoiser = denoiser();
     std::fs::create_dir_all(folder).expect("folder of the bundle");
-    std::fs::write(folder.join("encoder.onnx"), &encoder).expect("encoder");
+    std::fs::write(folder.join("encoder.onnx"), encoder).expect("encoder");
     std::fs::write(folder.join("denoiser.onnx"), &denoiser).expect("denoiser");
-    let mut policy = POLICY.replace("ENCODER", &sum(&encoder)).replace("DENOISER", &sum(&denoiser));
+    let mut policy = POLICY.replace("ENCODER", &sum(encoder)).replace("DENOISER", &sum(&denoiser));
     for Change { what, with } in changes {
         assert!(policy.contains(what), "{what} is not in policy.json");
         policy = policy.replace(what, with);
@@ -141,25 +146,48 @@ pub(crate) fn denoiser() -> Vec<u8> {
     model(graph)
 }
 
+/// The encoder with something more in the model (`field` of `ModelProto`).
+pub(crate) fn encoder_with(field: u64, more: &Message) -> Vec<u8> {
+    let mut model = Message(encoder());
+    model.message(field, more);
+    model.0
+}
+
+/// `TensorProto` whose four floats lie in the file `weights.bin`.
+pub(crate) fn external(name: &str) -> Message {
+    let mut entry = Message::default();
+    entry.bytes(1, b"location").bytes(2, b"weights.bin");
+    let mut tensor = Message::default();
+    tensor.number(1, 4).number(2, FLOAT).bytes(8, name.as_bytes()).message(13, &entry).number(14, 1);
+    tensor
+}
+
+/// A message with one message in it.
+pub(crate) fn within(field: u64, inside: &Message) -> Message {
+    let mut message = Message::default();
+    message.message(field, inside);
+    message
+}
+
 /// A message of protobuf as it is written: fields one after the other.
 #[derive(Default)]
-struct Message(Vec<u8>);
+pub(crate) struct Message(Vec<u8>);
 
 impl Message {
-    fn number(&mut self, field: u64, value: u64) -> &mut Self {
+    pub(crate) fn number(&mut self, field: u64, value: u64) -> &mut Self {
         self.varint(field << 3);
         self.varint(value);
         self
     }
 
-    fn bytes(&mut self, field: u64, bytes: &[u8]) -> &mut Self {
+    pub(crate) fn bytes(&mut self, field: u64, bytes: &[u8]) -> &mut Self {
         self.varint(field << 3 | 2);
         self.varint(bytes.len() as u64);
         self.0.extend_from_slice(bytes);
         self
     }
 
-    fn message(&mut self, field: u64, message: &Self) -> &mut Self {
+    pub(crate) fn message(&mut self, field: u64, message: &Self) -> &mut Self {
         self.bytes(field, &message.0)
     }
 

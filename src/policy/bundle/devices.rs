@@ -66,7 +66,10 @@ impl Bundle {
             None => {
                 let names: Vec<&str> = actuators.iter().map(|(name, _)| *name).collect();
                 let fix = if names.is_empty() {
-                    format!("add [device.{wanted}.action] to devices.toml: no device there takes actions")
+                    format!(
+                        "no device there takes actions: add motors behind a CAN adapter, or a program that moves \
+                         \"{wanted}\" and has the table [device.{wanted}.action]"
+                    )
                 } else {
                     did_you_mean(wanted, &names, "devices that take actions are")
                 };

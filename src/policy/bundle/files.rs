@@ -6,6 +6,8 @@ use std::path::Path;
 
 use sha2::{Digest, Sha256};
 
+use super::external::{self, Refused};
+use super::inside;
 use super::parse::parse;
 use super::read::Problems;
 use super::spec::{Bundle, BundleErrors, GraphFile};
@@ -14,8 +16,6 @@ use super::spec::{Bundle, BundleErrors, GraphFile};
 pub const POLICY_FILE: &str = "policy.json";
 /// It is a few kilobytes, provenance included.
 const MAX_POLICY_BYTES: u64 = 4 << 20;
-/// Read at once for a hash.
-const CHUNK: usize = 64 << 10;
 
 /// Which of the two graphs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -38,7 +38,16 @@ impl Graph {
 }
 
 impl Bundle {
-    /// Reads the bundle in `folder` and checks that its graphs are there, byte for byte.
+    /// The bundle in `folder`, or without one that [inside the program](Self::inside).
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn open(folder: Option<&Path>) -> Result<Self, BundleErrors> {
+        folder.map_or_else(Self::inside, Self::load)
+    }
+
+    /// Reads the bundle in `folder` and checks that its graphs are there, byte for byte, and that all their
+    /// numbers lie in them.
     ///
     /// # Errors
     /// Everything that is wrong with `policy.json`, or else with the graphs' files.
@@ -59,9 +68,7 @@ impl Bundle {
         folder.clone_into(&mut bundle.folder);
         let mut problems = Problems::new(&label);
         for graph in [Graph::Encoder, Graph::Denoiser] {
-            let file = bundle.graph(graph);
-            let found = open(&folder.join(&file.file)).and_then(|mut file| hash(&mut file));
-            verify(graph, file, found, &mut problems);
+            bundle.verified(graph, &mut problems);
         }
         problems.check()?;
         Ok(bundle)
@@ -88,13 +95,32 @@ impl Bundle {
     /// # Errors
     /// When it cannot be read or is no longer the one that `policy.json` means.
     pub fn read_graph(&self, graph: Graph) -> Result<Vec<u8>, BundleErrors> {
-        let file = self.graph(graph);
-        let mut bytes = Vec::new();
-        let read = open(&self.folder.join(&file.file)).and_then(|mut open| open.read_to_end(&mut bytes));
         let mut problems = Problems::new(&self.label());
-        verify(graph, file, read.and_then(|_| hash(&mut bytes.as_slice())), &mut problems);
+        let bytes = self.verified(graph, &mut problems);
         problems.check()?;
         Ok(bytes)
+    }
+
+    /// The bytes of a graph, if they are those that are meant and nothing of it lies elsewhere; empty otherwise.
+    pub(super) fn verified(&self, graph: Graph, problems: &mut Problems) -> Vec<u8> {
+        let file = self.graph(graph);
+        let mut bytes = Vec::new();
+        let read = if self.inside {
+            bytes.extend_from_slice(inside::graph(graph));
+            Ok(bytes.len())
+        } else {
+            open(&self.folder.join(&file.file)).and_then(|mut open| open.read_to_end(&mut bytes))
+        };
+        let wrong = match read {
+            Err(error) => Some((
+                format!("{} cannot be read: {error}", file.file),
+                "copy the whole bundle again: the graph belongs beside policy.json".to_owned(),
+            )),
+            Ok(_) => wrong(file, &bytes),
+        };
+        let Some((message, fix)) = wrong else { return bytes };
+        problems.report(&format!("graphs.{}", graph.key()), message, fix);
+        Vec::new()
     }
 
     /// Where a graph lies and what its bytes are.
@@ -130,35 +156,26 @@ fn open(path: &Path) -> io::Result<File> {
     File::open(path)
 }
 
-fn hash(from: &mut impl Read) -> io::Result<String> {
-    let mut hasher = Sha256::new();
-    let mut chunk = vec![0; CHUNK];
-    loop {
-        match from.read(&mut chunk) {
-            Ok(0) => return Ok(hexadecimal(&hasher.finalize())),
-            Ok(length) => hasher.update(&chunk[..length]),
-            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-            Err(error) => return Err(error),
-        }
+/// What is wrong with the bytes of a graph, and the fix.
+fn wrong(file: &GraphFile, bytes: &[u8]) -> Option<(String, String)> {
+    let (name, found) = (&file.file, hexadecimal(&Sha256::digest(bytes)));
+    if found != file.sha256 {
+        let message = format!("{name} has the SHA-256 {found}, policy.json says {}", file.sha256);
+        let fix = "copy the whole bundle again: this graph is not the one that belongs to it";
+        return Some((message, fix.to_owned()));
     }
-}
-
-fn verify(graph: Graph, file: &GraphFile, found: io::Result<String>, problems: &mut Problems) {
-    let entry = format!("graphs.{}", graph.key());
-    match found {
-        Ok(found) if found == file.sha256 => {}
-        Ok(found) => {
-            let message = format!("{} has the SHA-256 {found}, policy.json says {}", file.file, file.sha256);
-            problems.report(
-                &entry,
-                message,
-                "copy the whole bundle again: this graph is not the one that belongs to it",
-            );
-        }
-        Err(error) => {
-            let message = format!("{} cannot be read: {error}", file.file);
-            problems.report(&entry, message, "copy the whole bundle again: the graph belongs beside policy.json");
-        }
+    let again = format!("then write the new SHA-256 of {name} here");
+    match external::check(bytes).err()? {
+        Refused::NoModel => Some((
+            format!("{name} is not an ONNX model"),
+            format!("export it again, as ONNX and not in onnxruntime's own format; {again}"),
+        )),
+        Refused::External { tensor, file } => Some((
+            format!(
+                "{name}: the numbers of tensor \"{tensor}\" lie in another file, \"{file}\", which no SHA-256 covers"
+            ),
+            format!("store them in the graph: onnx.save(onnx.load(\"{name}\"), \"{name}\") in Python; {again}"),
+        )),
     }
 }
 

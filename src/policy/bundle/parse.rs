@@ -100,6 +100,7 @@ fn root(value: &Value, problems: &mut Problems) -> Option<Bundle> {
     }
     Some(Bundle {
         folder: PathBuf::new(),
+        inside: false,
         hash: String::new(),
         name: name?,
         mask_aware: mask_aware?,

@@ -14,8 +14,10 @@ use crate::registry::Diagnostic;
 /// A checked bundle.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Bundle {
-    /// The folder it was read from.
+    /// The folder it was read from; of the one inside the program a word that says so.
     pub folder: PathBuf,
+    /// It is the one inside the program.
+    pub inside: bool,
     /// SHA-256 over the bytes of `policy.json` and the hashes of both graphs as they stand in it,
     /// encoder first; lower-case hexadecimal. Names in a recording what has run.
     pub hash: String,

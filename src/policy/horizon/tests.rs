@@ -351,3 +351,20 @@ proptest! {
         prop_assert_eq!(bundle.n_action_steps as u64, STEPS);
     }
 }
+
+/// In training one of several pictures was always there: what the policy does without any nobody has taught it.
+#[test]
+fn without_any_picture_it_holds_and_without_one_of_two_it_goes_on() {
+    const NO_PICTURE: PhysicalMask = PhysicalMask(0b100);
+    let mut bundle = bundle();
+    bundle.observations[0].required = false;
+    let mut executor = Executor::new(&bundle, &registry(), WithoutMask::Hold);
+    assert_eq!(lockstep(&mut executor, 0, seen(NO_CAM)), Ok(1.0));
+    assert_eq!(lockstep(&mut executor, 1, seen(NO_TIP)), Ok(101.0));
+    assert!(!executor.wants_observation(2, seen(NO_PICTURE)));
+    let step = executor.step(2, seen(NO_PICTURE));
+    assert_eq!((step.hold, step.missing), (Some(HoldReason::NoPicture), Some("cam_wrist")));
+    assert_eq!(lockstep(&mut executor, 3, seen(NO_CAM)), Ok(301.0));
+    let mut executor = Executor::new(&bundle, &registry(), WithoutMask::GoOn);
+    assert_eq!(lockstep(&mut executor, 0, seen(NO_PICTURE)), Ok(1.0));
+}

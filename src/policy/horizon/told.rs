@@ -10,6 +10,8 @@ pub enum HoldReason {
     RequiredMissing,
     /// A modality is not there, and the policy was not trained to do without.
     NotMaskAware,
+    /// None of the pictures that the policy observes is there.
+    NoPicture,
     /// What the sensors last saw is older than the bundle allows.
     ObservationOld,
     /// The policy is computing, and no action is left of its last chunk.
@@ -20,7 +22,7 @@ pub enum HoldReason {
 
 impl HoldReason {
     pub(super) const fn is_missing(self) -> bool {
-        matches!(self, Self::RequiredMissing | Self::NotMaskAware)
+        matches!(self, Self::RequiredMissing | Self::NotMaskAware | Self::NoPicture)
     }
 }
 
@@ -29,6 +31,7 @@ impl std::fmt::Display for HoldReason {
         f.write_str(match self {
             Self::RequiredMissing => "a modality that the policy requires is missing",
             Self::NotMaskAware => "a modality is missing, and the policy was not trained to do without",
+            Self::NoPicture => "no picture that the policy observes is there",
             Self::ObservationOld => "the observation is too old",
             Self::Waiting => "the next actions are still being computed",
             Self::Unusable => "the policy's last answer could not be used",

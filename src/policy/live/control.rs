@@ -12,14 +12,12 @@ use crate::bus::{Inbox, TopicId, Writer};
 use crate::fault;
 use crate::mask::PhysicalMask;
 use crate::policy::horizon::Counts;
-use crate::policy::pilot::Pilot;
+use crate::policy::pilot::{FIRST_TICK_AFTER, Pilot};
 use crate::registry::Registry;
 use crate::sample::{Encoding, SampleHeader};
 use crate::status::{Board, Chunk, Level, PolicyStatus, What};
 use crate::time::Stamp;
 
-/// From the capture of a sample to the tick that is to see it: what a device and the bus take.
-const PHASE: Duration = Duration::from_millis(10);
 /// The longest time between two looks at the bus, whatever the rate of the grid.
 const LOOK: Duration = Duration::from_millis(20);
 /// How often the board is told.
@@ -119,7 +117,7 @@ impl Control {
         while !stop.is_cancelled() {
             self.drain();
             if let Some(newest) = self.pilot.first_sight() {
-                return Some(newest.after(PHASE).max(Stamp::now()));
+                return Some(newest.after(FIRST_TICK_AFTER).max(Stamp::now()));
             }
             let _ = self.inbox.wait(LOOK);
             self.report();

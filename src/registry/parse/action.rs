@@ -1,4 +1,7 @@
 //! `[device.NAME.action]`: that a device is an actuator, and what it may be told.
+//!
+//! Of what `rapid` reads itself, motors behind a CAN adapter alone move, and each of them is an axis without a table;
+//! a program may move what it likes.
 
 use crate::action::MAX_ACTION;
 use crate::registry::section::{Problems, Section};
@@ -6,9 +9,18 @@ use crate::registry::spec::ActionSpec;
 
 const KEYS: [&str; 4] = ["names", "units", "min", "max"];
 
-/// Reads the table; `None` without one, or if a problem with it was reported.
-pub(super) fn action(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<ActionSpec> {
+/// Reads the table; `None` without one, or if a problem with it was reported. One of a device that does not `move`
+/// is such a problem.
+pub(super) fn action(section: &Section<'_>, moves: bool, problems: &mut Problems<'_>) -> Option<ActionSpec> {
     let table = section.table(problems, "action")?;
+    if !moves {
+        let node = section.text(problems, "node").map_or("", |node| node.value);
+        let message = format!("node {node:?} takes no actions: nothing would move");
+        let fix = "remove the table; motors behind a CAN adapter are axes without one (protocol = \"damiao\"), and any \
+                   other device is moved by a program (node = its name)";
+        section.report(problems, "action", message, fix);
+        return None;
+    }
     table.allow(problems, &KEYS);
     for key in KEYS {
         if !table.has(key) {

@@ -201,7 +201,10 @@ pub(super) fn read<'a>(
         Some(NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(damiao), .. })) => {
             Some(motors::axes(damiao, &section, problems))
         }
-        _ => action::action(&section, problems),
+        settings => {
+            let moves = settings.as_ref().is_none_or(|node| matches!(node, NodeSpec::Process(_)));
+            action::action(&section, moves || programs.are_nowhere(), problems)
+        }
     };
     let written = section.integer(problems, "depth", 2..=4096).and_then(|depth| u64::try_from(depth.value).ok());
     Draft {

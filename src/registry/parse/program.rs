@@ -48,6 +48,11 @@ impl For {
 type Wrong = (String, String);
 
 impl Programs<'_> {
+    /// Is this a registry of which nothing will be run, such as that of an episode?
+    pub(super) const fn are_nowhere(self) -> bool {
+        matches!(self, Self::Nowhere)
+    }
+
     /// The program of this name.
     pub(super) fn find(self, purpose: For, name: &str) -> Result<PathBuf, Wrong> {
         let Self::Beside(file) = self else { return Ok(PathBuf::from(name)) };

@@ -38,6 +38,8 @@ pub const fn layout(part: TaskPart) -> (Encoding, u32, u32) {
 pub struct Trial {
     /// The world.
     pub world: World,
+    /// The same one step earlier.
+    before: World,
     looks: Looks,
     /// What the actuator was told last.
     command: Option<[f64; AXES]>,
@@ -50,7 +52,7 @@ impl Trial {
     pub fn new(seed: u64) -> Self {
         let world = World::new(seed);
         let looks = Looks::new(seed, world.texture);
-        Self { world, looks, command: None, picture: Vec::with_capacity(SIDE * SIDE * 3) }
+        Self { before: world.clone(), world, looks, command: None, picture: Vec::with_capacity(SIDE * SIDE * 3) }
     }
 
     /// Tells the actuator where to go; it goes there from the next step on.
@@ -61,6 +63,7 @@ impl Trial {
     /// Lets a tenth of a second pass. Without a command the arm stays where it is.
     pub fn step(&mut self, shake: f64) {
         let target = self.command.unwrap_or_else(|| self.world.state());
+        self.before.clone_from(&self.world);
         self.world.step(target, shake);
     }
 
@@ -76,12 +79,22 @@ impl Trial {
     /// # Errors
     /// When the picture cannot be encoded.
     pub fn sample(&mut self, part: TaskPart, payload: &mut Vec<u8>) -> Result<(), DriverError> {
+        self.sample_part_way(part, 1.0, payload)
+    }
+
+    /// The same after `share` of the last step, 0 to 1.
+    ///
+    /// # Errors
+    /// When the picture cannot be encoded.
+    pub fn sample_part_way(&mut self, part: TaskPart, share: f64, payload: &mut Vec<u8>) -> Result<(), DriverError> {
         payload.clear();
+        let between = (share < 1.0).then(|| self.world.part_way_from(&self.before, share));
+        let world = between.as_ref().unwrap_or(&self.world);
         match part {
-            TaskPart::Wrist => self.looks.wrist(&self.world, &mut self.picture),
-            TaskPart::Tactile => self.looks.tactile(&self.world, &mut self.picture),
+            TaskPart::Wrist => self.looks.wrist(world, &mut self.picture),
+            TaskPart::Tactile => self.looks.tactile(world, &mut self.picture),
             TaskPart::Arm => {
-                payload.extend(self.world.state().into_iter().flat_map(f64::to_le_bytes));
+                payload.extend(world.state().into_iter().flat_map(f64::to_le_bytes));
                 return Ok(());
             }
         }

@@ -175,6 +175,23 @@ impl World {
         self.steps += 1;
     }
 
+    /// The world on its way here from `before`, one step earlier, after `share` of that step (0 to 1): what moves
+    /// is in between, and what was grasped or let go of was so in the middle of the step.
+    #[must_use]
+    pub fn part_way_from(&self, before: &Self, share: f64) -> Self {
+        let between = |from: f64, to: f64| from + (to - from) * share;
+        let mut world = if share < 0.5 { before.clone() } else { self.clone() };
+        for (place, (from, to)) in world.position.iter_mut().zip(before.position.iter().zip(self.position)) {
+            *place = between(*from, to);
+        }
+        for (place, (from, to)) in world.block.iter_mut().zip(before.block.iter().zip(self.block)) {
+            *place = between(*from, to);
+        }
+        world.grip = between(before.grip, self.grip);
+        world.pressure = between(before.pressure, self.pressure);
+        world
+    }
+
     /// Is the trial over? The block is put down in a bin and the gripper up again, or time is up.
     #[must_use]
     pub fn is_done(&self) -> bool {

@@ -1,0 +1,96 @@
+//! When the sensors of a trial capture, and when their samples are seen, as on a rig whose devices share no clock.
+//!
+//! Every sensor samples once a step, at a moment of the step of its own (phase), and what it captured is seen
+//! a while later (latency). The control grid begins as in a run in real time: when the last sensor has been
+//! seen, and not before [`FIRST_TICK_AFTER`] its capture.
+//!
+//! Invariant: pure; a function of the seed and of which sensors are there.
+
+use std::time::Duration;
+
+use super::STEP;
+use crate::policy::pilot::FIRST_TICK_AFTER;
+use crate::random::Random;
+
+/// The stream of a trial's seed that decides them.
+const TIMING: u64 = 0x7469_6d69_6e67;
+/// From the capture of a sample until it is seen, microseconds: a serial line with its USB adapter takes a few
+/// milliseconds, a camera with exposure and transfer a few tens.
+const LATENCY_US: (u64, u64) = (5_000, 50_000);
+
+/// Of one sensor.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Timing {
+    /// From a tick of the control grid to the next capture, below [`STEP`].
+    pub phase: Duration,
+    /// From a capture until the sample is seen.
+    pub latency: Duration,
+}
+
+impl Timing {
+    /// It captures at the ticks and is seen at once, as in a demonstration.
+    pub const LOCKED: Self = Self { phase: Duration::ZERO, latency: Duration::ZERO };
+
+    /// Of each sensor of trial `seed`. `there` says which of them are plugged in when the policy begins: on
+    /// these the control grid waits.
+    #[must_use]
+    pub fn draw(seed: u64, there: &[bool]) -> Vec<Self> {
+        let mut random = Random::new(seed, TIMING);
+        let step = micros(STEP);
+        let mut below = |end: i64| i64::try_from(random.below(end.unsigned_abs())).unwrap_or(0);
+        let (low, high) = (LATENCY_US.0.cast_signed(), LATENCY_US.1.cast_signed());
+        // Moments from when the policy begins to look, microseconds.
+        let drawn: Vec<(i64, i64)> = there.iter().map(|_| (below(step), low + below(high - low))).collect();
+        let begins = drawn.iter().zip(there).filter(|(_, there)| **there);
+        let begins = begins.map(|((seen, latency), _)| (*seen).max(seen - latency + micros(FIRST_TICK_AFTER)));
+        let begin = begins.max().unwrap_or(0);
+        let timing = |(seen, latency): (i64, i64)| Self {
+            phase: Duration::from_micros((seen - latency - begin).rem_euclid(step).unsigned_abs()),
+            latency: Duration::from_micros(latency.unsigned_abs()),
+        };
+        drawn.into_iter().map(timing).collect()
+    }
+}
+
+fn micros(duration: Duration) -> i64 {
+    i64::try_from(duration.as_micros()).unwrap_or(i64::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// How old the newest sample that has been seen is at a tick.
+    fn age(timing: Timing) -> Duration {
+        let newest = STEP.saturating_sub(timing.phase);
+        if newest >= timing.latency { newest } else { newest + STEP }
+    }
+
+    #[test]
+    fn sensors_have_every_phase_and_latency_and_the_last_seen_is_as_fresh_as_it_can_be() {
+        let mut tenths = [[0; 10]; 3];
+        let (mut fastest, mut slowest) = (Duration::MAX, Duration::ZERO);
+        for seed in 0..2000 {
+            let drawn = Timing::draw(seed, &[true; 3]);
+            assert_eq!(drawn, Timing::draw(seed, &[true; 3]), "seed {seed}");
+            for (timing, tenths) in drawn.iter().zip(&mut tenths) {
+                assert!(timing.phase < STEP && (5..=50).contains(&timing.latency.as_millis()), "{timing:?}");
+                assert!(age(*timing) <= STEP + timing.latency.max(FIRST_TICK_AFTER), "seed {seed}: {timing:?}");
+                tenths[usize::try_from(timing.phase.as_millis() / 10).unwrap()] += 1;
+                (fastest, slowest) = (fastest.min(timing.latency), slowest.max(timing.latency));
+            }
+            let last = drawn.iter().any(|timing| age(*timing) == timing.latency.max(FIRST_TICK_AFTER));
+            assert!(last, "seed {seed}: the grid waits for a sample that is seen: {drawn:?}");
+        }
+        assert!(tenths.iter().flatten().all(|count| *count > 20), "{tenths:?}");
+        assert!(fastest < Duration::from_millis(6) && slowest > Duration::from_millis(49), "{fastest:?} {slowest:?}");
+    }
+
+    #[test]
+    fn nothing_waits_for_a_sensor_that_is_not_there() {
+        for seed in 0..500 {
+            let drawn = Timing::draw(seed, &[true, false, false]);
+            assert_eq!(age(drawn[0]), drawn[0].latency.max(FIRST_TICK_AFTER), "seed {seed}");
+        }
+    }
+}
