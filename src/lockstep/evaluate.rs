@@ -220,9 +220,7 @@ impl Bench<'_> {
     ) -> Result<(Trial, Option<EpisodeReport>), TrialError> {
         let begun = recording.as_ref().map_or(Stamp(1_000_000_000), |recording| recording.begun);
         let scenario = condition.scenario(self.registry, seed);
-        let plugged = |name: &str| scenario.devices.iter().any(|device| device.name == name && device.plugged);
-        let there: Vec<bool> = self.registry.devices.iter().map(|device| plugged(&device.name)).collect();
-        let timings = if recording.is_some() { Vec::new() } else { Timing::draw(seed, &there) };
+        let timings = if recording.is_some() { Vec::new() } else { Timing::of_trial(seed, self.registry, &scenario) };
         let mut rig = Lockstep::new(self.registry, scenario, begun, &timings)?;
         self.model.reset();
         let (recorder, told) = match recording {

@@ -11,6 +11,8 @@ use std::time::Duration;
 use super::STEP;
 use crate::policy::pilot::FIRST_TICK_AFTER;
 use crate::random::Random;
+use crate::registry::Registry;
+use crate::registry::scenario::Scenario;
 
 /// The stream of a trial's seed that decides them.
 const TIMING: u64 = 0x7469_6d69_6e67;
@@ -30,6 +32,14 @@ pub struct Timing {
 impl Timing {
     /// It captures at the ticks and is seen at once, as in a demonstration.
     pub const LOCKED: Self = Self { phase: Duration::ZERO, latency: Duration::ZERO };
+
+    /// Of each device of a registry in trial `seed`, which begins with those plugged in that `scenario` says.
+    #[must_use]
+    pub fn of_trial(seed: u64, registry: &Registry, scenario: &Scenario) -> Vec<Self> {
+        let plugged = |name: &str| scenario.devices.iter().any(|device| device.name == name && device.plugged);
+        let there: Vec<bool> = registry.devices.iter().map(|device| plugged(&device.name)).collect();
+        Self::draw(seed, &there)
+    }
 
     /// Of each sensor of trial `seed`. `there` says which of them are plugged in when the policy begins: on
     /// these the control grid waits.
