@@ -31,7 +31,6 @@ use crate::time::Stamp;
 const WINDOWS: u64 = 0x7769_6e64_6f77;
 /// The device that is pulled out.
 const PULLED: &str = task::PARTS[1].0;
-const WRIST: &str = task::PARTS[0].0;
 /// Steps in which everything is plugged in and seen, before the policy begins.
 const SETTLE: u32 = 3;
 
@@ -87,7 +86,7 @@ impl Condition {
         let mut scenario = Scenario::task(registry, seed);
         let away = match self {
             Self::NoTactile => Some(PULLED),
-            Self::NoWrist => Some(WRIST),
+            Self::NoWrist => Some(task::PARTS[0].0),
             Self::Full | Self::HotUnplug | Self::HotReplug => None,
         };
         for device in scenario.devices.iter_mut().filter(|device| Some(device.name.as_str()) == away) {
@@ -197,8 +196,7 @@ impl Bench<'_> {
         self.carry_out(condition, seed, None).map(|(trial, _)| trial)
     }
 
-    /// Runs trial `seed` with sensors that are locked to the ticks, and records it from the policy's first tick on: what
-    /// it sees is all in the file.
+    /// Runs trial `seed` with sensors locked to the ticks, and records it from the policy's first tick on.
     ///
     /// # Errors
     /// When the simulation fails, or the file cannot be made.
