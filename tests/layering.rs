@@ -75,7 +75,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("iceoryx2_bb_elementary_traits", &["bus"]),
     ("iceoryx2_cal", &["bus"]),
     ("jpeg_encoder", &["driver/sim"]),
-    ("libc", &["registry", "hotplug", "driver", "rig", "app", "policy/library"]),
+    ("libc", &["registry", "bus", "hotplug", "driver", "rig", "app", "policy/library"]),
     ("lz4", &["episode_format"]),
     ("mcap", &["record"]),
     ("mdns_sd", &["hotplug/lan"]),

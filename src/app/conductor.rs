@@ -3,6 +3,7 @@
 //!
 //! Invariant: whether an episode is in progress is known to the recorder alone, and asked of it.
 
+use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -12,6 +13,7 @@ use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until, timeout};
 use tokio_util::sync::CancellationToken;
 
 use super::{AppError, Asked, Running, Screen, policy_ended, screen};
+use crate::bus;
 use crate::fault;
 use crate::record::{EpisodeRequest, RecordError, Recorder};
 use crate::status::{Board, EpisodeEnd, Event, SlotState, What};
@@ -53,6 +55,7 @@ impl Conductor {
         };
         // Nobody reads the output any more, and how that came.
         let mut output = Ok(());
+        let mut bus_lost = pin!(bus::lost());
         loop {
             tokio::select! {
                 biased;
@@ -60,6 +63,7 @@ impl Conductor {
                 // Its outcome is taken when everything is taken down.
                 () = running.rig_ending.cancelled() => return output,
                 () = running.rig_ended.cancelled() => return output,
+                error = &mut bus_lost => return Err(error.into()),
                 () = running.mask_ended.cancelled() => return Err(AppError::Panicked("thread `mask`")),
                 // It ends by itself only when it cannot go on.
                 outcome = policy_ended(&mut running.autopilot) => return outcome,

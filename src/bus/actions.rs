@@ -4,8 +4,9 @@
 use iceoryx2::node::Node;
 use iceoryx2::port::subscriber::Subscriber;
 
+use super::error::topic_error;
 use super::orders::Orders;
-use super::{BusError, Service, TopicFactory, TopicSpec, topic_error};
+use super::{BusError, Service, TopicFactory, TopicSpec, sigbus};
 use crate::action::{MAX_ACTION, Order};
 use crate::sample::{Encoding, SampleHeader};
 use crate::time::Stamp;
@@ -65,7 +66,8 @@ impl Actions {
             }
             newest = Some((numbers.len(), Stamp(sample.user_header().capture_ns)));
         }
-        let (axes, tick) = newest?;
+        // What was read may be the zeros of a page that was lost, and no action.
+        let (axes, tick) = newest.filter(|_| !sigbus::happened())?;
         Some((action.get(..axes)?, tick))
     }
 }

@@ -15,7 +15,8 @@ use iceoryx2::port::listener::Listener;
 use iceoryx2::port::subscriber::{Subscriber, SubscriberCreateError};
 use iceoryx2::unique_id_generator::unique_system_id::UniqueSystemId;
 
-use super::{BusError, EventFactory, Service, TopicFactory, TopicId, TopicSpec, Writer, topic_error};
+use super::error::topic_error;
+use super::{BusError, EventFactory, Service, TopicFactory, TopicId, TopicSpec, Writer, sigbus};
 use crate::sample::SampleHeader;
 
 /// A consumer of every topic. Samples wait in shared memory until they are drained.
@@ -111,12 +112,22 @@ impl Inbox {
         self.wake.timed_wait(|_| {}, timeout).map(|_| ()).map_err(|error| topic_error(super::WAKE_SERVICE, &error))
     }
 
+    /// An error as soon as memory of the bus has been lost: samples may have parts of others, or none, from then on.
+    #[must_use]
+    pub fn lost(&self) -> Option<BusError> {
+        sigbus::happened().then_some(BusError::Lost)
+    }
+
     /// Hands over every sample that waits at the time of the call, oldest first within a topic; the
     /// bytes are lent from shared memory for the call. Ends however fast more are published.
     ///
     /// # Errors
-    /// The first topic that cannot be read; the others are handed over all the same.
+    /// The first topic that cannot be read; the others are handed over all the same. None is once memory of the bus
+    /// has been lost.
     pub fn drain(&self, take: &mut dyn FnMut(TopicId, &SampleHeader, &[u8])) -> Result<(), BusError> {
+        if let Some(error) = self.lost() {
+            return Err(error);
+        }
         let mut result = Ok(());
         for topic in &self.topics {
             // No more than this wait at any time: a topic that is filled faster than `take` empties

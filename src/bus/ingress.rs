@@ -18,7 +18,8 @@ use iceoryx2::sample::Sample;
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
-use super::{BusError, MAX_NODES, Service, service_name, topic_error};
+use super::error::topic_error;
+use super::{BusError, MAX_NODES, Service, service_name};
 use crate::registry::DeviceSpec;
 use crate::sample::SampleHeader;
 

@@ -10,23 +10,29 @@
 //! Invariant: payloads lie in pools that are reserved when a topic is opened, and the handle of a
 //! loan in memory that is used again (`shared`): once a thread has published a sample, no sample
 //! allocates (`tests/stream_alloc.rs`). The locks of a topic's port are its stream's alone.
+//! Invariant: every segment of this program has all its memory from when it is made (`room`); what others made and is
+//! gone ends the run in order (`sigbus`). Nothing of the bus is writable by others, and none of it outlives the
+//! processes that use it (`leftovers`).
 //! Invariant: writers live as long as the bus. What a reader has not fetched dies with its writer
 //! (iceoryx2 0.10), so a writer that went with its device would take the last samples along.
 
 mod actions;
+mod error;
+mod home;
 mod inbox;
 mod ingress;
+mod leftovers;
 mod orders;
 mod place;
+mod room;
 mod service;
 mod shared;
+mod sigbus;
 mod topic;
 mod writer;
 
-use std::path::PathBuf;
 use std::sync::Arc;
 
-use iceoryx2::config::Config;
 use iceoryx2::prelude::*;
 use iceoryx2::service::port_factory::event::PortFactory as EventFactory;
 
@@ -34,12 +40,16 @@ use crate::modality::ModalityId;
 use crate::registry::{MAX_BORROWED, MAX_SUBSCRIBERS, NodeSpec, Registry};
 use crate::sample::SampleHeader;
 
+use error::topic_error;
+use home::Home;
 use service::Service;
 
 pub use actions::Actions;
+pub use error::BusError;
 pub use inbox::{Foreign, Inbox};
 pub use ingress::{Given, Ingress, Watch};
 pub use orders::give as give_order;
+pub use sigbus::lost;
 pub use topic::{TopicId, TopicSpec};
 pub use writer::Writer;
 
@@ -50,63 +60,15 @@ const WAKE_SERVICE: &str = "/rapid/wake";
 /// Processes that may take part at once: `rapid`, and subscribers or publishers of other programs.
 const MAX_NODES: usize = 32;
 
+/// Bytes of addresses that a run takes beside the bus: stacks and heaps of its threads.
+const OTHER_ADDRESSES: u64 = 512 << 20;
+
 // SAFETY: `SampleHeader` is `repr(C)`, holds only integers, no padding and no pointers.
 unsafe impl ZeroCopySend for SampleHeader {
     unsafe fn type_name() -> &'static str {
         // The name under which other languages describe the same 56 bytes.
         "RapidSampleHeader"
     }
-}
-
-/// Why the bus cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub enum BusError {
-    /// A topic could not be opened.
-    #[error("topic {topic}: {reason}; if a program of another version still uses it, end that program")]
-    Topic {
-        /// The topic.
-        topic: String,
-        /// What iceoryx2 says.
-        reason: String,
-    },
-    /// All places of a topic's subscribers are taken.
-    #[error("topic {topic}: {MAX_SUBSCRIBERS} programs subscribe already, and no more may; end one")]
-    Full {
-        /// The topic.
-        topic: String,
-    },
-    /// What the bus lives in is another user's.
-    #[error(
-        "shared-memory bus: {}: {what}; end the programs that use it and remove it (`sudo rm -r {}`), or run rapid as \
-         that user", path.display(), path.display()
-    )]
-    Foreign {
-        /// Folder or file.
-        path: PathBuf,
-        /// What is wrong with it.
-        what: String,
-    },
-    /// The node could not be created.
-    #[error("shared-memory bus: {0}")]
-    Node(String),
-    /// A sample is larger than the topic allows.
-    #[error("a sample of {size} bytes does not fit topic {topic} (at most {max}); raise max_bytes of the device")]
-    TooLarge {
-        /// The topic.
-        topic: String,
-        /// Bytes of the sample.
-        size: usize,
-        /// Bytes allowed.
-        max: usize,
-    },
-    /// A sample could not be sent or received.
-    #[error("topic {topic}: {reason}")]
-    Transfer {
-        /// The topic.
-        topic: String,
-        /// What iceoryx2 says.
-        reason: String,
-    },
 }
 
 /// The node and all its topics.
@@ -119,7 +81,7 @@ pub struct Bus {
     wake: EventFactory<Service>,
     ingresses: Vec<(ModalityId, Arc<Ingress>)>,
     instance: Option<String>,
-    node: Arc<Node<Service>>,
+    home: Arc<Home>,
 }
 
 impl std::fmt::Debug for Bus {
@@ -129,31 +91,35 @@ impl std::fmt::Debug for Bus {
 }
 
 impl Bus {
-    /// Opens the node and every topic of `registry`. Shared memory left behind by a killed process
-    /// is reclaimed.
+    /// Opens the node and every topic of `registry`, with room in shared memory for all of them. What killed
+    /// processes left behind is removed.
     ///
     /// `instance` keeps a second rig on the same machine, or a test, apart from the others.
     ///
     /// # Errors
-    /// When a topic is in use with another layout, or shared memory is not to be had.
+    /// When a topic is in use with another layout, a file of the bus is damaged, or the system lacks memory or
+    /// descriptors.
     pub fn open(registry: &Registry, instance: Option<&str>) -> Result<Self, BusError> {
-        let config = config(instance)?;
-        place::check(
-            // Its path ends in a slash, behind which a link could not be told from what it means.
-            &PathBuf::from(config.global.root_path().to_string()).components().collect::<PathBuf>(),
-        )?;
-        let node = NodeBuilder::new()
-            .config(&config)
-            // Signals belong to the program, not to a library.
-            .signal_handling_mode(SignalHandlingMode::Disabled)
-            .create::<Service>()
-            .map_err(|error| {
-                let prefix = config.global.prefix.to_string();
-                place::in_the_way(&prefix).unwrap_or_else(|| BusError::Node(error.to_string()))
-            })?;
-        let action = registry.actuator().map(|_| TopicSpec::action());
-        let specs = registry.devices.iter().map(TopicSpec::of_device).chain([TopicSpec::mask()]).chain(action);
-        let topics = specs.map(|spec| open_topic(&node, spec)).collect::<Result<Vec<_>, _>>()?;
+        let specs: Vec<_> = specs(registry).collect();
+        let need = specs.iter().map(TopicSpec::room).fold(room::BOOKS, u64::saturating_add);
+        error::addresses(need.saturating_add(OTHER_ADDRESSES))?;
+        let home = Arc::new(Home::open(instance, need)?);
+        let opened = Self::open_at(&home, registry, specs, instance);
+        match opened {
+            Err(error) => Err(home.explain(error)),
+            Ok(_) if sigbus::happened() => Err(BusError::Lost),
+            opened => opened,
+        }
+    }
+
+    fn open_at(
+        home: &Arc<Home>,
+        registry: &Registry,
+        specs: Vec<TopicSpec>,
+        instance: Option<&str>,
+    ) -> Result<Self, BusError> {
+        let node = home.node();
+        let topics = specs.into_iter().map(|spec| open_topic(node, spec)).collect::<Result<Vec<_>, _>>()?;
         let wake = node
             .service_builder(&service_name(WAKE_SERVICE)?)
             .event()
@@ -171,12 +137,12 @@ impl Bus {
             .devices
             .iter()
             .filter(|device| matches!(device.node, NodeSpec::Process(_)))
-            .map(|device| Ok((device.id, Arc::new(Ingress::open(&node, device)?))))
+            .map(|device| Ok((device.id, Arc::new(Ingress::open(node, device)?))))
             .collect::<Result<Vec<_>, BusError>>()?;
         let actions = topics.iter().find(|(spec, _)| spec.id == TopicId::Action);
-        let actions = actions.map(|(spec, factory)| Actions::open(&node, spec, factory).map(Arc::new)).transpose()?;
+        let actions = actions.map(|(spec, factory)| Actions::open(node, spec, factory).map(Arc::new)).transpose()?;
         let instance = instance.map(str::to_owned);
-        Ok(Self { writers, actions, topics, wake, ingresses, instance, node: Arc::new(node) })
+        Ok(Self { writers, actions, topics, wake, ingresses, instance, home: Arc::clone(home) })
     }
 
     /// What keeps this rig apart from others of the machine, if anything does.
@@ -194,7 +160,7 @@ impl Bus {
     /// What programs need to know to take part in this bus.
     #[must_use]
     pub fn membership(&self) -> Membership {
-        Membership { node: Arc::clone(&self.node) }
+        Membership { home: Arc::clone(&self.home) }
     }
 
     /// The one writer of a topic; `None` if the registry has no such topic.
@@ -227,7 +193,7 @@ impl Bus {
 /// Who takes part in the bus.
 #[derive(Clone)]
 pub struct Membership {
-    node: Arc<Node<Service>>,
+    home: Arc<Home>,
 }
 
 impl std::fmt::Debug for Membership {
@@ -240,24 +206,20 @@ impl Membership {
     /// iceoryx2's `global.prefix` of this bus: a program with another one is on another bus.
     #[must_use]
     pub fn prefix(&self) -> String {
-        self.node.config().global.prefix.to_string()
+        self.home.node().config().global.prefix.to_string()
     }
 
     /// Gives back what programs that were killed held of the bus: shared memory, their places at
     /// topics. Blocks for as long as files are looked through.
     pub fn sweep(&self) {
-        let _ = self.node.try_cleanup_dead_nodes();
+        self.home.sweep();
     }
 }
 
-fn config(instance: Option<&str>) -> Result<Config, BusError> {
-    let mut config = Config::global_config().clone();
-    if let Some(instance) = instance {
-        let prefix = format!("iox2_{instance}_");
-        config.global.prefix = FileName::new(prefix.as_bytes())
-            .map_err(|error| BusError::Node(format!("instance name {instance:?}: {error:?}")))?;
-    }
-    Ok(config)
+/// The topics of a rig.
+fn specs(registry: &Registry) -> impl Iterator<Item = TopicSpec> {
+    let action = registry.actuator().map(|_| TopicSpec::action());
+    registry.devices.iter().map(TopicSpec::of_device).chain([TopicSpec::mask()]).chain(action)
 }
 
 fn open_topic(node: &Node<Service>, spec: TopicSpec) -> Result<(TopicSpec, TopicFactory), BusError> {
@@ -279,10 +241,6 @@ fn open_topic(node: &Node<Service>, spec: TopicSpec) -> Result<(TopicSpec, Topic
 
 fn service_name(name: &str) -> Result<ServiceName, BusError> {
     ServiceName::new(name).map_err(|error| topic_error(name, &error))
-}
-
-fn topic_error(topic: &str, error: &dyn std::fmt::Debug) -> BusError {
-    BusError::Topic { topic: topic.to_owned(), reason: format!("{error:?}") }
 }
 
 #[cfg(test)]

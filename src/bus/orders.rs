@@ -14,7 +14,10 @@ use iceoryx2::port::server::Server;
 use iceoryx2::prelude::*;
 use iceoryx2::service::port_factory::request_response::PortFactory;
 
-use super::{BusError, MAX_NODES, Service, config, service_name, topic_error};
+use super::error::topic_error;
+use super::home::Home;
+use super::room::BOOKS;
+use super::{BusError, MAX_NODES, Service, service_name};
 use crate::action::Order;
 
 /// The service.
@@ -88,12 +91,12 @@ fn service(node: &Node<Service>) -> Result<PortFactory<Service, u8, (), u8, ()>,
 /// # Errors
 /// When the bus cannot be used.
 pub fn give(instance: Option<&str>, order: Order) -> Result<bool, BusError> {
-    let node = NodeBuilder::new()
-        .config(&config(instance)?)
-        .signal_handling_mode(SignalHandlingMode::Disabled)
-        .create::<Service>()
-        .map_err(|error| BusError::Node(error.to_string()))?;
-    let client = service(&node)?.client_builder().create().map_err(|error| topic_error(TOPIC, &error))?;
+    let home = Home::open(instance, BOOKS)?;
+    give_through(home.node(), order).map_err(|error| home.explain(error))
+}
+
+fn give_through(node: &Node<Service>, order: Order) -> Result<bool, BusError> {
+    let client = service(node)?.client_builder().create().map_err(|error| topic_error(TOPIC, &error))?;
     let asked = client.send_copy(u8::from(order == Order::Arm)).map_err(|error| topic_error(TOPIC, &error))?;
     let until = Instant::now() + ANSWER_LIMIT;
     loop {

@@ -4,16 +4,18 @@
 //! shared memory under names that anybody can foretell. Of another user's folder it only says
 //! `InternalError`; in one that is open to everybody it would use what lies there.
 
-use std::fs::Metadata;
-use std::os::unix::fs::MetadataExt;
+use std::fs::{Metadata, Permissions};
+use std::io::ErrorKind;
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
 use rustix::fs::Access;
 
 use super::BusError;
+use super::room::PLACE;
 
-/// Where Linux keeps POSIX shared memory, see `shm_overview(7)`.
-const SHARED_MEMORY: &str = "/dev/shm";
+/// Access to the folders: the owner's alone, whatever the umask.
+const MODE: u32 = 0o700;
 
 /// Refuses a folder that another user made, which leads elsewhere by another's link, or which we
 /// may not use. One that is missing will be made.
@@ -38,9 +40,30 @@ pub(super) fn check(folder: &Path) -> Result<(), BusError> {
     }
 }
 
+/// Makes the folders that iceoryx2 keeps files in, for their owner alone.
+pub(super) fn make(root: &Path) -> Result<(), BusError> {
+    for folder in [root.to_owned(), root.join("nodes"), root.join("services")] {
+        let unusable = |what: String| BusError::Damaged { path: folder.clone(), what };
+        match std::fs::create_dir(&folder) {
+            Err(error) if error.kind() != ErrorKind::AlreadyExists => return Err(unusable(error.to_string())),
+            _ => {}
+        }
+        let there = std::fs::metadata(&folder).map_err(|error| unusable(error.to_string()))?;
+        if !there.is_dir() {
+            return Err(unusable("not a folder".to_owned()));
+        }
+        let ours = there.uid() == rustix::process::geteuid().as_raw();
+        if ours && there.permissions().mode() & 0o777 != MODE {
+            let narrowed = std::fs::set_permissions(&folder, Permissions::from_mode(MODE));
+            narrowed.map_err(|error| unusable(error.to_string()))?;
+        }
+    }
+    Ok(())
+}
+
 /// A file of another user under a name that begins with ours: why a node could not be made.
 pub(super) fn in_the_way(prefix: &str) -> Option<BusError> {
-    let entries = std::fs::read_dir(SHARED_MEMORY).ok()?.flatten();
+    let entries = std::fs::read_dir(PLACE).ok()?.flatten();
     let ours = |path: &PathBuf| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(prefix));
     entries.map(|entry| entry.path()).filter(ours).find_map(|path| {
         let there = std::fs::symlink_metadata(&path).ok()?;

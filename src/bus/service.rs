@@ -5,6 +5,10 @@
 //! handles are an `Arc` around a POSIX mutex: an allocation, a mutex set up and taken down for every
 //! sample. Ours reuses the memory, so that a sample costs none of it.
 //!
+//! What counts the nodes of a process is memory of the process alone: iceoryx2's own segment for it is writable by
+//! everybody, outlives every run, and when damaged holds each start for ever. Numbers of nodes stay apart by process
+//! and time.
+//!
 //! Invariant: everything another process sees (names, files, layouts) is iceoryx2's own: programs
 //! with the ordinary `ipc` service talk to this one.
 
@@ -31,7 +35,7 @@ impl iceoryx2::service::Service for Service {
     type StaticStorage = static_storage::recommended::Ipc;
     type ConfigSerializer = serialize::recommended::Recommended;
     type PersistentDynamicStorage<T: Debug + Send + Sync + ZeroCopySend + 'static> =
-        dynamic_storage::recommended::PersistentIpc<T>;
+        dynamic_storage::recommended::PersistentLocal<T>;
     type Bag = bag::recommended::Recommended;
     type DynamicStorage<T: Debug + Send + Sync + ZeroCopySend + 'static> = dynamic_storage::recommended::Ipc<T>;
     type ServiceNameHasher = hash::recommended::Recommended;

@@ -3,7 +3,7 @@ use crate::modality::ModalityId;
 use crate::registry::{DeviceSpec, IdentitySpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbSpec, WhenStale};
 use std::time::Duration;
 
-fn registry(depth: usize) -> Registry {
+pub(super) fn registry(depth: usize) -> Registry {
     let id = ModalityId::new(3).expect("below 64");
     Registry {
         rig: RigSpec {
@@ -299,4 +299,30 @@ fn actions_of_another_program_are_its_right_until_a_policy_of_ours_gives_some() 
 fn foreign_after(inbox: &Inbox, taken: &[u64]) -> Vec<(String, u32, u64)> {
     assert_eq!(sequences(inbox).into_iter().map(|(_, seq, _)| seq).collect::<Vec<_>>(), taken);
     foreign(inbox)
+}
+
+#[test]
+fn every_segment_has_all_its_memory_when_the_bus_is_open_and_no_more_than_was_asked_for() {
+    use std::os::unix::fs::MetadataExt;
+    let (registry, bus) = open("m", 600);
+    let _inboxes: Vec<Inbox> = (0..MAX_SUBSCRIBERS).map(|_| bus.inbox().expect("inbox")).collect();
+    // A publisher meets its subscribers when it publishes.
+    for spec in specs(&registry) {
+        bus.writer(spec.id).expect("writer").publish(SampleHeader::default(), &[0; 16]).expect("publish");
+    }
+    let prefix = bus.membership().prefix();
+    let mut taken = 0;
+    let mut connections = 0;
+    for entry in std::fs::read_dir(room::PLACE).expect("shared memory").flatten() {
+        let name = entry.file_name().to_string_lossy().into_owned();
+        let Ok(about) = entry.metadata() else { continue };
+        if name.starts_with(&prefix) {
+            assert!(about.blocks() * 512 >= about.len(), "{name}: {} of {} bytes", about.blocks() * 512, about.len());
+            taken += about.blocks() * 512;
+            connections += usize::from(name.ends_with(".connection"));
+        }
+    }
+    assert_eq!(connections, 2 * MAX_SUBSCRIBERS);
+    let asked = specs(&registry).map(|spec| spec.room()).sum::<u64>() + room::BOOKS;
+    assert!(taken <= asked, "{taken} bytes, and {asked} were asked for");
 }

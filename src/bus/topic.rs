@@ -1,9 +1,10 @@
 //! Topics: name, depth and memory of each, decided once from the registry.
 
+use super::room::BOOKS;
 use crate::action::{ACTION_TOPIC, MAX_ACTION};
 use crate::mask::MASK_TOPIC;
 use crate::modality::ModalityId;
-use crate::registry::{DeviceSpec, POOL_SPARE};
+use crate::registry::{DeviceSpec, MAX_SUBSCRIBERS, POOL_SPARE};
 
 /// 4 s of mask at 500 Hz: as long as a consumer may be held up without losing one.
 const MASK_DEPTH: usize = 2048;
@@ -68,6 +69,17 @@ impl TopicSpec {
     /// the writer one. iceoryx2's own bound counts every queue as if it held other samples.
     pub(super) const fn pool_for(depth: usize) -> usize {
         depth + POOL_SPARE
+    }
+
+    /// Bytes of shared memory that the topic takes with as many subscribers as it may have, at most.
+    pub(super) fn room(&self) -> u64 {
+        /// Of iceoryx2 for each sample, with alignment.
+        const SAMPLE: u64 = 64;
+        /// Of iceoryx2 for a sample that waits for, or is lent to, one subscriber.
+        const WAITING: u64 = 24;
+        let samples = self.pool_samples() as u64;
+        let waiting = samples.saturating_mul(WAITING * MAX_SUBSCRIBERS as u64);
+        self.pool_bytes().saturating_add(samples.saturating_mul(SAMPLE)).saturating_add(waiting).saturating_add(BOOKS)
     }
 
     /// Bytes of the pool.

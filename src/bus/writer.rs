@@ -6,7 +6,8 @@ use iceoryx2::port::notifier::Notifier;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::prelude::*;
 
-use super::{BusError, EventFactory, Service, TopicFactory, TopicId, TopicSpec, topic_error};
+use super::error::topic_error;
+use super::{BusError, EventFactory, Service, TopicFactory, TopicId, TopicSpec, sigbus};
 use crate::modality::MAX_MODALITIES;
 use crate::sample::SampleHeader;
 
@@ -67,9 +68,12 @@ impl Writer {
     /// Publishes one sample and wakes the consumers.
     ///
     /// # Errors
-    /// When the payload is larger than the topic allows, or the pool is exhausted because a
-    /// subscriber that died still holds samples.
+    /// When the payload is larger than the topic allows, the pool is exhausted because a subscriber that died still
+    /// holds samples, or memory of the bus has been lost.
     pub fn publish(&self, header: SampleHeader, payload: &[u8]) -> Result<(), BusError> {
+        if sigbus::happened() {
+            return Err(BusError::Lost);
+        }
         if payload.len() > self.max_bytes {
             let (size, max) = (payload.len(), self.max_bytes);
             return Err(BusError::TooLarge { topic: self.topic.clone(), size, max });

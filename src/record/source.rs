@@ -23,6 +23,11 @@ pub trait Source: Send {
     fn foreign(&mut self, take: &mut dyn FnMut(Foreign<'_>)) {
         let _ = take;
     }
+
+    /// Why what is drained can be relied on no longer.
+    fn lost(&self) -> Option<String> {
+        None
+    }
 }
 
 impl Source for Inbox {
@@ -36,5 +41,9 @@ impl Source for Inbox {
 
     fn foreign(&mut self, take: &mut dyn FnMut(Foreign<'_>)) {
         Self::foreign(self, take);
+    }
+
+    fn lost(&self) -> Option<String> {
+        Self::lost(self).map(|error| error.to_string())
     }
 }

@@ -142,7 +142,9 @@ impl Writer {
         let Self { streams, session, .. } = self;
         let drained =
             source.drain(&mut |topic, header, payload| streams.take(session.as_mut(), topic, header, payload));
-        if let Err(error) = drained {
+        if let Some(reason) = source.lost() {
+            self.finish(now, Some(reason));
+        } else if let Err(error) = drained {
             self.complain_about_bus(&error);
         }
         let Self { publishers, config, .. } = self;

@@ -45,7 +45,7 @@ pub(crate) struct Place {
     pub(crate) instance: String,
 }
 
-/// iceoryx2 leaves one file of 16 bytes an instance behind, which nobody but a test would notice.
+/// What a run that was killed left behind is no use to another test.
 impl Drop for Place {
     fn drop(&mut self) {
         for file in self.shared_memory() {
@@ -113,9 +113,14 @@ impl Place {
 
     /// Starts a run whose standard output goes to a file, and waits for its first line with `word`.
     pub(crate) fn start(&self, arguments: &[&str], word: &str) -> Running {
+        self.start_as(self.command(arguments), word)
+    }
+
+    /// The same for a command that is started in another way.
+    pub(crate) fn start_as(&self, mut command: Command, word: &str) -> Running {
         let log = self.path("output.txt");
         let file = std::fs::File::create(&log).expect("output file");
-        let child = self.command(arguments).stdout(file).spawn().expect("rapid runs");
+        let child = command.stdout(file).spawn().expect("rapid runs");
         let mut running = Running { child: Some(child), log };
         running.wait_for(word);
         running

@@ -7,11 +7,11 @@ use Order::{Arm, Disarm};
 
 const PATIENCE: Duration = Duration::from_secs(30);
 
-fn open(test: &str) -> (String, Node<Service>, Orders) {
+fn open(test: &str) -> (String, Home, Orders) {
     let instance = format!("orders{test}{}", std::process::id());
-    let node = NodeBuilder::new().config(&config(Some(&instance)).expect("config")).create::<Service>().expect("node");
-    let orders = Orders::open(&node).expect("orders");
-    (instance, node, orders)
+    let home = Home::open(Some(&instance), 0).expect("node");
+    let orders = Orders::open(home.node()).expect("orders");
+    (instance, home, orders)
 }
 
 fn client(node: &Node<Service>) -> Client<Service, u8, (), u8, ()> {
@@ -31,7 +31,7 @@ fn taken(orders: &Orders) -> Vec<Order> {
 
 #[test]
 fn an_order_that_is_taken_is_answered() {
-    let (instance, _node, orders) = open("a");
+    let (instance, _home, orders) = open("a");
     for order in [Arm, Disarm] {
         let given = std::thread::spawn({
             let instance = instance.clone();
@@ -50,14 +50,14 @@ fn an_order_that_is_taken_is_answered() {
 
 #[test]
 fn an_arm_whose_client_is_gone_is_not_carried_out_and_a_disarm_is() {
-    let (_, node, orders) = open("b");
-    let client = client(&node);
+    let (_, home, orders) = open("b");
+    let client = client(home.node());
     for (request, wanted) in [(1, &[][..]), (0, &[Disarm]), (7, &[])] {
         drop(client.send_copy(request).expect("it is sent"));
         assert_eq!(taken(&orders), wanted, "{request}");
     }
     // The whole program is gone.
-    let other = self::client(&node);
+    let other = self::client(home.node());
     drop(other.send_copy(1).expect("it is sent"));
     drop(other);
     assert_eq!(taken(&orders), []);
@@ -69,9 +69,9 @@ fn an_arm_whose_client_is_gone_is_not_carried_out_and_a_disarm_is() {
 
 #[test]
 fn orders_of_before_the_device_was_there_are_not_for_it() {
-    let (_, node, orders) = open("c");
+    let (_, home, orders) = open("c");
     assert!(!orders.discard());
-    let client = client(&node);
+    let client = client(home.node());
     for (request, is_order) in [(0, true), (1, true), (9, false)] {
         let waiting = client.send_copy(request).expect("it is sent");
         assert_eq!(orders.discard(), is_order, "{request}");
@@ -84,12 +84,21 @@ fn orders_of_before_the_device_was_there_are_not_for_it() {
 
 #[test]
 fn an_order_that_the_actuator_does_not_take_is_not_answered() {
-    let (_, node, orders) = open("d");
-    let client = client(&node);
+    let (_, home, orders) = open("d");
+    let client = client(home.node());
     let first = client.send_copy(1).expect("it is sent");
     let second = client.send_copy(0).expect("it is sent");
     assert_eq!(orders.hand_over(&mut |_| Err("no")), Err("no"));
     assert_eq!(taken(&orders), [Disarm]);
     assert!(first.receive().expect("the bus").is_none());
     assert!(second.receive().expect("the bus").is_some());
+}
+
+#[test]
+fn a_second_receiver_of_orders_is_named_as_the_cause() {
+    let (_, home, _orders) = open("e");
+    let Err(error) = Orders::open(home.node()) else { panic!("there is one place") };
+    let error = error.to_string();
+    assert!(error.contains("another program receives these orders already") && error.contains("--instance"), "{error}");
+    assert!(!error.contains("another version"), "{error}");
 }

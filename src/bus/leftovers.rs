@@ -1,0 +1,324 @@
+//! The files of a bus: which there are, which of them somebody uses, and their removal.
+//!
+//! iceoryx2 0.10 keeps a bus in `/dev/shm` and in a folder of its own. It gives back what a killed process held
+//! node by node, reading the files of both: what is damaged stays for ever, makes every start fail, or holds it
+//! for ever. Here no file is read to be removed: its name says whose it is, and a lock whether that process lives.
+//!
+//! Names, below a prefix that ends in `_`: `<hash>_<port>.data`, `<hash>_<sender>_<receiver>.connection`,
+//! `<hash>_<port>.event_mgmt` and `<hash>_<service>.dynamic` in `/dev/shm`; `<port>.event`,
+//! `services/<hash>.service`, `nodes/<node>.node_monitor*` and `nodes/<node>/*` in the folder. A hash has 40
+//! digits; nodes and ports are numbers with the process id in their third 32 bits.
+//!
+//! Invariant: no file is removed that a living process may use. A file is that of nobody when its names are of
+//! processes without a node, or when the bus has no node at all.
+//! Invariant: a lock file of this process is never opened: closing it would give up the lock.
+
+use std::collections::BTreeSet;
+use std::fs::{File, Metadata, Permissions};
+use std::io::{ErrorKind, Read, Write};
+use std::os::unix::fs::{FileTypeExt, MetadataExt, PermissionsExt};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use rustix::fs::{Mode, OFlags};
+use rustix::process::{Flock, FlockType, fcntl_getlk};
+use rustix::time::{ClockId, clock_gettime};
+
+use super::{BusError, room};
+
+/// The first 8 bytes of each file of iceoryx2 0.10.0 in shared memory: major, minor and patch, 16 bits each.
+const VERSION: u64 = 10 << 16;
+/// Ends the name of the segment of iceoryx2 0.10.0 in which nodes are counted: version and number, 16 bytes. The hash
+/// is that of the name of its type.
+const COUNTER: &str = "9204dd183d1c4d8e1ff592a30766ffa6765aa8b5_node.0_10_0.global_mgmt";
+/// A key of every service's file.
+const SERVICE_KEY: &str = "messaging_pattern";
+/// How long another process may take to fill a file that it has made.
+const LOOKS: u32 = 20;
+const LOOK: Duration = Duration::from_millis(50);
+/// Access of anybody but the owner.
+const OTHERS: u32 = 0o077;
+
+/// The files of one bus.
+#[derive(Debug, Clone)]
+pub(super) struct Files {
+    prefix: String,
+    root: PathBuf,
+}
+
+/// What a file is for.
+#[derive(Debug, Clone, PartialEq, Eq)]
+enum Use {
+    /// Ports of the processes with these ids.
+    Ports(Vec<u32>),
+    /// The node with this number.
+    Node(u128),
+    /// All of the bus.
+    Common,
+}
+
+#[derive(Debug)]
+struct Entry {
+    path: PathBuf,
+    used: Use,
+}
+
+impl Files {
+    pub(super) const fn new(prefix: String, root: PathBuf) -> Self {
+        Self { prefix, root }
+    }
+
+    /// Removes what nobody uses, and takes away what others may do with the rest.
+    ///
+    /// # Errors
+    /// When something that is no use to anybody cannot be removed, or something damaged may be in use.
+    pub(super) fn clear(&self) -> Result<(), BusError> {
+        // First the files, then who lives: whoever begins meanwhile has made none of these.
+        let entries = self.entries();
+        let living = self.living(&entries);
+        for Entry { path, used } in entries {
+            let dead = living.is_empty()
+                || matches!(&used, Use::Ports(owners) if !owners.iter().any(|owner| living.contains(owner)));
+            match std::fs::symlink_metadata(&path) {
+                Ok(there) if !is_ours(&there) => {}
+                Ok(there) if dead => remove(&path, &there)?,
+                Ok(there) => {
+                    narrow(&path, &there);
+                    usable(&path, &used)?;
+                }
+                Err(_) => {}
+            }
+        }
+        Ok(())
+    }
+
+    /// Makes the file in which other programs count their nodes, for its owner alone: theirs would be writable by
+    /// everybody. They do without where it cannot be made.
+    pub(super) fn make_counter(&self) {
+        let path = Path::new(room::PLACE).join(format!("{}{COUNTER}", self.prefix));
+        // Whoever finds it while it has this mode waits.
+        let flags = OFlags::WRONLY | OFlags::CREATE | OFlags::EXCL | OFlags::NOFOLLOW | OFlags::CLOEXEC;
+        let Ok(file) = rustix::fs::open(&path, flags, Mode::WUSR).map(File::from) else { return };
+        let mut content = [0; 16];
+        content[..8].copy_from_slice(&VERSION.to_le_bytes());
+        let made = (&file).write_all(&content).and_then(|()| file.set_permissions(Permissions::from_mode(0o600)));
+        if made.is_err() {
+            let _ = std::fs::remove_file(&path);
+        }
+    }
+
+    /// A file that iceoryx2 cannot read, if there is one.
+    pub(super) fn unreadable(&self) -> Option<BusError> {
+        self.entries().into_iter().find_map(|Entry { path, .. }| {
+            let what = match path.extension()?.to_str()? {
+                "data" | "connection" | "dynamic" | "event_mgmt" => {
+                    let found = head(&path)?.first_chunk().copied().map_or(0, u64::from_le_bytes);
+                    (found != VERSION).then_some("another version of iceoryx2 made it, or it is damaged")
+                }
+                "service" => {
+                    let readable = String::from_utf8(head(&path)?).is_ok_and(|text| text.contains(SERVICE_KEY));
+                    (!readable).then_some("it is damaged")
+                }
+                _ => None,
+            };
+            Some(BusError::Damaged { what: what?.to_owned(), path })
+        })
+    }
+
+    fn entries(&self) -> Vec<Entry> {
+        let nodes = self.root.join("nodes");
+        let in_memory = list(Path::new(room::PLACE), |name| in_memory(name.strip_prefix(&self.prefix)?));
+        let sockets = list(&self.root, |name| socket(name.strip_prefix(&self.prefix)?));
+        let services = list(&self.root.join("services"), |name| {
+            let hash = name.strip_prefix(&self.prefix)?.strip_suffix(".service")?;
+            is_hash(hash).then_some(Use::Common)
+        });
+        let monitors = list(&nodes, |name| monitor(name.strip_prefix(&self.prefix)?));
+        let known: BTreeSet<u128> = monitors.iter().filter_map(Entry::node).collect();
+        let folders = list(&nodes, |name| {
+            let node = number(name)?;
+            (known.contains(&node) || self.is_our_folder(&nodes.join(name))).then_some(Use::Node(node))
+        });
+        [in_memory, sockets, services, monitors, folders].into_iter().flatten().collect()
+    }
+
+    /// Does all that lies in this folder of a node belong to this bus? Folders carry no prefix.
+    fn is_our_folder(&self, folder: &Path) -> bool {
+        let ours = |name: &str| {
+            let rest = name.strip_prefix(&self.prefix)?;
+            let (stem, _) = rest.split_once('.')?;
+            (stem == "node" || is_hash(stem) || number(stem).is_some()).then_some(())
+        };
+        let Ok(files) = std::fs::read_dir(folder) else { return false };
+        let mut names = files.flatten().map(|file| file.file_name()).peekable();
+        names.peek().is_some() && names.all(|name| name.to_str().and_then(ours).is_some())
+    }
+
+    /// Processes with a node on this bus.
+    fn living(&self, entries: &[Entry]) -> BTreeSet<u32> {
+        let nodes: BTreeSet<u128> = entries.iter().filter_map(Entry::node).collect();
+        nodes.into_iter().filter(|node| self.lives(*node)).map(process).collect()
+    }
+
+    fn lives(&self, node: u128) -> bool {
+        let nodes = self.root.join("nodes");
+        let lock = nodes.join(format!("{}{node}.node_monitor", self.prefix));
+        if process(node) == std::process::id() {
+            return std::fs::symlink_metadata(&lock).is_ok_and(|lock| is_locked_by_us(lock.ino()));
+        }
+        let flags = OFlags::RDWR | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::NOCTTY | OFlags::CLOEXEC;
+        let asked = Flock::from(FlockType::WriteLock);
+        let locked = rustix::fs::open(&lock, flags, Mode::empty()).is_ok_and(|lock| {
+            // Whoever holds it may be in another namespace of process ids.
+            matches!(fcntl_getlk(lock, &asked), Ok(Some(_)))
+        });
+        // One that begins has not locked yet; of another, somebody has exchanged the lock.
+        locked || has_lived_since(node)
+    }
+}
+
+impl Entry {
+    const fn node(&self) -> Option<u128> {
+        match self.used {
+            Use::Node(node) => Some(node),
+            Use::Ports(_) | Use::Common => None,
+        }
+    }
+}
+
+fn list(folder: &Path, used: impl Fn(&str) -> Option<Use>) -> Vec<Entry> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    entries.filter_map(|entry| Some(Entry { used: used(entry.file_name().to_str()?)?, path: entry.path() })).collect()
+}
+
+fn in_memory(name: &str) -> Option<Use> {
+    let (_, rest) = name.split_once('_').filter(|(hash, _)| is_hash(hash))?;
+    let (ports, suffix) = rest.split_once('.')?;
+    // A segment that grows has a number after its port's.
+    let owners: Vec<u32> = ports.split('_').filter_map(number).map(process).collect();
+    let of_ports = matches!(suffix, "data" | "connection" | "event_mgmt") && !owners.is_empty();
+    Some(if of_ports { Use::Ports(owners) } else { Use::Common })
+}
+
+fn socket(name: &str) -> Option<Use> {
+    Some(Use::Ports(vec![process(number(name.strip_suffix(".event")?)?)]))
+}
+
+fn monitor(name: &str) -> Option<Use> {
+    let (node, suffix) = name.split_once('.')?;
+    suffix.starts_with("node_monitor").then_some(Use::Node(number(node)?))
+}
+
+fn is_hash(text: &str) -> bool {
+    text.len() == 40 && text.bytes().all(|byte| byte.is_ascii_hexdigit())
+}
+
+/// The number of a node or port: at least its process id is in it.
+fn number(text: &str) -> Option<u128> {
+    text.parse().ok().filter(|number| process(*number) != 0)
+}
+
+/// Whose a node or port is, see `UniqueSystemId` of iceoryx2.
+#[expect(clippy::cast_possible_truncation, reason = "the third 32 bits")]
+const fn process(number: u128) -> u32 {
+    (number >> 64) as u32
+}
+
+/// Does the process that made this node live? A later one with the same id has begun after the node was made, the
+/// time of which is in the lowest 32 bits, in seconds of `CLOCK_MONOTONIC`.
+#[expect(clippy::cast_possible_truncation, reason = "the lowest 32 bits")]
+fn has_lived_since(node: u128) -> bool {
+    let Some(begun) = begin(process(node)) else { return false };
+    let seconds = |clock| clock_gettime(clock).tv_sec.unsigned_abs();
+    // A process's begin counts the time that the machine was suspended, too.
+    let suspended = seconds(ClockId::Boottime).saturating_sub(seconds(ClockId::Monotonic));
+    begun <= u64::from(node as u32) + suspended
+}
+
+/// When a process began, in seconds since the machine was started, see proc(5).
+fn begin(process: u32) -> Option<u64> {
+    let about = std::fs::read_to_string(format!("/proc/{process}/stat")).ok()?;
+    // The name, in brackets, may contain anything.
+    let ticks: u64 = about.rsplit_once(')')?.1.split_whitespace().nth(19)?.parse().ok()?;
+    // SAFETY: asks for a number.
+    let a_second = unsafe { libc::sysconf(libc::_SC_CLK_TCK) };
+    ticks.checked_div(u64::try_from(a_second).ok()?)
+}
+
+/// Does this process hold a lock of the file with this number, as proc(5) lists them? Where it cannot be
+/// known it does.
+fn is_locked_by_us(inode: u64) -> bool {
+    let Ok(locks) = std::fs::read_to_string("/proc/locks") else { return true };
+    let (process, file) = (std::process::id().to_string(), format!(":{inode}"));
+    locks.lines().any(|line| {
+        let words: Vec<&str> = line.split_whitespace().collect();
+        words.get(4) == Some(&process.as_str()) && words.get(5).is_some_and(|place| place.ends_with(&file))
+    })
+}
+
+fn is_ours(there: &Metadata) -> bool {
+    there.uid() == rustix::process::geteuid().as_raw()
+}
+
+fn remove(path: &Path, there: &Metadata) -> Result<(), BusError> {
+    let removed = if there.is_dir() { std::fs::remove_dir_all(path) } else { std::fs::remove_file(path) };
+    match removed {
+        Err(error) if error.kind() != ErrorKind::NotFound => {
+            let what = format!("an earlier run left it, and it cannot be removed: {error}");
+            Err(BusError::Damaged { path: path.to_owned(), what })
+        }
+        _ => Ok(()),
+    }
+}
+
+/// iceoryx2 makes some files so that everybody may write to them.
+fn narrow(path: &Path, there: &Metadata) {
+    let mode = there.permissions().mode();
+    if there.is_file() && mode & OTHERS != 0 {
+        let _ = std::fs::set_permissions(path, Permissions::from_mode(mode & !OTHERS));
+    }
+}
+
+/// Fails for what iceoryx2 would wait for without end: what is not the kind of file it makes, and what stays empty.
+fn usable(path: &Path, used: &Use) -> Result<(), BusError> {
+    let suffix = path.extension().and_then(|suffix| suffix.to_str());
+    let may_be_empty = matches!(used, Use::Node(_)) || suffix == Some("event");
+    for _ in 0..LOOKS {
+        let Ok(there) = std::fs::symlink_metadata(path) else { return Ok(()) };
+        let kind = there.file_type();
+        let right = match (used, suffix) {
+            (Use::Node(_), None) => kind.is_dir(),
+            (_, Some("event")) => kind.is_socket(),
+            _ => kind.is_file(),
+        };
+        if !right {
+            return Err(strange(path.to_owned()));
+        }
+        if kind.is_dir() {
+            let mut files = std::fs::read_dir(path).into_iter().flatten().flatten();
+            let other = files.find(|file| file.file_type().is_ok_and(|kind| !kind.is_file()));
+            return other.map_or(Ok(()), |other| Err(strange(other.path())));
+        }
+        if may_be_empty || there.len() > 0 {
+            return Ok(());
+        }
+        std::thread::sleep(LOOK);
+    }
+    Err(BusError::Damaged { path: path.to_owned(), what: "it is empty".to_owned() })
+}
+
+fn strange(path: PathBuf) -> BusError {
+    BusError::Damaged { path, what: "it is no file of iceoryx2".to_owned() }
+}
+
+/// The first bytes of a file that may be read.
+fn head(path: &Path) -> Option<Vec<u8>> {
+    let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::NOCTTY | OFlags::CLOEXEC;
+    let file = File::from(rustix::fs::open(path, flags, Mode::empty()).ok()?);
+    let mut bytes = Vec::new();
+    file.take(1 << 16).read_to_end(&mut bytes).ok()?;
+    Some(bytes)
+}
+
+#[cfg(test)]
+mod tests;

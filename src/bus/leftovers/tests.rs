@@ -1,0 +1,251 @@
+//! What killed processes leave behind, in every state of damage, and what living ones use.
+
+use std::io::{BufRead, BufReader};
+use std::os::unix::fs::OpenOptionsExt;
+use std::os::unix::process::CommandExt;
+use std::process::{Child, Command, Stdio};
+use std::sync::mpsc;
+
+use rustix::fs::{CWD, FileType, mknodat};
+
+use super::*;
+use crate::bus::Bus;
+use crate::bus::home::Home;
+use crate::bus::tests::registry;
+
+/// How long a condition may take to come true: no requirement.
+const PATIENCE: Duration = Duration::from_mins(1);
+
+const HASH: &str = "0354a209029e7d094a819e2d4030ea331e6caaf0";
+/// A port of process 25769.
+const PORT: &str = "475369541183522065285006754738";
+
+#[test]
+fn a_name_says_whose_a_file_is() {
+    let owner = process(number(PORT).unwrap());
+    for (name, used) in [
+        (format!("{HASH}_{PORT}.data"), Some(Use::Ports(vec![owner]))),
+        (format!("{HASH}_{PORT}__1.data"), Some(Use::Ports(vec![owner]))),
+        (format!("{HASH}_{PORT}_{PORT}.connection"), Some(Use::Ports(vec![owner, owner]))),
+        (format!("{HASH}_{PORT}.event_mgmt"), Some(Use::Ports(vec![owner]))),
+        (format!("{HASH}_{PORT}.dynamic"), Some(Use::Common)),
+        (format!("{HASH}_node.0_10_0.global_mgmt"), Some(Use::Common)),
+        // Of another instance, whose prefix begins as ours does.
+        (format!("exp_{HASH}_{PORT}.data"), None),
+        (format!("12345_{HASH}_{PORT}.data"), None),
+        (String::new(), None),
+        (HASH.to_owned(), None),
+    ] {
+        assert_eq!(in_memory(&name), used, "{name}");
+    }
+    assert_eq!(socket(&format!("{PORT}.event")), Some(Use::Ports(vec![owner])));
+    assert_eq!(socket(&format!("exp_{PORT}.event")), None);
+    assert_eq!(monitor(&format!("{PORT}.node_monitor_context")), Some(Use::Node(number(PORT).unwrap())));
+    assert_eq!(monitor(&format!("exp_{PORT}.node_monitor")), None);
+}
+
+/// Not a test of its own: a process on the bus `RAPID_TEST_BUS`, which stays there or ends.
+#[test]
+fn helper() {
+    let Ok(name) = std::env::var("RAPID_TEST_BUS") else { return };
+    let registry = registry(16);
+    let opened = Bus::open(&registry, Some(&name)).and_then(|bus| Ok((bus.inbox()?, bus)));
+    match opened {
+        Ok((inbox, bus)) => {
+            if std::env::var_os("RAPID_TEST_STAY").is_some() {
+                println!("opened");
+                std::thread::sleep(Duration::from_mins(10));
+            }
+            drop((inbox, bus));
+            println!("opened");
+        }
+        Err(error) => println!("refused: {error}"),
+    }
+}
+
+fn member(name: &str, stays: bool) -> (Child, String) {
+    let mut command = Command::new(std::env::current_exe().unwrap());
+    command.args(["--exact", "bus::leftovers::tests::helper", "--nocapture"]).env("RAPID_TEST_BUS", name);
+    if stays {
+        command.env("RAPID_TEST_STAY", "");
+    }
+    // A test that fails leaves none behind.
+    // SAFETY: a system call.
+    unsafe {
+        command.pre_exec(|| Ok(rustix::process::set_parent_process_death_signal(Some(rustix::process::Signal::KILL))?))
+    };
+    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
+    let output = BufReader::new(child.stdout.take().unwrap());
+    let (tell, told) = mpsc::channel();
+    std::thread::spawn(move || {
+        for line in output.lines().map_while(Result::ok) {
+            // The harness prints the test's name in front of its first line.
+            let said = line.find("opened").or_else(|| line.find("refused")).map(|at| line[at..].to_owned());
+            let _ = said.map(|said| tell.send(said));
+        }
+    });
+    let said = told.recv_timeout(PATIENCE).unwrap_or_else(|_| {
+        let _ = child.kill();
+        format!("nothing, and ended with {:?}", child.wait())
+    });
+    (child, said)
+}
+
+fn killed(name: &str) {
+    let (mut child, said) = member(name, true);
+    assert_eq!(said, "opened");
+    child.kill().unwrap();
+    child.wait().unwrap();
+}
+
+fn files(name: &str) -> Vec<PathBuf> {
+    let files = Files::new(format!("iox2_{name}_"), PathBuf::from("/tmp/iceoryx2"));
+    let mut found: Vec<PathBuf> = Vec::new();
+    for Entry { path, .. } in files.entries() {
+        if path.is_dir() {
+            found.extend(std::fs::read_dir(&path).unwrap().map(|entry| entry.unwrap().path()));
+        }
+        found.push(path);
+    }
+    found.sort();
+    found
+}
+
+/// What can have become of a file.
+#[derive(Debug, Clone, Copy)]
+enum Damage {
+    Empty,
+    Random,
+    Zeros,
+    Folder,
+    Fifo,
+    Gone,
+}
+
+impl Damage {
+    const ALL: [Self; 6] = [Self::Empty, Self::Random, Self::Zeros, Self::Folder, Self::Fifo, Self::Gone];
+
+    fn apply(self, path: &Path) {
+        let there = std::fs::symlink_metadata(path).unwrap();
+        remove(path, &there).unwrap();
+        self.make(path, &there);
+    }
+
+    /// Makes what `there` has become.
+    fn make(self, path: &Path, there: &Metadata) {
+        let mode = there.permissions().mode() & 0o777;
+        let write = |bytes: &[u8]| {
+            let mut file = std::fs::OpenOptions::new().write(true).create_new(true).mode(mode).open(path).unwrap();
+            std::io::Write::write_all(&mut file, bytes).unwrap();
+        };
+        match self {
+            Self::Empty => write(&[]),
+            Self::Random => {
+                write(&[0xa7, 3, 0x5c, 0xff, 0x11, 0x90, 0x42, 7, 0xee, 0x21, 0x83, 0x6d, 9, 0xc4, 0x77, 0x1b]);
+            }
+            Self::Zeros => write(&vec![0; usize::try_from(there.len()).unwrap()]),
+            Self::Folder => std::fs::create_dir(path).unwrap(),
+            Self::Fifo => mknodat(CWD, path, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap(),
+            Self::Gone => {}
+        }
+    }
+}
+
+/// One file of each kind, by what comes after its numbers.
+fn kinds(name: &str) -> Vec<(String, PathBuf)> {
+    let mut kinds: Vec<(String, PathBuf)> = Vec::new();
+    for path in files(name) {
+        let kind = path.file_name().unwrap().to_str().unwrap();
+        let kind = kind.trim_start_matches("iox2_").trim_start_matches(name).to_owned();
+        let kind: String = kind.split_once('.').map_or(String::from("folder"), |(_, suffix)| suffix.to_owned());
+        if !kinds.iter().any(|(known, _)| *known == kind) {
+            kinds.push((kind, path));
+        }
+    }
+    kinds
+}
+
+#[test]
+fn what_killed_processes_left_is_removed_in_every_state_of_damage() {
+    let name = format!("dead{}", std::process::id());
+    killed(&name);
+    let all = kinds(&name);
+    for wanted in ["data", "connection", "dynamic", "event_mgmt", "event", "service", "details", "port_tag", "folder"] {
+        assert!(all.iter().any(|(kind, _)| kind == wanted), "no {wanted} among {all:?}");
+    }
+    for (kind, _) in &all {
+        for damage in Damage::ALL {
+            if files(&name).is_empty() {
+                killed(&name);
+            }
+            let (_, path) = kinds(&name).into_iter().find(|(found, _)| found == kind).unwrap();
+            damage.apply(&path);
+            let opened = Home::open(Some(&name), 0);
+            assert!(opened.is_ok(), "{kind} {damage:?}: {:?}", opened.err());
+            drop(opened);
+            assert_eq!(files(&name), [] as [PathBuf; 0], "{kind} {damage:?}");
+        }
+    }
+}
+
+/// A file that is put back when this goes.
+struct Kept {
+    path: PathBuf,
+    aside: PathBuf,
+}
+
+impl Kept {
+    fn aside(path: &Path) -> Self {
+        let folder = if path.starts_with(room::PLACE) { room::PLACE } else { "/tmp" };
+        let aside = Path::new(folder).join(format!("rapid_test_aside_{}", std::process::id()));
+        std::fs::rename(path, &aside).unwrap();
+        Self { path: path.to_owned(), aside }
+    }
+}
+
+impl Drop for Kept {
+    fn drop(&mut self) {
+        let _ = std::fs::symlink_metadata(&self.path).map(|there| remove(&self.path, &there));
+        let _ = std::fs::rename(&self.aside, &self.path);
+    }
+}
+
+#[test]
+fn what_a_living_process_uses_stays_and_damage_to_it_is_named() {
+    let name = format!("live{}", std::process::id());
+    let (mut first, said) = member(&name, true);
+    assert_eq!(said, "opened");
+    let used = files(&name);
+    let (mut second, said) = member(&name, false);
+    second.wait().unwrap();
+    assert_eq!((said.as_str(), files(&name)), ("opened", used));
+    for (kind, _) in kinds(&name) {
+        for damage in Damage::ALL {
+            let before = files(&name);
+            let (_, path) = kinds(&name).into_iter().find(|(found, _)| *found == kind).unwrap();
+            let there = std::fs::symlink_metadata(&path).unwrap();
+            let kept = Kept::aside(&path);
+            damage.make(&path, &there);
+            let (mut second, said) = member(&name, false);
+            second.wait().unwrap();
+            let named = said.contains("rm -r /dev/shm/iox2_") || said.contains("rm -r /tmp/iceoryx2/");
+            // What is not there has no name of its own.
+            let missing = matches!(damage, Damage::Gone) && said.contains("end the programs that use the bus");
+            assert!(said == "opened" || named || missing, "{kind} {damage:?}: {said}");
+            drop(kept);
+            if files(&name) == before {
+                continue;
+            }
+            // To iceoryx2, a process without its lock is dead. It ends, and the next one finds all in order.
+            first.kill().unwrap();
+            first.wait().unwrap();
+            let (next, said) = member(&name, true);
+            assert_eq!(said, "opened", "after {kind} {damage:?}");
+            first = next;
+        }
+    }
+    first.kill().unwrap();
+    first.wait().unwrap();
+    Files::new(format!("iox2_{name}_"), PathBuf::from("/tmp/iceoryx2")).clear().unwrap();
+    assert_eq!(files(&name), [] as [PathBuf; 0]);
+}

@@ -1,0 +1,114 @@
+//! Room in shared memory: a segment that this program makes is reserved when it is made.
+//!
+//! iceoryx2 0.10 makes a segment with the C library's `ftruncate`, which reserves nothing on tmpfs: the first
+//! write to a page for which there is no room ends the process with SIGBUS, at any time later. [`ftruncate`] here
+//! takes that function's place in this program. The standard library and rustix do not use it.
+//!
+//! Invariant: a segment on tmpfs that this program made, at the start or for a subscriber that came later, has all
+//! its pages; or it was not made, and iceoryx2 reports it.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use libc::{c_int, off_t};
+
+use super::BusError;
+
+/// Where Linux keeps POSIX shared memory, see `shm_overview(7)`.
+pub(super) const PLACE: &str = "/dev/shm";
+/// The type of tmpfs in `statfs(2)`.
+const TMPFS_MAGIC: i64 = 0x0102_1994;
+/// Bytes for iceoryx2's own books of one topic or node, at most.
+pub(super) const BOOKS: u64 = 128 << 10;
+
+/// A segment was not made for want of room, and nobody has asked yet.
+static REFUSED: AtomicBool = AtomicBool::new(false);
+
+/// Fails where fewer than `need` bytes are free.
+pub(super) fn check(need: u64) -> Result<(), BusError> {
+    match space() {
+        Some((size, free)) if free < need => Err(BusError::Room { need, free, size }),
+        _ => Ok(()),
+    }
+}
+
+/// The error of a segment that was not made since the last call.
+pub(super) fn lacking() -> Option<BusError> {
+    if !REFUSED.swap(false, Ordering::Relaxed) {
+        return None;
+    }
+    let (size, free) = space()?;
+    Some(BusError::Room { need: free + BOOKS, free, size })
+}
+
+/// Bytes of a page.
+pub(super) fn page() -> usize {
+    // SAFETY: asks for a number.
+    usize::try_from(unsafe { libc::sysconf(libc::_SC_PAGESIZE) }).unwrap_or(4096)
+}
+
+/// Size and free bytes of the file system; `None` where the system does not limit it.
+fn space() -> Option<(u64, u64)> {
+    let space = rustix::fs::statvfs(PLACE).ok()?;
+    let bytes = |blocks: u64| blocks.saturating_mul(space.f_frsize);
+    (space.f_blocks > 0).then(|| (bytes(space.f_blocks), bytes(space.f_bavail)))
+}
+
+/// The size in MiB with which `need` bytes are free.
+pub(super) const fn mebibytes(size: u64, free: u64, need: u64) -> u64 {
+    size.saturating_add(need.saturating_sub(free)).div_ceil(1 << 20) + 64
+}
+
+/// `ftruncate(2)`, which on tmpfs fails with `ENOSPC` where there is no room for all of the file.
+///
+/// # Safety
+/// As for the C library's: every descriptor and length is allowed.
+// SAFETY: signature and contract are those of the C library's function of this name.
+#[unsafe(no_mangle)]
+unsafe extern "C" fn ftruncate(descriptor: c_int, length: off_t) -> c_int {
+    if length > 0 && is_on_tmpfs(descriptor) {
+        // SAFETY: takes numbers only.
+        while unsafe { libc::fallocate(descriptor, 0, 0, length) } != 0 {
+            match std::io::Error::last_os_error().raw_os_error() {
+                Some(libc::EINTR) => {}
+                // Nothing to reserve with: not Linux's own tmpfs.
+                Some(libc::EOPNOTSUPP | libc::ENOSYS) => break,
+                // `errno` is the caller's answer.
+                _ => {
+                    REFUSED.store(true, Ordering::Relaxed);
+                    return -1;
+                }
+            }
+        }
+    }
+    // SAFETY: takes numbers only.
+    let done = unsafe { libc::syscall(libc::SYS_ftruncate, descriptor, length) };
+    if done == 0 { 0 } else { -1 }
+}
+
+fn is_on_tmpfs(descriptor: c_int) -> bool {
+    let mut about = std::mem::MaybeUninit::<libc::statfs>::uninit();
+    // SAFETY: the kernel writes the whole struct or fails; it is read only if it did not.
+    unsafe { libc::fstatfs(descriptor, about.as_mut_ptr()) == 0 && about.assume_init().f_type == TMPFS_MAGIC }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_size_to_mount_with_has_room_for_what_is_needed() {
+        assert_eq!(mebibytes(64 << 20, 10 << 20, 74 << 20), 128 + 64);
+        assert_eq!(mebibytes(64 << 20, 10 << 20, 0), 64 + 64);
+    }
+
+    #[test]
+    fn what_is_needed_and_not_there_is_an_error_that_tells_the_fix() {
+        assert!(check(0).is_ok());
+        if space().is_none() {
+            println!("NOT CHECKED: {PLACE} has no limit");
+            return;
+        }
+        let error = check(1 << 50).unwrap_err().to_string();
+        assert!(error.starts_with("/dev/shm: ") && error.contains("mount -o remount,size="), "{error}");
+    }
+}

@@ -1,0 +1,256 @@
+//! The last resort where shared memory has no page to write to: segments that other programs made, and files
+//! that other programs truncate.
+//!
+//! The kernel raises SIGBUS. Its handler puts a page of the process's own in the place of the one that is missing,
+//! so that the thread continues, and wakes whoever waits in [`lost`]: the run ends in order, with motors disabled
+//! and the episode closed.
+//!
+//! Invariant: what the handler calls is safe in a signal handler: system calls and atomics.
+//! Invariant: a SIGBUS of any other memory is left to the handler before this one; that of the standard library
+//! ends the process.
+
+use std::mem::MaybeUninit;
+use std::os::fd::{AsRawFd, IntoRawFd, RawFd};
+use std::ptr;
+use std::sync::OnceLock;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use libc::{c_int, c_void, siginfo_t};
+use rustix::event::{EventfdFlags, eventfd};
+use tokio::io::Interest;
+use tokio::io::unix::AsyncFd;
+
+use super::{BusError, room};
+
+/// Bytes of a line of `/proc/self/maps` that are looked at: its numbers and the beginning of the path.
+const LINE: usize = 160;
+/// Bytes read at a time: a signal stack is small.
+const PIECE: usize = 512;
+/// `si_code` of memory that is mapped and has no page, see `sigaction(2)`.
+const BUS_ADRERR: c_int = 2;
+
+static HAPPENED: AtomicBool = AtomicBool::new(false);
+static HANDLER: OnceLock<Handler> = OnceLock::new();
+
+/// What the handler needs, made before it is one.
+struct Handler {
+    /// Of `/proc/self/maps`: there may be no descriptor left when it is needed.
+    maps: RawFd,
+    wake: RawFd,
+    page: usize,
+    before: libc::sigaction,
+}
+
+/// Has memory of the bus been lost?
+pub(super) fn happened() -> bool {
+    HAPPENED.load(Ordering::Relaxed)
+}
+
+/// Returns as soon as memory of the bus has been lost; needs tokio's I/O. Cancel-safe.
+pub async fn lost() -> BusError {
+    let Some(handler) = HANDLER.get() else { return std::future::pending().await };
+    // SAFETY: the descriptor is open for as long as the process lives.
+    let wake = unsafe { std::os::fd::BorrowedFd::borrow_raw(handler.wake) };
+    // One of its own: a descriptor can be waited for once at a time.
+    let wake = wake.try_clone_to_owned().ok();
+    // SAFETY: an owned descriptor stays open, and the same, for as long as it is watched.
+    let wake = wake.and_then(|wake| unsafe { AsyncFd::register_with_interest(wake, Interest::READABLE) }.ok());
+    let Some(wake) = wake else { return std::future::pending().await };
+    while !happened() {
+        let Ok(mut ready) = wake.readable().await else { return std::future::pending().await };
+        if !happened() {
+            ready.clear_ready();
+        }
+    }
+    BusError::Lost
+}
+
+/// Installs the handler, once for the process.
+///
+/// # Errors
+/// When the system has no descriptor for it.
+pub(super) fn install() -> Result<(), BusError> {
+    if HANDLER.get().is_some() {
+        return Ok(());
+    }
+    let failed = |error: std::io::Error| BusError::Node(format!("/proc/self/maps: {error}"));
+    let maps = std::fs::File::open("/proc/self/maps").map_err(failed)?;
+    let wake = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK).map_err(|error| failed(error.into()))?;
+    // SAFETY: all zeros is the default action, and the kernel writes the whole struct.
+    let before = unsafe {
+        let mut before = MaybeUninit::<libc::sigaction>::zeroed();
+        libc::sigaction(libc::SIGBUS, ptr::null(), before.as_mut_ptr());
+        before.assume_init()
+    };
+    let (maps_number, wake_number) = (maps.as_raw_fd(), wake.as_raw_fd());
+    let made = Handler { maps: maps_number, wake: wake_number, page: room::page(), before };
+    if HANDLER.set(made).is_err() {
+        return Ok(());
+    }
+    let _ = (maps.into_raw_fd(), wake.into_raw_fd());
+    // SAFETY: the handler keeps to what a handler may do; its signature is that of SA_SIGINFO.
+    unsafe {
+        let mut action = MaybeUninit::<libc::sigaction>::zeroed().assume_init();
+        action.sa_sigaction = handle as *const () as usize;
+        action.sa_flags = libc::SA_SIGINFO | libc::SA_ONSTACK;
+        libc::sigemptyset(&raw mut action.sa_mask);
+        libc::sigaction(libc::SIGBUS, &raw const action, ptr::null_mut());
+    }
+    Ok(())
+}
+
+extern "C" fn handle(signal: c_int, info: *mut siginfo_t, context: *mut c_void) {
+    let Some(handler) = HANDLER.get() else { return };
+    // SAFETY: the thread's own `errno`, which the interrupted code may be about to read.
+    let errno = unsafe { *libc::__errno_location() };
+    // SAFETY: the kernel gives a valid `info`.
+    let (code, address) = unsafe { ((*info).si_code, (*info).si_addr() as usize) };
+    if code == BUS_ADRERR && handler.is_of_the_bus(address) && handler.replace(address) {
+        HAPPENED.store(true, Ordering::Relaxed);
+        let one = 1_u64;
+        // SAFETY: eight bytes of this stack frame.
+        unsafe { libc::write(handler.wake, (&raw const one).cast(), size_of::<u64>()) };
+    } else {
+        handler.pass_on(signal, info, context);
+    }
+    // SAFETY: as above.
+    unsafe { *libc::__errno_location() = errno };
+}
+
+impl Handler {
+    /// Is this address in a mapping of a file in shared memory?
+    fn is_of_the_bus(&self, address: usize) -> bool {
+        let (mut line, mut length, mut at) = ([0; LINE], 0, 0);
+        loop {
+            let mut piece = [0_u8; PIECE];
+            // SAFETY: `piece` has as many bytes.
+            let got = unsafe { libc::pread(self.maps, piece.as_mut_ptr().cast(), PIECE, at) };
+            let Some(read) = usize::try_from(got).ok().filter(|read| *read > 0) else { return false };
+            at += got as libc::off_t;
+            for byte in piece.iter().take(read) {
+                if *byte == b'\n' {
+                    if covers(line.get(..length).unwrap_or_default(), address) {
+                        return true;
+                    }
+                    length = 0;
+                } else if let Some(place) = line.get_mut(length) {
+                    *place = *byte;
+                    length += 1;
+                }
+            }
+        }
+    }
+
+    /// Puts a page of our own where `address` is.
+    fn replace(&self, address: usize) -> bool {
+        let page = address & !(self.page - 1);
+        let protection = libc::PROT_READ | libc::PROT_WRITE;
+        let flags = libc::MAP_FIXED | libc::MAP_ANONYMOUS | libc::MAP_PRIVATE;
+        // SAFETY: the page is part of a mapping of shared memory, and no access to it succeeds.
+        let mapped = unsafe { libc::mmap(page as *mut c_void, self.page, protection, flags, -1, 0) };
+        mapped != libc::MAP_FAILED
+    }
+
+    /// Does what would have been done without this handler.
+    fn pass_on(&self, signal: c_int, info: *mut siginfo_t, context: *mut c_void) {
+        match self.before.sa_sigaction {
+            libc::SIG_DFL | libc::SIG_IGN => {
+                // The instruction is tried again, and ends the process.
+                // SAFETY: allowed in a handler.
+                unsafe { libc::signal(signal, libc::SIG_DFL) };
+            }
+            handler if self.before.sa_flags & libc::SA_SIGINFO != 0 => {
+                // SAFETY: with SA_SIGINFO, it is a function of this signature.
+                let handler: extern "C" fn(c_int, *mut siginfo_t, *mut c_void) =
+                    unsafe { std::mem::transmute(handler) };
+                handler(signal, info, context);
+            }
+            handler => {
+                // SAFETY: without SA_SIGINFO, it is a function of this signature.
+                let handler: extern "C" fn(c_int) = unsafe { std::mem::transmute(handler) };
+                handler(signal);
+            }
+        }
+    }
+}
+
+/// Is `line` of `/proc/self/maps` that of a shared mapping of a file in shared memory, with `address` in it?
+fn covers(line: &[u8], address: usize) -> bool {
+    let mut words = line.split(|byte| *byte == b' ').filter(|word| !word.is_empty());
+    let (Some(range), Some(permissions)) = (words.next(), words.next()) else { return false };
+    let mut ends = range.split(|byte| *byte == b'-').map(hexadecimal);
+    let (Some(Some(first)), Some(Some(end))) = (ends.next(), ends.next()) else { return false };
+    let shared = permissions.get(3) == Some(&b's');
+    // Offset, device and inode come before the path.
+    shared && (first..end).contains(&address) && words.nth(3).is_some_and(|path| path.starts_with(b"/dev/shm/"))
+}
+
+fn hexadecimal(digits: &[u8]) -> Option<usize> {
+    digits.iter().try_fold(0_usize, |sum, digit| {
+        let digit = char::from(*digit).to_digit(16)?;
+        sum.checked_mul(16)?.checked_add(digit as usize)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_shared_mappings_of_shared_memory_are_of_the_bus() {
+        let line = b"7f0000001000-7f0000003000 rw-s 00000000 00:1b 7     /dev/shm/iox2_a.data (deleted)";
+        for (address, covered) in [(0xfff, false), (0x1000, true), (0x2fff, true), (0x3000, false)] {
+            assert_eq!(covers(line, 0x7f00_0000_0000 + address), covered, "{address:x}");
+        }
+        for other in [
+            &b"7f0000001000-7f0000003000 rw-p 00000000 00:1b 7     /dev/shm/iox2_a.data"[..],
+            b"7f0000001000-7f0000003000 rw-s 00000000 00:1b 7     /dev/video0",
+            b"7f0000001000-7f0000003000 rw-s 00000000 00:00 0",
+            b"7f0000001000 rw-s",
+            b"",
+        ] {
+            assert!(!covers(other, 0x7f00_0000_1000), "{}", String::from_utf8_lossy(other));
+        }
+    }
+    /// Not a test of its own: touches a file's page that is gone.
+    #[test]
+    fn helper() {
+        let Ok(path) = std::env::var("RAPID_TEST_TOUCH") else { return };
+        install().unwrap();
+        let file = std::fs::File::options().read(true).write(true).create(true).truncate(false).open(path).unwrap();
+        file.set_len(4096).unwrap();
+        // SAFETY: a mapping of its own, touched within its length.
+        unsafe {
+            let flags = libc::MAP_SHARED;
+            let page =
+                libc::mmap(ptr::null_mut(), 4096, libc::PROT_READ | libc::PROT_WRITE, flags, file.as_raw_fd(), 0);
+            assert_ne!(page, libc::MAP_FAILED);
+            file.set_len(0).unwrap();
+            page.cast::<u8>().write_volatile(7);
+            assert_eq!(page.cast::<u8>().read_volatile(), 7);
+        }
+        assert!(happened());
+    }
+
+    #[test]
+    fn a_page_of_shared_memory_that_is_gone_is_replaced_and_any_other_ends_the_process() {
+        use std::os::unix::process::ExitStatusExt;
+        let number = std::process::id();
+        for (path, signal) in [
+            (format!("/dev/shm/rapid_test_sigbus_{number}"), None),
+            (format!("{}/rapid_test_sigbus_{number}", std::env::temp_dir().display()), Some(libc::SIGBUS)),
+        ] {
+            let ended = std::process::Command::new(std::env::current_exe().unwrap())
+                .args(["--exact", "bus::sigbus::tests::helper"])
+                .env("RAPID_TEST_TOUCH", &path)
+                .output()
+                .unwrap();
+            std::fs::remove_file(&path).unwrap();
+            assert_eq!(
+                (ended.status.signal(), ended.status.success()),
+                (signal, signal.is_none()),
+                "{path}: {ended:?}"
+            );
+        }
+    }
+}

@@ -1,0 +1,225 @@
+//! The bus and the memory it lives in: what is there too little of, what others do to it, what stays behind.
+//!
+//! Tests with a `/dev/shm` of their own mount one in a namespace of their own, which needs root.
+
+#![allow(clippy::expect_used, clippy::print_stdout, reason = "what fails here fails a test, or names what is missing")]
+mod support;
+
+use std::fs::File;
+use std::io::Write;
+use std::os::unix::fs::PermissionsExt;
+use std::os::unix::process::ExitStatusExt;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+
+use rustix::fs::{FallocateFlags, fallocate};
+use rustix::process::Signal;
+use support::{Episode, Place, Running, python, until};
+
+const RECORD: [&str; 6] = ["--sim", "--headless", "--json", "--record", "--out", "out"];
+const RECORDING: &str = "\"event\":\"recording\"";
+/// Where iceoryx2 keeps what is no memory.
+const FOLDER: &str = "/tmp/iceoryx2";
+
+/// `rapid ARGUMENTS` after `first` has been run in the same shell.
+fn after(place: &Place, first: &str, arguments: &[&str]) -> Command {
+    let plain = place.command(arguments);
+    let mut command = Command::new("sh");
+    command.args(["-c", &format!("{first}\nexec \"$@\""), "sh"]).arg(plain.get_program()).args(plain.get_args());
+    for (name, value) in plain.get_envs() {
+        match value {
+            Some(value) => command.env(name, value),
+            None => command.env_remove(name),
+        };
+    }
+    command.current_dir(place.folder.path()).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    command
+}
+
+/// The same with a `/dev/shm` of `size`.
+fn in_memory_of(place: &Place, size: &str, arguments: &[&str]) -> Command {
+    let shell = after(place, &format!("mount -t tmpfs -o size={size} tmpfs /dev/shm"), arguments);
+    let mut command = Command::new("unshare");
+    command.args(["-m", "--propagation", "private"]).arg(shell.get_program()).args(shell.get_args());
+    for (name, value) in shell.get_envs() {
+        match value {
+            Some(value) => command.env(name, value),
+            None => command.env_remove(name),
+        };
+    }
+    command.current_dir(place.folder.path()).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    command
+}
+
+fn may_mount() -> bool {
+    let tried = Command::new("unshare").args(["-m", "mount", "-t", "tmpfs", "tmpfs", "/dev/shm"]).output();
+    let may = tried.is_ok_and(|tried| tried.status.success());
+    if !may {
+        println!("NOT CHECKED: a /dev/shm of its own needs root");
+    }
+    may
+}
+
+fn said(output: &Output) -> String {
+    let errors = String::from_utf8_lossy(&output.stderr);
+    errors.lines().rfind(|line| line.starts_with("error: ")).unwrap_or_default().to_owned()
+}
+
+/// Everything of the bus of this place.
+fn files(place: &Place) -> Vec<PathBuf> {
+    let prefix = format!("iox2_{}_", place.instance);
+    let ours = |path: &PathBuf| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(&prefix));
+    let list = |folder: &Path| -> Vec<PathBuf> {
+        std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path()).collect()
+    };
+    let folder = Path::new(FOLDER);
+    let nodes = list(&folder.join("nodes")).into_iter().filter(|path| path.is_dir());
+    let folders = ["/dev/shm".into(), folder.into(), folder.join("services"), folder.join("nodes")];
+    folders.into_iter().chain(nodes).flat_map(|folder: PathBuf| list(&folder)).filter(ours).collect()
+}
+
+fn whole_episode(place: &Place) -> Episode {
+    let files = place.files("out");
+    let [file] = files.as_slice() else { panic!("{files:?}") };
+    Episode::read(&place.path("out").join(file))
+}
+
+#[test]
+fn nothing_on_the_bus_is_writable_by_others_and_nothing_stays_whatever_the_umask() {
+    for umask in ["000", "022", "077"] {
+        let place = Place::new();
+        let command = after(&place, &format!("umask {umask}"), &["--sim", "--headless", "--json"]);
+        let running = place.start_as(command, "\"mask\":\"0x07\"");
+        // A program that takes part makes files, too.
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/subscribe.py");
+        let mut program = Command::new(python());
+        program.arg(script).args(["/rapid/camera/wrist", "100000"]).env("RAPID_INSTANCE", &place.instance);
+        let mut program = program.stdout(Stdio::null()).spawn().expect("python");
+        let nodes = || files(&place).iter().filter(|path| path.to_string_lossy().ends_with(".node_monitor")).count();
+        until("a subscriber", || nodes() == 2);
+        let all = files(&place);
+        assert!(all.len() > 20, "{all:?}");
+        let folders = [FOLDER, "/tmp/iceoryx2/nodes", "/tmp/iceoryx2/services"].map(PathBuf::from);
+        for path in all.iter().chain(&folders) {
+            let mode = std::fs::symlink_metadata(path).expect("it is in use").permissions().mode();
+            assert_eq!(mode & 0o022, 0, "umask {umask}: {} has mode {mode:o}", path.display());
+        }
+        // What it made is nobody's once it is gone.
+        program.kill().expect("python");
+        program.wait().expect("python");
+        running.signal(Signal::INT);
+        let (code, _, errors) = running.end();
+        assert_eq!(code, Some(0), "{errors}");
+        assert_eq!(files(&place), [] as [PathBuf; 0], "umask {umask}");
+    }
+}
+
+#[test]
+fn too_little_memory_at_the_start_is_an_error_with_numbers_and_fix() {
+    if !may_mount() {
+        return;
+    }
+    let run = &["--sim", "--headless", "--duration", "1s"][..];
+    for (size, arguments) in
+        [("64k", run), ("1m", run), ("2m", run), ("8m", run), ("60m", run), ("8k", &["disarm"]), ("64k", &["arm"])]
+    {
+        let place = Place::new();
+        let ended = in_memory_of(&place, size, arguments).output().expect("a shell");
+        let error = said(&ended);
+        assert_eq!(ended.status.code(), Some(1), "{size} {arguments:?}: {ended:?}");
+        for wanted in ["/dev/shm: ", " free of ", " are needed", "sudo mount -o remount,size="] {
+            assert!(error.contains(wanted), "{size} {arguments:?}: {error}");
+        }
+    }
+}
+
+/// Fills the memory that a run sees, to the last byte.
+fn fill(running: &Running) -> PathBuf {
+    let path = PathBuf::from(format!("/proc/{}/root/dev/shm/fill", running.pid()));
+    fill_up(&mut File::create(&path).expect("the run's memory"));
+    path
+}
+
+fn fill_up(file: &mut File) {
+    for size in [1 << 20, 4096, 1] {
+        while file.write_all(&vec![1; size]).is_ok() {}
+    }
+}
+
+#[test]
+fn memory_that_another_program_fills_ends_no_run() {
+    if !may_mount() {
+        return;
+    }
+    let place = Place::new();
+    let arguments: Vec<&str> = RECORD.iter().copied().chain(["--duration", "3s"]).collect();
+    let running = place.start_as(in_memory_of(&place, "90m", &arguments), RECORDING);
+    fill(&running);
+    // A subscriber that comes, and orders, find no room: they get an error.
+    let enter = |program: &mut Command| {
+        let mut command = Command::new("nsenter");
+        command.args(["-m", "-t", &running.pid().to_string()]).arg(program.get_program()).args(program.get_args());
+        command.env("RAPID_INSTANCE", &place.instance).output().expect("nsenter")
+    };
+    let disarm = enter(&mut place.command(&["disarm"]));
+    assert_eq!(disarm.status.code(), Some(1), "{disarm:?}");
+    assert!(said(&disarm).contains("/dev/shm: "), "{disarm:?}");
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/subscribe.py");
+    enter(Command::new(python()).arg(script).args(["/rapid/camera/wrist", "5", "2"]));
+    let (code, output, errors) = running.end();
+    // A busy machine may make a BAD episode of it, which is no error of the bus.
+    assert!(matches!(code, Some(0 | 4)), "{code:?}: {errors}{output}");
+    let told = support::events(&output);
+    let ended = told.iter().find(|event| event["event"] == "episode").expect("the end of the episode");
+    assert_eq!((&ended["error"], &ended["dropped"]), (&serde_json::Value::Null, &serde_json::json!(0)), "{ended}");
+    assert!(whole_episode(&place).topic("/rapid/camera/wrist").count() > 0, "{output}");
+}
+
+#[test]
+fn memory_in_use_that_is_lost_ends_the_run_in_order() {
+    if !may_mount() {
+        return;
+    }
+    let place = Place::new();
+    let running = place.start_as(in_memory_of(&place, "90m", &RECORD), RECORDING);
+    let memory = fill(&running);
+    // What was reserved for pictures is taken back, and taken by another.
+    for entry in std::fs::read_dir(memory.parent().expect("a folder")).expect("the run's memory").flatten() {
+        let is_pictures = entry.file_name().to_string_lossy().ends_with(".data");
+        if let Some(length) =
+            entry.metadata().ok().map(|about| about.len()).filter(|length| is_pictures && *length > 1 << 20)
+        {
+            let file = File::options().write(true).open(entry.path()).expect("the segment");
+            let hole = FallocateFlags::PUNCH_HOLE | FallocateFlags::KEEP_SIZE;
+            fallocate(&file, hole, 4096, length - 4096).expect("a hole");
+        }
+    }
+    fill_up(&mut File::options().append(true).open(&memory).expect("the run's memory"));
+    let (code, output, errors) = running.end();
+    assert_eq!(code, Some(1), "{errors}");
+    let reason = "/dev/shm: shared memory that is in use cannot be written";
+    assert!(errors.contains(&format!("error: {reason}")), "{errors}");
+    let told = support::events(&output);
+    let ended = told.iter().find(|event| event["event"] == "episode").expect("the end of the episode");
+    assert!(ended["error"].as_str().is_some_and(|error| error.contains(reason)), "{ended}");
+    assert!(whole_episode(&place).topic("/rapid/mask").count() > 0);
+}
+
+#[test]
+fn a_limit_of_the_process_is_named_and_a_start_that_fails_leaves_nothing() {
+    let limits = (24..120).step_by(4).map(|count| (format!("ulimit -n {count}"), "limit of"));
+    let limits = limits.chain([("ulimit -v 400000".to_owned(), "address space is limited to")]);
+    let mut refused = 0;
+    for (limit, wanted) in limits {
+        let place = Place::new();
+        let ended = after(&place, &limit, &["--sim", "--headless", "--duration", "100ms"]).output().expect("a shell");
+        assert_eq!(ended.status.signal(), None, "{limit}: {ended:?}");
+        let error = said(&ended);
+        if error.contains("topic ") || error.contains("shared-memory") {
+            refused += 1;
+            assert!(error.contains(wanted), "{limit}: {error}");
+        }
+        assert_eq!(files(&place), [] as [PathBuf; 0], "{limit}: {error}");
+    }
+    assert!(refused > 0, "no limit was met while the bus was opened");
+}
