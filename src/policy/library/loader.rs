@@ -9,7 +9,7 @@
 use std::ffi::CStr;
 use std::fs::File;
 use std::io;
-use std::os::fd::AsRawFd as _;
+use std::os::fd::IntoRawFd as _;
 
 use rustix::fs::{MemfdFlags, memfd_create};
 use rustix::io::Errno;
@@ -47,7 +47,9 @@ fn load_one_of(name: &CStr, packed: &[u8]) -> Result<(), Cause> {
         return Err(missing);
     }
     let memory = unpack(c"libstdc++.so", packed).map_err(Cause::Memory)?;
-    let path = format!("{MEMORY}{}\0", memory.as_raw_fd());
+    // Never closed: the loader knows what it has loaded by this name too, and would take the next memory with the
+    // same number for it.
+    let path = format!("{MEMORY}{}\0", memory.into_raw_fd());
     // No NUL but the last is in it.
     CStr::from_bytes_with_nul(path.as_bytes()).map_or(Err(missing), load)
 }
