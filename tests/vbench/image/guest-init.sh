@@ -1,37 +1,81 @@
 #!/bin/bash
 # PID 1 of the guest: mounts, the real systemd-udevd, then run.sh of the share, whose results go back through it.
 # Whatever run.sh does, the machine ends by powering off, with the exit code in share/rc (written last, by rename).
+# Where the share has a file `systemd`, systemd takes over as PID 1 after the mounts: it starts udevd, and then this
+# script once more, as a service.
 export PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin HOME=/root LANG=C TERM=dumb
 share=/mnt/share
-mount -t sysfs sys /sys
-mount -t tmpfs run /run
-mount -t tmpfs -o mode=1777,size=60% tmp /tmp
-mkdir -p /dev/shm /dev/pts $share /run/udev /etc/udev/rules.d
-mount -t tmpfs -o mode=1777 shm /dev/shm
-mount -t devpts pts /dev/pts
-ln -sf /proc/self/fd /dev/fd
-hostname bench
-ip link set lo up
-modprobe -a 9pnet_virtio 9p
-mount -t 9p -o trans=virtio,version=9p2000.L,msize=524288 share $share
-cp $share/rules/*.rules /etc/udev/rules.d/ 2>/dev/null
-/lib/systemd/systemd-udevd --daemon
-udevadm trigger --action=add --subsystem-match=block --subsystem-match=tty
-modprobe -a vhci_hcd uvcvideo cdc_acm ftdi_sio
-udevadm settle
-echo "bench: ready after $(cut -d' ' -f1 /proc/uptime) s" >/dev/kmsg
 
-# Programs and results live in the guest's memory: 9p costs a round trip to the host for every read and write.
-mkdir -p /tmp/bench/out
-cp -r $share/in/. /tmp/bench/
-cd /tmp/bench
-timeout -k 5 "$(cat $share/limit)" bash ./run.sh >/tmp/out.log 2>&1 </dev/null
-rc=$?
-cp /tmp/out.log $share/out.log
-dmesg >$share/dmesg.log
-cp -r /tmp/bench/out/. $share/out/
-sync
-echo $rc >$share/rc.part
-mv $share/rc.part $share/rc
-echo o >/proc/sysrq-trigger
-sleep 30
+mounts() {
+  mount -t sysfs sys /sys
+  mount -t tmpfs -o mode=755 run /run
+  mount -t tmpfs -o mode=1777,size=60% tmp /tmp
+  mkdir -p /dev/shm /dev/pts $share /run/udev /etc/udev/rules.d
+  mount -t tmpfs -o mode=1777 shm /dev/shm
+  mount -t devpts pts /dev/pts
+  ln -sf /proc/self/fd /dev/fd
+  hostname bench
+  ip link set lo up
+  modprobe -a 9pnet_virtio 9p
+  mount -t 9p -o trans=virtio,version=9p2000.L,msize=524288 share $share
+  cp $share/rules/*.rules /etc/udev/rules.d/ 2>/dev/null
+}
+
+# Units of no use here; each costs time on an emulated processor. Without an id systemd would set the machine up first.
+as_systemd() {
+  echo 5c0f1e0d9a6b4d1e8f2a3b4c5d6e7f80 >/etc/machine-id
+  local unit
+  for unit in systemd-udev-trigger systemd-random-seed systemd-update-utmp systemd-update-utmp-runlevel systemd-logind \
+    systemd-journal-flush systemd-journal-catalog-update systemd-timesyncd systemd-networkd systemd-resolved systemd-hwdb-update \
+    systemd-sysctl systemd-binfmt systemd-pstore systemd-user-sessions getty@tty1 serial-getty@ttyS0 console-getty \
+    kmod-static-nodes e2scrub_reap modprobe@; do
+    ln -sf /dev/null "/etc/systemd/system/$unit.service"
+  done
+  for unit in dev-hugepages.mount dev-mqueue.mount sys-kernel-debug.mount sys-kernel-tracing.mount sys-fs-fuse-connections.mount \
+    sys-kernel-config.mount proc-sys-fs-binfmt_misc.automount timers.target getty.target remote-fs.target systemd-ask-password-wall.path \
+    systemd-initctl.socket; do
+    ln -sf /dev/null "/etc/systemd/system/$unit"
+  done
+  cat >/etc/systemd/system/bench.service <<END
+[Unit]
+Requires=multi-user.target
+After=multi-user.target
+[Service]
+Type=oneshot
+ExecStart=/usr/sbin/bench-init script
+END
+  exec /lib/systemd/systemd --unit=bench.service
+}
+
+udev_alone() {
+  /lib/systemd/systemd-udevd --daemon
+  udevadm trigger --action=add --subsystem-match=block --subsystem-match=tty
+}
+
+script() {
+  modprobe -a vhci_hcd uvcvideo cdc_acm ftdi_sio
+  udevadm settle
+  echo "bench: ready after $(cut -d' ' -f1 /proc/uptime) s" >/dev/kmsg
+
+  # Programs and results live in the guest's memory: 9p costs a round trip to the host for every read and write.
+  mkdir -p /tmp/bench/out
+  cp -r $share/in/. /tmp/bench/
+  cd /tmp/bench
+  timeout -k 5 "$(cat $share/limit)" bash ./run.sh >/tmp/out.log 2>&1 </dev/null
+  rc=$?
+  cp /tmp/out.log $share/out.log
+  dmesg >$share/dmesg.log
+  cp -r /tmp/bench/out/. $share/out/
+  sync
+  echo $rc >$share/rc.part
+  mv $share/rc.part $share/rc
+  echo o >/proc/sysrq-trigger
+  sleep 30
+}
+
+if [ "${1:-}" != script ]; then
+  mounts
+  [ ! -e $share/systemd ] || as_systemd
+  udev_alone
+fi
+script

@@ -48,6 +48,7 @@ pub struct Scenario {
     watch_mask: bool,
     node_program: bool,
     action_program: bool,
+    systemd: bool,
     limit: Duration,
 }
 
@@ -73,6 +74,7 @@ impl Scenario {
             watch_mask: false,
             node_program: false,
             action_program: false,
+            systemd: false,
             limit: Duration::from_mins(10),
         }
     }
@@ -149,6 +151,13 @@ impl Scenario {
         self
     }
 
+    /// Boots with systemd as PID 1; the script runs as a service, after `multi-user.target`.
+    #[must_use]
+    pub fn systemd(mut self) -> Self {
+        self.systemd = true;
+        self
+    }
+
     /// Puts a file beside `devices.toml`, in `/tmp/bench`; the name may have folders.
     #[must_use]
     pub fn file(mut self, name: &str, contents: impl Into<Vec<u8>>) -> Self {
@@ -198,6 +207,10 @@ impl Scenario {
         write("devices.toml", self.registry.as_bytes())?;
         self.files.iter().try_for_each(|(name, contents)| write(name, contents))?;
         write("run.sh", self.guest_script(&usbemu, &rapid).as_bytes())?;
+        if self.systemd {
+            let path = share.join("systemd");
+            fs::write(&path, "").map_err(|error| ScenarioError::Share(path, error))?;
+        }
         let boot = image
             .boot(&share, self.limit)
             .inspect_err(|_| eprintln!("vbench: the share is kept in {}", share.display()))?;
