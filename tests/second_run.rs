@@ -79,8 +79,8 @@ fn after_a_kill_the_next_run_takes_over_and_leaves_nothing_of_the_dead_one() {
     let running = place.start(&arguments, "\"event\":\"recording\"");
     running.signal(Signal::KILL);
     assert_eq!(running.end().0, None);
-    // iceoryx2's one file of a fixed name is meant to stay; every other has the port's or node's own
-    // number in its name.
+    // The counter of nodes has the same name in each run; every other file has the port's or node's own number in its
+    // name.
     let own = |place: &Place| {
         let mut files = place.shared_memory();
         files.retain(|file| !file.ends_with(".global_mgmt"));

@@ -170,7 +170,6 @@ fn one_thread(registry: &Registry, scenario: &Scenario, device: usize) {
     });
     assert_eq!(allocated, 0, "{}: allocations for {SAMPLES} samples", spec.name);
     drop((inbox, writer, bus));
-    remove_leftovers(&instance);
 }
 
 fn whole_rig(registry: &Registry, scenario: Scenario) {
@@ -214,7 +213,6 @@ fn whole_rig(registry: &Registry, scenario: Scenario) {
     stop.cancel();
     runtime.block_on(task).unwrap();
     drop((commands, inbox, bus));
-    remove_leftovers(&instance);
 
     // A file may fall between two stretches or be cut by their border, and a worker may have had no
     // sample while it was warming up.
@@ -234,14 +232,4 @@ fn take(inbox: &Inbox, counts: &mut [usize; 3]) {
             TopicId::Action => {}
         })
         .unwrap();
-}
-
-/// iceoryx2 leaves one small file an instance behind.
-fn remove_leftovers(instance: &str) {
-    let prefix = format!("iox2_{instance}_");
-    for entry in std::fs::read_dir("/dev/shm").unwrap().flatten() {
-        if entry.file_name().to_string_lossy().starts_with(&prefix) {
-            let _ = std::fs::remove_file(entry.path());
-        }
-    }
 }

@@ -102,8 +102,6 @@ pub(crate) struct Recording {
     pub log: Log,
     /// Where it is reported.
     pub board: Arc<Board>,
-    /// Name of the bus.
-    pub instance: String,
     recorder: Recorder,
     _out: tempfile::TempDir,
 }
@@ -128,7 +126,7 @@ impl Recording {
         let request =
             EpisodeRequest { out: out.path().to_owned(), task: "frame".to_owned(), ..EpisodeRequest::default() };
         runtime.block_on(recorder.start(request))?;
-        Ok(Self { bus, log, board, instance, recorder, _out: out })
+        Ok(Self { bus, log, board, recorder, _out: out })
     }
 
     /// Ends the episode: everything that passed.
@@ -138,18 +136,7 @@ impl Recording {
             return Err(error.into());
         }
         drop((self.recorder, self.bus));
-        remove_leftovers(&self.instance);
         Ok(std::mem::take(&mut self.log.lock().unwrap_or_else(PoisonError::into_inner)))
-    }
-}
-
-/// iceoryx2 leaves one small file an instance behind.
-fn remove_leftovers(instance: &str) {
-    let prefix = format!("iox2_{instance}_");
-    for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
-        if entry.file_name().to_string_lossy().starts_with(&prefix) {
-            let _ = std::fs::remove_file(entry.path());
-        }
     }
 }
 
