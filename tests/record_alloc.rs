@@ -174,6 +174,7 @@ async fn only_chunks_allocate() {
         cooldown: Duration::from_secs(2),
         memory_budget: 1 << 29,
         disk_reserve: None,
+        expect: Vec::new(),
     };
     let registry =
         Arc::new(Registry { rig, devices: vec![device], modules: Vec::new(), path: None, text: String::new() });

@@ -28,7 +28,7 @@ fn valid(name: &str) -> Loaded {
 
 #[test]
 fn every_mistake_is_told_in_full() {
-    mistakes::check("registry/invalid", "toml", 171, |text| {
+    mistakes::check("registry/invalid", "toml", 174, |text| {
         let errors = Registry::parse(text, Some(Path::new("devices.toml"))).err()?;
         Some((errors.to_string(), errors.diagnostics))
     });

@@ -13,6 +13,7 @@ pub(super) fn registry(depth: usize) -> Registry {
             cooldown: Duration::from_secs(2),
             memory_budget: 1 << 20,
             disk_reserve: None,
+            expect: Vec::new(),
         },
         devices: vec![DeviceSpec {
             name: "motor".into(),

@@ -94,6 +94,8 @@ pub(super) struct Ending<'a> {
     pub(super) events_missed: u64,
     /// Publications of the mask lost.
     pub(super) masks_dropped: u64,
+    /// Actions lost.
+    pub(super) actions_dropped: u64,
     /// Other programs that published on topics of ours.
     pub(super) publishers: &'a [Publisher],
     /// What each modality was like.
@@ -136,6 +138,7 @@ pub(super) fn end(ending: &Ending<'_>) -> BTreeMap<String, String> {
         ("dropped", sum(|quality| quality.dropped)),
         ("damaged", sum(|quality| quality.damaged)),
         ("masks_dropped", ending.masks_dropped.to_string()),
+        ("actions_dropped", ending.actions_dropped.to_string()),
         ("events_missed", ending.events_missed.to_string()),
         ("modalities", Value::Object(modalities).to_string()),
         ("skew_ms", json!(ending.skew).to_string()),

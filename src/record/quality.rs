@@ -130,6 +130,9 @@ pub struct Quality {
     pub frames_present: u64,
     /// Frames with a sample of it in the window.
     pub frames_valid: u64,
+    /// Frames in which it was present without such a sample; the first and the last of a presence are not
+    /// counted: the sample that belongs to them may lie outside of it, or of the episode.
+    pub frames_missed: u64,
 }
 
 /// See the module's comment.
@@ -219,9 +222,8 @@ impl Measures {
         let mut ages: Option<(i64, i64)> = None;
         for (id, present, age) in slots {
             let Some(Some(Lane { meter, .. })) = self.lanes.get_mut(id.index()) else { continue };
-            meter.frames_present += u64::from(present);
+            meter.frame(present, age.is_some());
             let Some(age) = age else { continue };
-            meter.frames_valid += 1;
             meter.offset.push(age.unsigned_abs());
             ages = Some(ages.map_or((age, age), |(least, most)| (least.min(age), most.max(age))));
         }
@@ -291,6 +293,7 @@ impl Measures {
             longest_gap: longest_gap_ns as f64 / 1e9,
             frames_present: meter.frames_present,
             frames_valid: meter.frames_valid,
+            frames_missed: meter.frames_missed,
         })
     }
 

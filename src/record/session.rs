@@ -72,6 +72,8 @@ pub(super) struct Session {
     measures: Measures,
     announcer: Announcer,
     masks_dropped: u64,
+    actions_dropped: u64,
+    logs: u64,
     events: u64,
     events_missed: u64,
     units: Units,
@@ -116,6 +118,8 @@ impl Session {
             measures,
             announcer: Announcer::new(),
             masks_dropped: 0,
+            actions_dropped: 0,
+            logs: 0,
             events: 0,
             events_missed: 0,
             units,
@@ -178,8 +182,12 @@ impl Session {
         self.measures.mask(header.capture_ns, mask);
     }
 
-    /// Takes an action.
-    pub(super) fn action(&mut self, header: &SampleHeader, payload: &[u8]) {
+    /// Takes an action, and the hole before it.
+    pub(super) fn action(&mut self, header: &SampleHeader, payload: &[u8], hole: Option<Hole>) {
+        if let (Some(hole), None) = (hole, &self.failed) {
+            let missing = self.share(&hole, hole.lost.saturating_add(hole.dropped), Duration::ZERO);
+            self.actions_dropped = self.actions_dropped.saturating_add(missing);
+        }
         if self.holds(Stamp(header.capture_ns), Duration::ZERO) && self.failed.is_none() {
             self.failed = self.file.action(header, payload).err();
         }
@@ -275,11 +283,14 @@ impl Session {
             .map(|(device, quality)| Judged { name: &device.name, quality, limits: device.verdict })
             .collect();
         let (masks_dropped, events_missed) = (self.masks_dropped, self.events_missed);
+        let (actions_dropped, expect) = (self.actions_dropped, self.registry.rig.expect.as_slice());
         let verdict = |file: FileState<'_>| {
             let (losses, findings) = (Losses::Apart, [].as_slice());
             judge(&Facts {
                 modalities: &judged,
                 masks_dropped,
+                actions_dropped,
+                expect,
                 events_missed,
                 publishers,
                 seconds,
@@ -295,6 +306,7 @@ impl Session {
             frames: self.next_tick,
             events_missed,
             masks_dropped,
+            actions_dropped,
             publishers,
             qualities: &qualities,
             skew: self.measures.skew(),
@@ -380,7 +392,8 @@ impl Session {
         let said = EventText { kind: field("event"), device: field("device"), text: &text, json: &json.to_string() };
         self.file.event(self.events, event.stamp, &said)?;
         if let What::Log { level, text } = &event.what {
-            self.file.log(self.events, event.stamp, *level, text)?;
+            self.file.log(self.logs, event.stamp, *level, text)?;
+            self.logs += 1;
         }
         Ok(())
     }

@@ -16,11 +16,12 @@ pub(super) struct Streams {
     /// The last sample of each modality.
     last: [Option<Last>; MAX_MODALITIES],
     last_mask: Option<Last>,
+    last_action: Option<Last>,
 }
 
 impl Streams {
     pub(super) fn new() -> Self {
-        Self { masks: MaskHistory::new(), last: [None; MAX_MODALITIES], last_mask: None }
+        Self { masks: MaskHistory::new(), last: [None; MAX_MODALITIES], last_mask: None, last_action: None }
     }
 
     /// Takes a sample, for `session` too if there is one.
@@ -40,8 +41,10 @@ impl Streams {
                 }
             }
             TopicId::Action => {
+                let now = Last { seq: header.seq, lost: header.lost, captured: Stamp(header.capture_ns) };
+                let hole = self.last_action.replace(now).and_then(|last| last.hole(now));
                 if let Some(session) = session {
-                    session.action(header, payload);
+                    session.action(header, payload, hole);
                 }
             }
             TopicId::Mask => {

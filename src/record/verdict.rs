@@ -9,7 +9,9 @@
 //! 4. A file that is not whole, or not proven to be as it was written, is SUSPECT; one that the disk did not
 //!    take is BAD. What could not be measured is a [`Finding`] of whoever could not.
 //! 5. An episode in which another program published on a topic of ours is SUSPECT.
-//! 6. Of two checks that one fault breaks, the one that names the fault is told: a frozen camera also
+//! 6. One shorter than [`SHORTEST`] is BAD: nobody demonstrates anything in that time.
+//! 7. One without a sample of a modality that `expect` names is SUSPECT.
+//! 8. Of two checks that one fault breaks, the one that names the fault is told: a frozen camera also
 //!    repeats its pictures, a silent one also has a low rate.
 //!
 //! Invariant: pure.
@@ -62,6 +64,10 @@ pub(super) struct Facts<'a> {
     pub(super) modalities: &'a [Judged<'a>],
     /// Publications of the mask that are not in the file.
     pub(super) masks_dropped: u64,
+    /// Actions that are not in the file.
+    pub(super) actions_dropped: u64,
+    /// Names of the modalities that every episode has to have.
+    pub(super) expect: &'a [String],
     /// Events that are not in the file.
     pub(super) events_missed: u64,
     /// Other programs that published on topics of ours.
@@ -96,6 +102,9 @@ impl Finding {
 const LEAST_SAMPLES: f64 = 10.0;
 const LEAST_PRESENCE: f64 = 1.0;
 
+/// A shorter episode is an accident: a key pressed twice.
+const SHORTEST: Duration = Duration::from_millis(500);
+
 /// The verdict.
 pub(super) fn judge(facts: &Facts<'_>) -> Verdict {
     let mut found: Vec<(Grade, String)> = Vec::new();
@@ -105,15 +114,28 @@ pub(super) fn judge(facts: &Facts<'_>) -> Verdict {
         FileState::Failed(why) => found.push((Grade::Bad, format!("the file could not be written: {why}"))),
     }
     found.extend(facts.findings.iter().map(|finding| (finding.grade, finding.reason.clone())));
+    if facts.seconds < SHORTEST.as_secs_f64() {
+        let limit = seconds(SHORTEST.as_secs_f64());
+        found.push((Grade::Bad, format!("too short: {} (limit {limit})", seconds(facts.seconds))));
+    }
     for judged in facts.modalities {
-        let of_it = modality(judged, facts);
+        let mut of_it = modality(judged, facts);
+        // What was found says more.
+        if of_it.is_empty() && judged.quality.samples == 0 && facts.expect.iter().any(|name| name == judged.name) {
+            of_it.push((Grade::Suspect, "took no part, and is expected (expect under [rig])".to_owned()));
+        }
         found.extend(of_it.into_iter().map(|(grade, text)| (grade, format!("{}: {text}", judged.name))));
     }
     let silent = facts.modalities.iter().all(|judged| judged.quality.samples == 0);
     if silent && !found.iter().any(|(grade, _)| *grade == Grade::Bad) {
         found.push((Grade::Bad, "nothing was received from any modality".to_owned()));
     }
-    for (count, what) in [(facts.masks_dropped, "publications of the mask"), (facts.events_missed, "events")] {
+    let missing = [
+        (facts.actions_dropped, "actions"),
+        (facts.masks_dropped, "publications of the mask"),
+        (facts.events_missed, "events"),
+    ];
+    for (count, what) in missing {
         if count > 0 {
             found.push((Grade::Suspect, format!("{count} {what} are not in the file (limit 0)")));
         }
@@ -182,7 +204,9 @@ fn modality(judged: &Judged<'_>, facts: &Facts<'_>) -> Vec<(Grade, String)> {
         (grade, format!("plugged in for {} without running (limit {limit})", seconds(quality.opening)))
     });
     let rate = rate(quality, limits).filter(|rate| unless(rate, [&gap, &lost, &dropped]));
-    [dropped, lost, damaged, duplicate, repeated, frozen, late, gap, opening, clock(quality, limits), rate]
+    let valid =
+        valid(quality, limits).filter(|valid| unless(valid, [&gap, &lost, &dropped, &damaged, &late, &opening, &rate]));
+    [dropped, lost, damaged, duplicate, repeated, frozen, late, gap, opening, clock(quality, limits), rate, valid]
         .into_iter()
         .flatten()
         .collect()
@@ -220,6 +244,18 @@ fn rate(quality: &Quality, limits: &VerdictSpec) -> Option<(Grade, String)> {
     }
     let (grade, limit) = exceeded(limits, |limits| limits.rate.filter(|limit| hz < limit * nominal))?;
     Some((grade, format!("{hz:.1} samples a second while present, of {nominal} (limit {})", percent(limit))))
+}
+
+fn valid(quality: &Quality, limits: &VerdictSpec) -> Option<(Grade, String)> {
+    let valid = quality.frames_valid.min(quality.frames_present);
+    let ticks = valid.saturating_add(quality.frames_missed);
+    let below = |limit: &f64| (valid as f64) < limit * ticks as f64;
+    let (grade, limit) = exceeded(limits, |limits| limits.valid.filter(below))?;
+    let limit = percent(limit);
+    Some((
+        grade,
+        format!("{valid} of {ticks} ticks have a valid sample while present (limit {limit}; see sync_window)"),
+    ))
 }
 
 /// The graver grade whose limit `exceeds` gives, and the limit.

@@ -36,6 +36,8 @@ pub struct Limits {
     pub clock: Option<Duration>,
     /// Least rate while the device was there, as a share of the nominal one.
     pub rate: Option<f64>,
+    /// Least share of the ticks at which the device was there that have a sample of it in `sync_window`.
+    pub valid: Option<f64>,
 }
 
 /// What the verdict on a modality is made of.
@@ -67,6 +69,8 @@ impl VerdictSpec {
     ///   another two. Longer is a node that does not start. How bad that is depends on the task.
     /// * clock 10 ms, 100 ms: less than half the usual window of 25 ms cannot move many samples into
     ///   another frame.
+    /// * valid 90 %, 50 %: a policy learns from what the frames hold, and of a tick without a valid sample that is
+    ///   an old one or nothing. A device slower than twice `sync_window` misses ticks by its phase alone.
     /// * rate 90 %, 50 %: in poor light cameras expose longer and halve their rate.
     #[must_use]
     pub fn of(kind: ModalityKind, stall_after: Duration, hz: Option<f64>) -> Self {
@@ -83,6 +87,7 @@ impl VerdictSpec {
             opening: Some(Duration::from_secs(5)),
             clock: Some(Duration::from_millis(10)),
             rate: Some(0.9),
+            valid: Some(0.9),
         };
         let bad = Limits {
             lost: Some(0.05),
@@ -96,6 +101,7 @@ impl VerdictSpec {
             opening: None,
             clock: Some(Duration::from_millis(100)),
             rate: Some(0.5),
+            valid: Some(0.5),
         };
         Self { suspect, bad, hz }
     }

@@ -25,7 +25,7 @@ mod verdict;
 use std::path::Path;
 use std::time::Duration;
 
-use super::diagnostic::{Diagnostic, RegistryErrors};
+use super::diagnostic::{Diagnostic, RegistryErrors, did_you_mean};
 use super::section::{At, Problems, Section, file_label, read};
 use super::spec::{IdentitySpec, Registry, RigSpec};
 use super::trust::distrust;
@@ -86,7 +86,7 @@ impl Registry {
         problems.check()?;
         let root = Section::new(document.get_ref(), 0, String::new());
         root.allow(&mut problems, &["rig", "verdict", "device", "module"]);
-        let rig = rig(&root, &mut problems);
+        let mut rig = rig(&root, &mut problems);
         let verdict = verdict::read(&root, Whose::Rig, &mut problems);
         let programs = path.map_or(Programs::Nowhere, Programs::Beside);
         let mut drafts = drafts(&root, programs, &mut problems);
@@ -95,6 +95,7 @@ impl Registry {
         }
         check_identities(&drafts, &mut problems);
         check_topics(&drafts, &mut problems);
+        rig.expect = expected(&root, &drafts, &mut problems);
         check_actuators(&drafts, &mut problems);
         lan::check_ports(&drafts, &mut problems);
         let mut warnings = assign_bits(&mut drafts, &mut problems);
@@ -136,9 +137,11 @@ fn rig(root: &Section<'_>, problems: &mut Problems<'_>) -> RigSpec {
         cooldown: Duration::from_secs(2),
         memory_budget: 512 << 20,
         disk_reserve: None,
+        expect: Vec::new(),
     };
     let Some(section) = root.table(problems, "rig") else { return rig };
-    section.allow(problems, &["name", "observation_hz", "sync_window", "cooldown", "memory_budget", "disk_reserve"]);
+    let known = ["name", "observation_hz", "sync_window", "cooldown", "memory_budget", "disk_reserve", "expect"];
+    section.allow(problems, &known);
     if let Some(name) = section.text(problems, "name") {
         // The name becomes part of file names.
         let legal = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
@@ -250,6 +253,27 @@ fn check_topics(drafts: &[Draft<'_>], problems: &mut Problems<'_>) {
         let fix = format!("choose another, for example {:?}", format!("{}/{}", draft.topic, draft.name));
         draft.section.report(problems, "topic", message, fix);
     }
+}
+
+/// The entries that every episode has to have samples of.
+fn expected(root: &Section<'_>, drafts: &[Draft<'_>], problems: &mut Problems<'_>) -> Vec<String> {
+    // One that is no table has been reported.
+    let rig = root.fields().into_iter().find(|(_, key, _)| *key == "rig");
+    let Some((at, table)) = rig.and_then(|(at, _, value)| Some((at, value.get_ref().as_table()?))) else {
+        return Vec::new();
+    };
+    let rig = Section::new(table, at, root.child("rig"));
+    let expected = rig.texts(problems, "expect").unwrap_or_default();
+    for (index, name) in expected.iter().enumerate() {
+        if !drafts.iter().any(|draft| draft.name == *name) {
+            let known: Vec<&str> = drafts.iter().map(|draft| draft.name.as_str()).collect();
+            let fix = did_you_mean(name, &known, "entries are");
+            rig.report(problems, "expect", format!("expect: there is no [device.{name}]"), fix);
+        } else if expected.iter().take(index).any(|earlier| earlier == name) {
+            rig.report(problems, "expect", format!("expect: {name:?} is in the list twice"), "name it once");
+        }
+    }
+    expected
 }
 
 /// An action has no name of a device in it: it means the one actuator there is.

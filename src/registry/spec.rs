@@ -73,6 +73,8 @@ pub struct RigSpec {
     /// What recording leaves free on its disk, bytes; `None` is the smaller of 1 GiB and a twentieth
     /// of the disk.
     pub disk_reserve: Option<u64>,
+    /// Names of the entries without whose samples an episode is SUSPECT; none by default.
+    pub expect: Vec<String>,
 }
 
 /// One `[device.NAME]` table.

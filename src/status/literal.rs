@@ -163,6 +163,7 @@ pub(crate) fn board(names: &[&str]) -> Board {
             cooldown: Duration::from_secs(2),
             memory_budget: 1 << 29,
             disk_reserve: None,
+            expect: Vec::new(),
         },
         devices: names.iter().enumerate().map(device).collect(),
         modules: Vec::new(),

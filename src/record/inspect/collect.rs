@@ -11,6 +11,7 @@ use super::judge::{Counted, Ending, Judge, recorded_verdict, without_metadata};
 use super::policy::Gathered;
 use super::units;
 use super::{EventReport, Inspection, Judgement, Lateness, MaskEdge, ModalityReport, TopicReport};
+use crate::action::ACTION_TOPIC;
 use crate::episode_format::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, RECOVERED, SUMMARY, Writer};
 use crate::mask::{MASK_TOPIC, PhysicalMask};
 use crate::modality::ModalityId;
@@ -209,7 +210,9 @@ impl Collected {
             std::mem::take(&mut self.policy).report(end_ns, [self.summary.get(POLICY), self.about.get(POLICY)]);
         let (mut modalities, topics) = self.topics(begin_ns, seconds);
         let (messages, frames, unread) = (self.messages, self.frames, self.unread);
-        let counted = Counted { messages, frames, unread };
+        let actions_missing =
+            topics.iter().filter(|topic| topic.topic == ACTION_TOPIC).map(|topic| topic.missing).sum();
+        let counted = Counted { messages, frames, unread, actions_missing };
         let ending = Ending { file: walked, seconds, summary: &self.summary, repaired: self.repaired, counted };
         let verdict = match &judge {
             Some(judge) => Judgement::Episode(judge.judge(&mut modalities, &ending)),

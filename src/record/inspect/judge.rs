@@ -56,6 +56,8 @@ pub(super) struct Counted {
     pub(super) frames: u64,
     /// Records that could not be understood.
     pub(super) unread: u64,
+    /// Numbers missing between its actions.
+    pub(super) actions_missing: u64,
 }
 
 /// Measures an episode while its file is read.
@@ -67,6 +69,8 @@ pub(super) struct Judge {
     modalities: Vec<Registered>,
     /// The limits are not those of the registry in the file, which is not understood.
     usual_limits: bool,
+    /// Names of the modalities that every episode has to have.
+    expect: Vec<String>,
     /// Next number of each modality, and how many are missing.
     numbers: Vec<(Option<u32>, u64)>,
     /// By the events of the file.
@@ -86,9 +90,9 @@ impl Judge {
         let number = |key: &str| about.get(key)?.parse::<u64>().ok();
         let begin_ns = number("begin_wall_ns")?;
         let hz = about.get("observation_hz")?.parse().ok()?;
-        let (modalities, usual_limits) = match registered(about) {
-            Some(modalities) => (modalities, false),
-            None => (listed(about)?, true),
+        let (modalities, expect, usual_limits) = match registered(about) {
+            Some((modalities, expect)) => (modalities, expect, false),
+            None => (listed(about)?, Vec::new(), true),
         };
         let all: Vec<Measured> = modalities.iter().map(|modality| modality.measured.clone()).collect();
         let latency = Duration::from_nanos(all.iter().map(|measured| measured.latency_ns).max().unwrap_or(0));
@@ -97,7 +101,7 @@ impl Judge {
         let measures = Measures::new(&all, Frames { begin_ns, hz, wait });
         let numbers = vec![(None, 0); MAX_MODALITIES];
         let publishers = Publishers::default();
-        let mut judge = Self { measures, begin_ns, modalities, usual_limits, numbers, publishers };
+        let mut judge = Self { measures, begin_ns, modalities, usual_limits, expect, numbers, publishers };
         for (device, _) in objects(about, "serials") {
             judge.plugged(&device, begin_ns, true);
         }
@@ -202,6 +206,8 @@ impl Judge {
             publishers: publishers.list(),
             modalities: &judged,
             masks_dropped: count("masks_dropped"),
+            actions_dropped: counted.count("actions_dropped").unwrap_or(ending.counted.actions_missing),
+            expect: &self.expect,
             events_missed: count("events_missed"),
             seconds: ending.seconds,
             // A repaired file's summary counts what is there.
@@ -362,8 +368,8 @@ pub(super) fn recorded_verdict(summary: &BTreeMap<String, String>) -> Option<Ver
     Some(Verdict { grade, reasons, sensors })
 }
 
-/// The modalities by the registry in the file.
-fn registered(about: &BTreeMap<String, String>) -> Option<Vec<Registered>> {
+/// The modalities by the registry in the file, and the names of those that it expects.
+fn registered(about: &BTreeMap<String, String>) -> Option<(Vec<Registered>, Vec<String>)> {
     let text = about.get("registry").filter(|text| text.len() <= LONGEST_REGISTRY)?;
     let registry = Registry::parse(text, None).ok()?.registry;
     // Nothing is reserved: how large payloads are, a file is not believed.
@@ -371,7 +377,7 @@ fn registered(about: &BTreeMap<String, String>) -> Option<Vec<Registered>> {
         name: device.name.clone(),
         measured: Measured { id: device.id, limits: device.verdict, latency_ns: nanoseconds(device.latency) },
     });
-    Some(measured.collect())
+    Some((measured.collect(), registry.rig.expect))
 }
 
 /// The modalities by their list, where this version does not understand the registry.

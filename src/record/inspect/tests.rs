@@ -53,6 +53,7 @@ async fn a_finished_episode_is_told_as_it_was() {
     let announced = said.events.iter().filter(|event| !event.text.contains("lost"));
     let kinds: Vec<_> = announced.take(3).map(|event| event.kind.as_str()).collect();
     assert_eq!(kinds, ["recording", "attach", "log"]);
+    assert!(said.topics.iter().all(|topic| topic.missing == 0), "{:?}", said.topics);
     let together: u64 = said.topics.iter().chain(said.modalities.iter().map(|m| &m.topic)).map(|t| t.messages).sum();
     assert_eq!(together, said.messages);
     let shown = render(&said, 80, Paint::Ansi);

@@ -81,6 +81,10 @@ pub(in crate::record) struct Meter {
     pub(super) offset: Tally,
     pub(super) frames_present: u64,
     pub(super) frames_valid: u64,
+    pub(super) frames_missed: u64,
+    /// Was it present in the newest frame, and did that lack a sample without being the first of a presence?
+    was_present: bool,
+    lacked: bool,
     /// Latest capture so far; the beginning before the first sample.
     pub(super) latest_ns: u64,
     begin_ns: u64,
@@ -106,6 +110,9 @@ impl Meter {
             offset: Tally::new(),
             frames_present: 0,
             frames_valid: 0,
+            frames_missed: 0,
+            was_present: false,
+            lacked: false,
             latest_ns: begin_ns,
             begin_ns,
             seq: None,
@@ -134,6 +141,16 @@ impl Meter {
         let before = self.latest_ns;
         self.latest_ns = before.max(seen.capture_ns);
         (before < seen.capture_ns).then_some((before, seen.capture_ns))
+    }
+
+    /// Takes a frame, in the order of time: was it present, and was there a sample in the window?
+    pub(super) fn frame(&mut self, present: bool, valid: bool) {
+        self.frames_present += u64::from(present);
+        self.frames_valid += u64::from(valid);
+        // The frame before this one was not the last of a presence.
+        self.frames_missed += u64::from(present && self.lacked);
+        self.lacked = present && !valid && self.was_present;
+        self.was_present = present;
     }
 
     fn time(&mut self, seen: &Seen<'_>) {

@@ -303,3 +303,25 @@ proptest! {
         prop_assert!(serde_json::to_string(&said).is_ok());
     }
 }
+
+#[test]
+fn a_frame_at_the_edge_of_a_presence_may_lack_a_sample_and_no_other() {
+    // Present with (v) and without (-) a valid sample, absent (.).
+    for (frames, missed) in [
+        ("vvvvvv", 0),
+        ("-vvvv-", 0),
+        ("v-vv-v", 2),
+        ("--vv--", 2),
+        ("v-..-v", 0),
+        ("v--..--v", 2),
+        ("......", 0),
+        ("----------", 8),
+        ("-", 0),
+    ] {
+        let mut meter = Meter::new(0, false);
+        for frame in frames.chars() {
+            meter.frame(frame != '.', frame == 'v');
+        }
+        assert_eq!(meter.frames_missed, missed, "{frames}");
+    }
+}

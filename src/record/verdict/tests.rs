@@ -36,6 +36,8 @@ fn facts<'a>(modalities: &'a [Judged<'a>], file: FileState<'a>) -> Facts<'a> {
     Facts {
         modalities,
         masks_dropped: 0,
+        actions_dropped: 0,
+        expect: &[],
         events_missed: 0,
         publishers: &[],
         seconds: 10.0,
@@ -118,8 +120,50 @@ fn every_check_has_its_words_and_its_two_limits() {
         Suspect,
         &["cam: no sample for 3.0 s while present (limit 500 ms)"],
     );
+    let ticks = |valid, missed| move |q: &mut Quality| (q.frames_valid, q.frames_missed) = (valid, missed);
+    let says = |valid, ticks, limit| {
+        format!("cam: {valid} of {ticks} ticks have a valid sample while present (limit {limit} %; see sync_window)")
+    };
+    is(ticks(90, 10), Good, &[]);
+    is(ticks(89, 11), Suspect, &[&says(89, 100, 90)]);
+    is(ticks(50, 50), Suspect, &[&says(50, 100, 90)]);
+    is(ticks(49, 51), Bad, &[&says(49, 100, 50)]);
+    // As T8 has it: none of 140.
+    is(ticks(0, 138), Bad, &[&says(0, 138, 50)]);
     // Too short to have a rate.
     is(|q| (q.present, q.hz) = (0.9, Some(3.0)), Good, &[]);
+}
+
+#[test]
+fn an_episode_of_a_moment_is_bad_and_so_many_actions_are_missing() {
+    let quality = good();
+    let modalities = [Judged { name: "cam", quality: &quality, limits: limits() }];
+    let of = |seconds, actions_dropped| {
+        let said = judge(&Facts { actions_dropped, seconds, ..facts(&modalities, FileState::Whole) });
+        (said.grade, said.why())
+    };
+    assert_eq!(of(0.0, 0), (Grade::Bad, "too short: 0 ms (limit 500 ms)".to_owned()));
+    assert_eq!(of(0.499, 0).0, Grade::Bad);
+    assert_eq!(of(0.5, 0), (Grade::Good, String::new()));
+    assert_eq!(of(9.0, 3), (Grade::Suspect, "3 actions are not in the file (limit 0)".to_owned()));
+}
+
+#[test]
+fn an_expected_sensor_without_a_sample_is_suspect_and_every_verdict_names_who_is_missing() {
+    let (talks, never) = (good(), Quality { samples: 0, present: 0.0, plugged: 0.0, opening: 0.0, ..good() });
+    let of = |name| Judged { name, quality: if name == "cam" { &talks } else { &never }, limits: limits() };
+    let modalities = [of("cam"), of("tof"), of("gel")];
+    let names = |names: &[&str]| names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>();
+    for (expect, reasons) in [
+        (names(&[]), vec![]),
+        (names(&["cam"]), vec![]),
+        (names(&["cam", "gel"]), vec!["gel: took no part, and is expected (expect under [rig])"]),
+    ] {
+        let said = judge(&Facts { expect: &expect, ..facts(&modalities, FileState::Whole) });
+        assert_eq!(said.reasons, reasons);
+        assert_eq!(said.grade == Grade::Suspect, !reasons.is_empty());
+        assert_eq!(said.sensors(), "1 of 3 sensors, without tof, gel");
+    }
 }
 
 #[test]
@@ -212,6 +256,7 @@ fn a_check_that_is_off_says_nothing() {
         opening: None,
         clock: None,
         rate: None,
+        valid: None,
     };
     let quality = Quality {
         lost: 50,
@@ -226,6 +271,7 @@ fn a_check_that_is_off_says_nothing() {
         clock_drift: Some(999.0),
         clock_ahead: 999.0,
         hz: Some(1.0),
+        frames_missed: 500,
         ..good()
     };
     let limits = VerdictSpec { suspect: off, bad: off, hz: Some(30.0) };

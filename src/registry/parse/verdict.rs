@@ -17,7 +17,7 @@ type Share = fn(&mut Limits) -> &mut Option<f64>;
 type Time = fn(&mut Limits) -> &mut Option<Duration>;
 
 /// Checks whose limit is a share, and whether more of it is worse.
-const SHARES: [(&str, Share, Worse); 7] = [
+const SHARES: [(&str, Share, Worse); 8] = [
     ("lost", |limits| &mut limits.lost, Worse::More),
     ("dropped", |limits| &mut limits.dropped, Worse::More),
     ("damaged", |limits| &mut limits.damaged, Worse::More),
@@ -25,6 +25,7 @@ const SHARES: [(&str, Share, Worse); 7] = [
     ("repeated", |limits| &mut limits.repeated, Worse::More),
     ("late", |limits| &mut limits.late, Worse::More),
     ("rate", |limits| &mut limits.rate, Worse::Less),
+    ("valid", |limits| &mut limits.valid, Worse::Less),
 ];
 /// Checks whose limit is a time; longer is worse.
 const TIMES: [(&str, Time); 4] = [
@@ -114,7 +115,7 @@ fn text<'a>(section: &Section<'a>, key: &str) -> Option<&'a str> {
 
 /// `"0.1%"`, `"0.1 %"`, or `"off"`.
 fn read_share(section: &Section<'_>, key: &str, problems: &mut Problems<'_>) -> Option<Given<f64>> {
-    let usual = if key == "rate" { "90%" } else { "0.5%" };
+    let usual = if ["rate", "valid"].contains(&key) { "90%" } else { "0.5%" };
     let fix = format!("write 0% to 100%, or \"off\", for example {key} = \"{usual}\"");
     if !section.has(key) {
         return None;

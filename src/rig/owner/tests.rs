@@ -54,6 +54,7 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
             cooldown,
             memory_budget: 1 << 20,
             disk_reserve: None,
+            expect: Vec::new(),
         },
         devices: [(0, "a"), (1, "b")].into_iter().map(device).collect(),
         modules: Vec::new(),
