@@ -141,12 +141,26 @@ pub enum AppError {
         /// Why.
         reason: String,
     },
+    /// A run without a screen recorded something that is not to be used.
+    #[error("{}", bad(*count, file))]
+    Bad {
+        /// Episodes that are BAD.
+        count: u64,
+        /// The last of them.
+        file: PathBuf,
+    },
     /// A task or thread of ours panicked.
     #[error("{0} panicked; please report this")]
     Panicked(&'static str),
     /// A second signal came while the run was ending.
     #[error("interrupted twice")]
     InterruptedTwice,
+}
+
+fn bad(count: u64, file: &Path) -> String {
+    let file = file.display();
+    let many = if count > 1 { format!(", and {} before it", count - 1) } else { String::new() };
+    format!("{file} is BAD{many}: its verdict above says why; see `rapid inspect`")
 }
 
 /// Where the mask of an instance is published.
@@ -303,6 +317,8 @@ async fn finish(
     mut conductor: Conductor,
     mut outcome: Result<(), AppError>,
 ) -> Result<(), AppError> {
+    // Lines and JSON are read by scripts, which look at the exit code.
+    let judged = (conductor.record && running.kind != Screen::Monitor).then(|| Arc::clone(&conductor.board));
     // First of all nothing moves any more, whoever publishes actions. A chunk that is being computed is waited for
     // with the rest.
     let _ = running.rig_commands.try_send(RigCommand::Order(Order::Disarm));
@@ -353,6 +369,9 @@ async fn finish(
         if let Ok(ended) = timeout(limit, screen::ended(&mut running.screen)).await {
             keep_first(&mut outcome, ended);
         }
+    }
+    if let Some((count, file)) = judged.and_then(|board| board.bad_episodes()) {
+        keep_first(&mut outcome, Err(AppError::Bad { count, file }));
     }
     if twice { outcome.and(Err(AppError::InterruptedTwice)) } else { outcome }
 }

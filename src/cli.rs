@@ -65,7 +65,8 @@ Examples:
   rapid recover episodes                after a crash: makes the unfinished episodes whole
 
 Exit codes: 0 done, 1 failed while running, 2 bad configuration or arguments,
-            3 a device that is needed is not there, 130 interrupted twice";
+            3 a device that is needed is not there,
+            4 without a screen: an episode is BAD, 130 interrupted twice";
 
 const RECOVER: &str = "\
 A run that may record does this by itself, in the background, for what it finds in its --out folder.
@@ -187,7 +188,7 @@ pub enum Command {
         sudo rapid artifacts --install")]
     Artifacts {
         /// Copy them into /etc and make udev read them (needs root)
-        #[arg(long)]
+        #[arg(long, conflicts_with = "to")]
         install: bool,
         /// Where to write them
         #[arg(long, value_name = "DIR", default_value = "udev", value_hint = ValueHint::DirPath)]
@@ -284,6 +285,15 @@ impl Cli {
         {
             return Err(command.error(ErrorKind::ArgumentConflict, text));
         }
+        let tags = match &cli.command {
+            Some(Command::Replay { run, .. }) => &run.tag,
+            _ => &cli.run.tag,
+        };
+        if let Some(key) = repeated(tags) {
+            let text =
+                format!("--tag {key} is given more than once, and an episode has one value of each: leave one out");
+            return Err(command.error(ErrorKind::ArgumentConflict, text));
+        }
         if let Some(Some(file)) = &cli.simulation.sim
             && let Some(name) = file.to_str().filter(|name| command.find_subcommand(name).is_some())
         {
@@ -298,6 +308,13 @@ impl Cli {
         }
         Ok(cli)
     }
+}
+
+/// A key with more than one value.
+fn repeated(tags: &[(String, String)]) -> Option<&str> {
+    let is_again =
+        |(place, (key, _)): &(usize, &(String, String))| tags.iter().take(*place).any(|(before, _)| before == key);
+    tags.iter().enumerate().find(is_again).map(|(_, (key, _))| key.as_str())
 }
 
 /// An option of a run before a command that would not look at it.

@@ -31,7 +31,8 @@ fn record(place: &Place, scenario: &str, more: &[&str]) -> String {
     let before = place.files("episodes");
     let run = ["--json", "--headless", "--sim", scenario, "--record", "--duration", "500ms", "--task", "t"];
     let output = place.run(&[&run[..], more].concat());
-    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    let code = support::recorded_code(&String::from_utf8_lossy(&output.stdout));
+    assert_eq!(output.status.code(), code, "{}", String::from_utf8_lossy(&output.stderr));
     place.files("episodes").into_iter().find(|name| !before.contains(name)).expect("an episode")
 }
 

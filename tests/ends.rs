@@ -12,9 +12,18 @@ use std::time::{Duration, Instant, SystemTime};
 
 use rustix::process::{Pid, Signal, kill_process};
 use support::terminal::OnTerminal;
-use support::{Episode, PATIENCE, Place, until};
+use support::{Episode, PATIENCE, Place, recorded_code, until};
 
 const RECORD: [&str; 6] = ["--sim", "--headless", "--json", "--record", "--out", "out"];
+
+/// Waits until there is something to be judged in the one episode in `out`.
+fn until_recorded(place: &Place) {
+    const ENOUGH: u64 = 200_000;
+    until("a file with samples", || {
+        let file = place.files("out").pop().and_then(|name| std::fs::metadata(place.path("out").join(name)).ok());
+        file.is_some_and(|file| file.len() >= ENOUGH)
+    });
+}
 
 /// The one episode in `out`, read strictly.
 fn whole_episode(place: &Place, what: &str) -> Episode {
@@ -118,7 +127,7 @@ fn a_panic_in_one_device_is_its_own() {
     let panicked = output().len();
     until("a restart", || output()[panicked..].contains("\"state\":\"streaming\""));
     signal(&child, Signal::INT);
-    assert_eq!(child.wait_with_output().expect("end").status.code(), Some(0));
+    assert_eq!(child.wait_with_output().expect("end").status.code(), recorded_code(&output()));
     whole_episode(&place, "stream");
 }
 
@@ -170,7 +179,8 @@ fn one_interrupt_while_a_run_ends_by_itself_is_not_two() {
     until("a whole file", || place.files("out").iter().any(|file| file.ends_with(".mcap")));
     signal(&child, Signal::INT);
     let ended = child.wait_with_output().expect("end");
-    assert_eq!(ended.status.code(), Some(0), "{}", String::from_utf8_lossy(&ended.stderr));
+    let code = recorded_code(&String::from_utf8_lossy(&ended.stdout));
+    assert_eq!(ended.status.code(), code, "{}", String::from_utf8_lossy(&ended.stderr));
     whole_episode(&place, "ended by itself");
 }
 
@@ -182,7 +192,7 @@ fn a_terminal_that_is_closed_ends_the_run_with_a_whole_file() {
         let place = Place::new();
         let mut run = OnTerminal::start(&place, arguments, "");
         run.read_until(if arguments == monitor { "REC" } else { "recording" });
-        until("a file", || place.files("out").iter().any(|file| file.ends_with(".partial")));
+        until_recorded(&place);
         // Closing the master hangs the terminal up.
         run.master = None;
         until("the end", || run.child.try_wait().expect("wait").is_some());
@@ -278,11 +288,12 @@ fn an_episode_ends_when_asked_however_slowly_its_devices_close() {
         }
         let running = place.start(&arguments, "\"event\":\"recording\"");
         if let Some(signal) = signal {
+            until_recorded(&place);
             running.signal(signal);
         }
-        let (code, _, said) = running.end();
+        let (code, output, said) = running.end();
         let exited = SystemTime::now();
-        assert_eq!(code, Some(0), "{what}: {said}");
+        assert_eq!(code, recorded_code(&output), "{what}: {said}");
         ended_before_its_devices_closed(&place, exited, &what);
     }
 }
@@ -316,5 +327,29 @@ fn the_monitor_ends_an_episode_when_asked_however_slowly_its_devices_close() {
         run.master = None;
         reading.map(std::thread::JoinHandle::join).transpose().expect("the reader ends");
         ended_before_its_devices_closed(&place, exited, what);
+    }
+}
+
+#[test]
+fn a_run_without_a_screen_that_ends_with_a_bad_episode_says_so_with_exit_code_4() {
+    // All devices are registered and none sends: every one is plugged in and silent.
+    const SILENT: &str = "[[device]]\nname = \"motor_state\"\n[[event]]\nat = \"0s\"\nsilence = \"motor_state\"\n";
+    const FINE: &str = "[[device]]\nname = \"motor_state\"\n";
+    for (scenario, screen, expected) in [
+        (SILENT, "--json", Some(4)),
+        (SILENT, "--headless", Some(4)),
+        (FINE, "--json", Some(0)),
+        (FINE, "--headless", Some(0)),
+    ] {
+        let place = Place::new();
+        place.write("play.toml", scenario);
+        let run = ["--sim", "play.toml", "--headless", "--record", "--out", "out", "--duration", "3s"];
+        let more: &[&str] = if screen == "--json" { &["--json"] } else { &[] };
+        let ended = place.run(&[&run[..], more].concat());
+        let (shown, said) = (String::from_utf8_lossy(&ended.stdout), String::from_utf8_lossy(&ended.stderr));
+        assert_eq!(recorded_code(&shown), expected, "{shown}");
+        assert_eq!(ended.status.code(), expected, "{said}");
+        assert_eq!(said.contains("_001.mcap is BAD"), expected == Some(4), "{said}");
+        whole_episode(&place, screen);
     }
 }

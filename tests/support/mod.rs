@@ -203,6 +203,12 @@ pub(crate) fn events(output: &str) -> Vec<serde_json::Value> {
         .collect()
 }
 
+/// The exit code of a headless run that recorded and did what it was asked, by what it printed: 4 if an episode is BAD.
+pub(crate) fn recorded_code(output: &str) -> Option<i32> {
+    let is_bad = output.lines().any(|line| line.contains("\"verdict\":\"BAD\"") || line.starts_with("BAD "));
+    Some(if is_bad { 4 } else { 0 })
+}
+
 /// Texts of the log that hold `words`.
 pub(crate) fn logged<'a>(events: &'a [serde_json::Value], words: &str) -> Vec<&'a str> {
     events.iter().filter_map(|event| event["text"].as_str()).filter(|text| text.contains(words)).collect()
