@@ -204,6 +204,7 @@ pub(crate) fn events(output: &str) -> Vec<serde_json::Value> {
 }
 
 /// The exit code of a headless run that recorded and did what it was asked, by what it printed: 4 if an episode is BAD.
+#[allow(clippy::unnecessary_wraps, reason = "as an exit status gives it")]
 pub(crate) fn recorded_code(output: &str) -> Option<i32> {
     let is_bad = output.lines().any(|line| line.contains("\"verdict\":\"BAD\"") || line.starts_with("BAD "));
     Some(if is_bad { 4 } else { 0 })
