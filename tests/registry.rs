@@ -136,7 +136,7 @@ fn devices_on_the_network_arrive() {
     assert_eq!(lan("lidar").find, fixed("192.168.1.201", Probe::Udp, 2368));
     assert_eq!((lan("lidar").lease.as_secs(), lan("gopro").lease.as_secs()), (1, 3));
     assert_eq!(lan("lidar_asked").find, fixed("fd00::7", Probe::Http, 80));
-    assert_eq!(lan("gopro").protocol, LanProtocol::Gopro { port: 8080, download: true });
+    assert_eq!(lan("gopro").protocol, LanProtocol::Gopro { port: 8080, download: true, reserve: Some(3 << 30) });
     assert_eq!(lan("gopro").find, LanFind::Adapter { host: None });
     assert_eq!(lan("cam_behind_adapter").find, LanFind::Adapter { host: Some(host("10.0.0.2")) });
     let instance = Some("iPhone 15-iPhoneVIO".to_owned());

@@ -27,7 +27,7 @@ use std::time::Duration;
 
 use super::diagnostic::{Diagnostic, RegistryErrors, did_you_mean};
 use super::section::{At, Problems, Section, file_label, read};
-use super::spec::{IdentitySpec, Registry, RigSpec};
+use super::spec::{IdentitySpec, NodeSpec, Registry, RigSpec};
 use super::trust::distrust;
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use device::Draft;
@@ -106,6 +106,11 @@ impl Registry {
         problems.check()?;
         let mut devices: Vec<_> = drafts.into_iter().filter_map(|draft| draft.finish(&verdict)).collect();
         devices.sort_by_key(|device| device.id);
+        for device in &mut devices {
+            if let NodeSpec::Lan(lan) = &mut device.node {
+                lan.keep_free(rig.disk_reserve);
+            }
+        }
         let registry = Self { rig, devices, modules, path: path.map(Path::to_path_buf), text: text.to_owned() };
         Ok(Loaded { registry, warnings })
     }

@@ -47,6 +47,15 @@ const LOOK_FOR_ADDRESS: Duration = Duration::from_millis(200);
 /// An answer that did not come is asked for again.
 const TRIES: u32 = 2;
 
+/// What becomes of the clips.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Clips {
+    /// They are fetched after the episode.
+    pub(super) download: bool,
+    /// `disk_reserve` of the registry, bytes.
+    pub(super) reserve: Option<u64>,
+}
+
 /// See the module's comment.
 #[derive(Debug)]
 pub(super) struct Gopro {
@@ -58,19 +67,19 @@ pub(super) struct Gopro {
 }
 
 impl Gopro {
-    pub(super) async fn open(name: &str, place: &Place, port: u16, download: bool) -> Result<Self, DriverError> {
+    pub(super) async fn open(name: &str, place: &Place, port: u16, clips: Clips) -> Result<Self, DriverError> {
         let place = match place.peer() {
             Some(_) => place.clone(),
             None => place.at(address(place).await?.into()),
         };
-        Self::begin(name, place.server(port)?, download, state_directory(), Pace::USUAL).await
+        Self::begin(name, place.server(port)?, clips, state_directory(), Pace::USUAL).await
     }
 
     /// `state` is the folder of the books.
     async fn begin(
         name: &str,
         server: Server,
-        download: bool,
+        clips: Clips,
         state: Option<PathBuf>,
         pace: Pace,
     ) -> Result<Self, DriverError> {
@@ -83,7 +92,7 @@ impl Gopro {
         let books = Books::open(state.as_deref(), serial.as_deref().unwrap_or(name)).await;
         let (tell, states) = mpsc::channel(4);
         let (told, tasks) = watch::channel(None);
-        let camera = Camera::new(name, server, download, books, tell, pace).await;
+        let camera = Camera::new(name, server, clips, books, tell, pace).await;
         let task = AbortOnDropHandle::new(tokio::spawn(camera.run(tasks)));
         Ok(Self { states, told, task, model: answer::model(&info), payload: Vec::new() })
     }

@@ -74,8 +74,9 @@ impl Lan {
                 Protocol::Mjpeg(mjpeg::Camera::open(&spec.name, server, path, *picture, spec.max_bytes).await?)
             }
             LanProtocol::Udp { port } => Protocol::Udp(udp::Packets::open(place, *port, spec.max_bytes)?),
-            LanProtocol::Gopro { port, download } => {
-                Protocol::Gopro(gopro::Gopro::open(&spec.name, &place, *port, *download).await?)
+            LanProtocol::Gopro { port, download, reserve } => {
+                let clips = gopro::Clips { download: *download, reserve: *reserve };
+                Protocol::Gopro(gopro::Gopro::open(&spec.name, &place, *port, clips).await?)
             }
             LanProtocol::Iphone { port, stream, picture } => {
                 Protocol::Iphone(iphone::Phone::open(&spec.name, place, *port, *stream, *picture, spec.max_bytes)?)

@@ -108,6 +108,8 @@ fn protocol(table: &Section<'_>, word: Word, port: Option<u16>, problems: &mut P
         Word::Gopro => LanProtocol::Gopro {
             port: port.unwrap_or(GOPRO_PORT),
             download: table.flag(problems, "download").unwrap_or(false),
+            // Known when the whole registry is read.
+            reserve: None,
         },
         Word::Iphone => {
             const STREAMS: [(&str, PhoneStream); 2] = [("image", PhoneStream::Image), ("pose", PhoneStream::Pose)];

@@ -39,6 +39,8 @@ pub enum LanProtocol {
         port: u16,
         /// Are its clips fetched after the episode? Default no.
         download: bool,
+        /// `disk_reserve` of the rig, bytes: clips leave as much free, and room for an episode beside it.
+        reserve: Option<u64>,
     },
     /// A phone that connects to us and sends pictures with the camera's pose.
     Iphone {
@@ -152,6 +154,13 @@ impl LanPicture {
 }
 
 impl LanSpec {
+    /// Takes over what the rig says of the disk.
+    pub(in crate::registry) fn keep_free(&mut self, disk_reserve: Option<u64>) {
+        if let LanProtocol::Gopro { reserve, .. } = &mut self.protocol {
+            *reserve = disk_reserve;
+        }
+    }
+
     /// What its samples hold.
     #[must_use]
     pub const fn modality_kind(&self) -> ModalityKind {

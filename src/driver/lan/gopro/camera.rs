@@ -23,7 +23,7 @@ use super::super::place::Server;
 use super::answer::{self, Name, State};
 use super::books::{Before, Books, Shutter};
 use super::clip::{self, Clip, Failure};
-use super::{ANSWER_LIMIT, LARGEST_ANSWER, TRIES, ask};
+use super::{ANSWER_LIMIT, Clips, LARGEST_ANSWER, TRIES, ask};
 use crate::driver::DriverError;
 use crate::time::Stamp;
 
@@ -57,7 +57,7 @@ pub(super) struct Camera {
     name: String,
     server: Server,
     pace: Pace,
-    download: bool,
+    clips: Clips,
     states: mpsc::Sender<Result<State, DriverError>>,
     books: Books,
     /// The shutter in the books is of an earlier connection: whether it still runs is to be seen.
@@ -78,7 +78,7 @@ impl Camera {
     pub(super) async fn new(
         name: &str,
         server: Server,
-        download: bool,
+        clips: Clips,
         books: Books,
         states: mpsc::Sender<Result<State, DriverError>>,
         pace: Pace,
@@ -87,7 +87,7 @@ impl Camera {
             name: name.to_owned(),
             server,
             pace,
-            download,
+            clips,
             states,
             is_inherited: books.shutter().is_some(),
             books,
@@ -98,7 +98,7 @@ impl Camera {
             pending: VecDeque::new(),
             fetching: None,
         };
-        if download {
+        if clips.download {
             camera.inherit().await;
         }
         camera
@@ -303,7 +303,7 @@ impl Camera {
             return;
         }
         tracing::info!(device = self.name, clip = file, folder, size, "recorded");
-        if self.download {
+        if self.clips.download {
             self.books.remember(clip.note_path()).await;
             self.pending.push_back(clip);
         }
@@ -323,7 +323,7 @@ impl Camera {
             return;
         }
         if let Some(clip) = self.pending.front() {
-            let fetching = clip::fetch(clip.clone(), self.server.clone());
+            let fetching = clip::fetch(clip.clone(), self.server.clone(), self.clips.reserve);
             self.fetching = Some(AbortOnDropHandle::new(tokio::spawn(fetching)));
         }
     }

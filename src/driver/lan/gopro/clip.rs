@@ -110,8 +110,8 @@ impl Clip {
     }
 }
 
-/// Fetches the clip, from where an earlier try ended.
-pub(super) async fn fetch(clip: Clip, server: Server) -> Result<(), Failure> {
+/// Fetches the clip, from where an earlier try ended. `reserve` is the registry's `disk_reserve`.
+pub(super) async fn fetch(clip: Clip, server: Server, reserve: Option<u64>) -> Result<(), Failure> {
     let target = clip.target();
     if target.exists() {
         return Ok(());
@@ -122,7 +122,11 @@ pub(super) async fn fetch(clip: Clip, server: Server) -> Result<(), Failure> {
     let mut progress = Progress { device: clip.device.clone(), file: clip.name.file.clone(), told: 0 };
     let (mut failed, mut furthest) = (0, length(&part));
     loop {
-        let error = match attempt(&clip, &server, &part, &mut progress).await {
+        let attempted = async {
+            let part = Part::open(&part, clip.size, reserve).await?;
+            attempt(&clip, &server, part, &mut progress).await
+        };
+        let error = match attempted.await {
             Ok(()) => break,
             Err(Broken::Finally(failure)) => return Err(failure),
             Err(Broken::Off(reason)) => reason,
@@ -156,8 +160,7 @@ fn stays(reason: impl std::fmt::Display) -> Broken {
     Broken::Finally(Failure::Stays(reason.to_string()))
 }
 
-async fn attempt(clip: &Clip, server: &Server, part: &Path, progress: &mut Progress) -> Result<(), Broken> {
-    let mut part = Part::open(part, clip.size).await?;
+async fn attempt(clip: &Clip, server: &Server, mut part: Part, progress: &mut Progress) -> Result<(), Broken> {
     let mut reply = http::get(server, &clip.path(), part.there, HEAD_LIMIT).await.map_err(off)?;
     match reply.status {
         StatusCode::PARTIAL_CONTENT if begins(&reply) == Some(part.there) => {}
@@ -225,11 +228,13 @@ struct Part {
     path: PathBuf,
     /// Bytes that are there.
     there: u64,
+    /// What is to stay free on the disk, if the registry says so.
+    reserve: Option<u64>,
 }
 
 impl Part {
     /// `size` is that of the clip, if it is known: what is longer is of another.
-    async fn open(path: &Path, size: Option<u64>) -> Result<Self, Broken> {
+    async fn open(path: &Path, size: Option<u64>, reserve: Option<u64>) -> Result<Self, Broken> {
         let path = path.to_owned();
         let named = path.display().to_string();
         let open = move || {
@@ -241,7 +246,7 @@ impl Part {
                 return Err(Errno::WOULDBLOCK.into());
             }
             let there = file.metadata()?.len();
-            let mut part = Self { file, path, there };
+            let mut part = Self { file, path, there, reserve };
             if size.is_some_and(|size| part.there > size) {
                 part.truncate()?;
             }
@@ -265,17 +270,17 @@ impl Part {
 
     /// Is there room on the disk for so many bytes more?
     fn has_room(&self, bytes: u64) -> Result<(), Broken> {
-        full(&self.file, bytes).map_or(Ok(()), |full| Err(stays(full)))
+        full(&self.file, bytes, self.reserve).map_or(Ok(()), |full| Err(stays(full)))
     }
 
     /// Writes what follows; the emptied block comes back.
     async fn write(self, mut block: Vec<u8>, is_last: bool) -> Result<(Self, Vec<u8>), Broken> {
         let named = self.path.display().to_string();
         let write = move || {
-            let Self { file, path, there } = self;
+            let Self { file, path, there, reserve } = self;
             let bytes = block.len() as u64;
             // Recordings eat the same disk.
-            if let Some(full) = full(&file, bytes) {
+            if let Some(full) = full(&file, bytes, reserve) {
                 return Err(io::Error::other(full));
             }
             file.write_all_at(&block, there)?;
@@ -283,19 +288,23 @@ impl Part {
             if is_last {
                 file.sync_all()?;
             }
-            Ok((Self { file, path, there: there.saturating_add(bytes) }, block))
+            Ok((Self { file, path, there: there.saturating_add(bytes), reserve }, block))
         };
         let written = tokio::task::spawn_blocking(write).await.map_err(off)?;
         written.map_err(|error| stays(format_args!("{named}: {error}")))
     }
 }
 
-/// Why so many bytes more do not fit on the disk of `file`; `None` if they do, or the disk does not say. The room that the
-/// registry may reserve for episodes is not known here: it is that of a rig which says nothing.
-fn full(file: &File, bytes: u64) -> Option<String> {
-    let disk = Disk::of(file).ok().filter(|disk| disk.lacks_room_beside_an_episode(bytes, None))?;
-    let (wanted, free, kept) = (bytes.div_ceil(1 << 20), disk.free >> 20, (2 * disk.reserve(None)) >> 20);
-    Some(format!("{wanted} MB do not fit on the disk: {free} MB are free, and {kept} MB of them are kept for episodes"))
+/// Why so many bytes more do not fit on the disk of `file`; `None` if they do, or the disk does not say. Episodes keep
+/// their room: twice the registry's `disk_reserve`, as an episode that comes near the reserve is warned of.
+fn full(file: &File, bytes: u64, reserve: Option<u64>) -> Option<String> {
+    let disk = Disk::of(file).ok().filter(|disk| disk.lacks_room_beside_an_episode(bytes, reserve))?;
+    let (wanted, free) = (bytes.div_ceil(1 << 20), disk.free >> 20);
+    let kept = disk.reserve(reserve).saturating_mul(2) >> 20;
+    Some(format!(
+        "{wanted} MB do not fit on the disk: {free} MB are free, and {kept} MB are kept for episodes (disk_reserve under \
+         [rig]); remove or move recordings"
+    ))
 }
 
 fn announced(reply: &Reply) -> Option<u64> {

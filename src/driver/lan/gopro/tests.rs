@@ -57,14 +57,14 @@ async fn a_clip_is_fetched_on_from_where_it_broke_off() {
     let bytes: Vec<u8> = (0..3_u32 << 20).map(|index| index.to_le_bytes()[1]).collect();
     let (server, asked) = camera(bytes.clone(), 2).await;
     let clip = clip_in(folder.path());
-    clip::fetch(clip.clone(), server.clone()).await.expect("fetched");
+    clip::fetch(clip.clone(), server.clone(), None).await.expect("fetched");
     assert!(std::fs::read(clip.target()).expect("the clip") == bytes, "the clip is another");
     assert_eq!(asked.load(Ordering::Relaxed), 3);
     let files: Vec<_> =
         std::fs::read_dir(folder.path()).expect("a folder").flatten().map(|file| file.file_name()).collect();
     assert_eq!(files, ["ep_001.gopro.GX010001.MP4"], "nothing is left over");
     // What is there is not asked for again.
-    clip::fetch(clip, server).await.expect("there");
+    clip::fetch(clip, server, None).await.expect("there");
     assert_eq!(asked.load(Ordering::Relaxed), 3);
 }
 
@@ -72,7 +72,7 @@ async fn a_clip_is_fetched_on_from_where_it_broke_off() {
 async fn a_camera_that_always_breaks_off_is_given_up_and_what_came_is_kept() {
     let (server, _) = camera(vec![7], usize::MAX).await;
     let folder = tempfile::tempdir().expect("a folder");
-    let failed = clip::fetch(clip_in(folder.path()), server).await.expect_err("half of one byte never comes");
+    let failed = clip::fetch(clip_in(folder.path()), server, None).await.expect_err("half of one byte never comes");
     assert!(matches!(failed, Failure::Stays(_)), "{failed:?}");
     assert!(folder.path().join("ep_001.gopro.GX010001.MP4.partial").exists());
     assert!(!folder.path().join("ep_001.gopro.GX010001.MP4").exists());
@@ -294,7 +294,9 @@ impl Bench {
     async fn open(&mut self) {
         self.gopro = None;
         let state = Some(self.folder.path().join("state"));
-        let gopro = Gopro::begin("gopro", self.server.clone(), self.download, state, QUICK).await;
+        let gopro =
+            Gopro::begin("gopro", self.server.clone(), Clips { download: self.download, reserve: None }, state, QUICK)
+                .await;
         self.gopro = Some(gopro.expect("open"));
     }
 
@@ -485,7 +487,7 @@ async fn fetched(head: &'static str, size: Option<u64>, there: &[u8]) -> (Result
     let clip = Clip::new(named(1), size, folder.path().join("ep_001.mcap"), "gopro");
     let part = clip.target().with_extension("MP4.partial");
     std::fs::write(&part, there).expect("written");
-    let fetched = clip::fetch(clip.clone(), server).await;
+    let fetched = clip::fetch(clip.clone(), server, None).await;
     (fetched, std::fs::read(clip.target()).or_else(|_| std::fs::read(part)).unwrap_or_default())
 }
 
@@ -528,9 +530,23 @@ async fn a_clip_is_fetched_by_one_at_a_time() {
     let clip = clip_in(folder.path());
     let held = std::fs::File::create(clip.target().with_extension("MP4.partial")).expect("a file");
     rustix::fs::flock(&held, rustix::fs::FlockOperation::LockExclusive).expect("held");
-    let failed = clip::fetch(clip.clone(), server.clone()).await.expect_err("held by another");
+    let failed = clip::fetch(clip.clone(), server.clone(), None).await.expect_err("held by another");
     assert!(matches!(failed, Failure::Stays(_)), "{failed:?}");
     assert_eq!(asked.load(Ordering::Relaxed), 0);
     drop(held);
-    clip::fetch(clip, server).await.expect("fetched");
+    clip::fetch(clip, server, None).await.expect("fetched");
+}
+
+#[tokio::test]
+async fn a_clip_leaves_the_room_free_that_the_registry_reserves() {
+    let (server, _) = camera(CLIP.to_vec(), 0).await;
+    let folder = tempfile::tempdir().expect("a folder");
+    let clip = clip_in(folder.path());
+    // More than any disk has.
+    let failed = clip::fetch(clip.clone(), server.clone(), Some(1 << 62)).await.expect_err("no room");
+    let Failure::Stays(reason) = failed else { panic!("{failed:?}") };
+    assert!(reason.contains("kept for episodes (disk_reserve under [rig])"), "{reason}");
+    assert!(!clip.target().exists());
+    clip::fetch(clip.clone(), server, Some(0)).await.expect("room enough");
+    assert_eq!(std::fs::read(clip.target()).expect("the clip"), CLIP);
 }
