@@ -204,6 +204,9 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     let hotplug: HotplugStream = match options.devices {
         Devices::Machine => {
             driver::can::prepare(&registry);
+            if !Path::new(UDEV).exists() {
+                tracing::warn!("no udev runs here ({UDEV} is missing): USB devices are not seen; start systemd-udevd");
+            }
             match LanMonitor::open(&registry) {
                 Some(lan) => Box::pin(futures::stream::select(UdevMonitor::open()?, lan)),
                 None => Box::pin(UdevMonitor::open()?),
@@ -275,6 +278,8 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     finish(running, conductor, outcome).await
 }
 
+/// Made by udev's daemon when it starts.
+const UDEV: &str = "/run/udev/control";
 /// The screen has limits of its own for a reader that does not read. This one is for a screen that is
 /// stuck: crossterm 0.29 reads without end from a terminal that was hung up at the wrong moment.
 const LAST_OUTPUT: Duration = Duration::from_secs(10);

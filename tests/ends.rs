@@ -353,3 +353,15 @@ fn a_run_without_a_screen_that_ends_with_a_bad_episode_says_so_with_exit_code_4(
         whole_episode(&place, screen);
     }
 }
+
+#[test]
+fn a_run_without_any_device_says_so() {
+    for (plugged, expected) in [("false", 1), ("true", 0)] {
+        let place = Place::new();
+        place.write("play.toml", &format!("[[device]]\nname = \"motor_state\"\nplugged = {plugged}\n"));
+        let ended = place.run(&["--sim", "play.toml", "--headless", "--json", "--duration", "5s"]);
+        let events = support::events(&String::from_utf8_lossy(&ended.stdout));
+        let said = support::logged(&events, "no device of the registry is plugged in");
+        assert_eq!((said.len(), ended.status.code()), (expected, Some(0)), "{said:?}");
+    }
+}

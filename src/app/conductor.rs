@@ -16,7 +16,7 @@ use super::{AppError, Asked, Running, Screen, policy_ended, screen};
 use crate::bus;
 use crate::fault;
 use crate::record::{EpisodeRequest, RecordError, Recorder};
-use crate::status::{Board, EpisodeEnd, Event, SlotState, What};
+use crate::status::{Board, EpisodeEnd, Event, Level, SlotState, What};
 use crate::time::Stamp;
 
 /// An episode asked for at the start begins when every attached device delivers, at the latest
@@ -27,6 +27,8 @@ const SETTLE_LEAST: Duration = Duration::from_millis(100);
 /// How often it is looked whether they deliver.
 const SETTLE_LOOK: Duration = Duration::from_millis(20);
 
+/// That no device is plugged in is said after this time.
+const NONE_AFTER: Duration = Duration::from_secs(3);
 /// The last samples of an episode have this long to arrive: the longest `latency` of a device is a second.
 const LAST_SAMPLES: Duration = Duration::from_secs(2);
 
@@ -53,6 +55,7 @@ impl Conductor {
             (false, Some(duration)) => Some(begun + duration),
             _ => None,
         };
+        let mut looked = false;
         // Nobody reads the output any more, and how that came.
         let mut output = Ok(());
         let mut bus_lost = pin!(bus::lost());
@@ -97,7 +100,20 @@ impl Conductor {
                     }
                 }
                 () = sleep_until(end.unwrap_or(begun)), if end.is_some() => return output,
+                () = sleep_until(begun + NONE_AFTER), if !looked => {
+                    looked = true;
+                    self.say_if_none();
+                }
             }
+        }
+    }
+
+    /// A run that waits for its first device looks like one that works.
+    fn say_if_none(&self) {
+        let devices = self.board.snapshot().devices;
+        if !devices.is_empty() && devices.iter().all(|device| device.state == SlotState::Absent) {
+            let text = "no device of the registry is plugged in; `rapid devices` lists what is, and which entry it is";
+            self.board.announce(What::Log { level: Level::Warn, text: text.to_owned() });
         }
     }
 
