@@ -61,7 +61,8 @@ pub fn dispatch(cli: Cli) -> ExitCode {
         Err(Failure::Output(error)) if error.kind() == io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
         Err(failure) => {
             // Paths and what a library says of a file are text of strangers.
-            let text: Vec<_> = failure.to_string().lines().map(|line| text::plain(line).into_owned()).collect();
+            let said = failure::with_cause(failure.to_string());
+            let text: Vec<_> = said.lines().map(|line| text::plain(line).into_owned()).collect();
             let text = text.join("\n");
             if !text.is_empty() {
                 let said = format!("{} {text}\n", stderr_palette().bad("error:"));

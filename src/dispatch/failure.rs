@@ -141,3 +141,39 @@ impl Failure {
         }
     }
 }
+
+/// What the failure says, with its cause where that is a limit of this process: whatever could not be opened then is not
+/// what is wrong.
+pub(super) fn with_cause(text: String) -> String {
+    // EMFILE and ENFILE, as the standard library words them.
+    if text.contains("(os error 24)") {
+        let limit = rustix::process::getrlimit(rustix::process::Resource::Nofile).current;
+        let limit = limit.map_or_else(String::new, |limit| format!(" of {limit} open files"));
+        return format!("the limit{limit} is reached; raise it (`ulimit -n 4096`, or LimitNOFILE= in the unit)");
+    }
+    if text.contains("(os error 23)") {
+        return "this machine has too many files open (sysctl fs.file-max): end what opens them, or raise the limit"
+            .to_owned();
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::folder::FolderError;
+
+    #[test]
+    fn a_limit_that_is_reached_is_named_and_not_the_file_that_was_opened_then() {
+        let of = |code| {
+            let error = io::Error::from_raw_os_error(code);
+            let folder = FolderError::Io { path: PathBuf::from("out"), error };
+            with_cause(Failure::Folder(RecordError::Folder(folder)).to_string())
+        };
+        let said = of(24);
+        assert!(said.contains("open files is reached") && said.contains("ulimit -n"), "{said}");
+        assert!(said.contains("LimitNOFILE=") && !said.contains("--out"), "{said}");
+        assert!(of(23).contains("fs.file-max"), "{}", of(23));
+        assert!(of(13).contains("--out") && of(13).contains("Permission denied"), "{}", of(13));
+    }
+}
