@@ -9,8 +9,13 @@
 set -euo pipefail
 [[ $# -ge 1 ]] || { echo "usage: leftovers.sh COMMAND..." >&2; exit 2; }
 
-# Files of ours in places that others use as well, one path a line.
-shared() { find /dev/shm /tmp/iceoryx2 \( -type f -o -type s -o -type p -o -type l \) \( -path '*/iox2_*' -o -name 'rapid*' -o -name 'test-*' \) 2>/dev/null | sort || true; }
+# What is ours in places that others use as well, one path a line. The bus names folders of its own by numbers alone.
+shared() {
+    {
+        find /dev/shm -mindepth 1 -maxdepth 1 \( -name 'iox2_*' -o -name 'rapid*' \) || true
+        find /tmp/iceoryx2 -mindepth 1 ! -path /tmp/iceoryx2/nodes ! -path /tmp/iceoryx2/services || true
+    } 2>/dev/null | sort
+}
 
 in_use() {
     grep -qsF -- " $1" /proc/[0-9]*/maps && return 0

@@ -45,11 +45,34 @@ pub(crate) struct Place {
     pub(crate) instance: String,
 }
 
-/// What a run that was killed left behind is no use to another test.
+/// A run that was killed leaves what it had in shared memory, and no test leaves it to the next run.
 impl Drop for Place {
     fn drop(&mut self) {
         for file in self.shared_memory() {
             let _ = std::fs::remove_file(Path::new("/dev/shm").join(file));
+        }
+        let mask = self.mask_file();
+        for file in [mask.with_extension(format!("{}.json", self.instance)), mask] {
+            let _ = std::fs::remove_file(file);
+        }
+        sweep(Path::new(BUS_FILES), &format!("iox2_{}_", self.instance));
+    }
+}
+
+/// Where iceoryx2 keeps the files of nodes and services.
+const BUS_FILES: &str = "/tmp/iceoryx2";
+
+/// Removes files whose name begins so from a folder and those in it, and the folders that held nothing else.
+fn sweep(folder: &Path, prefix: &str) {
+    for path in std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path()) {
+        if path.is_dir() {
+            sweep(&path, prefix);
+        } else if path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(prefix)) {
+            let _ = std::fs::remove_file(&path);
+            // A folder of others' files stays, and so does that of all services.
+            if folder.parent().is_some_and(|parent| parent.ends_with("nodes")) {
+                let _ = std::fs::remove_dir(folder);
+            }
         }
     }
 }

@@ -29,7 +29,8 @@ const PERIOD: Duration = Duration::from_micros(16_667);
 const WARM_UP: Duration = Duration::from_millis(500);
 
 pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
-    let length = bench.length(10, 2);
+    // Beyond the warm-up, and beyond what a busy machine needs to begin.
+    let length = bench.length(10, 2).max(Duration::from_secs(2));
     let (mut alone, mut bare, mut loaded) = (Vec::new(), Vec::new(), Vec::new());
     for run in 0..bench.runs {
         bench.progress(&format!("frame: run {} of {}", run + 1, bench.runs));
@@ -198,7 +199,7 @@ fn one_camera(bench: &Bench, length: Duration) -> Result<Sorted, Failure> {
 
 fn full_load(bench: &Bench, length: Duration) -> Result<Sorted, Failure> {
     let (registry, scenario) = feed::rig()?;
-    let passed = play(bench, &registry, move || Box::pin(Script::new(scenario)), length)?;
+    let passed = play(bench, &registry, move || Box::pin(Script::new(scenario)), WARM_UP + length)?;
     let state = registry.named("state").map(|spec| TopicId::Modality(spec.id));
     Ok(delays(&passed, |topic| topic != TopicId::Mask && Some(topic) != state))
 }
