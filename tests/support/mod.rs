@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 /// How long a condition may take to come true before a test gives up. It is no requirement: a slow
 /// machine only makes the test slow.
-pub(crate) const PATIENCE: Duration = Duration::from_mins(1);
+pub(crate) const PATIENCE: Duration = Duration::from_mins(3);
 
 /// Waits for a condition.
 pub(crate) fn until(what: &str, mut holds: impl FnMut() -> bool) {

@@ -22,7 +22,7 @@ use vbench::emu::order::Order;
 use vbench::emu::told::Told;
 
 /// The longest that something is waited for.
-pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
+pub(crate) const PATIENCE: Duration = Duration::from_mins(2);
 
 /// An adapter with motors behind it. Dropped, it is pulled out.
 pub(crate) struct Adapter {
