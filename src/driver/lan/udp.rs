@@ -169,7 +169,7 @@ fn bind(place: &Place, port: u16) -> io::Result<OwnedFd> {
         set_bytes(&socket, libc::SO_BINDTODEVICE, interface.as_bytes())?;
     }
     let port = port.to_be();
-    #[expect(clippy::cast_possible_truncation, reason = "2 and 10")]
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "2 and 10")]
     let family = family as libc::sa_family_t;
     let result = match own.ip() {
         IpAddr::V6(own) => {

@@ -96,7 +96,7 @@ fn rule(device: &DeviceSpec, usb: &UsbSpec, identity: &str) -> String {
     )
 }
 
-/// Brings up the CAN interface of a unit when it is plugged in. Not every driver returns from bus-off by itself, gs_usb
+/// Brings up the CAN interface of a unit when it is plugged in. Not every driver returns from bus-off by itself, `gs_usb`
 /// among them: the kernels of today (seen with 6.1.192) refuse the whole command that asks for it ("Device doesn't
 /// support restart from Bus Off"). So that command is one of its own, and its failure leaves the other to be run.
 fn bring_up(usb: &UsbSpec, identity: &str, bitrate: u32) -> String {

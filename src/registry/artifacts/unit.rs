@@ -14,6 +14,8 @@
 //!   name are in `/proc/sys`.
 //! * `RestrictRealtime`: the thread that publishes the mask runs with real-time priority.
 
+use std::collections::BTreeSet;
+
 use super::HEADER;
 use crate::registry::spec::{CanAdapter, NodeSpec, Opens, Registry};
 
@@ -21,14 +23,10 @@ use crate::registry::spec::{CanAdapter, NodeSpec, Opens, Registry};
 pub const SYSTEM_REGISTRY: &str = "/etc/rapid/devices.toml";
 
 /// What the entries of a registry need of the system.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Default)]
 struct Needs {
-    /// Sockets on CAN interfaces. A CAN adapter on a serial line has none.
-    can: bool,
-    /// Sockets of IPv4.
-    inet: bool,
-    /// Sockets of IPv6.
-    inet6: bool,
+    /// Kinds of sockets, besides those of udev, the journal and programs. A CAN adapter on a serial line has none.
+    sockets: BTreeSet<&'static str>,
     /// A program opens the USB device itself.
     usb: bool,
     /// Programs of others run: nodes and hooks.
@@ -40,44 +38,40 @@ impl Needs {
         let mut needs = Self::default();
         for device in &registry.devices {
             match &device.node {
-                NodeSpec::Can(can) => needs.can |= can.adapter == CanAdapter::SocketCan,
+                NodeSpec::Can(can) if can.adapter == CanAdapter::SocketCan => {
+                    needs.sockets.insert("AF_CAN");
+                }
                 NodeSpec::Lan(lan) => {
-                    let [inet, inet6] = lan.find.families();
-                    needs.inet |= inet;
-                    needs.inet6 |= inet6;
+                    let families = ["AF_INET", "AF_INET6"].into_iter().zip(lan.find.families());
+                    needs.sockets.extend(families.filter(|(_, is_needed)| *is_needed).map(|(family, _)| family));
                 }
                 NodeSpec::Process(process) => {
                     needs.programs = true;
                     needs.usb |= process.opens == Opens::Usb;
                 }
-                NodeSpec::Camera(_) | NodeSpec::Serial(_) => {}
+                NodeSpec::Can(_) | NodeSpec::Camera(_) | NodeSpec::Serial(_) => {}
             }
             needs.programs |= !device.hooks.is_empty();
         }
         needs
     }
 
-    /// `RestrictAddressFamilies=`: udev speaks netlink, the journal and programs AF_UNIX.
-    fn families(self) -> String {
-        let wanted = [(self.can, " AF_CAN"), (self.inet, " AF_INET"), (self.inet6, " AF_INET6")];
-        let wanted: String = wanted.iter().filter(|(is_wanted, _)| *is_wanted).map(|(_, family)| *family).collect();
-        format!("AF_UNIX AF_NETLINK{wanted}")
+    /// `RestrictAddressFamilies=`: udev speaks netlink, the journal and programs `AF_UNIX`.
+    fn families(&self) -> String {
+        let all = ["AF_UNIX", "AF_NETLINK"].into_iter().chain(self.sockets.iter().copied());
+        all.collect::<Vec<_>>().join(" ")
     }
 
     /// Settings that only some registries permit, a line each.
-    fn only_without(self) -> String {
-        let mut lines = String::new();
-        if !self.inet && !self.inet6 {
-            lines.push_str("IPAddressDeny=any\n");
-        }
-        if self.programs {
-            lines.push_str(PROGRAMS);
-        } else {
-            lines.push_str("MemoryDenyWriteExecute=yes\n");
-        }
-        lines
+    fn only_without(&self) -> String {
+        let network = if self.sockets.iter().any(|family| family.starts_with("AF_INET")) { "" } else { NO_NETWORK };
+        let programs = if self.programs { PROGRAMS } else { "MemoryDenyWriteExecute=yes\n" };
+        format!("{network}{programs}")
     }
 }
+
+/// Of a unit without sockets for the network.
+const NO_NETWORK: &str = "IPAddressDeny=any\n";
 
 /// What whoever has programs of their own should know.
 const PROGRAMS: &str = "\
