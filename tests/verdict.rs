@@ -45,6 +45,7 @@ fn good(place: &Place) -> String {
     place.write("devices.toml", DEVICES);
     let run = ["--json", "--headless", "--sim", "--record", "--duration", "1s", "--task", "t", "--tag", "finger=a"];
     // On a busy machine an episode may be SUSPECT with reason: another is recorded.
+    let mut reasons = Vec::new();
     for _ in 0..20 {
         let output = place.run(&run);
         let said = events(&String::from_utf8_lossy(&output.stdout));
@@ -53,9 +54,9 @@ fn good(place: &Place) -> String {
             let file = Path::new(end["file"].as_str().expect("a name"));
             return file.file_name().expect("a name").to_string_lossy().into_owned();
         }
-        println!("recorded again: {}", end["reasons"]);
+        reasons.push(end["reasons"].to_string());
     }
-    panic!("no good episode");
+    panic!("no good episode: {reasons:?}");
 }
 
 /// What a file becomes: its name says what was done.
