@@ -71,7 +71,7 @@ Exit codes: 0 done, 1 failed while running, 2 bad configuration or arguments,
 const RECOVER: &str = "\
 A run that may record does this by itself, in the background, for what it finds in its --out folder.
 
-X.mcap.partial becomes X.mcap, and is kept as X.mcap.damaged if not all of it could be read. \
+X.mcap.partial becomes X.mcap, and is kept as X.mcap.damaged if anything of it was left out. \
 Of a cut or damaged X.mcap a whole X.recovered.mcap is made beside it. A file being written is left alone.
 
 Examples:

@@ -44,6 +44,7 @@ const LAYERS: &[&[&str]] = &[
 const SIDEWAYS: &[(&str, &[&str])] = &[
     ("status", &["registry", "text"]),
     ("control", &["registry"]),
+    ("episode_format", &["text"]),
     ("app", &["tui", "headless", "logging"]),
     // Without a screen the log is lines among the lines of the run.
     ("logging", &["headless"]),
@@ -88,7 +89,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("rustix", &["time", ABOVE_NOUNS]),
     ("serde", &[ANYWHERE]),
     ("serde_json", &[ABOVE_NOUNS]),
-    ("sha2", &["policy/bundle"]),
+    ("sha2", &["policy/bundle", "record/recover"]),
     ("socketcan", &["driver/can"]),
     ("strsim", &["registry"]),
     ("thiserror", &[ANYWHERE]),

@@ -14,7 +14,6 @@ pub mod tape;
 mod wire;
 
 use std::fs::File;
-use std::io::BufReader;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -174,7 +173,7 @@ struct Batch {
 /// Reads the file, on the blocking pool.
 #[derive(Debug)]
 struct Reader {
-    messages: Messages<BufReader<File>>,
+    messages: Messages<File>,
     begin_ns: u64,
 }
 

@@ -6,16 +6,26 @@
 //! Invariant: no bytes make anything here panic, and memory holds one record of a file at a time.
 
 mod chunk;
+mod ends;
 mod header;
+mod index;
+mod names;
+pub(crate) mod op;
+mod resync;
+mod source;
+mod structure;
 #[cfg(test)]
 pub(crate) mod testing;
 #[cfg(test)]
 mod tests;
 pub(crate) mod walk;
+mod walked;
+mod whole;
 pub(crate) mod wire;
 
 pub(crate) use chunk::is_sound;
 pub(crate) use header::Writer;
+pub(crate) use source::ReadAt;
 
 use std::fs::File;
 use std::io;
@@ -37,6 +47,18 @@ pub(crate) const ABOUT: &str = "rapid";
 pub(crate) const SUMMARY: &str = "rapid/summary";
 /// Metadata record of an episode that was repaired.
 pub(crate) const RECOVERED: &str = "rapid/recovered";
+
+/// Attachment of an episode: its channels and schemas once more, as records, for a file whose first chunk is damaged.
+pub(crate) const CHANNELS: &str = "rapid/channels";
+/// Key of [`ABOUT`]: the boot of the machine in which the episode was recorded.
+pub(crate) const BOOT_ID: &str = "boot_id";
+
+/// The present boot of this machine (proc(5)): within one boot the kernel keeps the order of writes, whatever becomes
+/// of the processes. `None` where the system does not say.
+pub(crate) fn boot_id() -> Option<String> {
+    let text = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").ok()?;
+    Some(text.trim().to_owned()).filter(|id| !id.is_empty())
+}
 
 /// Why a file cannot be opened to be read.
 #[derive(Debug, thiserror::Error)]

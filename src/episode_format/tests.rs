@@ -1,18 +1,19 @@
 //! Files that were made to break a reader.
 
+use super::op;
 use super::testing::{episode, layouts, mutated, mutations};
-use super::walk::{FileEnd, MAGIC, Trust, Walk, Walked, op, walk};
+use super::walk::{FileEnd, MAGIC, Walk, Walked, walk};
 use proptest::prelude::*;
 
-/// A record's opcode, content, and what it is worth.
-type Shown = (u8, Vec<u8>, Trust);
+/// A record's opcode and content.
+type Shown = (u8, Vec<u8>);
 
 /// The records of `bytes`, and what the walk found.
 fn walked(bytes: &[u8]) -> Option<(Vec<Shown>, Walked)> {
     let mut walk = Walk::new(bytes, bytes.len() as u64).unwrap()?;
     let mut records = Vec::new();
     while let Some(record) = walk.next().unwrap() {
-        records.push((record.opcode, record.data.to_vec(), record.trust));
+        records.push((record.opcode, record.data.to_vec()));
     }
     Some((records, walk.walked()))
 }
@@ -43,7 +44,7 @@ fn a_whole_file_is_sound_and_every_flipped_bit_of_it_is_noticed() {
         let bytes = episode(options);
         let (whole, found) = walked(&bytes).unwrap();
         assert!(found.sound && found.end == FileEnd::Finished && found.bytes == bytes.len() as u64);
-        assert_eq!(whole.iter().filter(|(opcode, ..)| *opcode == op::MESSAGE).count(), 200);
+        assert_eq!(whole.iter().filter(|(opcode, _)| *opcode == op::MESSAGE).count(), 200);
         for at in 0..bytes.len() {
             let mut flipped = bytes.clone();
             flipped[at] ^= 1 << (at % 8);
@@ -84,7 +85,7 @@ fn lengths_that_are_no_lengths_take_no_memory() {
             let (records, found) = walked(&bytes).unwrap();
             assert!(records.is_empty() && found.end != FileEnd::Finished);
             // A file that says it is as long as that, and is not.
-            assert!(walk(&mut &*bytes, u64::MAX, &mut |_, _| ()).unwrap().is_some());
+            assert!(walk(&*bytes, u64::MAX, None, &mut |_, _| ()).unwrap().is_some());
         }
         for compression in ["", "zstd", "lz4", "none"] {
             let (records, found) = walked(&file(&[chunk(compression, length, 0, b"little")])).unwrap();
@@ -112,20 +113,56 @@ fn chunks_in_chunks_and_chunks_of_nothing_are_passed_over() {
     }
     let (records, found) = walked(&file(&[inner, chunk("", 0, 0, b""), record(op::CHUNK, b"")])).unwrap();
     // The outermost is opened; nobody asks for chunks.
-    assert_eq!(records.iter().map(|(opcode, ..)| *opcode).collect::<Vec<_>>(), [op::CHUNK]);
+    assert_eq!(records.iter().map(|(opcode, _)| *opcode).collect::<Vec<_>>(), [op::CHUNK]);
     assert_eq!((found.damaged_chunks, found.end), (1, FileEnd::Unfinished));
 }
 
 #[test]
 fn attachments_and_private_records_are_shown_and_text_that_is_none_is_not_trusted() {
-    let bytes = file(&[record(op::ATTACHMENT, b"a"), record(0x85, b"mine"), chunk("\u{fffd}", 0, 0, b"")]);
+    let bytes = file(&[record(op::ATTACHMENT, &[0; 36]), record(0x85, b"mine"), chunk("\u{fffd}", 0, 0, b"")]);
     let mut bytes = bytes;
     // The name of the compression is no UTF-8.
     let at = bytes.windows(3).position(|window| window == "\u{fffd}".as_bytes()).unwrap();
     bytes[at] = 0xff;
     let (records, found) = walked(&bytes).unwrap();
-    assert_eq!(records.iter().map(|(opcode, ..)| *opcode).collect::<Vec<_>>(), [op::ATTACHMENT, 0x85]);
+    assert_eq!(records.iter().map(|(opcode, _)| *opcode).collect::<Vec<_>>(), [op::ATTACHMENT, 0x85]);
     assert_eq!(found.damaged_chunks, 1);
+}
+
+#[test]
+fn a_file_without_a_summary_is_whole() {
+    for options in layouts() {
+        let options = options.emit_statistics(false).emit_summary_offsets(false).emit_chunk_indexes(false);
+        let options = options.emit_attachment_indexes(false).emit_metadata_indexes(false);
+        let bytes = episode(options.repeat_channels(false).repeat_schemas(false));
+        let footer = &bytes[bytes.len() - 28..];
+        assert_eq!(footer[..8], [0; 8], "a summary");
+        let (_, found) = walked(&bytes).unwrap();
+        assert!(found.sound && found.end == FileEnd::Finished, "{found:?}");
+    }
+}
+
+#[test]
+fn what_is_decompressed_of_a_file_is_bounded_by_its_size() {
+    let channel = [&[1, 0, 0, 0, 2, 0, 0, 0][..], b"/a", &[0; 8]].concat();
+    let mut records = vec![record(op::CHANNEL, &channel)];
+    // Times and numbers differ, or they were one chunk many times.
+    for number in 0..9_u8 {
+        let message = [&[1, 0, number, 0, 0, 0, number, 0, 0, 0, 0, 0, 0, 0][..], &vec![0; 60 << 20]].concat();
+        let message = record(op::MESSAGE, &message);
+        let packed = zstd::encode_all(&message[..], 0).unwrap();
+        records.push(chunk("zstd", message.len() as u64, crc32fast::hash(&message), &packed));
+    }
+    let bytes = file(&records);
+    assert!(bytes.len() < 100_000);
+    let mut walk = Walk::new(&*bytes, bytes.len() as u64).unwrap().unwrap();
+    let mut shown = 0;
+    while let Some(record) = walk.next().unwrap() {
+        shown += record.data.len();
+    }
+    let found = walk.walked();
+    println!("{} bytes, {shown} shown, {} chunks left out", bytes.len(), found.left_out.swollen_chunks);
+    assert_eq!((shown >> 20, found.left_out.swollen_chunks, found.sound), (240, 5, false));
 }
 
 #[test]

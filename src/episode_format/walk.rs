@@ -1,126 +1,113 @@
-//! Walking through an MCAP file from its beginning, whole or not.
+//! Walking through an MCAP file from its beginning to its end, whole or not.
 //!
 //! Format: <https://mcap.dev/spec>. The framing is read here and not by the `mcap` crate's readers
 //! because those panic on some damaged files (mcap 0.26: an inner record longer than its chunk, an
 //! attachment shorter than its check value, an index that names another record) and keep in memory
-//! as many chunks as an index calls overlapping, and because what a torn chunk still holds is worth
-//! having.
+//! as many chunks as an index calls overlapping, and because what lies behind damage is worth having.
+//!
+//! Where something is no record, reading continues behind it: see `resync`.
 //!
 //! Invariant: no file makes anything here panic.
+//! Invariant: every message of every chunk whose check value is right is shown, once, if its channel is known; of
+//! a damaged chunk nothing is shown. What is left out is counted in [`Walked`].
 //! Invariant: memory holds one record of the file at a time, a chunk of at most [`MAX_RECORD`], as it
-//! is and decompressed.
+//! is and decompressed, and the head of every chunk.
+//! Invariant: work is bounded by the size of the file, also that of decompressing.
 
-use std::io::{self, Read};
-use std::ops::Range;
+use std::collections::{BTreeMap, BTreeSet};
+use std::io;
 
-use super::chunk::Opened;
-use super::header::{self, Writer};
+use super::chunk::{Records, take};
+use super::header;
+use super::index::Index;
+use super::names::Names;
+use super::source::{ReadAt, Source};
+use super::structure::{Fit, is_known};
 use super::wire::Fields;
+use super::{ABOUT, BOOT_ID};
 
-/// Opcodes: <https://mcap.dev/spec#records>.
-pub(crate) mod op {
-    pub(crate) const HEADER: u8 = 0x01;
-    pub(crate) const FOOTER: u8 = 0x02;
-    pub(crate) const SCHEMA: u8 = 0x03;
-    pub(crate) const CHANNEL: u8 = 0x04;
-    pub(crate) const MESSAGE: u8 = 0x05;
-    pub(crate) const CHUNK: u8 = 0x06;
-    pub(crate) const ATTACHMENT: u8 = 0x09;
-    pub(crate) const METADATA: u8 = 0x0c;
-    pub(crate) const DATA_END: u8 = 0x0f;
-    /// From here on opcodes are private.
-    pub(crate) const PRIVATE: u8 = 0x80;
-}
+pub(crate) use super::op;
+pub use super::walked::{FileEnd, LeftOut};
+pub(crate) use super::walked::{Record, Walked, walk};
 
 /// At the beginning of a file and at its end.
 pub(crate) const MAGIC: [u8; 8] = *b"\x89MCAP0\r\n";
 /// Largest record that is read: more is taken for a damaged length. A 4K raw picture has 16 MiB.
 pub(crate) const MAX_RECORD: u64 = 256 << 20;
 /// An opcode, and the length of what follows as u64.
-const HEAD: u64 = 9;
+pub(super) const HEAD: u64 = 9;
 /// Bytes read at once of what is passed over.
 const PIECE: u64 = 64 << 10;
-
-/// How a file ends.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum FileEnd {
-    /// With its footer: the recorder finished it.
-    Finished,
-    /// Between two records: the recorder was ended before it could finish, or is still writing.
-    Unfinished,
-    /// Within a record: the last write was cut in two.
-    Torn,
-    /// At something that is no record; what follows it is unknown.
-    Damaged,
-}
-
-/// What a walk has found so far.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Walked {
-    /// How the file ends.
-    pub(crate) end: FileEnd,
-    /// Bytes understood.
-    pub(crate) bytes: u64,
-    /// Chunks whose content is not what was written.
-    pub(crate) damaged_chunks: u64,
-    /// Records passed over because they are larger than [`MAX_RECORD`].
-    pub(crate) oversized: u64,
-    /// The file is whole: finished, nothing behind its end, every check value right, an index.
-    pub(crate) sound: bool,
-    /// It is sound, and every check value is there: none is zero, which the format has for "not computed".
-    pub(crate) proven: bool,
-    /// Which program wrote it.
-    pub(crate) writer: Writer,
-}
-
-/// Is a record as it was written?
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Trust {
-    /// As far as check values tell.
-    Sound,
-    /// It lies in a chunk that the end of the file cuts, before the cut: nothing checks it.
-    Torn,
-    /// It lies in a chunk whose check value is not right, or where such a record has no place.
-    Damaged,
-}
-
-/// A record that is not one of the container's own.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Record<'a> {
-    pub(crate) opcode: u8,
-    pub(crate) data: &'a [u8],
-    pub(crate) trust: Trust,
-}
+/// Bytes that may be decompressed: of any file, and for each of its bytes.
+const UNPACKED: (u64, u64) = (256 << 20, 200);
+/// Bytes that may be tried in vain for a chunk in any file, and for each of its bytes.
+const TRIED: (u64, u64) = (64 << 20, 2);
 
 /// A file being read.
 #[allow(clippy::struct_excessive_bools, reason = "each is a fact of its own about the file")]
 pub(crate) struct Walk<R> {
-    file: R,
-    size: u64,
-    walked: Walked,
+    pub(super) source: Source<R>,
+    /// Where the next record of the file begins.
+    pub(super) at: u64,
+    /// Up to here it is known which bytes belong to which record: a record without a check value may lack some, unless
+    /// another stands behind it.
+    pub(super) sure: u64,
+    pub(super) walked: Walked,
     ended: bool,
-    data_ended: bool,
+    pub(super) data_ended: bool,
     /// Of the section being read, data or summary.
-    crc: crc32fast::Hasher,
-    /// Every check value so far was right.
-    checked: bool,
+    pub(super) crc: crc32fast::Hasher,
+    /// Every check value so far was right, and nothing was passed over.
+    pub(super) checked: bool,
     /// Every check value so far was there and right.
-    proven: bool,
+    pub(super) proven: bool,
     /// Where the summary begins.
-    summary: u64,
-    buffer: Vec<u8>,
-    unpacked: Vec<u8>,
-    chunk: Option<Opened>,
+    pub(super) summary: u64,
+    pub(super) buffer: Vec<u8>,
+    pub(super) unpacked: Vec<u8>,
+    /// The chunk being shown.
+    pub(super) chunk: Option<Records>,
     found: Option<Found>,
+    /// A definition shown.
+    defined: Vec<u8>,
     /// There was a chunk.
-    chunked: bool,
-    /// The chunk is the last, and not whole.
-    cut: bool,
+    pub(super) chunked: bool,
+    /// A chunk had a check value: one without is not one of this writer's.
+    pub(super) with_checks: bool,
+    /// The chunk being shown is the last, and not whole.
+    pub(super) cut: bool,
+    /// Chunks shown: sizes and check value.
+    pub(super) seen: BTreeSet<(u64, u64, u32)>,
+    pub(super) names: Names,
+    /// Definitions of the summary, until its check value is read.
+    pub(super) summarised: Vec<(u8, Vec<u8>)>,
+    /// Only definitions are wanted.
+    pub(super) defining: bool,
+    /// Bytes that may still be decompressed, and be tried in vain.
+    pub(super) budget: (u64, u64),
+    /// The boot of this machine, if that is to prove anything; then, whether the episode was recorded in it.
+    boot: Option<String>,
+    pub(super) same_boot: bool,
+    /// When the episode began, ns since 1970.
+    pub(super) begin_ns: Option<u64>,
+    /// Damage was met: the index was looked for.
+    pub(super) index: Known,
+    /// Definitions were looked for elsewhere, once.
+    pub(super) looked: bool,
 }
 
-/// What the next record of the file is.
-enum Next {
+/// The index, once it was looked for.
+#[derive(Debug, Default)]
+pub(super) enum Known {
+    #[default]
+    NotYet,
+    /// There is none that is right.
+    None,
+    Right(Index),
+}
+
+/// What a step through the file found.
+pub(super) enum Step {
     Show(u8),
     Again,
     End(FileEnd),
@@ -128,49 +115,66 @@ enum Next {
 
 /// Where a record that is shown lies.
 enum Found {
-    Buffer(u8, Trust),
-    Chunk { opcode: u8, unpacked: bool, range: Range<usize>, trust: Trust },
+    Buffer(u8),
+    Defined(u8),
+    Chunk { opcode: u8, unpacked: bool, range: std::ops::Range<usize> },
 }
 
-impl<R: Read> Walk<R> {
+impl<R: ReadAt> Walk<R> {
     /// Begins to read a file of `size` bytes. `None`: no MCAP file.
     pub(crate) fn new(file: R, size: u64) -> io::Result<Option<Self>> {
+        Self::begin(file, size, false)
+    }
+
+    pub(super) fn begin(file: R, size: u64, defining: bool) -> io::Result<Option<Self>> {
+        let allowed = |(least, each): (u64, u64)| size.saturating_mul(each).saturating_add(least);
         let mut walk = Self {
-            file,
-            size,
-            walked: Walked {
-                end: FileEnd::Unfinished,
-                bytes: 0,
-                damaged_chunks: 0,
-                oversized: 0,
-                sound: false,
-                proven: false,
-                writer: Writer::Unknown,
-            },
+            source: Source::new(file, size),
+            at: 0,
+            sure: 0,
+            walked: Walked::nothing(),
+            proven: true,
             ended: false,
             data_ended: false,
             crc: crc32fast::Hasher::new(),
             checked: true,
-            proven: true,
             summary: 0,
             buffer: Vec::new(),
             unpacked: Vec::new(),
             chunk: None,
             found: None,
+            defined: Vec::new(),
             chunked: false,
+            with_checks: false,
             cut: false,
+            seen: BTreeSet::new(),
+            names: Names::default(),
+            summarised: Vec::new(),
+            defining,
+            budget: (allowed(UNPACKED), allowed(TRIED)),
+            boot: None,
+            same_boot: false,
+            begin_ns: None,
+            index: Known::NotYet,
+            looked: false,
         };
-        let whole = walk.read(MAGIC.len() as u64)?;
-        if !whole || walk.buffer != MAGIC {
-            return Ok(None);
+        if walk.source.peek(0, MAGIC.len())?.starts_with(&MAGIC) {
+            walk.crc.update(&MAGIC);
+            walk.at = MAGIC.len() as u64;
+            (walk.sure, walk.walked.bytes) = (walk.at, walk.at);
+            return Ok(Some(walk));
         }
-        walk.crc.update(&MAGIC);
-        walk.walked.bytes = MAGIC.len() as u64;
-        Ok(Some(walk))
+        // Its beginning may be damaged: then there is a chunk of it somewhere.
+        Ok(walk.resync(0, 0)?.then_some(walk))
+    }
+
+    /// Lets `boot`, the present boot of this machine, prove what was written last: the kernel keeps the order of writes.
+    pub(crate) fn of_boot(mut self, boot: Option<String>) -> Self {
+        self.boot = boot;
+        self
     }
 
     /// The next record that is not one of the container's own, chunks opened up; `None` at the end.
-    /// Records of the summary that repeat those of the data are shown too.
     pub(crate) fn next(&mut self) -> io::Result<Option<Record<'_>>> {
         Ok(if self.advance()? { Some(self.record()) } else { None })
     }
@@ -184,11 +188,12 @@ impl<R: Read> Walk<R> {
     /// The record gone to last; one of no content before the first and after the last.
     pub(crate) fn record(&self) -> Record<'_> {
         match &self.found {
-            None => Record { opcode: 0, data: &[], trust: Trust::Sound },
-            Some(Found::Buffer(opcode, trust)) => Record { opcode: *opcode, data: &self.buffer, trust: *trust },
-            Some(Found::Chunk { opcode, unpacked, range, trust }) => {
+            None => Record { opcode: 0, data: &[] },
+            Some(Found::Buffer(opcode)) => Record { opcode: *opcode, data: &self.buffer },
+            Some(Found::Defined(opcode)) => Record { opcode: *opcode, data: &self.defined },
+            Some(Found::Chunk { opcode, unpacked, range }) => {
                 let bytes = if *unpacked { &self.unpacked } else { &self.buffer };
-                Record { opcode: *opcode, data: bytes.get(range.clone()).unwrap_or_default(), trust: *trust }
+                Record { opcode: *opcode, data: bytes.get(range.clone()).unwrap_or_default() }
             }
         }
     }
@@ -198,178 +203,197 @@ impl<R: Read> Walk<R> {
         self.walked
     }
 
+    /// Messages left out because nothing says what their channel is, by the number of the channel.
+    pub(crate) fn nameless(&self) -> &BTreeMap<u16, u64> {
+        &self.names.unknown
+    }
+
     fn find(&mut self) -> io::Result<Option<Found>> {
         loop {
+            if let Some((opcode, data)) = self.names.next() {
+                self.defined = data;
+                return Ok(Some(Found::Defined(opcode)));
+            }
             if let Some(found) = self.next_in_chunk() {
                 return Ok(Some(found));
+            }
+            if self.chunk.is_some() {
+                // A message of a channel that a damaged chunk defined.
+                self.look_for_names()?;
+                continue;
             }
             if self.ended {
                 return Ok(None);
             }
-            match self.next_in_file()? {
-                Next::Show(opcode) => {
-                    // No writer mixes them: it is the index of a chunk's messages, one bit of it changed.
-                    let stray = self.chunked && opcode == op::MESSAGE;
-                    return Ok(Some(Found::Buffer(opcode, if stray { Trust::Damaged } else { Trust::Sound })));
+            match self.step()? {
+                Step::Show(opcode) => {
+                    self.remember(opcode);
+                    if self.names.admit(opcode, &self.buffer) {
+                        return Ok(Some(Found::Buffer(opcode)));
+                    }
                 }
-                Next::Again => {}
-                Next::End(end) => {
-                    self.ended = true;
-                    self.walked.end = end;
-                    self.walked.sound = self.checked && end == FileEnd::Finished && self.walked.bytes == self.size;
-                    self.walked.proven = self.walked.sound && self.proven;
-                }
+                Step::Again => {}
+                Step::End(end) => self.end(end),
             }
         }
+    }
+
+    fn end(&mut self, end: FileEnd) {
+        self.ended = true;
+        self.walked.end = end;
+        self.walked.left_out.nameless_messages = self.names.unknown.values().sum();
+        self.walked.sound = self.checked
+            && end == FileEnd::Finished
+            && self.walked.bytes == self.source.size
+            && self.walked.left_out == LeftOut::default();
+        self.walked.proven = self.walked.sound && self.proven;
     }
 
     fn next_in_chunk(&mut self) -> Option<Found> {
-        let chunk = self.chunk.as_mut()?;
-        let bytes = if chunk.unpacked { &self.unpacked } else { &self.buffer };
-        let mut fields = Fields(bytes.get(chunk.records.clone()).unwrap_or_default());
-        let record = (|| {
-            let (opcode, length) = (fields.u8()?, fields.u64()?);
-            fields.bytes(length).map(|data| (opcode, data.len()))
-        })();
-        // The end, or the first record that is not whole.
-        let Some((opcode, length)) = record else {
-            self.chunk = None;
-            return None;
-        };
-        let end = chunk.records.end - fields.0.len();
-        chunk.records.start = end;
-        Some(Found::Chunk { opcode, unpacked: chunk.unpacked, range: end - length..end, trust: chunk.trust })
+        loop {
+            let chunk = self.chunk.as_mut()?;
+            let bytes = if chunk.unpacked { &self.unpacked } else { &self.buffer };
+            let mut fields = Fields(bytes.get(chunk.range.clone()).unwrap_or_default());
+            // The end, or the first record that is not whole.
+            let Some((opcode, data)) = take(&mut fields) else {
+                self.chunk = None;
+                return None;
+            };
+            if opcode == op::MESSAGE && !self.checked && !self.looked && !self.names.knows(data) {
+                return None;
+            }
+            let end = chunk.range.end - fields.0.len();
+            chunk.range.start = end;
+            if self.names.admit(opcode, data) {
+                self.walked.ordered_messages += u64::from(self.cut && opcode == op::MESSAGE);
+                return Some(Found::Chunk { opcode, unpacked: chunk.unpacked, range: end - data.len()..end });
+            }
+        }
     }
 
-    fn next_in_file(&mut self) -> io::Result<Next> {
+    /// Takes a step through the file.
+    fn step(&mut self) -> io::Result<Step> {
         if self.cut {
-            return Ok(Next::End(FileEnd::Torn));
+            return Ok(Step::End(FileEnd::Torn));
         }
-        if !self.read(HEAD)? {
-            return Ok(Next::End(if self.buffer.is_empty() { FileEnd::Unfinished } else { FileEnd::Torn }));
+        let at = self.at;
+        let mut head = Fields(self.source.peek(at, 9)?);
+        if head.0.is_empty() {
+            return Ok(Step::End(FileEnd::Unfinished));
         }
-        let mut head = Fields(&self.buffer);
-        let (Some(opcode), Some(length)) = (head.u8(), head.u64()) else { return Ok(Next::End(FileEnd::Torn)) };
-        if !((1..=op::DATA_END).contains(&opcode) || opcode >= op::PRIVATE) {
-            return Ok(Next::End(FileEnd::Damaged));
+        let (Some(opcode), Some(length)) = (head.u8(), head.u64()) else { return Ok(Step::End(FileEnd::Torn)) };
+        let left = self.source.size.saturating_sub(at).saturating_sub(HEAD);
+        // No writer mixes messages with chunks: it is the index of a chunk's messages, one bit of it changed.
+        if !is_known(opcode)
+            || opcode == op::CHUNK && length.min(left) > MAX_RECORD
+            || opcode == op::MESSAGE && self.chunked
+        {
+            return self.lost(at, opcode);
         }
+        let fit = self.source.fit(opcode, at + HEAD, length)?;
+        if length > left {
+            self.sure = if fit == Fit::Exact { at } else { self.sure };
+            return if fit == Fit::Not { self.lost(at, opcode) } else { self.torn(at, opcode) };
+        }
+        let is_right = match fit {
+            Fit::Exact | Fit::Cut => true,
+            Fit::Loose => self.source.stands(at + HEAD + length, self.chunked)?,
+            Fit::Not => false,
+        };
+        if !is_right {
+            return self.lost(at, opcode);
+        }
+        self.sure = at;
+        self.take(at, opcode, length)
+    }
+
+    /// Takes the record at `at`, which is whole.
+    fn take(&mut self, at: u64, opcode: u8, length: u64) -> io::Result<Step> {
         // The footer's check value covers the summary and the footer's own first bytes, that of the data ends before
         // the record that holds it.
-        if opcode != op::DATA_END {
-            self.crc.update(&self.buffer);
+        if opcode != op::DATA_END && self.counts() {
+            let head = self.source.peek(at, 9)?.get(..9).unwrap_or_default();
+            self.crc.update(head);
         }
-        let left = self.size.saturating_sub(self.walked.bytes).saturating_sub(HEAD);
-        let next = match opcode {
-            op::CHUNK if length.min(left) > MAX_RECORD => Next::End(FileEnd::Damaged),
-            op::CHUNK => self.chunk(length)?,
-            _ if length > left => Next::End(FileEnd::Torn),
-            op::FOOTER => self.footer(length)?,
-            op::DATA_END => self.data_end(length)?,
-            op::HEADER if length <= header::LARGEST => self.header(length)?,
+        self.at = at + HEAD + length;
+        let step = match opcode {
+            op::CHUNK => return self.whole_chunk(at, length),
+            op::FOOTER => return self.footer(at, length),
+            op::DATA_END => self.data_end(at, length)?,
+            op::HEADER if length <= header::LARGEST => {
+                self.read(at, length)?;
+                self.walked.writer = header::writer(&self.buffer);
+                Step::Again
+            }
+            op::SCHEMA | op::CHANNEL if self.data_ended => {
+                self.read(at, length.min(MAX_RECORD))?;
+                if self.defining {
+                    self.summarised.push((opcode, self.buffer.clone()));
+                }
+                Step::Again
+            }
             op::SCHEMA | op::CHANNEL | op::MESSAGE | op::ATTACHMENT | op::METADATA | op::PRIVATE.. => {
                 // Messages and the like do not belong into the summary.
-                let shown = !self.data_ended || matches!(opcode, op::SCHEMA | op::CHANNEL);
                 if length > MAX_RECORD {
-                    self.walked.oversized += u64::from(shown);
-                    self.skip(length)?
-                } else if !self.read(length)? {
-                    Next::End(FileEnd::Torn)
+                    self.walked.left_out.oversized_records += u64::from(!self.data_ended);
+                    self.skip(at, length)?
                 } else {
-                    self.crc.update(&self.buffer);
-                    if shown { Next::Show(opcode) } else { Next::Again }
+                    self.read(at, length)?;
+                    let is_shown = !self.data_ended && self.is_whole(opcode)?;
+                    if is_shown { Step::Show(opcode) } else { Step::Again }
                 }
             }
-            _ => self.skip(length)?,
+            _ => self.skip(at, length)?,
         };
-        self.walked.bytes += match next {
-            Next::End(FileEnd::Finished) => HEAD + length + MAGIC.len() as u64,
-            Next::Show(_) | Next::Again if !self.cut => HEAD + length,
-            _ => 0,
-        };
-        Ok(next)
+        self.walked.bytes += HEAD + length;
+        Ok(step)
     }
 
-    fn header(&mut self, length: u64) -> io::Result<Next> {
-        if !self.read(length)? {
-            return Ok(Next::End(FileEnd::Torn));
+    /// What the file says of itself at its beginning, and definitions beside the chunks.
+    fn remember(&mut self, opcode: u8) {
+        if opcode == op::ATTACHMENT {
+            self.names.attached(&self.buffer);
         }
-        self.crc.update(&self.buffer);
-        self.walked.writer = header::writer(&self.buffer);
-        Ok(Next::Again)
-    }
-
-    fn chunk(&mut self, length: u64) -> io::Result<Next> {
-        let whole = self.read(length)?;
-        self.crc.update(&self.buffer);
-        let opened = Opened::new(&self.buffer, whole, &mut self.unpacked);
-        let damaged = opened.trust == Trust::Damaged;
-        self.walked.damaged_chunks += u64::from(damaged);
-        self.checked &= !damaged;
-        self.proven &= opened.proven;
-        self.chunk = Some(opened);
-        (self.chunked, self.cut) = (true, !whole);
-        Ok(Next::Again)
-    }
-
-    /// The data's check value, and where the summary begins.
-    fn data_end(&mut self, length: u64) -> io::Result<Next> {
-        let data = std::mem::take(&mut self.crc).finalize();
-        if !self.read(length.min(MAX_RECORD))? {
-            return Ok(Next::End(FileEnd::Torn));
-        }
-        let crc = Fields(&self.buffer).u32();
-        self.checked &= !self.data_ended && crc.is_some_and(|crc| crc == 0 || crc == data);
-        self.proven &= crc == Some(data);
-        self.data_ended = true;
-        self.summary = self.walked.bytes + HEAD + length;
-        Ok(Next::Again)
-    }
-
-    fn footer(&mut self, length: u64) -> io::Result<Next> {
-        if !self.read(length.min(MAX_RECORD))? {
-            return Ok(Next::End(FileEnd::Torn));
+        if opcode != op::METADATA || self.begin_ns.is_some() {
+            return;
         }
         let mut fields = Fields(&self.buffer);
-        let footer = (|| Some((fields.u64()?, fields.u64()?, fields.u32()?)))();
-        self.crc.update(self.buffer.get(..16).unwrap_or_default());
-        let summary = std::mem::take(&mut self.crc).finalize();
-        self.checked &= self.data_ended
-            && footer.is_some_and(|(begin, _, crc)| begin == self.summary && (crc == 0 || crc == summary));
-        self.proven &= footer.is_some_and(|(_, _, crc)| crc == summary);
-        if !self.read(MAGIC.len() as u64)? {
-            return Ok(Next::End(FileEnd::Torn));
-        }
-        Ok(Next::End(if self.buffer == MAGIC { FileEnd::Finished } else { FileEnd::Damaged }))
+        let about = fields.string().filter(|name| *name == ABOUT).and_then(|_| fields.map());
+        let Some(about) = about else { return };
+        self.begin_ns = about.get("begin_wall_ns").and_then(|ns| ns.parse().ok());
+        self.same_boot = self.boot.is_some() && about.get(BOOT_ID) == self.boot.as_ref();
     }
 
-    fn skip(&mut self, length: u64) -> io::Result<Next> {
-        let mut left = length;
-        while left > 0 {
-            let piece = left.min(PIECE);
-            if !self.read(piece)? {
-                return Ok(Next::End(FileEnd::Torn));
+    fn skip(&mut self, at: u64, length: u64) -> io::Result<Step> {
+        let (mut at, end) = (at + HEAD, at + HEAD + length);
+        while self.counts() && at < end {
+            let piece = (end - at).min(PIECE);
+            if !self.source.read(at, piece, &mut self.buffer)? {
+                break;
             }
             self.crc.update(&self.buffer);
-            left -= piece;
+            at += piece;
         }
-        Ok(Next::Again)
+        Ok(Step::Again)
     }
 
-    /// Reads up to `count` bytes into the buffer; were there as many? Memory grows with what is there,
-    /// not with what is asked for.
-    fn read(&mut self, count: u64) -> io::Result<bool> {
-        self.buffer.clear();
-        Ok(self.file.by_ref().take(count).read_to_end(&mut self.buffer)? as u64 == count)
+    /// Reads the content of the record at `at` into the buffer.
+    pub(super) fn read(&mut self, at: u64, length: u64) -> io::Result<()> {
+        self.source.read(at + HEAD, length, &mut self.buffer)?;
+        if self.counts() {
+            self.crc.update(&self.buffer);
+        }
+        Ok(())
     }
-}
 
-/// Is `file`, of `size` bytes, an MCAP file, and what does a walk through it find? Every record that is not one of the
-/// container's own is shown to `visit`, with its opcode, chunks opened up, damaged ones as far as they
-/// go. `None`: no MCAP file.
-pub(crate) fn walk(file: &mut impl Read, size: u64, visit: &mut dyn FnMut(u8, &[u8])) -> io::Result<Option<Walked>> {
-    let Some(mut walk) = Walk::new(file, size)? else { return Ok(None) };
-    while let Some(record) = walk.next()? {
-        visit(record.opcode, record.data);
+    /// Is the check value of what is being read of use? Behind damage only that of the summary.
+    fn counts(&self) -> bool {
+        self.checked || self.data_ended
     }
-    Ok(Some(walk.walked()))
+
+    /// Continues with the summary, at `at`.
+    pub(super) fn summary_at(&mut self, at: u64) {
+        (self.at, self.summary, self.data_ended) = (at, at, true);
+        self.crc = crc32fast::Hasher::new();
+    }
 }

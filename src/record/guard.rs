@@ -12,7 +12,7 @@
 //! Invariant: between two samples nothing here runs: a look belongs to a flush.
 
 use std::fs::File;
-use std::io::{self, BufReader};
+use std::io;
 use std::mem::MaybeUninit;
 use std::os::fd::{AsRawFd, OwnedFd};
 use std::path::PathBuf;
@@ -90,7 +90,7 @@ impl Guard {
             return Ok(());
         }
         let file = File::open(itself(&self.file))?;
-        let walked = walk(&mut BufReader::new(file), written, &mut |_, _| {})?;
+        let walked = walk(file, written, None, &mut |_, _| {})?;
         if walked.is_some_and(|walked| walked.sound) {
             return Ok(());
         }

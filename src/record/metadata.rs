@@ -9,6 +9,7 @@ use super::configuration::{self, Configuration};
 use super::provenance::Units;
 use super::publishers::{self, Publisher};
 use super::quality::{Quality, Spread};
+use crate::episode_format::{self, BOOT_ID};
 use crate::registry::{DeviceSpec, Registry, WhenStale};
 use crate::status::Verdict;
 use crate::time::{Stamp, WallClock, nanoseconds};
@@ -24,7 +25,7 @@ pub(super) const POLICY: &str = "policy";
 /// JSON: `layout` `{name: bit}`, `modalities` `[{name, bit, topic, kind, shape, when_stale,
 /// latency_ns}]`, `serials` `{name: serial or null}` of what was attached when the episode began,
 /// `provenance` (see [`Units::epochs`]) of what ran then, `tags` `{key: value}`, `policy` `{name, hash,
-/// dry_run}` of the policy at the controls, absent if none was.
+/// dry_run}` of the policy at the controls, absent if none was. `boot_id` is the boot of this machine (proc(5)).
 ///
 /// A message's `log_time` is its capture time as the kernel gave it. The latency is taken off when
 /// a frame's samples are chosen: a sample stands for the moment `log_time - latency_ns`.
@@ -78,6 +79,8 @@ pub(super) fn beginning(
         ("wall_minus_monotonic_ns", clock.wall_ns(Stamp(0)).to_string()),
     ]);
     said.extend(units.policy().map(|policy| (POLICY.to_owned(), policy.to_string())));
+    // A repair trusts what was written last only where the kernel that wrote it still runs.
+    said.extend(episode_format::boot_id().map(|id| (BOOT_ID.to_owned(), id)));
     said
 }
 

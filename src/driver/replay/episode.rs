@@ -1,19 +1,18 @@
 //! A recorded episode as a file: what is in it, and its messages one by one.
 //!
-//! Invariant: the file is read from its beginning to its end, one chunk at a time; its index is not
-//! looked at, so a wrong one leads nowhere.
+//! Invariant: the file is read from its beginning to its end, one chunk at a time.
 //! Invariant: what lies in a damaged chunk is not played.
 
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{self, BufReader, Read, Seek, SeekFrom};
+use std::io::{self, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use super::wire::{self, Schema};
 use super::{DriverError, fatal};
-use crate::episode_format::walk::{FileEnd, MAGIC, Trust, Walk, op};
+use crate::episode_format::walk::{FileEnd, MAGIC, Walk, op};
 use crate::episode_format::wire::Fields;
-use crate::episode_format::{self, ABOUT};
+use crate::episode_format::{self, ABOUT, ReadAt};
 use crate::mask::{MASK_TOPIC, PhysicalMask};
 use crate::modality::ModalityId;
 
@@ -24,8 +23,6 @@ const MAX_CHANGES: usize = 1_000_000;
 pub(super) const MAX_TEXT: usize = 16 << 20;
 /// Channel, sequence number and two times stand before a message's data.
 pub(super) const MESSAGE_HEAD: usize = 2 + 4 + 8 + 8;
-/// Bytes read at once.
-pub(super) const BUFFER_BYTES: usize = 1 << 16;
 
 /// What an episode holds.
 #[derive(Debug, Clone, PartialEq)]
@@ -96,7 +93,7 @@ impl Episode {
     }
 
     /// The messages of `topic` from `from_ns` on.
-    pub(super) fn play(self, topic: &str, from_ns: u64) -> Result<Messages<BufReader<File>>, DriverError> {
+    pub(super) fn play(self, topic: &str, from_ns: u64) -> Result<Messages<File>, DriverError> {
         let Self { path, file, size } = self;
         let walk = begin(&path, file, size)?;
         let mut messages = Messages::new(walk, topic, from_ns);
@@ -123,8 +120,8 @@ fn fix(path: &Path) -> String {
     format!("`rapid recover {}` makes it whole, `rapid inspect` reads what is there", path.display())
 }
 
-fn begin(path: &Path, file: File, size: u64) -> Result<Walk<BufReader<File>>, DriverError> {
-    let walk = Walk::new(BufReader::with_capacity(BUFFER_BYTES, file), size).map_err(|error| fatal(path, error))?;
+fn begin(path: &Path, file: File, size: u64) -> Result<Walk<File>, DriverError> {
+    let walk = Walk::new(file, size).map_err(|error| fatal(path, error))?;
     walk.ok_or_else(|| fatal(path, NO_MCAP))
 }
 
@@ -219,7 +216,7 @@ struct Collected {
 }
 
 impl Collected {
-    fn read(mut walk: Walk<impl Read>) -> io::Result<Self> {
+    fn read(mut walk: Walk<impl ReadAt>) -> io::Result<Self> {
         let mut collected = Self {
             channels: Channels::default(),
             about: BTreeMap::new(),
@@ -228,9 +225,6 @@ impl Collected {
             end: FileEnd::Unfinished,
         };
         while let Some(record) = walk.next()? {
-            if record.trust == Trust::Damaged {
-                continue;
-            }
             // `None` is a record that is shorter than it says.
             let _ = match record.opcode {
                 op::MESSAGE => collected.message(record.data),
@@ -323,7 +317,7 @@ pub(super) struct Recorded<'a> {
     pub(super) data: &'a [u8],
 }
 
-impl<R: Read> Messages<R> {
+impl<R: ReadAt> Messages<R> {
     fn new(walk: Walk<R>, topic: &str, from_ns: u64) -> Self {
         Self { walk, channels: Channels::default(), topic: topic.to_owned(), from_ns }
     }
@@ -331,7 +325,7 @@ impl<R: Read> Messages<R> {
     /// Reads on to a channel of the topic that can be played; is there one?
     fn seek(&mut self) -> io::Result<bool> {
         while let Some(record) = self.walk.next()? {
-            if record.trust == Trust::Damaged || record.opcode == op::MESSAGE {
+            if record.opcode == op::MESSAGE {
                 continue;
             }
             let _ = self.channels.take(record.opcode, record.data);
@@ -357,9 +351,6 @@ impl<R: Read> Messages<R> {
     /// Is the record at hand a message to be played? Its time, and what it is.
     fn wanted(&mut self) -> Option<(u64, Schema)> {
         let record = self.walk.record();
-        if record.trust == Trust::Damaged {
-            return None;
-        }
         if record.opcode != op::MESSAGE {
             self.channels.take(record.opcode, record.data)?;
             return None;

@@ -5,13 +5,12 @@
 
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
-use super::episode::{BUFFER_BYTES, Channels, MAX_TEXT, NO_MCAP};
+use super::episode::{Channels, MAX_TEXT, NO_MCAP};
 use super::wire::{self, Shape};
 use super::{DriverError, fatal};
-use crate::episode_format::walk::{FileEnd, Trust, Walk, op};
+use crate::episode_format::walk::{FileEnd, Walk, op};
 use crate::episode_format::wire::{Fields, protobuf};
 use crate::episode_format::{self, ABOUT, EVENT_TOPIC};
 use crate::mask::{MASK_TOPIC, PhysicalMask};
@@ -20,7 +19,7 @@ use crate::sample::Encoding;
 /// See the module's comment.
 pub struct Tape {
     path: PathBuf,
-    walk: Walk<BufReader<File>>,
+    walk: Walk<File>,
     channels: Channels,
     about: BTreeMap<String, String>,
     payload: Vec<u8>,
@@ -87,8 +86,8 @@ impl Tape {
     /// When it cannot be read or is no MCAP file.
     pub fn open(path: &Path) -> Result<Self, DriverError> {
         let (file, size) = episode_format::open(path).map_err(|error| DriverError::Fatal(error.to_string()))?;
-        let walk = Walk::new(BufReader::with_capacity(BUFFER_BYTES, file), size);
-        let walk = walk.map_err(|error| fatal(path, error))?.ok_or_else(|| fatal(path, NO_MCAP))?;
+        let walk = Walk::new(file, size).map_err(|error| fatal(path, error))?.ok_or_else(|| fatal(path, NO_MCAP))?;
+        let walk = walk.of_boot(episode_format::boot_id());
         let (channels, about, payload) = (Channels::default(), BTreeMap::new(), Vec::new());
         Ok(Self { path: path.to_owned(), walk, channels, about, payload })
     }
@@ -100,9 +99,6 @@ impl Tape {
     pub fn next_message(&mut self) -> Result<Option<Taped<'_>>, DriverError> {
         while self.walk.advance().map_err(|error| fatal(&self.path, error))? {
             let record = self.walk.record();
-            if record.trust == Trust::Damaged {
-                continue;
-            }
             let read = match record.opcode {
                 op::MESSAGE => read(&self.channels, record.data, &mut self.payload),
                 op::METADATA => {
@@ -139,8 +135,7 @@ impl Tape {
             FileEnd::Torn => Some("the file ends within a record".to_owned()),
             FileEnd::Damaged => Some(format!("the file is damaged after {} bytes", walked.bytes)),
         };
-        let chunks = (walked.damaged_chunks > 0).then(|| format!("{} parts of it are damaged", walked.damaged_chunks));
-        let said: Vec<String> = end.into_iter().chain(chunks).collect();
+        let said: Vec<String> = end.into_iter().chain(walked.left_out.sentences(walked.damaged_chunks)).collect();
         (!said.is_empty()).then(|| format!("{}; what could be read is used", said.join(", ")))
     }
 

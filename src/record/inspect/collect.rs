@@ -25,7 +25,7 @@ pub(super) struct Collected {
     channels: BTreeMap<u16, Channel>,
     about: BTreeMap<String, String>,
     summary: BTreeMap<String, String>,
-    repaired: bool,
+    recovered: BTreeMap<String, String>,
     messages: u64,
     /// Records that are not what their kind has to be.
     unread: u64,
@@ -103,7 +103,7 @@ impl Collected {
                 self.about = map;
             }
             SUMMARY => self.summary = map,
-            RECOVERED => self.repaired = true,
+            RECOVERED => self.recovered = map,
             _ => {}
         }
         Some(())
@@ -213,7 +213,8 @@ impl Collected {
         let actions_missing =
             topics.iter().filter(|topic| topic.topic == ACTION_TOPIC).map(|topic| topic.missing).sum();
         let counted = Counted { messages, frames, unread, actions_missing };
-        let ending = Ending { file: walked, seconds, summary: &self.summary, repaired: self.repaired, counted };
+        let ending =
+            Ending { file: walked, seconds, summary: &self.summary, repaired: !self.recovered.is_empty(), counted };
         let verdict = match &judge {
             Some(judge) => Judgement::Episode(judge.judge(&mut modalities, &ending)),
             // What is damaged and has no name of its writer may be an episode.
@@ -234,6 +235,9 @@ impl Collected {
             recorded_verdict: recorded_verdict(&self.summary),
             unread_bytes: size.saturating_sub(walked.bytes),
             damaged_chunks: walked.damaged_chunks,
+            left_out: walked.left_out,
+            ordered_messages: walked.ordered_messages,
+            recovered: self.recovered,
             software: said(&self.about, "software"),
             commit: said(&self.about, "commit"),
             host: said(&self.about, "host"),

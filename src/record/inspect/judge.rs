@@ -237,7 +237,7 @@ impl Judge {
                 "this version does not understand the registry in the file: judged by the usual limits",
             ));
         }
-        let passed_over = ending.counted.unread.saturating_add(ending.file.oversized);
+        let passed_over = ending.counted.unread.saturating_add(ending.file.left_out.oversized_records);
         if passed_over > 0 {
             findings.push(Finding::suspect(format!("{passed_over} records in the file cannot be understood")));
         }

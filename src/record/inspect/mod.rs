@@ -18,19 +18,19 @@ mod tests;
 mod units;
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::io::{self, BufReader, Read};
+use std::io;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
 use super::quality::{Quality, Spread};
 use super::walk::walk;
-use crate::episode_format::{self, OpenError};
+use crate::episode_format::{self, OpenError, ReadAt};
 use crate::status::Verdict;
 use crate::text;
 use collect::Collected;
 
-pub use super::walk::FileEnd;
+pub use super::walk::{FileEnd, LeftOut};
 pub use judgement::Judgement;
 pub use list::{Listed, episodes, list, render_list};
 pub use policy::{HoldReport, PolicyReport};
@@ -70,10 +70,18 @@ pub struct Inspection {
     pub verdict: Judgement,
     /// What the recorder said when it was finished.
     pub recorded_verdict: Option<Verdict>,
-    /// Bytes at its end that could not be understood.
+    /// Bytes of it that could not be understood.
     pub unread_bytes: u64,
-    /// Chunks whose content is not what was written.
+    /// Chunks whose content is not what was written; nothing of them is counted below.
     pub damaged_chunks: u64,
+    /// What else of the file is left out.
+    #[serde(flatten)]
+    pub left_out: LeftOut,
+    /// Messages of a chunk that the end of the file cuts, taken because they were written since this machine was started.
+    pub ordered_messages: u64,
+    /// What a repair said of this file when it made it: the metadata `rapid/recovered`.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub recovered: BTreeMap<String, String>,
     /// The program that wrote it, with its version.
     pub software: String,
     /// The commit it was built from; empty if that was not known.
@@ -206,20 +214,20 @@ pub fn inspect(path: &Path) -> Result<Inspection, InspectError> {
         OpenError::Io { path, source } => InspectError::Io { path, source },
         OpenError::NotFile(path) => InspectError::NotFile(path),
     })?;
-    // One that grows meanwhile is read as it was.
-    let mut file = BufReader::with_capacity(1 << 16, file.take(size));
-    inspect_from(&mut file, size, path).map_err(io)?.ok_or_else(|| InspectError::NotMcap(path.to_owned()))
+    inspect_from(file, size, path, episode_format::boot_id())
+        .map_err(io)?
+        .ok_or_else(|| InspectError::NotMcap(path.to_owned()))
 }
 
 /// What a file of these bytes, which may be any, holds; `None` if they are no MCAP file.
 #[must_use]
 pub fn inspect_bytes(bytes: &[u8]) -> Option<Inspection> {
-    inspect_from(&mut &*bytes, bytes.len() as u64, Path::new("bytes.mcap")).ok()?
+    inspect_from(bytes, bytes.len() as u64, Path::new("bytes.mcap"), None).ok()?
 }
 
 /// `None`: no MCAP file.
-fn inspect_from(file: &mut impl Read, size: u64, path: &Path) -> io::Result<Option<Inspection>> {
+fn inspect_from(file: impl ReadAt, size: u64, path: &Path, boot: Option<String>) -> io::Result<Option<Inspection>> {
     let mut collected = Collected::default();
-    let walked = walk(file, size, &mut |opcode, record| collected.record(opcode, record))?;
+    let walked = walk(file, size, boot, &mut |opcode, record| collected.record(opcode, record))?;
     Ok(walked.map(|walked| collected.report(path, size, walked)))
 }

@@ -1,5 +1,6 @@
 //! An [`Inspection`] as text for a terminal.
 
+use std::collections::BTreeMap;
 use std::fmt::Write;
 
 use super::{FileEnd, Inspection, Judgement, Lateness, ModalityReport, PolicyReport, TopicReport};
@@ -34,9 +35,15 @@ pub fn render(inspection: &Inspection, width: usize, paint: Paint) -> String {
 fn write_all(out: &mut String, inspection: &Inspection, width: usize, paint: Paint) -> std::fmt::Result {
     let name = inspection.file.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     writeln!(out, "{}  {}", clean(&name), ending(inspection, paint))?;
-    if inspection.damaged_chunks > 0 {
-        let text = format!("{} damaged chunks: their messages may be missing or wrong", inspection.damaged_chunks);
+    for text in inspection.left_out.sentences(inspection.damaged_chunks) {
         writeln!(out, "{}", colour(paint, RED, &text))?;
+    }
+    if inspection.ordered_messages > 0 {
+        let text = format!("{} messages of the chunk that is cut are taken", inspection.ordered_messages);
+        writeln!(out, "{}", colour(paint, YELLOW, &text))?;
+    }
+    if let Some(source) = inspection.recovered.get("source") {
+        writeln!(out, "{}", colour(paint, YELLOW, &clean(&repair(source, &inspection.recovered))))?;
     }
     write_verdict(out, inspection, paint)?;
     let mut about = vec![format!("task {}", or_dash(&inspection.task)), format!("rig {}", or_dash(&inspection.rig))];
@@ -173,6 +180,25 @@ fn wrapped(head: &str, words: &[String], width: usize) -> String {
     text
 }
 
+/// What a repair left out when it made this file.
+fn repair(source: &str, recovered: &BTreeMap<String, String>) -> String {
+    const COUNTED: &[&str] = &[
+        "damaged_chunks",
+        "gaps",
+        "oversized_records",
+        "swollen_chunks",
+        "repeated_chunks",
+        "nameless_messages",
+        "unproven_messages",
+        "refused_records",
+        "ordered_messages",
+    ];
+    let counts = COUNTED.iter().filter_map(|key| Some((key, recovered.get(*key).filter(|count| *count != "0")?)));
+    let counts: Vec<String> = counts.map(|(key, count)| format!("{} {count}", key.replace('_', " "))).collect();
+    let counts = if counts.is_empty() { "nothing left out".to_owned() } else { counts.join(", ") };
+    format!("repaired from {source}: {counts}")
+}
+
 fn ending(inspection: &Inspection, paint: Paint) -> String {
     let unread = size(inspection.unread_bytes);
     match inspection.end {
@@ -181,7 +207,7 @@ fn ending(inspection: &Inspection, paint: Paint) -> String {
         FileEnd::Torn => {
             colour(paint, YELLOW, &format!("INCOMPLETE: the last record is cut, {unread} of it not whole"))
         }
-        FileEnd::Damaged => colour(paint, RED, &format!("DAMAGED: the last {unread} cannot be read")),
+        FileEnd::Damaged => colour(paint, RED, &format!("DAMAGED: {unread} cannot be read")),
     }
 }
 

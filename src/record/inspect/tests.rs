@@ -8,7 +8,7 @@ use crate::record::tests::Bench;
 use crate::status::{Chunk, Grade, Sensors, What};
 
 fn of(bytes: &[u8]) -> Option<Inspection> {
-    inspect_from(&mut &*bytes, bytes.len() as u64, Path::new("x.mcap")).unwrap()
+    inspect_from(bytes, bytes.len() as u64, Path::new("x.mcap"), episode_format::boot_id()).unwrap()
 }
 
 async fn episode() -> (Bench, PathBuf) {
@@ -214,6 +214,7 @@ fn what_is_no_mcap_file_is_said() {
 }
 
 #[test]
+#[allow(clippy::too_many_lines, reason = "a report has that many fields")]
 fn the_report_on_a_screen() {
     let topic = |topic: &str, messages, missing, lateness| TopicReport {
         topic: topic.to_owned(),
@@ -232,6 +233,9 @@ fn the_report_on_a_screen() {
         recorded_verdict: None,
         unread_bytes: 512,
         damaged_chunks: 0,
+        left_out: LeftOut::default(),
+        ordered_messages: 0,
+        recovered: BTreeMap::new(),
         software: "rapid 0.1.0".to_owned(),
         commit: String::new(),
         host: "rig-7".to_owned(),

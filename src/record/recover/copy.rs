@@ -1,27 +1,29 @@
 //! Copying: from what can be read of a file to a whole one.
 //!
-//! Channels and schemas keep their numbers, messages their order; what lies in a damaged chunk is
-//! left out, what lies before a cut is taken.
+//! Channels and schemas keep their numbers, messages their order; what the walk through the file leaves out is
+//! counted.
 
-use std::collections::BTreeSet;
-use std::io::{self, BufReader, BufWriter, Read};
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{self, BufWriter};
 use std::ops::ControlFlow;
 
 use mcap::records::{MessageHeader, Metadata};
 use mcap::write::{NoSeek, PrivateRecordOptions};
 use mcap::{Attachment, McapError, Writer};
+use sha2::{Digest, Sha256};
 
 use super::super::file::{self, Sink};
-use super::super::walk::{FileEnd, Record, Trust, Walk, op};
+use super::super::walk::{Record, Walk, Walked, op};
 use super::super::wire::Fields;
 use super::said;
 use super::{Watch, summary::Summary};
-use crate::episode_format::{RECOVERED, SUMMARY, is_sound};
+use crate::episode_format::{RECOVERED, ReadAt, SUMMARY, is_sound};
 
 /// Bytes read between two calls of a [`Watch`].
 const WATCH_EVERY: u64 = 1 << 20;
-/// Bytes read at once.
-const BUFFER_BYTES: usize = 1 << 16;
+/// Bytes read at once where only their hash is wanted.
+const PIECE: usize = 256 << 10;
 
 /// Why copying ended.
 #[derive(Debug)]
@@ -32,30 +34,33 @@ pub(super) enum Error {
 }
 
 /// What is said about the repair itself.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub(super) struct About<'a> {
     /// The original.
     pub(super) name: &'a str,
+    /// Its SHA-256, hexadecimal.
+    pub(super) sha256: String,
     /// Wall time now.
     pub(super) time_ns: u64,
+    /// The present boot, if that is to prove what was written last: see [`Walk::of_boot`].
+    pub(super) boot: Option<String>,
 }
 
 /// What of the original is not in the copy.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Damage {
-    pub(super) end: FileEnd,
+    pub(super) walked: Walked,
     pub(super) unread_bytes: u64,
-    pub(super) damaged_chunks: u64,
+    /// Records that contradict others.
     pub(super) refused_records: u64,
-    /// The original is whole as a container.
-    pub(super) sound: bool,
+    /// Messages left out because nothing says what their channel is, by its number.
+    pub(super) nameless: BTreeMap<u16, u64>,
 }
 
 impl Damage {
     /// Is nothing of the original left out but a torn end?
-    pub(super) fn is_lossless(self) -> bool {
-        let torn_at_most = self.sound || matches!(self.end, FileEnd::Unfinished | FileEnd::Torn);
-        torn_at_most && self.damaged_chunks == 0 && self.refused_records == 0
+    pub(super) fn is_lossless(&self) -> bool {
+        self.walked.is_all() && self.refused_records == 0
     }
 }
 
@@ -67,60 +72,77 @@ pub(super) struct Copied {
 }
 
 /// What a file holds. `None`: no MCAP file.
-pub(super) fn summary(file: impl Read, size: u64, watch: &mut Watch<'_>) -> Result<Option<Summary>, Error> {
-    let Some(mut walk) = open(file, size)? else { return Ok(None) };
+pub(super) fn summary(file: impl ReadAt, size: u64, watch: &mut Watch<'_>) -> Result<Option<Summary>, Error> {
+    let Some(mut walk) = Walk::new(file, size).map_err(Error::Read)? else { return Ok(None) };
     let mut summary = Summary::default();
     let mut watched = 0;
     while let Some(record) = walk.next().map_err(Error::Read)? {
-        if record.trust != Trust::Damaged {
-            summary.record(record.opcode, record.data);
-        }
-        look(&walk, size, &mut watched, watch)?;
+        summary.record(record.opcode, record.data);
+        look(walk.walked().bytes, size, &mut watched, watch)?;
     }
     summary.sound(walk.walked().sound);
     Ok(Some(summary))
 }
 
-/// Writes to `sink` a whole file of what can be read of `file`, `size` bytes long; channels that it
-/// lacks are taken from `known`. Returns once it is on the disk. `None`: no MCAP file.
+/// Writes to `sink` a whole file of what can be read of `file`, `size` bytes long. Returns once it is on the disk.
+/// `None`: no MCAP file.
 pub(super) fn copy(
-    file: impl Read,
+    file: impl ReadAt,
     size: u64,
-    known: &Summary,
     about: &About<'_>,
     sink: impl Sink,
     watch: &mut Watch<'_>,
 ) -> Result<Option<Copied>, Error> {
-    let Some(mut walk) = open(file, size)? else { return Ok(None) };
-    let mut copy = Copy::new(sink, known)?;
+    let Some(walk) = Walk::new(file, size).map_err(Error::Read)? else { return Ok(None) };
+    let mut walk = walk.of_boot(about.boot.clone());
+    let mut copy = Copy::new(sink)?;
     let mut watched = 0;
     while let Some(record) = walk.next().map_err(Error::Read)? {
         copy.take(&record)?;
-        look(&walk, size, &mut watched, watch)?;
+        look(walk.walked().bytes, size, &mut watched, watch)?;
     }
     let walked = walk.walked();
     let damage = Damage {
-        end: walked.end,
+        walked,
         unread_bytes: size.saturating_sub(walked.bytes),
-        damaged_chunks: walked.damaged_chunks,
-        refused_records: copy.refused.saturating_add(walked.oversized),
-        sound: walked.sound,
+        refused_records: copy.refused,
+        nameless: walk.nameless().clone(),
     };
-    let summary = copy.finish(damage, about, size)?;
+    let summary = copy.finish(&damage, about, size)?;
     Ok(Some(Copied { summary, damage }))
 }
 
+/// The SHA-256 of the first `size` bytes of `file`, hexadecimal.
+pub(super) fn sha256(file: &File, size: u64, watch: &mut Watch<'_>) -> Result<String, Error> {
+    let (mut hasher, mut piece) = (Sha256::new(), vec![0; PIECE]);
+    let (mut done, mut watched) = (0, 0);
+    while done < size {
+        let count = usize::try_from(size - done).unwrap_or(usize::MAX).min(PIECE);
+        let Some(room) = piece.get_mut(..count) else { break };
+        let read = match ReadAt::read_at(file, room, done) {
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
+            read => read.map_err(Error::Read)?,
+        };
+        if read == 0 {
+            break;
+        }
+        hasher.update(room.get(..read).unwrap_or_default());
+        done += read as u64;
+        look(done, size, &mut watched, watch)?;
+    }
+    let digit = |nibble: u8| char::from_digit(nibble.into(), 16).unwrap_or_default();
+    Ok(hasher.finalize().iter().flat_map(|byte| [digit(byte >> 4), digit(byte & 0xf)]).collect())
+}
+
 /// The whole file that repair makes of `bytes`, which may be any; `None` if they are no MCAP file.
-/// Nothing of it touches a disk.
+/// Nothing of it touches a disk, and nothing proves what a torn chunk holds.
 #[must_use]
 pub fn recover_bytes(bytes: &[u8]) -> Option<Vec<u8>> {
     let size = bytes.len() as u64;
-    let go_on = &mut |_, _| ControlFlow::Continue(());
-    let known = summary(bytes, size, go_on).ok()??;
-    let about = About { name: "bytes.mcap", time_ns: 0 };
+    let about = About { name: "bytes.mcap", sha256: String::new(), time_ns: 0, boot: None };
     let mut whole = Vec::new();
     // Memory takes what is written to it.
-    copy(bytes, size, &known, &about, &mut whole, go_on).ok()??;
+    copy(bytes, size, &about, &mut whole, &mut |_, _| ControlFlow::Continue(())).ok()??;
     Some(whole)
 }
 
@@ -130,13 +152,7 @@ impl Sink for &mut Vec<u8> {
     }
 }
 
-/// One that grows meanwhile is read as it was.
-fn open<R: Read>(file: R, size: u64) -> Result<Option<Walk<impl Read + use<R>>>, Error> {
-    Walk::new(BufReader::with_capacity(BUFFER_BYTES, file.take(size)), size).map_err(Error::Read)
-}
-
-fn look<R: Read>(walk: &Walk<R>, size: u64, watched: &mut u64, watch: &mut Watch<'_>) -> Result<(), Error> {
-    let done = walk.walked().bytes;
+fn look(done: u64, size: u64, watched: &mut u64, watch: &mut Watch<'_>) -> Result<(), Error> {
     if done.saturating_sub(*watched) < WATCH_EVERY {
         return Ok(());
     }
@@ -148,27 +164,21 @@ fn look<R: Read>(walk: &Walk<R>, size: u64, watched: &mut u64, watch: &mut Watch
 }
 
 /// The file being written.
-struct Copy<'a, S: Sink> {
+struct Copy<S: Sink> {
     writer: Writer<NoSeek<BufWriter<S>>>,
-    known: &'a Summary,
-    /// Channels and schemas of `known` that were asked for.
-    asked: BTreeSet<(u8, u16)>,
     summary: Summary,
     refused: u64,
 }
 
-impl<'a, S: Sink> Copy<'a, S> {
-    fn new(sink: S, known: &'a Summary) -> Result<Self, Error> {
+impl<S: Sink> Copy<S> {
+    fn new(sink: S) -> Result<Self, Error> {
         let writer = file::writer(sink).map_err(Error::Write)?;
-        Ok(Self { writer, known, asked: BTreeSet::new(), summary: Summary::default(), refused: 0 })
+        Ok(Self { writer, summary: Summary::default(), refused: 0 })
     }
 
     /// Writes a record; one that cannot be meant as it stands is counted.
     fn take(&mut self, record: &Record<'_>) -> Result<(), Error> {
-        let Record { opcode, data, trust } = *record;
-        if trust == Trust::Damaged {
-            return Ok(());
-        }
+        let Record { opcode, data } = *record;
         let written = match opcode {
             op::SCHEMA => self.schema(data),
             op::CHANNEL => self.channel(data),
@@ -214,9 +224,6 @@ impl<'a, S: Sink> Copy<'a, S> {
         let (id, schema) = (fields.u16()?, fields.u16()?);
         let (topic, encoding) = (fields.string()?, fields.string()?);
         let metadata = fields.map()?;
-        if let Err(error) = self.ask(op::SCHEMA, schema) {
-            return Some(Err(error));
-        }
         let added = match self.writer.add_channel_with_id(id, schema, topic, encoding, &metadata) {
             // Better a channel that cannot be decoded than none.
             Err(McapError::UnknownSchema(..)) => {
@@ -232,11 +239,6 @@ impl<'a, S: Sink> Copy<'a, S> {
         let mut fields = Fields(data);
         let (channel_id, sequence) = (fields.u16()?, fields.u32()?);
         let (log_time, publish_time) = (fields.u64()?, fields.u64()?);
-        if !self.summary.has_channel(channel_id)
-            && let Err(error) = self.ask(op::CHANNEL, channel_id)
-        {
-            return Some(Err(error));
-        }
         let header = MessageHeader { channel_id, sequence, log_time, publish_time };
         Some(self.writer.write_to_known_channel(&header, fields.0))
     }
@@ -262,22 +264,7 @@ impl<'a, S: Sink> Copy<'a, S> {
         Some(self.writer.write_metadata(&Metadata { name, metadata }))
     }
 
-    /// Takes over what `known` says a channel or schema is, once.
-    fn ask(&mut self, opcode: u8, id: u16) -> Result<(), McapError> {
-        if !self.asked.insert((opcode, id)) {
-            return Ok(());
-        }
-        let Some(record) = self.known.definition(opcode, id) else { return Ok(()) };
-        let taken = if opcode == op::SCHEMA { self.schema(record) } else { self.channel(record) };
-        match taken {
-            Some(Err(error @ McapError::Io(_))) => return Err(error),
-            Some(Ok(())) => self.summary.record(opcode, record),
-            _ => {}
-        }
-        Ok(())
-    }
-
-    fn finish(mut self, damage: Damage, about: &About<'_>, size: u64) -> Result<Summary, Error> {
+    fn finish(mut self, damage: &Damage, about: &About<'_>, size: u64) -> Result<Summary, Error> {
         let finished = (|| {
             if !self.summary.has_end {
                 let metadata = said::end(&self.summary);

@@ -6,6 +6,7 @@
 use std::fs::{self, DirEntry, File};
 use std::io;
 use std::ops::ControlFlow;
+use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -38,7 +39,7 @@ fn entries(folder: &Path) -> io::Result<Vec<DirEntry>> {
     let mut entries: Vec<DirEntry> = fs::read_dir(folder)?.collect::<Result<_, _>>()?;
     entries.retain(|entry| {
         let is_file = entry.file_type().is_ok_and(|kind| kind.is_file());
-        is_file && entry.file_name().to_str().is_some_and(|name| name.ends_with(".mcap.partial"))
+        is_file && entry.file_name().as_bytes().ends_with(b".mcap.partial")
     });
     entries.sort_by_key(DirEntry::file_name);
     Ok(entries)

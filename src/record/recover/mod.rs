@@ -6,19 +6,21 @@
 //! [`Outcome`]:
 //!
 //! 1. Not whole, with something recorded: repaired into a file of the finished name. The `.partial`
-//!    is removed once that file has its name, or kept as `.damaged` if there is more in it than could
-//!    be read. A finished file is never touched: the repaired one stands beside it, `.recovered.mcap`.
+//!    is removed once that file has its name, or kept as `.damaged` if anything of it was left out. A finished file is never touched: the repaired one stands beside it, `.recovered.mcap`.
 //! 2. Whole, and only its name is missing (a kill at the very end): it gets its name.
-//! 3. Of no bytes: removed, and said. Without a sample: set aside as `.empty`. No MCAP file: set aside
-//!    as `.damaged`. Both are said once, and their number stays taken.
+//! 3. Of no bytes: removed, and said. Whole as far as it goes and without a sample: set aside as `.empty`. No MCAP file,
+//!    or damaged and without a message: set aside as `.damaged`. Both are said once, and their number stays taken.
 //!
-//! Invariant: every message of a repaired file is, byte for byte, one that was recorded.
+//! Invariant: every message of a repaired file is, byte for byte, one that was recorded: its chunk's check value is
+//! right, or the kernel that has kept the order of writes is still running.
 //! Invariant: at every moment all that was recorded is in a file that a later repair finds or in the
 //! repaired file; a repair that ends in its middle leaves a `.recovering`, which the next one replaces.
 //! Invariant: a file somebody else writes or repairs is left alone.
 //! Invariant: memory does not grow with the file, but for the index of its chunks.
 
 mod copy;
+#[cfg(test)]
+mod damage;
 mod folder;
 mod names;
 mod said;
@@ -26,6 +28,7 @@ mod summary;
 #[cfg(test)]
 mod tests;
 
+use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::{self, Read, Seek};
 use std::ops::ControlFlow;
@@ -44,7 +47,7 @@ use self::copy::{Copied, Damage};
 pub use self::folder::{Repairs, left_behind};
 use self::names::{Names, set_aside};
 use self::summary::{Made, Summary};
-pub use super::walk::FileEnd;
+pub use super::walk::{FileEnd, LeftOut};
 
 /// Why a file was not repaired. It is as it was.
 #[derive(Debug, thiserror::Error)]
@@ -128,7 +131,7 @@ pub enum Outcome {
         #[serde(serialize_with = "text::lossy_option")]
         kept: Option<PathBuf>,
     },
-    /// It is no MCAP file.
+    /// It is no MCAP file, or none of its messages can be read.
     Unreadable {
         /// What it is called now.
         #[serde(serialize_with = "text::lossy")]
@@ -148,11 +151,19 @@ pub struct Repaired {
     pub messages: u64,
     /// How the original ends.
     pub end: FileEnd,
-    /// Bytes at the original's end that are not in the file.
+    /// Bytes of the original that could not be read.
     pub unread_bytes: u64,
     /// Chunks left out because they are not what was written.
     pub damaged_chunks: u64,
-    /// Records left out because they contradict others or are too large.
+    /// What else is left out.
+    #[serde(flatten)]
+    pub left_out: LeftOut,
+    /// Messages left out because the definition of their channel is lost, by the channel's number.
+    pub nameless: BTreeMap<u16, u64>,
+    /// Messages taken from a chunk that the end of the file cuts: written since this machine was started, they are
+    /// what was written.
+    pub ordered_messages: u64,
+    /// Records left out because they contradict others.
     pub refused_records: u64,
     /// Time of the last message, RFC 3339.
     pub last: String,
@@ -207,8 +218,8 @@ impl Source<'_> {
             return Ok(Outcome::Empty { kept: None });
         }
         // A footer at the end: perhaps the whole episode, perhaps one that was repaired already.
-        let known = if self.ends_with_magic()? { self.read(watch)?.unwrap_or_default() } else { Summary::default() };
-        if known.is_whole() {
+        let known = if self.ends_with_magic()? { self.read(watch)? } else { None };
+        if known.is_some_and(|known| known.is_whole()) {
             match publish(self.path, &names.finished) {
                 Ok(()) => return Ok(Outcome::Whole { to: names.finished.clone() }),
                 Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
@@ -220,7 +231,8 @@ impl Source<'_> {
             set_aside(path, &names.finished, ending)
                 .map_err(|source| RecoverError::Io { path: path.to_owned(), source })
         };
-        if let Some(made) = self.repaired(&names.finished, watch)? {
+        let sha256 = self.sha256(watch)?;
+        if let Some(made) = self.repaired(&names.finished, &sha256, watch)? {
             let kept = match made {
                 Made::OfAll => {
                     fs::remove_file(path).map_err(|source| self.io(source))?;
@@ -230,16 +242,20 @@ impl Source<'_> {
             };
             return Ok(Outcome::AlreadyRepaired { to: names.finished.clone(), kept });
         }
-        let Some(copied) = self.copy(&names.recovering, &known, watch)? else {
+        let Some(copied) = self.copy(&names.recovering, sha256, watch)? else {
             return Ok(Outcome::Unreadable { kept: aside("damaged")? });
         };
-        if copied.summary.is_empty() {
+        let is_all = copied.damage.is_lossless();
+        if copied.summary.is_empty() && (is_all || copied.summary.messages == 0) {
             remove(&names.recovering);
-            return Ok(Outcome::Empty { kept: Some(aside("empty")?) });
+            // Damage before the first message is not emptiness.
+            let ending = if is_all { "empty" } else { "damaged" };
+            let kept = aside(ending)?;
+            return Ok(if is_all { Outcome::Empty { kept: Some(kept) } } else { Outcome::Unreadable { kept } });
         }
         let to = self.publish(names)?;
         // Removed only where nothing is lost by it: what follows a torn end is less than one record.
-        let original = if copied.damage.is_lossless() {
+        let original = if is_all {
             fs::remove_file(self.path).err().map(|error| {
                 tracing::warn!(file = %self.path.display(), %error, "repaired, but not removed");
                 self.path.to_owned()
@@ -255,11 +271,11 @@ impl Source<'_> {
         if known.is_whole() {
             return Ok(Outcome::Whole { to: self.path.to_owned() });
         }
-        if self.repaired(&names.finished, watch)?.is_some() {
+        let sha256 = self.sha256(watch)?;
+        if self.repaired(&names.finished, &sha256, watch)?.is_some() {
             return Ok(Outcome::AlreadyRepaired { to: names.finished.clone(), kept: None });
         }
-        // Channels that a damaged chunk defines are repeated in the index, if that is left.
-        let Some(copied) = self.copy(&names.recovering, &known, watch)? else {
+        let Some(copied) = self.copy(&names.recovering, sha256, watch)? else {
             return Err(RecoverError::NotMcap(self.path.to_owned()));
         };
         if copied.summary.messages == 0 {
@@ -272,11 +288,11 @@ impl Source<'_> {
 
     /// Copies what can be read into a whole file of the name `to`; `None` if this is no MCAP file.
     /// After an error there is no such file.
-    fn copy(&mut self, to: &Path, known: &Summary, watch: &mut Watch<'_>) -> Result<Option<Copied>, RecoverError> {
-        self.rewind()?;
-        let about = copy::About { name: &self.name(), time_ns: time::realtime_ns() };
+    fn copy(&self, to: &Path, sha256: String, watch: &mut Watch<'_>) -> Result<Option<Copied>, RecoverError> {
+        let boot = episode_format::boot_id();
+        let about = copy::About { name: &self.name(), sha256, time_ns: time::realtime_ns(), boot };
         let copied = names::create(to).map_err(copy::Error::Write).and_then(|file| {
-            let copied = copy::copy(&self.file, self.size, known, &about, file, watch);
+            let copied = copy::copy(&self.file, self.size, &about, file, watch);
             if !matches!(copied, Ok(Some(_))) {
                 remove(to);
             }
@@ -290,23 +306,30 @@ impl Source<'_> {
     }
 
     /// Reads the file without writing anything.
-    fn read(&mut self, watch: &mut Watch<'_>) -> Result<Option<Summary>, RecoverError> {
-        self.rewind()?;
+    fn read(&self, watch: &mut Watch<'_>) -> Result<Option<Summary>, RecoverError> {
         self.summary_of(&self.file, self.size, watch)
     }
 
     fn summary_of(&self, file: &File, size: u64, watch: &mut Watch<'_>) -> Result<Option<Summary>, RecoverError> {
-        copy::summary(file, size, watch).map_err(|error| match error {
-            copy::Error::Read(source) | copy::Error::Write(source) => self.io(source),
-            copy::Error::Interrupted => RecoverError::Interrupted(self.path.to_owned()),
-        })
+        copy::summary(file, size, watch).map_err(|error| self.read_error(error))
     }
 
-    /// Is `finished` a whole file that was made of this one?
-    fn repaired(&self, finished: &Path, watch: &mut Watch<'_>) -> Result<Option<Made>, RecoverError> {
+    fn sha256(&self, watch: &mut Watch<'_>) -> Result<String, RecoverError> {
+        copy::sha256(&self.file, self.size, watch).map_err(|error| self.read_error(error))
+    }
+
+    fn read_error(&self, error: copy::Error) -> RecoverError {
+        match error {
+            copy::Error::Read(source) | copy::Error::Write(source) => self.io(source),
+            copy::Error::Interrupted => RecoverError::Interrupted(self.path.to_owned()),
+        }
+    }
+
+    /// Is `finished` a whole file that was made of this one, whose hash is `sha256`?
+    fn repaired(&self, finished: &Path, sha256: &str, watch: &mut Watch<'_>) -> Result<Option<Made>, RecoverError> {
         let Ok((file, size)) = episode_format::open(finished) else { return Ok(None) };
-        let summary = self.summary_of(&file, size, watch)?;
-        Ok(summary.and_then(|summary| summary.made_of(&self.name(), self.size)))
+        let Some(summary) = self.summary_of(&file, size, watch)? else { return Ok(None) };
+        Ok(summary.made_of(self.size).and_then(|(of, made)| (of == sha256).then_some(made)))
     }
 
     /// Gives the repaired file its name, another one if that is taken.
@@ -333,10 +356,6 @@ impl Source<'_> {
         Ok(end == MAGIC)
     }
 
-    fn rewind(&mut self) -> Result<(), RecoverError> {
-        self.file.rewind().map_err(|source| self.io(source))
-    }
-
     fn name(&self) -> String {
         self.path.file_name().unwrap_or_default().to_string_lossy().into_owned()
     }
@@ -355,14 +374,17 @@ fn remove(recovering: &Path) {
 
 impl Copied {
     fn repaired(&self, to: PathBuf, original: Option<PathBuf>) -> Repaired {
-        let Damage { end, unread_bytes, damaged_chunks, refused_records, .. } = self.damage;
+        let Damage { walked, unread_bytes, refused_records, ref nameless } = self.damage;
         Repaired {
             to,
             seconds: self.summary.seconds(),
             messages: self.summary.messages,
-            end,
+            end: walked.end,
             unread_bytes,
-            damaged_chunks,
+            damaged_chunks: walked.damaged_chunks,
+            left_out: walked.left_out,
+            nameless: nameless.clone(),
+            ordered_messages: walked.ordered_messages,
             refused_records,
             last: time::rfc3339(self.summary.last_ns),
             original,

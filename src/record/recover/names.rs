@@ -1,8 +1,9 @@
 //! How the files of a repair are called.
 
-use std::ffi::OsString;
+use std::ffi::{OsStr, OsString};
 use std::fs::{self, File};
 use std::io;
+use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 
 use super::super::episode::{PARTIAL, publish};
@@ -26,8 +27,9 @@ pub(super) struct Names {
 impl Names {
     pub(super) fn of(path: &Path) -> Self {
         let name = path.file_name().unwrap_or_default();
-        let partial =
-            name.to_str().and_then(|name| name.strip_suffix(PARTIAL)?.strip_suffix('.')).filter(|name| is_mcap(name));
+        // Names need not be UTF-8.
+        let partial = name.as_bytes().strip_suffix(PARTIAL.as_bytes()).and_then(|name| name.strip_suffix(b"."));
+        let partial = partial.map(OsStr::from_bytes).filter(|name| is_mcap(name));
         let (base, finished) = match partial.map(|name| path.with_file_name(name)) {
             Some(finished) => (finished.clone(), finished),
             None => (path.to_owned(), beside(path, 1)),
@@ -44,7 +46,7 @@ impl Names {
     }
 }
 
-fn is_mcap(name: &str) -> bool {
+fn is_mcap(name: &OsStr) -> bool {
     Path::new(name).extension().is_some_and(|extension| extension == "mcap")
 }
 

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use serde_json::{Map, Value, json};
 
 use super::copy::{About, Damage};
-use super::summary::{LOSSLESS, Summary};
+use super::summary::{LOSSLESS, SHA256, Summary};
 use super::{FileEnd, Outcome, Recovered, Repaired};
 use crate::status::Level;
 use crate::text;
@@ -31,11 +31,12 @@ pub(super) fn end(summary: &Summary) -> BTreeMap<String, String> {
 }
 
 /// The metadata record `rapid/recovered`: what was repaired when and by whom, what is there and what
-/// is not.
-pub(super) fn recovered(summary: &Summary, damage: Damage, about: &About<'_>, size: u64) -> BTreeMap<String, String> {
-    let Damage { end, unread_bytes, damaged_chunks, refused_records, .. } = damage;
-    let end = serde_json::to_value(end).ok();
-    text_map([
+/// is not: the keys of [`LeftOut`](super::LeftOut), and as JSON `nameless` `{channel: messages}`. `ordered_messages` were
+/// taken without a check value, because the machine has not been started anew since they were written.
+pub(super) fn recovered(summary: &Summary, damage: &Damage, about: &About<'_>, size: u64) -> BTreeMap<String, String> {
+    let Damage { walked, unread_bytes, refused_records, nameless } = damage;
+    let end = serde_json::to_value(walked.end).ok();
+    let mut said = text_map([
         ("software", concat!("rapid ", env!("CARGO_PKG_VERSION")).to_owned()),
         ("time", time::rfc3339(about.time_ns)),
         ("source", about.name.to_owned()),
@@ -45,10 +46,17 @@ pub(super) fn recovered(summary: &Summary, damage: Damage, about: &About<'_>, si
         ("seconds", summary.seconds().to_string()),
         ("last_wall_ns", summary.last_ns.to_string()),
         ("unread_bytes", unread_bytes.to_string()),
-        ("damaged_chunks", damaged_chunks.to_string()),
+        (SHA256, about.sha256.clone()),
+        ("damaged_chunks", walked.damaged_chunks.to_string()),
+        ("ordered_messages", walked.ordered_messages.to_string()),
+        ("nameless", json!(nameless).to_string()),
         ("refused_records", refused_records.to_string()),
         (LOSSLESS, damage.is_lossless().to_string()),
-    ])
+    ]);
+    if let Ok(Value::Object(left_out)) = serde_json::to_value(walked.left_out) {
+        said.extend(left_out.into_iter().map(|(key, count)| (key, count.to_string())));
+    }
+    said
 }
 
 fn text_map<const N: usize>(pairs: [(&str, String); N]) -> BTreeMap<String, String> {
@@ -68,7 +76,7 @@ impl Recovered {
                     said = format!("{said}; now {}", name(&repaired.to));
                 }
                 if let Some(original) = repaired.original.as_ref().filter(|original| **original != self.file) {
-                    said = format!("{said}; what could not be read is kept in {}", name(original));
+                    said = format!("{said}; all of it is kept in {}", name(original));
                 }
                 (if whole { Level::Info } else { Level::Warn }, said)
             }
@@ -77,13 +85,15 @@ impl Recovered {
             Outcome::AlreadyRepaired { to, kept: None } => (Level::Info, format!("already repaired: {}", name(to))),
             Outcome::AlreadyRepaired { to, kept: Some(kept) } => {
                 let (to, kept) = (name(to), name(kept));
-                (Level::Warn, format!("already repaired: {to}; what could not be read is kept in {kept}"))
+                (Level::Warn, format!("already repaired: {to}; all of it is kept in {kept}"))
             }
             Outcome::Empty { kept: None } => (Level::Info, "of no bytes; removed".to_owned()),
             Outcome::Empty { kept: Some(kept) } => {
                 (Level::Info, format!("nothing was recorded in it; set aside as {}", name(kept)))
             }
-            Outcome::Unreadable { kept } => (Level::Warn, format!("not an MCAP file; set aside as {}", name(kept))),
+            Outcome::Unreadable { kept } => {
+                (Level::Warn, format!("no message in it can be read; set aside as {}", name(kept)))
+            }
         };
         (level, format!("{}: {text}", self.file.display()))
     }
@@ -104,12 +114,16 @@ impl Repaired {
                 let were = if self.unread_bytes == 1 { "was" } else { "were" };
                 but(format!("the last second may be missing: {unread} at the end {were} torn"));
             }
-            FileEnd::Damaged => but(format!("the last {unread} cannot be read")),
+            FileEnd::Damaged => but("the end cannot be read".to_owned()),
         }
-        match self.damaged_chunks {
-            0 => {}
-            1 => but("1 damaged chunk is left out".to_owned()),
-            chunks => but(format!("{} damaged chunks are left out", text::count(chunks))),
+        if self.ordered_messages > 0 {
+            let messages = counted(self.ordered_messages, "message");
+            but(format!("{messages} of a torn chunk taken, written since this machine was started"));
+        }
+        self.left_out.sentences(self.damaged_chunks).into_iter().for_each(&mut but);
+        if !self.nameless.is_empty() {
+            let channels: Vec<_> = self.nameless.iter().map(|(id, count)| format!("{id} ({count})")).collect();
+            but(format!("of channels {}", channels.join(", ")));
         }
         match self.refused_records {
             0 => {}
@@ -126,6 +140,7 @@ fn counted(count: u64, what: &str) -> String {
 
 #[cfg(test)]
 mod tests {
+    use super::super::LeftOut;
     use super::*;
 
     #[test]
@@ -140,6 +155,9 @@ mod tests {
                 seconds: 1.0,
                 unread_bytes: count,
                 damaged_chunks: count,
+                left_out: LeftOut { gaps: count, nameless_messages: count, ..LeftOut::default() },
+                nameless: BTreeMap::from([(7, count)]),
+                ordered_messages: 0,
                 refused_records: count,
             };
             repaired.sentence()
@@ -147,12 +165,14 @@ mod tests {
         assert_eq!(
             said(1),
             "repaired, 1.0 s, 1 message; the last second may be missing: 1 byte at the end was torn; \
-             1 damaged chunk is left out; 1 record that makes no sense is left out"
+             1 damaged chunk is left out; 1 place is not readable; 1 message is left out: the definition of the channel is lost; \
+             of channels 7 (1); 1 record that makes no sense is left out"
         );
         assert_eq!(
             said(2000),
             "repaired, 1.0 s, 2,000 messages; the last second may be missing: 2,000 bytes at the end were torn; \
-             2,000 damaged chunks are left out; 2,000 records that make no sense are left out"
+             2,000 damaged chunks are left out; 2,000 places are not readable; 2,000 messages are left out: the definition \
+             of the channel is lost; of channels 7 (2000); 2,000 records that make no sense are left out"
         );
     }
 }

@@ -8,9 +8,8 @@ use crate::episode_format::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, RECOVERE
 
 /// Key of `rapid/recovered`: "true" where nothing of the original is left out but a torn end.
 pub(super) const LOSSLESS: &str = "lossless";
-/// Bytes of channels and schemas that are remembered: a hundred times what an episode of 64 devices
-/// has. What goes beyond it is not taken over from an index.
-const DEFINITIONS: usize = 16 << 20;
+/// Key of `rapid/recovered`: SHA-256 of the original.
+pub(super) const SHA256: &str = "source_sha256";
 
 /// See the module's comment.
 #[derive(Debug, Default)]
@@ -34,16 +33,14 @@ pub(super) struct Summary {
     /// Messages that say something of the episode: not events or lines of the log, nor what was so
     /// before it began.
     captured: u64,
-    /// Name and size of the file this one was made of.
+    /// The file this one was made of.
     origin: Option<Origin>,
-    definitions: BTreeMap<(u8, u16), Vec<u8>>,
-    defined_bytes: usize,
 }
 
 /// What a file was made of.
 #[derive(Debug)]
 struct Origin {
-    name: String,
+    sha256: String,
     bytes: u64,
     lossless: bool,
 }
@@ -72,7 +69,6 @@ impl Summary {
         let fields = Fields(data);
         // `None` is a record that is shorter than it says.
         let _ = match opcode {
-            op::SCHEMA => self.define(opcode, fields),
             op::CHANNEL => self.channel(fields),
             op::MESSAGE => self.message(fields),
             op::METADATA => self.metadata(fields),
@@ -91,21 +87,11 @@ impl Summary {
         self.captured == 0
     }
 
-    pub(super) fn has_channel(&self, id: u16) -> bool {
-        self.channels.contains_key(&id)
-    }
-
-    /// The record that defines a channel or schema.
-    pub(super) fn definition(&self, opcode: u8, id: u16) -> Option<&[u8]> {
-        self.definitions.get(&(opcode, id)).map(Vec::as_slice)
-    }
-
-    /// Was it made, to its end, by repair of a file of this name and size? Then, whether it holds all
-    /// that file held.
-    pub(super) fn made_of(&self, name: &str, bytes: u64) -> Option<Made> {
-        let origin = self.origin.as_ref().filter(|_| self.is_whole())?;
-        let same = origin.name == name && origin.bytes == bytes;
-        same.then_some(if origin.lossless { Made::OfAll } else { Made::OfParts })
+    /// Was it made, to its end, by repair of a file of so many bytes? Then that file's SHA-256, and whether this one holds
+    /// all that it held.
+    pub(super) fn made_of(&self, bytes: u64) -> Option<(&str, Made)> {
+        let origin = self.origin.as_ref().filter(|origin| self.is_whole() && origin.bytes == bytes)?;
+        Some((&origin.sha256, if origin.lossless { Made::OfAll } else { Made::OfParts }))
     }
 
     /// Says whether every byte of the file was understood and is right.
@@ -119,20 +105,7 @@ impl Summary {
         self.is_sound && (self.has_end || self.begin_ns.is_none())
     }
 
-    fn define(&mut self, opcode: u8, mut fields: Fields<'_>) -> Option<()> {
-        let record = fields.0;
-        let id = fields.u16()?;
-        let bytes = self.defined_bytes + record.len();
-        if bytes <= DEFINITIONS && !self.definitions.contains_key(&(opcode, id)) {
-            self.definitions.insert((opcode, id), record.to_owned());
-            self.defined_bytes = bytes;
-        }
-        Some(())
-    }
-
-    fn channel(&mut self, fields: Fields<'_>) -> Option<()> {
-        self.define(op::CHANNEL, fields);
-        let mut fields = fields;
+    fn channel(&mut self, mut fields: Fields<'_>) -> Option<()> {
         let (id, _schema) = (fields.u16()?, fields.u16()?);
         let (topic, _encoding) = (fields.string()?, fields.string()?);
         let mut metadata = fields.map()?;
@@ -169,8 +142,8 @@ impl Summary {
             _ => {
                 let lossless = map.get(LOSSLESS).is_some_and(|said| said == "true");
                 let bytes = map.get("source_bytes").and_then(|bytes| bytes.parse().ok());
-                let origin = |(name, bytes)| Origin { name, bytes, lossless };
-                self.origin = map.remove("source").zip(bytes).map(origin);
+                let origin = |(sha256, bytes)| Origin { sha256, bytes, lossless };
+                self.origin = map.remove(SHA256).zip(bytes).map(origin);
             }
         }
         Some(())

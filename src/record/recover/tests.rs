@@ -13,7 +13,7 @@ use crate::record::Sink;
 use crate::record::tests::{Bench, registry};
 use crate::status::{Grade, Level};
 
-fn go_on(_: u64, _: u64) -> ControlFlow<()> {
+pub(super) fn go_on(_: u64, _: u64) -> ControlFlow<()> {
     ControlFlow::Continue(())
 }
 
@@ -60,13 +60,15 @@ async fn a_torn_episode_becomes_a_whole_one_with_all_that_was_in_it() {
     assert!(messages.len() > 100 && original.starts_with(&messages));
     assert_eq!((repaired.messages, repaired.end), (messages.len() as u64, FileEnd::Torn));
     assert_eq!((repaired.damaged_chunks, repaired.refused_records, &repaired.original), (0, 0, &None));
-    assert!(repaired.unread_bytes > 0);
+    assert!(repaired.unread_bytes > 0 && repaired.ordered_messages > 0);
     let (level, sentence) = said.sentence();
     let expected = format!(
-        "20261121_t_003.mcap.partial: repaired, {:.1} s, {} messages; the last second may be missing: {} bytes at the end were torn",
+        "20261121_t_003.mcap.partial: repaired, {:.1} s, {} messages; the last second may be missing: {} bytes at the end were torn; \
+         {} messages of a torn chunk taken, written since this machine was started",
         repaired.seconds,
         crate::text::count(repaired.messages),
-        crate::text::count(repaired.unread_bytes)
+        crate::text::count(repaired.unread_bytes),
+        crate::text::count(repaired.ordered_messages)
     );
     assert!(level == Level::Info && sentence.ends_with(&expected), "{sentence}");
 
@@ -281,11 +283,11 @@ impl Sink for SmallDisk {
 #[test]
 fn a_disk_that_is_full_at_any_byte_is_said() {
     let bytes = testing::episode(testing::options().compression(None));
-    let about = About { name: "bytes.mcap", time_ns: 0 };
+    let about = About { name: "bytes.mcap", sha256: String::new(), time_ns: 0, boot: None };
     let needed = recover_bytes(&bytes).unwrap().len();
     for room in (0..needed).step_by(13) {
         let disk = SmallDisk(Vec::new(), room);
-        let copied = copy::copy(&*bytes, bytes.len() as u64, &Summary::default(), &about, disk, &mut go_on);
+        let copied = copy::copy(&*bytes, bytes.len() as u64, &about, disk, &mut go_on);
         assert!(matches!(copied, Err(Error::Write(error)) if error.kind() == io::ErrorKind::StorageFull), "{room}");
     }
 }

@@ -1,0 +1,140 @@
+//! What a walk through a file finds of the file itself.
+
+use std::io;
+
+use super::header::Writer;
+use super::source::ReadAt;
+use super::walk::Walk;
+use crate::text;
+
+/// How a file ends.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum FileEnd {
+    /// With its footer: the recorder finished it.
+    Finished,
+    /// Between two records: the recorder was ended before it could finish, or is still writing.
+    Unfinished,
+    /// Within a record: the last write was cut in two.
+    Torn,
+    /// At something that is no record; what follows it is unknown.
+    Damaged,
+}
+
+/// What of a file is left out because it cannot be read, or because nothing proves it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
+pub struct LeftOut {
+    /// Places at which the file could not be read. Reading continued behind them where anything right follows.
+    pub gaps: u64,
+    /// Records larger than 256 MiB.
+    pub oversized_records: u64,
+    /// Chunks that would decompress to more than is allowed for a file of this size.
+    pub swollen_chunks: u64,
+    /// Chunks that were there before.
+    pub repeated_chunks: u64,
+    /// Messages of right chunks whose channel nothing in the file defines.
+    pub nameless_messages: u64,
+    /// Whole messages of a chunk that the end of the file cuts, which nothing proves.
+    pub unproven_messages: u64,
+    /// Bytes of that chunk.
+    pub unproven_bytes: u64,
+}
+
+impl LeftOut {
+    /// What it is and how much, for people, one part after the other; of `damaged_chunks` too.
+    #[must_use]
+    pub fn sentences(&self, damaged_chunks: u64) -> Vec<String> {
+        let Self { gaps, oversized_records, swollen_chunks, repeated_chunks, nameless_messages, .. } = *self;
+        let said = [
+            (damaged_chunks, "damaged chunk", "left out"),
+            (gaps, "place", "not readable"),
+            (oversized_records, "record", "left out: larger than 256 MiB"),
+            (swollen_chunks, "chunk", "left out: too large when decompressed"),
+            (repeated_chunks, "chunk", "left out: a repetition"),
+            (nameless_messages, "message", "left out: the definition of the channel is lost"),
+        ];
+        let said = said.into_iter().filter(|(count, ..)| *count > 0);
+        let mut said: Vec<String> = said.map(|(count, what, why)| format!("{} {why}", is(count, what))).collect();
+        if self.unproven_bytes > 0 {
+            let messages = is(self.unproven_messages, "message");
+            said.push(format!("{messages} left out: in a chunk that is cut, and nothing proves that they are whole"));
+        }
+        said
+    }
+
+    fn is_nothing(&self) -> bool {
+        *self == Self::default()
+    }
+}
+
+/// `1 place is`, `2,000 places are`.
+fn is(count: u64, what: &str) -> String {
+    if count == 1 { format!("1 {what} is") } else { format!("{} {what}s are", text::count(count)) }
+}
+
+/// What a walk has found so far.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Walked {
+    /// How the file ends.
+    pub(crate) end: FileEnd,
+    /// Bytes understood.
+    pub(crate) bytes: u64,
+    /// Chunks whose content is not what was written; nothing of them is shown.
+    pub(crate) damaged_chunks: u64,
+    /// What else is left out.
+    pub(crate) left_out: LeftOut,
+    /// Whole messages of a chunk that the end of the file cuts, shown because the kernel that was running when they
+    /// were written still is: it has kept their order.
+    pub(crate) ordered_messages: u64,
+    /// The file is whole: finished, nothing behind its end, every check value right, nothing left out.
+    pub(crate) sound: bool,
+    /// It is sound, and every check value is there: none is zero, which the format has for "not computed".
+    pub(crate) proven: bool,
+    /// Which program wrote it.
+    pub(crate) writer: Writer,
+}
+
+impl Walked {
+    /// Of a walk that begins.
+    pub(super) fn nothing() -> Self {
+        Self {
+            end: FileEnd::Unfinished,
+            bytes: 0,
+            damaged_chunks: 0,
+            left_out: LeftOut::default(),
+            ordered_messages: 0,
+            sound: false,
+            proven: false,
+            writer: Writer::Unknown,
+        }
+    }
+
+    /// Is nothing left out but, perhaps, less than one record at a torn end?
+    pub(crate) fn is_all(&self) -> bool {
+        self.sound || self.end != FileEnd::Damaged && self.damaged_chunks == 0 && self.left_out.is_nothing()
+    }
+}
+
+/// A record that is not one of the container's own.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Record<'a> {
+    pub(crate) opcode: u8,
+    pub(crate) data: &'a [u8],
+}
+
+/// Is `file`, of `size` bytes, an MCAP file, and what does a walk through it find? Every record that is not one of the
+/// container's own is shown to `visit`, with its opcode, chunks opened up. `boot`: see [`Walk::of_boot`]. `None`: no
+/// MCAP file.
+pub(crate) fn walk(
+    file: impl ReadAt,
+    size: u64,
+    boot: Option<String>,
+    visit: &mut dyn FnMut(u8, &[u8]),
+) -> io::Result<Option<Walked>> {
+    let Some(walk) = Walk::new(file, size)? else { return Ok(None) };
+    let mut walk = walk.of_boot(boot);
+    while let Some(record) = walk.next()? {
+        visit(record.opcode, record.data);
+    }
+    Ok(Some(walk.walked()))
+}
