@@ -71,9 +71,8 @@ impl<R: ReadAt> Walk<R> {
     pub(super) fn show(&mut self, head: ChunkHead, records: Records) {
         self.sure = self.at;
         (self.chunked, self.with_checks) = (true, self.with_checks || head.crc != 0);
-        // Two messages at two times are not recorded twice.
-        let is_new =
-            self.seen.insert((head.size, head.packed, head.crc)) || head.crc == 0 || head.times.0 == head.times.1;
+        // Nothing is recorded twice; without a clock it cannot be told.
+        let is_new = self.seen.insert((head.size, head.packed, head.crc)) || head.crc == 0 || head.times == (0, 0);
         if is_new {
             self.chunk = Some(records);
         } else {
