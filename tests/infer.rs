@@ -70,7 +70,7 @@ fn infer(place: &Place, bundle: &str, scenario: &str, more: &[&str]) -> (Option<
 
 /// The exit code by the verdicts of the episodes.
 fn recorded_code(events: &[Value]) -> Option<i32> {
-    support::recorded_code(&events.iter().map(|event| format!("{event}\n")).collect::<String>())
+    support::recorded_code(&events.iter().map(Value::to_string).collect::<Vec<_>>().join("\n"))
 }
 
 fn of<'a>(events: &'a [Value], event: &'a str) -> impl Iterator<Item = &'a Value> {
