@@ -375,10 +375,13 @@ async fn finish(
             keep_first(&mut outcome, ended);
         }
     }
+    if twice {
+        keep_first(&mut outcome, Err(AppError::InterruptedTwice));
+    }
     if let Some((count, file)) = judged.and_then(|board| board.bad_episodes()) {
         keep_first(&mut outcome, Err(AppError::Bad { count, file }));
     }
-    if twice { outcome.and(Err(AppError::InterruptedTwice)) } else { outcome }
+    outcome
 }
 
 fn keep_first(outcome: &mut Result<(), AppError>, next: Result<(), AppError>) {

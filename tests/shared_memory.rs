@@ -183,7 +183,8 @@ fn memory_in_use_that_is_lost_ends_the_run_in_order() {
     let place = Place::new();
     let running = place.start_as(in_memory_of(&place, "90m", &RECORD), RECORDING);
     let memory = fill(&running);
-    // What was reserved for pictures is taken back, and taken by another.
+    // What was reserved for pictures is taken back, and taken by another, before the run can take it again.
+    running.signal(Signal::STOP);
     for entry in std::fs::read_dir(memory.parent().expect("a folder")).expect("the run's memory").flatten() {
         let is_pictures = entry.file_name().to_string_lossy().ends_with(".data");
         if let Some(length) =
@@ -195,6 +196,7 @@ fn memory_in_use_that_is_lost_ends_the_run_in_order() {
         }
     }
     fill_up(&mut File::options().append(true).open(&memory).expect("the run's memory"));
+    running.signal(Signal::CONT);
     let (code, output, errors) = running.end();
     assert_eq!(code, Some(1), "{errors}");
     let reason = "/dev/shm: shared memory that is in use cannot be written";

@@ -16,7 +16,8 @@ use super::{AppError, Asked, Running, Screen, policy_ended, screen};
 use crate::bus;
 use crate::fault;
 use crate::record::{EpisodeRequest, RecordError, Recorder};
-use crate::status::{Board, EpisodeEnd, Event, Level, SlotState, What};
+use crate::sample::Epoch;
+use crate::status::{Board, DeviceStatus, EpisodeEnd, Event, Level, SlotState, What};
 use crate::time::Stamp;
 
 /// An episode asked for at the start begins when every attached device delivers, at the latest
@@ -108,10 +109,12 @@ impl Conductor {
         }
     }
 
-    /// A run that waits for its first device looks like one that works.
+    /// A run that waits for its first device looks like one that works. Of one whose devices were unplugged the events
+    /// tell.
     fn say_if_none(&self) {
         let devices = self.board.snapshot().devices;
-        if !devices.is_empty() && devices.iter().all(|device| device.state == SlotState::Absent) {
+        let never = |device: &DeviceStatus| device.state == SlotState::Absent && device.epoch == Epoch::default();
+        if !devices.is_empty() && devices.iter().all(never) {
             let text = "no device of the registry is plugged in; `rapid devices` lists what is, and which entry it is";
             self.board.announce(What::Log { level: Level::Warn, text: text.to_owned() });
         }

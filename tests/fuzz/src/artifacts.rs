@@ -2,11 +2,13 @@
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
+use std::net::{Ipv4Addr, Ipv6Addr};
 use std::path::Path;
+use std::time::Duration;
 
 use rapid::modality::ModalityKind;
 use rapid::registry::artifacts::{ArtifactKind, artifacts};
-use rapid::registry::{CanAdapter, DeviceSpec, NodeSpec, Opens, ProcessSpec, Registry};
+use rapid::registry::{CanAdapter, DeviceSpec, Hook, LanFind, LanProtocol, LanSpec, NodeSpec, ProcessSpec, Registry};
 use yaml_rust2::{Yaml, YamlLoader};
 
 use crate::rules::{self, Token};
@@ -14,25 +16,9 @@ use crate::rules::{self, Token};
 /// All of them.
 pub(crate) fn check(registry: &Registry) {
     let unit_without_names = |text: &str| text.replace(&registry.rig.name, "");
-    // A harmless registry that has as much to open: of all that is in a registry only that may change the unit.
+    // A harmless registry whose entries have as much to open: of all that is in a registry only that may change the unit.
     let mut harmless = Registry::builtin();
-    let on_usb =
-        |device: &DeviceSpec| matches!(&device.node, NodeSpec::Process(program) if program.opens == Opens::Usb);
-    if let (true, Some(first)) = (registry.devices.iter().any(on_usb), harmless.devices.first_mut()) {
-        first.node = NodeSpec::Process(ProcessSpec {
-            program: "/usr/bin/true".into(),
-            args: Vec::new(),
-            opens: Opens::Usb,
-            kind: ModalityKind::Bytes,
-            shape: Vec::new(),
-        });
-    }
-    let bus = |device: &DeviceSpec| {
-        matches!(&device.node, NodeSpec::Can(can) if can.adapter == CanAdapter::SocketCan).then(|| device.node.clone())
-    };
-    if let (Some(bus), Some(last)) = (registry.devices.iter().find_map(bus), harmless.devices.last_mut()) {
-        last.node = bus;
-    }
+    harmless.devices = registry.devices.iter().map(harmless_device).collect();
     let expected = unit_without_names(&text_of_unit(&harmless).replace(&harmless.rig.name, ""));
     for artifact in artifacts(registry) {
         let text = &artifact.contents;
@@ -42,6 +28,39 @@ pub(crate) fn check(registry: &Registry) {
             ArtifactKind::Descriptor => check_descriptor(registry, &artifact.path, text),
         }
     }
+}
+
+/// A device of which the system is asked the same as of `device`, and that has nothing else in common with it.
+fn harmless_device(device: &DeviceSpec) -> DeviceSpec {
+    let mut harmless = Registry::builtin().devices.swap_remove(0);
+    let program = || std::path::PathBuf::from("/usr/bin/true");
+    match &device.node {
+        NodeSpec::Process(process) => {
+            harmless.node = NodeSpec::Process(ProcessSpec {
+                program: program(),
+                args: Vec::new(),
+                opens: process.opens,
+                kind: ModalityKind::Bytes,
+                shape: Vec::new(),
+            });
+        }
+        NodeSpec::Can(can) if can.adapter == CanAdapter::SocketCan => harmless.node = device.node.clone(),
+        NodeSpec::Lan(lan) => {
+            let hosts = [Ipv4Addr::LOCALHOST.into(), Ipv6Addr::LOCALHOST.into()];
+            let find = match (&lan.find, lan.find.families()) {
+                (LanFind::Mdns { .. }, _) => LanFind::Mdns { service: "_x._tcp".to_owned(), instance: None },
+                (_, [_, true]) => LanFind::Adapter { host: Some(hosts[1]) },
+                _ => LanFind::Adapter { host: Some(hosts[0]) },
+            };
+            harmless.node =
+                NodeSpec::Lan(LanSpec { protocol: LanProtocol::Udp { port: 1 }, find, lease: Duration::from_secs(3) });
+        }
+        NodeSpec::Can(_) | NodeSpec::Camera(_) | NodeSpec::Serial(_) => {}
+    }
+    if !device.hooks.is_empty() {
+        harmless.hooks.attach = Some(Hook { program: program(), args: Vec::new() });
+    }
+    harmless
 }
 
 fn text_of_unit(registry: &Registry) -> String {
