@@ -16,7 +16,7 @@ fn a_recording_of_a_given_duration_ends_by_itself_with_one_whole_file() {
     let place = Place::new();
     let output =
         place.run(&[&RECORD[..], &["--duration", "2s", "--task", "Place block!", "--tag", "finger=soft"]].concat());
-    assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+    assert_eq!(output.status.code(), support::recorded_code(&text(&output.stdout)), "{}", text(&output.stderr));
     let files = place.files("out");
     assert_eq!(files.len(), 1, "{files:?}");
     assert!(files[0].ends_with("_place-block_001.mcap"), "{files:?}");
@@ -63,7 +63,7 @@ fn a_killed_run_leaves_a_partial_file_and_the_next_one_starts_cleanly_and_looks_
     assert!(place.files("out")[0].ends_with(".mcap.partial"));
     assert!(place.mask_file().exists());
     let output = place.run(&[&RECORD[..], &["--duration", "1s"]].concat());
-    assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+    assert_eq!(output.status.code(), support::recorded_code(&text(&output.stdout)), "{}", text(&output.stderr));
     let files = place.files("out");
     assert!(files.len() == 2 && !files.iter().any(|name| name.ends_with(".partial")), "{files:?}");
     assert!(!place.mask_file().exists());
@@ -191,7 +191,8 @@ fn a_reader_that_goes_away_does_not_end_the_recording() {
     let mut child = place.command(&[&RECORD[..], &["--duration", "2s"]].concat()).spawn().expect("rapid runs");
     drop(child.stdout.take());
     let status = child.wait().expect("wait");
-    assert_eq!(status.code(), Some(0));
+    // What became of the episode has no reader.
+    assert!(matches!(status.code(), Some(0 | 4)), "{status}");
     let files = place.files("out");
     assert!(files.len() == 1 && files[0].ends_with("_001.mcap"), "{files:?}");
     Episode::read(&place.path("out").join(&files[0]));

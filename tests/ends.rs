@@ -196,7 +196,9 @@ fn a_terminal_that_is_closed_ends_the_run_with_a_whole_file() {
         // Closing the master hangs the terminal up.
         run.master = None;
         until("the end", || run.child.try_wait().expect("wait").is_some());
-        assert_eq!(run.child.wait().expect("wait").code(), Some(0), "{arguments:?}");
+        let code = run.child.wait().expect("wait").code();
+        // What became of the episode cannot be read from a terminal that is gone.
+        assert!(code == Some(0) || (arguments == headless && code == Some(4)), "{arguments:?}: {code:?}");
         whole_episode(&place, "hung up");
         assert!(!place.mask_file().exists());
     }

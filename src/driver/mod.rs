@@ -7,6 +7,7 @@
 //! Invariant: no driver blocks: what may block while opening runs on tokio's blocking pool.
 //! Invariant: no bytes from a device make a driver panic.
 
+mod arrival;
 pub mod camera;
 pub mod can;
 pub mod lan;

@@ -8,20 +8,19 @@
 //! Invariant: memory is bounded by the longest permitted message, whatever the device sends.
 //! Invariant: a stamp is the moment the bytes that completed the message came into our hands; a
 //! serial line gives no earlier one. Of several messages in one read each is older than the next by the
-//! least time that its bytes take on a line ([`BYTE_TIME`]): stamps always increase.
+//! least time that its bytes take on a line (`arrival`): stamps always increase.
 
 mod framing;
 mod parse;
 
 use std::os::fd::{FromRawFd as _, IntoRawFd as _, OwnedFd};
 use std::path::Path;
-use std::time::Duration;
 
 use tokio::io::AsyncReadExt as _;
 use tokio_serial::{ClearBuffer, SerialPort as _, SerialPortBuilder, SerialStream};
 
 use self::framing::{Cut, Framer};
-use super::{DriverError, Reading, unblock};
+use super::{DriverError, Reading, arrival, unblock};
 use crate::provenance::{Format, Negotiated};
 use crate::registry::{Framing, Parse, SerialSpec};
 use crate::sample::Encoding;
@@ -29,9 +28,6 @@ use crate::time::Stamp;
 
 /// Bytes taken from the kernel at once.
 const INBOX: usize = 4096;
-/// What a byte takes at full speed of USB, 12 Mbit/s (USB 2.0, section 7.1.11); the baud rate of a CDC-ACM device
-/// says nothing about its line.
-const BYTE_TIME: Duration = Duration::from_nanos(667);
 /// Longest message of a text format without many channels.
 const SHORT_MESSAGE: usize = 4096;
 /// The longest a number in text may reasonably be, with its separator; JSON keys included.
@@ -99,7 +95,7 @@ impl Serial {
             (self.taken, self.filled) = (0, count);
         }
         let lost = std::mem::take(&mut self.lost);
-        self.stamped = completed(self.arrived, self.filled - self.taken, self.stamped);
+        self.stamped = arrival::completed(self.arrived, self.filled - self.taken, self.stamped);
         Ok(self.decoder.reading(self.stamped, lost))
     }
 
@@ -130,13 +126,6 @@ impl Serial {
     pub fn negotiated(&self) -> Negotiated {
         Negotiated { format: Some(self.format.clone()), ..Negotiated::default() }
     }
-}
-
-/// When the message before the last `behind` bytes of a read at `arrived` was complete; later than `last`, the stamp of
-/// the message before it.
-fn completed(arrived: Stamp, behind: usize, last: Stamp) -> Stamp {
-    let behind = BYTE_TIME.saturating_mul(u32::try_from(behind).unwrap_or(u32::MAX));
-    arrived.before(behind).max(last.after(Duration::from_nanos(1)))
 }
 
 /// From bytes to readings, without I/O.

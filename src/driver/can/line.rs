@@ -13,7 +13,7 @@ use rustix::io::Errno;
 use super::link::{Arrival, LinkError};
 use super::{damiao_serial, slcan};
 use crate::control::can::CanFrame;
-use crate::driver::serial;
+use crate::driver::{arrival, serial};
 use crate::time::Stamp;
 
 /// Bytes taken from the kernel at once.
@@ -34,6 +34,8 @@ pub struct Line {
     filled: usize,
     /// When the bytes in `inbox` arrived.
     arrived: Stamp,
+    /// Of the last frame.
+    stamped: Stamp,
     /// `unsent[..left]` is what is still to be written of the last frame.
     unsent: [u8; LONGEST],
     left: usize,
@@ -99,6 +101,7 @@ impl Line {
             taken: 0,
             filled: 0,
             arrived: Stamp::default(),
+            stamped: Stamp::default(),
             unsent: [0; LONGEST],
             left: 0,
             lost: 0,
@@ -186,7 +189,8 @@ impl Line {
             while self.taken < self.filled {
                 if let Decoded::Frame(found) = self.decode() {
                     *frame = found;
-                    return Ok(Some(Arrival { at: self.arrived, from_kernel: false }));
+                    self.stamped = arrival::completed(self.arrived, self.filled - self.taken, self.stamped);
+                    return Ok(Some(Arrival { at: self.stamped, from_kernel: false }));
                 }
             }
             if !self.fill()? {

@@ -90,23 +90,3 @@ proptest! {
         prop_assert_eq!(decode(&spec, &chunks), decode(&spec, &[&bytes]));
     }
 }
-
-proptest! {
-    #[test]
-    fn messages_of_one_read_are_one_after_another(
-        reads in proptest::collection::vec((1u64..50_000_000, proptest::collection::vec(1usize..100, 1..40)), 1..20),
-    ) {
-        // As a line does: no byte comes faster than the line carries it.
-        let (mut arrived, mut last) = (Stamp(1_000_000_000), Stamp::default());
-        for (pause, lengths) in reads {
-            let mut behind: usize = lengths.iter().sum();
-            arrived = arrived.after(BYTE_TIME * u32::try_from(behind).unwrap()).after(Duration::from_nanos(pause));
-            for length in lengths {
-                behind -= length;
-                let stamp = completed(arrived, behind, last);
-                prop_assert!(stamp > last && stamp <= arrived, "{stamp:?} after {last:?}, read at {arrived:?}");
-                last = stamp;
-            }
-        }
-    }
-}

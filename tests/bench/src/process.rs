@@ -52,7 +52,8 @@ pub(crate) struct Usage {
     pub threads: Vec<ThreadUse>,
     /// Everything it wrote to standard output.
     pub output: String,
-    /// It ended with success.
+    /// It ended with success. Code 4 is an episode that is BAD, as one without a device must be: what a section measures is
+    /// for the section to judge.
     pub success: bool,
 }
 
@@ -155,7 +156,7 @@ impl Running {
             std::thread::sleep(LOOK);
         }
         self.usage.cpu_s = cpu_s(self.pid).unwrap_or_default();
-        self.usage.success = self.child.wait()?.success();
+        self.usage.success = matches!(self.child.wait()?.code(), Some(0 | 4));
         while let Ok(line) = self.lines.recv_timeout(END_LIMIT) {
             self.take(&line);
         }

@@ -18,13 +18,18 @@ pub fn play(scenario: Scenario) -> Outcome {
 /// Plays a scenario in which `rapid` records to its end without an error on any side.
 pub fn recorded(scenario: Scenario) -> Outcome {
     let outcome = play(scenario);
-    assert_eq!(outcome.code, 0, "the guest's script");
-    // A BAD episode is for the scenario to judge; the exit code is to say so.
-    let is_bad = outcome.rapid.iter().any(|line| line["event"] == "episode" && line["verdict"] == "BAD");
-    assert_eq!(outcome.rapid_code, Some(if is_bad { 4 } else { 0 }), "rapid's exit code");
+    ended(&outcome);
     assert!(outcome.emulator_errors().is_empty(), "{:?}", outcome.emulator_errors());
     assert!(outcome.rapid.iter().any(|line| line["event"] == "episode"), "no episode was announced");
     outcome
+}
+
+/// The guest's script and `rapid` ended without an error. A BAD episode is for the scenario to judge; the exit code is to
+/// say so.
+pub fn ended(outcome: &Outcome) {
+    assert_eq!(outcome.code, 0, "the guest's script: {}", outcome.log);
+    let is_bad = outcome.rapid.iter().any(|line| line["event"] == "episode" && line["verdict"] == "BAD");
+    assert_eq!(outcome.rapid_code, Some(if is_bad { 4 } else { 0 }), "rapid's exit code: {}", outcome.log);
 }
 
 /// The one episode there must be.

@@ -1,7 +1,7 @@
 //! `rapid` with motors behind a CAN adapter: they move after an arm and at no other time, and each way out disables them.
 
 use serde_json::Value;
-use vbench::check::{episode, ms, play};
+use vbench::check::{ended, episode, ms, play};
 use vbench::emu::can::adapter::Protocol;
 use vbench::emu::spec::DeviceSpec;
 use vbench::entries::{can, registry};
@@ -107,7 +107,7 @@ fn motors_move_after_an_arm_and_at_no_other_time() {
             .script(SCRIPT)
             .limit(std::time::Duration::from_secs(180)),
     );
-    assert_eq!((outcome.code, outcome.rapid_code), (0, Some(0)), "{}", outcome.log);
+    ended(&outcome);
     assert!(outcome.emulator_errors().is_empty(), "{:?}", outcome.emulator_errors());
     let log = &outcome.emu[..];
 
