@@ -81,6 +81,7 @@ impl<R: ReadAt> Walk<R> {
         // Parts of the file itself may stand behind: another file does not belong to it.
         self.sure = self.at;
         if is_last || !self.resync(self.at, self.at)? {
+            self.walked.left_out.bytes_behind = self.source.size.saturating_sub(self.sure);
             return Ok(Step::End(FileEnd::Finished));
         }
         Ok(Step::Again)

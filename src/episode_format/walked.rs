@@ -38,13 +38,16 @@ pub struct LeftOut {
     pub unproven_messages: u64,
     /// Bytes of that chunk.
     pub unproven_bytes: u64,
+    /// Bytes behind the end of a finished file: they are another file's, or belong to none.
+    pub bytes_behind: u64,
 }
 
 impl LeftOut {
     /// What it is and how much, for people, one part after the other; of `damaged_chunks` too.
     #[must_use]
     pub fn sentences(&self, damaged_chunks: u64) -> Vec<String> {
-        let Self { gaps, oversized_records, swollen_chunks, repeated_chunks, nameless_messages, .. } = *self;
+        let Self { gaps, oversized_records, swollen_chunks, repeated_chunks, nameless_messages, bytes_behind, .. } =
+            *self;
         let said = [
             (damaged_chunks, "damaged chunk", "left out"),
             (gaps, "place", "not readable"),
@@ -52,6 +55,7 @@ impl LeftOut {
             (swollen_chunks, "chunk", "left out: too large when decompressed"),
             (repeated_chunks, "chunk", "left out: a repetition"),
             (nameless_messages, "message", "left out: the definition of the channel is lost"),
+            (bytes_behind, "byte", "left out: behind the end of the file"),
         ];
         let said = said.into_iter().filter(|(count, ..)| *count > 0);
         let mut said: Vec<String> = said.map(|(count, what, why)| format!("{} {why}", is(count, what))).collect();

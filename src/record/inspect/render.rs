@@ -190,6 +190,7 @@ fn repair(source: &str, recovered: &BTreeMap<String, String>) -> String {
         "repeated_chunks",
         "nameless_messages",
         "unproven_messages",
+        "bytes_behind",
         "refused_records",
         "ordered_messages",
     ];

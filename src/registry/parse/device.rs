@@ -11,9 +11,11 @@ use super::verdict::{VerdictTable, Whose};
 use super::{action, can, hooks, identity, lan, motors, node, process, verdict};
 use crate::modality::ModalityId;
 use crate::registry::diagnostic::did_you_mean;
+use crate::registry::limits::VerdictSpec;
 use crate::registry::section::{At, Problems, Section};
 use crate::registry::spec::{
-    ActionSpec, CanProtocol, CanSpec, DeviceSpec, Hook, Hooks, IdentitySpec, LanSpec, Mount, NodeSpec, Opens, WhenStale,
+    ActionSpec, CanProtocol, CanSpec, DeviceSpec, Hook, Hooks, IdentitySpec, LanProtocol, LanSpec, Mount, NodeSpec,
+    Opens, WhenStale,
 };
 
 /// Kinds of node this version has a driver for.
@@ -97,8 +99,13 @@ impl Draft<'_> {
             NodeSpec::Lan(lan) => lan.rate(),
             _ => None,
         };
+        let mut usual = VerdictSpec::of(node.modality_kind(), self.stall_after, fps);
+        if matches!(&node, NodeSpec::Lan(lan) if matches!(lan.protocol, LanProtocol::Gopro { .. })) {
+            // Its samples are looks at its state, once a second, and no observation: its pictures are in the clip.
+            (usual.suspect.valid, usual.bad.valid) = (None, None);
+        }
         Some(DeviceSpec {
-            verdict: verdict::spec(node.modality_kind(), self.stall_after, fps, rig, &self.verdict),
+            verdict: verdict::changed(usual, rig, &self.verdict),
             name: self.name,
             id: self.id?,
             identity: self.identity?,

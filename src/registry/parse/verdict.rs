@@ -9,7 +9,6 @@
 
 use std::time::Duration;
 
-use crate::modality::ModalityKind;
 use crate::registry::limits::{Limits, VerdictSpec};
 use crate::registry::section::{Problems, Section};
 
@@ -172,15 +171,9 @@ impl Worse {
     }
 }
 
-/// The limits of a device: the defaults, changed by the rig's table, then by its own.
-pub(super) fn spec(
-    kind: ModalityKind,
-    stall_after: Duration,
-    fps: Option<f64>,
-    rig: &VerdictTable,
-    own: &VerdictTable,
-) -> VerdictSpec {
-    let mut spec = VerdictSpec::of(kind, stall_after, own.hz.or(fps));
+/// The limits of a device: `spec`, the defaults, changed by the rig's table, then by its own.
+pub(super) fn changed(mut spec: VerdictSpec, rig: &VerdictTable, own: &VerdictTable) -> VerdictSpec {
+    spec.hz = own.hz.or(spec.hz);
     for (table, whose) in [(rig, Whose::Rig), (own, Whose::Device)] {
         for (index, (_, of, worse)) in SHARES.iter().enumerate() {
             let written = |of: &Written| of.shares.get(index).copied().flatten();

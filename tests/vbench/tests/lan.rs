@@ -38,7 +38,7 @@ emu link 1 1
 wait_for 60 states 3 lidar streaming || fail 'the lidar does not stream with its cable back'
 sleep 2
 rapid_stop
-[ "$(cat $out/rapid.rc)" = 0 ] || fail 'rapid ended with an error'
+case $(cat $out/rapid.rc) in 0|4) ;; *) fail 'rapid ended with an error' ;; esac
 cp $out/rapid.jsonl $out/first.jsonl
 # The clip is fetched beside its episode, by the next run if the first had no time for it.
 clip() { find $out/rec -name '*.MP4' -size 2000000c | grep -q .; }
