@@ -256,6 +256,22 @@ fn what_an_ended_repair_could_not_read_is_kept_by_the_next() {
     assert_eq!(names(folder.path()), ["a_001.mcap", "a_001.mcap.damaged"]);
 }
 
+#[test]
+fn what_stands_behind_the_end_of_a_file_is_kept() {
+    let whole = testing::episode(testing::options());
+    let other = testing::episode(testing::options().compression(None));
+    for behind in [&b"x"[..], &[0; 5000], &whole, &other] {
+        let folder = tempfile::tempdir().unwrap();
+        let bytes = [&whole[..], behind].concat();
+        let partial = put(&folder, "a_001.mcap.partial", &bytes);
+        let first = repaired(&partial);
+        let original = first.original.expect("what was not read is kept");
+        assert_eq!(fs::read(original).unwrap(), bytes);
+        assert_eq!(strictly(&fs::read(first.to).unwrap()), strictly(&whole));
+        assert_eq!(first.left_out.bytes_behind, behind.len() as u64);
+    }
+}
+
 /// A disk that takes so many bytes.
 struct SmallDisk(Vec<u8>, usize);
 
