@@ -250,10 +250,11 @@ impl Writer {
             begin,
         };
         let session = Session::begin(beginning, &self.streams.masks).map_err(failed)?;
+        // Withdrawn before the next one shows.
+        self.set_short(None);
         self.config.board.set_recording(Some(session.status(begin)));
         self.config.board.announce(What::Recording { file: finished.clone() });
         self.session = Some(session);
-        self.set_short(None);
         self.publishers = Publishers::default();
         self.episode.send_replace(Some(Arc::new(Episode::new(&finished))));
         self.space = Some(space);

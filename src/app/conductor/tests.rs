@@ -257,25 +257,28 @@ async fn the_last_episode_is_dropped_when_asked_for_and_no_other() {
     let keys = async {
         let first = moment(&bench.board, &bench.keys).await;
         let second = moment(&bench.board, &bench.keys).await;
-        // Not the last one; a file that is no episode; the last one.
+        // Not the last one; a file that is no episode.
         let foreign = first.with_file_name("notes.mcap");
         std::fs::write(&foreign, "precious").unwrap();
-        for file in [&first, &foreign, &second] {
+        for file in [&first, &foreign] {
             bench.keys.send(Asked::DropEpisode(file.clone())).unwrap();
         }
-        when(&bench.board, "the last is dropped", |snapshot| snapshot.short_episode.is_none()).await;
-        when(&bench.board, "its file is gone", |snapshot| snapshot.last_episode.is_none()).await;
-        assert!(first.exists() && foreign.exists() && !second.exists());
-        // One that is asked for when the next has begun.
+        // What is asked for is done in turn: both were refused when this one has begun.
         let third = moment(&bench.board, &bench.keys).await;
-        bench.keys.send(Asked::ToggleRecording(Stamp::now())).unwrap();
+        assert!(first.exists() && foreign.exists() && second.exists());
         bench.keys.send(Asked::DropEpisode(third.clone())).unwrap();
+        when(&bench.board, "its file is gone", |snapshot| snapshot.last_episode.is_none()).await;
+        assert!(!third.exists() && bench.board.snapshot().short_episode.is_none());
+        // One that is asked for when the next has begun.
+        let fourth = moment(&bench.board, &bench.keys).await;
+        bench.keys.send(Asked::ToggleRecording(Stamp::now())).unwrap();
+        bench.keys.send(Asked::DropEpisode(fourth.clone())).unwrap();
         bench.keys.send(Asked::ToggleRecording(Stamp::now())).unwrap();
         bench.keys.send(Asked::Quit).unwrap();
-        third
+        fourth
     };
-    let (outcome, third) = tokio::join!(bench.conductor.conduct(&mut bench.running), keys);
+    let (outcome, fourth) = tokio::join!(bench.conductor.conduct(&mut bench.running), keys);
     outcome.unwrap();
-    assert!(third.exists());
-    assert_eq!(bench.files().len(), 4, "{:?}", bench.files());
+    assert!(fourth.exists());
+    assert_eq!(bench.files().len(), 5, "{:?}", bench.files());
 }
