@@ -122,6 +122,8 @@ async fn pretend(board: Arc<Board>, count: u8, mut commands: mpsc::Receiver<Comm
                     }
                     None => episode = Some((Stamp::now(), "episodes/2026-01-01_place-block_001.mcap".into(), 0)),
                 },
+                // The preview offers none: its episodes have no file.
+                Command::DropEpisode(_) => {}
                 Command::Restart(id) => states[id.index()] = SlotState::Absent,
             },
             _ = beat.tick() => {}

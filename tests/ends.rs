@@ -231,6 +231,8 @@ fn the_monitor_gives_the_terminal_back_after_a_panic() {
         run.master = None;
         let text = reading.join().expect("text");
         assert!(text.contains("\x1b[?1049l") && text.contains("\x1b[?25h"), "{at}: {text}");
+        // Pasted text is marked while the monitor is up, and not afterwards.
+        assert!(text.contains("\x1b[?2004l"), "{at}: {text}");
         assert!(text.contains(&format!("fault ordered for {at}")) && text.contains("error:"), "{at}: {text}");
         assert!(!place.mask_file().exists(), "{at}");
     }

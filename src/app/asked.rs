@@ -3,6 +3,8 @@
 //! Invariant: an order to the actuator waits for nothing that becomes of an episode: it does not pass
 //! through the conductor, which waits for files to be closed.
 
+use std::path::PathBuf;
+
 use tokio::sync::mpsc;
 
 use crate::rig::RigCommand;
@@ -10,10 +12,12 @@ use crate::status::Command;
 use crate::time::Stamp;
 
 /// What the conductor is asked for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Asked {
     /// Begin an episode, or end the one in progress at this moment.
     ToggleRecording(Stamp),
+    /// Remove this file, the last episode.
+    DropEpisode(PathBuf),
     /// End the run.
     Quit,
 }
@@ -30,6 +34,7 @@ pub(super) fn sorted(
             // Either is gone only when the run ends.
             let _ = match command {
                 Command::ToggleRecording => conductor.send(Asked::ToggleRecording(Stamp::now())).is_ok(),
+                Command::DropEpisode(file) => conductor.send(Asked::DropEpisode(file)).is_ok(),
                 Command::Quit => conductor.send(Asked::Quit).is_ok(),
                 Command::Restart(id) => rig.send(RigCommand::Restart(id)).await.is_ok(),
                 Command::Order(order) => rig.send(RigCommand::Order(order)).await.is_ok(),

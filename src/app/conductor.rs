@@ -3,6 +3,7 @@
 //!
 //! Invariant: whether an episode is in progress is known to the recorder alone, and asked of it.
 
+use std::path::PathBuf;
 use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
@@ -89,6 +90,11 @@ impl Conductor {
                         () = running.signals.next() => return output,
                         done = self.toggle(at) => done?,
                     },
+                    Asked::DropEpisode(file) => tokio::select! {
+                        biased;
+                        () = running.signals.next() => return output,
+                        () = self.drop_episode(file) => {}
+                    },
                     Asked::Quit => return output,
                 },
                 // After the events: what became of its episode says more.
@@ -137,6 +143,14 @@ impl Conductor {
             tracing::error!(%error, "the episode was not begun");
         }
         Ok(())
+    }
+
+    /// Removes the file of the last episode, if the recorder still offers that: not when another has begun, or is
+    /// to begin.
+    async fn drop_episode(&self, file: PathBuf) {
+        if let Err(error) = self.recorder.drop_short(file).await {
+            tracing::warn!(%error, "the episode was not dropped");
+        }
     }
 
     /// Fixes the end of the episode in progress to this moment, and waits until its last samples are written: those

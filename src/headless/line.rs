@@ -122,6 +122,10 @@ impl Columns {
                 }
                 (&"episode".to_owned(), None, palette.grade(verdict.grade, &pad(verdict.grade.word())), rest)
             }
+            What::Dropped { file, seconds } => {
+                let rest = format!("{}  {seconds:.1} s", file.display());
+                (&"episode".to_owned(), None, palette.warn(&pad("dropped")), rest)
+            }
             What::DiskLow { .. } | What::ClockStep { .. } => {
                 let (level, text) = event.what.sentence().unwrap_or((Level::Warn, String::new()));
                 let subject = if matches!(event.what, What::DiskLow { .. }) { "disk" } else { "clock" };

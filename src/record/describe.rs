@@ -24,6 +24,7 @@ pub(super) fn describe(what: &What) -> String {
         What::Recovered { text, .. } | What::Log { text, .. } => text.clone(),
         What::Actuator { .. }
         | What::Publisher { .. }
+        | What::Dropped { .. }
         | What::DiskLow { .. }
         | What::ClockStep { .. }
         | What::Policy { .. }

@@ -89,6 +89,16 @@ impl EpisodePath {
     /// Takes the next free number in `out` for `task` on the day of `wall_ns` (UTC) and creates the
     /// partial file.
     pub(super) fn create(out: &Path, task: &str, wall_ns: u64) -> Result<Self, RecordError> {
+        Self::create_beside(out, task, wall_ns, &[])
+    }
+
+    /// The same, under none of the names `dropped`: other programs know these as another episode's.
+    pub(super) fn create_beside(
+        out: &Path,
+        task: &str,
+        wall_ns: u64,
+        dropped: &[PathBuf],
+    ) -> Result<Self, RecordError> {
         let refused = |source| RecordError::Io { path: out.to_owned(), source };
         let folder = open_folder(out)?;
         let stem = format!("{}_{}_", date(wall_ns), slug(task));
@@ -96,7 +106,7 @@ impl EpisodePath {
         for number in first..first.saturating_add(ATTEMPTS) {
             let name = format!("{stem}{number:03}.mcap");
             let partial = format!("{name}.{PARTIAL}");
-            if folder.has(&name) {
+            if folder.has(&name) || dropped.contains(&out.join(&name)) {
                 continue;
             }
             match folder.create_new(&partial, 0o666) {

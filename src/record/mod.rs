@@ -29,6 +29,7 @@ mod recorder;
 pub mod recover;
 pub mod schema;
 mod session;
+mod short;
 mod source;
 mod space;
 pub mod stepped;
@@ -92,6 +93,9 @@ pub enum RecordError {
     /// There is no episode in progress.
     #[error("not recording")]
     Idle,
+    /// Only the last episode may be dropped, if it is too short to be used and none has begun since.
+    #[error("{}: not dropped; it is not the last episode, or long enough to be used", .0.display())]
+    Kept(PathBuf),
     /// The `writer` thread has ended.
     #[error("the writer thread has ended; the log says why")]
     Ended,

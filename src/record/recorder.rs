@@ -132,6 +132,15 @@ impl Recorder {
         self.ask(Order::Await).await
     }
 
+    /// Drops the last episode, `file`, if it is too short to be used and none has begun since; another file that
+    /// has its name by now, or one that was changed, stays.
+    ///
+    /// # Errors
+    /// When it is another episode, or the file cannot be removed.
+    pub async fn drop_short(&self, file: PathBuf) -> Result<(), RecordError> {
+        self.ask(|reply| Order::Drop(file, reply)).await
+    }
+
     async fn ask<T>(&self, order: impl FnOnce(Reply<T>) -> Order) -> Result<T, RecordError> {
         let (reply, answer) = oneshot::channel();
         let orders = self.orders.as_ref().ok_or(RecordError::Ended)?;

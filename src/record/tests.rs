@@ -4,6 +4,7 @@ mod episode;
 mod faults;
 mod room;
 mod session;
+mod short;
 mod tampering;
 
 use std::collections::{BTreeMap, VecDeque};

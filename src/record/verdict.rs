@@ -105,6 +105,11 @@ const LEAST_PRESENCE: f64 = 1.0;
 /// A shorter episode is an accident: a key pressed twice.
 const SHORTEST: Duration = Duration::from_millis(500);
 
+/// Is an episode of this length, in seconds, too short to be used?
+pub(super) fn is_short(seconds: f64) -> bool {
+    seconds < SHORTEST.as_secs_f64()
+}
+
 /// The verdict.
 pub(super) fn judge(facts: &Facts<'_>) -> Verdict {
     let mut found: Vec<(Grade, String)> = Vec::new();
@@ -114,7 +119,7 @@ pub(super) fn judge(facts: &Facts<'_>) -> Verdict {
         FileState::Failed(why) => found.push((Grade::Bad, format!("the file could not be written: {why}"))),
     }
     found.extend(facts.findings.iter().map(|finding| (finding.grade, finding.reason.clone())));
-    if facts.seconds < SHORTEST.as_secs_f64() {
+    if is_short(facts.seconds) {
         let limit = seconds(SHORTEST.as_secs_f64());
         found.push((Grade::Bad, format!("too short: {} (limit {limit})", seconds(facts.seconds))));
     }

@@ -22,6 +22,7 @@ use super::provenance::Attached;
 use super::publishers::Publishers;
 use super::recorder::RecorderConfig;
 use super::session::{Beginning, Session};
+use super::short::Short;
 use super::source::Source;
 use super::space::{Finding, Space};
 use super::streams::Streams;
@@ -52,6 +53,8 @@ pub(super) enum Order {
     End(Stamp),
     /// Answer when the file of the episode in progress is closed.
     Await(Reply<EpisodeReport>),
+    /// Drop this file, the last episode, if it is short.
+    Drop(PathBuf, Reply<()>),
 }
 
 /// The thread's own state.
@@ -64,6 +67,10 @@ pub(super) struct Writer {
     /// Of the episode in progress, or of the time since the last one began.
     publishers: Publishers,
     session: Option<Session>,
+    /// The last episode, if it is too short to be used, until the next one begins.
+    short: Option<Short>,
+    /// Files that were dropped: their names are not given again.
+    dropped: Vec<PathBuf>,
     /// Told of the session.
     episode: watch::Sender<Option<Arc<Episode>>>,
     /// Room for the session's file.
@@ -97,6 +104,8 @@ impl Writer {
             attached: Attached::default(),
             publishers: Publishers::default(),
             session: None,
+            short: None,
+            dropped: Vec::new(),
             episode,
             space: None,
             clock,
@@ -198,6 +207,9 @@ impl Writer {
                         let _ = reply.send(Err(RecordError::Idle));
                     }
                 },
+                Ok(Order::Drop(file, reply)) => {
+                    let _ = reply.send(self.drop_short(file));
+                }
                 Err(TryRecvError::Empty) => return true,
                 Err(TryRecvError::Disconnected) => {
                     if let Some(session) = &mut self.session {
@@ -215,7 +227,7 @@ impl Writer {
         }
         let clock = (self.config.clock)();
         let begin = (self.config.begin)();
-        let path = EpisodePath::create(&request.out, &request.task, clock.wall_ns(begin))?;
+        let path = EpisodePath::create_beside(&request.out, &request.task, clock.wall_ns(begin), &self.dropped)?;
         let (finished, partial) = (path.finished.clone(), path.partial.clone());
         // Nothing was recorded into it, and it was made a moment ago.
         let refuse = |error| {
@@ -238,6 +250,8 @@ impl Writer {
             begin,
         };
         let session = Session::begin(beginning, &self.streams.masks).map_err(failed)?;
+        // Withdrawn before the next one shows.
+        self.set_short(None);
         self.config.board.set_recording(Some(session.status(begin)));
         self.config.board.announce(What::Recording { file: finished.clone() });
         self.session = Some(session);
@@ -308,12 +322,30 @@ impl Writer {
         board.set_recording(None);
         if report.file.extension().is_none_or(|extension| extension != PARTIAL) {
             board.set_last_episode(report.file.clone(), report.verdict.clone());
+            self.set_short(Short::of(&report));
         }
+        let board = &self.config.board;
         let EpisodeReport { file, seconds, messages, bytes, dropped, error, verdict } = report.clone();
         board.announce(What::Episode { file, seconds, messages, bytes, dropped, error, verdict });
         for reply in self.waiting.drain(..) {
             let _ = reply.send(Ok(report.clone()));
         }
+    }
+
+    fn set_short(&mut self, short: Option<Short>) {
+        self.config.board.set_short_episode(short.as_ref().map(Short::offer));
+        self.short = short;
+    }
+
+    fn drop_short(&mut self, file: PathBuf) -> Result<(), RecordError> {
+        let Some(short) = self.short.take_if(|short| short.is(&file)) else { return Err(RecordError::Kept(file)) };
+        // Tried once: what cannot be removed is not offered again.
+        self.set_short(None);
+        let seconds = short.remove().map_err(|source| RecordError::Io { path: file.clone(), source })?;
+        self.config.board.forget_last_episode();
+        self.dropped.push(file.clone());
+        self.config.board.announce(What::Dropped { file, seconds });
+        Ok(())
     }
 
     fn complain_about_bus(&mut self, error: &str) {

@@ -15,7 +15,8 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use tokio::sync::broadcast;
 
 use super::{
-    DeviceStatus, Event, Grade, Level, LogLine, PolicyStatus, RecordingStatus, SlotState, Snapshot, Verdict, What,
+    DeviceStatus, Event, Grade, Level, LogLine, PolicyStatus, RecordingStatus, ShortEpisode, SlotState, Snapshot,
+    Verdict, What,
 };
 use crate::mask::PhysicalMask;
 use crate::modality::{MAX_MODALITIES, ModalityId};
@@ -84,6 +85,7 @@ pub struct Board {
     recording: Mutex<Option<RecordingStatus>>,
     policy: Mutex<Option<PolicyStatus>>,
     last_episode: Mutex<Option<(PathBuf, Verdict)>>,
+    short_episode: Mutex<Option<ShortEpisode>>,
     last_end: Mutex<Option<EpisodeEnd>>,
     /// How many episodes were BAD, and the last of them.
     bad: Mutex<Option<(u64, PathBuf)>>,
@@ -108,6 +110,7 @@ impl Board {
             recording: Mutex::new(None),
             policy: Mutex::new(None),
             last_episode: Mutex::new(None),
+            short_episode: Mutex::new(None),
             last_end: Mutex::new(None),
             bad: Mutex::new(None),
             log: Mutex::new(VecDeque::with_capacity(LOG_LINES)),
@@ -166,6 +169,16 @@ impl Board {
     /// Reports the last file finished.
     pub fn set_last_episode(&self, file: PathBuf, verdict: Verdict) {
         *lock(&self.last_episode) = Some((file, verdict));
+    }
+
+    /// Reports that the last file finished is gone.
+    pub fn forget_last_episode(&self) {
+        *lock(&self.last_episode) = None;
+    }
+
+    /// Reports the episode that may be dropped, or that none may.
+    pub fn set_short_episode(&self, short: Option<ShortEpisode>) {
+        *lock(&self.short_episode) = short;
     }
 
     /// Adds a line to the log, without what of a device's text could move the cursor of a terminal.
@@ -251,6 +264,7 @@ impl Board {
             policy: lock(&self.policy).clone(),
             last_episode,
             last_verdict,
+            short_episode: lock(&self.short_episode).clone(),
             log: lock(&self.log).iter().cloned().collect(),
         }
     }

@@ -1,16 +1,30 @@
 //! The episode in progress, as those are told of it who do something about it themselves: devices that
-//! record on their own, and the programs of a user.
+//! record on their own, and the programs of a user; and the last one, if it may be dropped.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
 
+use serde::Serialize;
 use tokio::sync::watch;
+
+use crate::text;
 
 /// An episode in progress.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Episode {
     /// The file it will be once it is finished, an absolute path.
     pub file: PathBuf,
+}
+
+/// The last episode, while it may be dropped because it is too short to be used.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct ShortEpisode {
+    /// Its file.
+    #[serde(serialize_with = "text::lossy")]
+    pub file: PathBuf,
+    /// Its length.
+    pub length: Duration,
 }
 
 /// The episode in progress, if there is one, whenever that changes.

@@ -106,6 +106,14 @@ pub enum What {
         #[serde(flatten)]
         verdict: Verdict,
     },
+    /// An episode too short to be used was dropped, as the user asked: its file is gone.
+    Dropped {
+        /// The file.
+        #[serde(serialize_with = "text::lossy")]
+        file: PathBuf,
+        /// Length in seconds.
+        seconds: f64,
+    },
     /// The disk of the episode in progress is nearly full; told once an episode.
     DiskLow {
         /// The folder.
@@ -307,6 +315,9 @@ impl What {
                 let (file, word) = (file.display(), verdict.grade.word());
                 let why = if verdict.reasons.is_empty() { String::new() } else { format!(": {}", verdict.why()) };
                 (level, format!("{word} {file} finished, {seconds:.1} s{}{why}", with_comma(verdict)))
+            }
+            Self::Dropped { file, seconds } => {
+                (Level::Info, format!("episode {} dropped; it was {seconds:.1} s long", file.display()))
             }
             Self::DiskLow { folder, free, seconds } => {
                 let (free, left) = (text::size(*free), text::about(Duration::from_secs(*seconds)));

@@ -54,6 +54,7 @@ pub(crate) fn snapshot(devices: Vec<DeviceStatus>) -> Snapshot {
         policy: None,
         last_episode: None,
         last_verdict: None,
+        short_episode: None,
         log: Vec::new(),
     }
 }

@@ -26,7 +26,7 @@ use crate::text;
 use crate::time::Stamp;
 
 pub use board::{Board, EpisodeEnd};
-pub use episode::{Episode, EpisodeWatch};
+pub use episode::{Episode, EpisodeWatch, ShortEpisode};
 pub use event::{Event, Provenance, What};
 pub use policy::{Chunk, ObservedSamples, PolicyStatus};
 pub use verdict::{Grade, Sensors, Verdict};
@@ -170,6 +170,8 @@ pub struct Snapshot {
     pub last_episode: Option<PathBuf>,
     /// The verdict on it.
     pub last_verdict: Option<Verdict>,
+    /// The last episode, while it may be dropped because it is too short to be used.
+    pub short_episode: Option<ShortEpisode>,
     /// The newest log lines, oldest first.
     pub log: Vec<LogLine>,
 }
@@ -179,6 +181,8 @@ pub struct Snapshot {
 pub enum Command {
     /// Begin an episode, or end the one in progress.
     ToggleRecording,
+    /// Remove this file: the last episode, if it is too short to be used and none has begun since.
+    DropEpisode(PathBuf),
     /// Start a failed device again.
     Restart(ModalityId),
     /// Let the actuator move, or stop it.

@@ -153,6 +153,7 @@ mod tests {
             }),
             last_episode: None,
             last_verdict: None,
+            short_episode: None,
             log: Vec::new(),
         }
     }

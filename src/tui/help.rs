@@ -11,8 +11,9 @@ use crate::status::SlotState;
 
 /// Of the box with its border and padding.
 const WIDTH: u16 = 58;
-const KEYS: [(&str, &str); 10] = [
+const KEYS: [(&str, &str); 11] = [
     ("space", "start an episode, end the one in progress"),
+    ("x, y", "drop the last episode, if it is too short"),
     ("up, down", "select a device"),
     ("r", "restart the selected device, if it failed"),
     ("a, a", "arm the actuator: motors follow actions"),

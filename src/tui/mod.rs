@@ -94,6 +94,7 @@ async fn drive(
             () = shutdown.cancelled() => return Ok(()),
             event = events.next() => match event {
                 Some(Ok(Event::Key(key))) => model.update(Msg::Key(key)),
+                // Another size, which the next frame finds by itself, and pasted text, which asks for nothing.
                 Some(Ok(_)) => Effect::None,
                 Some(Err(error)) => return Err(TuiError::Gone(error)),
                 None => return Err(TuiError::Gone(io::ErrorKind::UnexpectedEof.into())),

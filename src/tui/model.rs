@@ -5,10 +5,13 @@
 //!
 //! Invariant: pure: no clock, no terminal, no channel; time is what the snapshots say.
 
+mod dropping;
+
 use std::time::Duration;
 
 use crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 
+use self::dropping::Asked;
 use super::theme::Edge;
 use crate::action::Order;
 use crate::modality::{MAX_MODALITIES, ModalityId};
@@ -88,6 +91,8 @@ pub struct Model {
     quit: Quit,
     /// The user has asked to arm the actuator: the next key counts.
     arming: bool,
+    /// The user has asked to drop the last episode: the next key counts.
+    dropping: Option<Asked>,
     notice: Option<(String, Stamp)>,
 }
 
@@ -110,6 +115,7 @@ impl Model {
             help: false,
             quit: Quit::No,
             arming: false,
+            dropping: None,
             notice: None,
         };
         model.read();
@@ -189,6 +195,7 @@ impl Model {
         }
         // Only the key after the first asks for it.
         let armed = std::mem::take(&mut self.arming);
+        let dropping = self.dropping.take();
         // What stops motion works everywhere.
         if key.code == KeyCode::Char('d') {
             self.help = false;
@@ -205,6 +212,8 @@ impl Model {
             KeyCode::Char(' ') if key.kind == KeyEventKind::Press => return self.toggle_recording(),
             KeyCode::Char('r') => return self.restart(),
             KeyCode::Char('a') if key.kind == KeyEventKind::Press => return self.arm(armed),
+            KeyCode::Char('x') if key.kind == KeyEventKind::Press => self.ask_to_drop(),
+            KeyCode::Char('y') if key.kind == KeyEventKind::Press => return self.drop_episode(dropping),
             KeyCode::Char('p') => self.toggle_pause(),
             KeyCode::Char('?') | KeyCode::F(1) => self.help = true,
             KeyCode::Up | KeyCode::Char('k') => self.selected = self.selected.saturating_sub(1),

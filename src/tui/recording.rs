@@ -69,7 +69,13 @@ fn idle(area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
     let word = Span::styled(format!("{} ", grade.word()), theme.grade(*grade));
     let label = Span::styled("last ", theme.faint());
     let width = usize::from(area.width);
+    let offer = shown.short_episode.as_ref().filter(|short| short.file == *last);
+    let offer = offer.map(|short| format!("{:.1} s long: x drops it", short.length.as_secs_f64()));
     if area.height < 2 {
+        if let Some(offer) = offer {
+            first.spans.extend([Span::raw("   "), label, Span::styled(offer, theme.warning())]);
+            return vec![first];
+        }
         let room = width.saturating_sub(first.width() + 3 + label.width() + word.width());
         first.spans.extend([Span::raw("   "), label, word, Span::raw(file(last, room, theme))]);
         return vec![first];
@@ -83,7 +89,8 @@ fn idle(area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
     // The reasons beside the name as far as there is room; the log has all of them.
     let room = width.saturating_sub(label.width() + word.width());
     let name_width = last.file_name().map_or(0, |name| text::width(&name.to_string_lossy()));
-    let why = theme.safe(&reasons.join("; "));
+    // The offer says of a short one what the first reason does.
+    let why = offer.unwrap_or_else(|| theme.safe(&reasons.join("; ")));
     let room_why = room.saturating_sub(name_width + 2);
     let path = file(last, if why.is_empty() { room } else { name_width.min(room) }, theme);
     let mut line = Line::from(vec![label, word, Span::raw(path)]);

@@ -11,6 +11,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
 use std::time::Duration;
 
 use crossterm::cursor::{Hide, Show};
+use crossterm::event::{DisableBracketedPaste, EnableBracketedPaste};
 use crossterm::terminal::{
     DisableLineWrap, EnableLineWrap, EnterAlternateScreen, LeaveAlternateScreen, disable_raw_mode, enable_raw_mode,
 };
@@ -53,7 +54,8 @@ impl Screen {
                 return Err(error);
             }
         };
-        crossterm::queue!(screen.frame, EnterAlternateScreen, DisableLineWrap, Hide)?;
+        // Pasted text is marked, and not taken for keys.
+        crossterm::queue!(screen.frame, EnterAlternateScreen, DisableLineWrap, Hide, EnableBracketedPaste)?;
         Ok(screen)
     }
 
@@ -117,7 +119,7 @@ pub(super) fn give_back() {
     let (done, is_done) = mpsc::channel();
     let leave = move || {
         if let Ok(mut terminal) = writer() {
-            let _ = crossterm::execute!(terminal, EnableLineWrap, LeaveAlternateScreen, Show);
+            let _ = crossterm::execute!(terminal, DisableBracketedPaste, EnableLineWrap, LeaveAlternateScreen, Show);
         }
         let _ = done.send(());
     };

@@ -13,7 +13,7 @@ use super::*;
 use crate::status::literal::{
     TAKEN, board, device, every_state, line, recording, sixty_four, snapshot, three_streaming,
 };
-use crate::status::{Grade, Level, RecordingStatus, Sensors, SlotState, Snapshot, Verdict};
+use crate::status::{Grade, Level, RecordingStatus, Sensors, ShortEpisode, SlotState, Snapshot, Verdict};
 use crate::time::Stamp;
 use theme::{Charset, Colours};
 
@@ -100,6 +100,34 @@ fn the_last_verdict_stands_beside_its_file_with_as_many_reasons_as_there_is_room
     }
     assert_snapshot!("verdict_80x24", draw(&measured(&end), (80, 24), ASCII));
     assert_snapshot!("verdict_60x12", draw(&measured(&end), (60, 12), THEME));
+}
+
+#[test]
+fn a_short_episode_is_offered_to_be_dropped() {
+    let mut end = three_streaming();
+    end.last_episode = Some("episodes/20231114_cube_003.mcap".into());
+    end.last_verdict = Some(Verdict {
+        grade: Grade::Bad,
+        reasons: vec!["too short: 200 ms (limit 500 ms)".to_owned()],
+        sensors: Some(Sensors { registered: 3, recorded: 3, without: Vec::new() }),
+    });
+    end.short_episode =
+        Some(ShortEpisode { file: end.last_episode.clone().unwrap(), length: Duration::from_millis(210) });
+    let mut model = measured(&end);
+    assert_snapshot!("short_80x24", draw(&model, (80, 24), THEME));
+    assert_snapshot!("short_60x12", draw(&model, (60, 12), ASCII));
+    model.update(press(KeyCode::Char('x')));
+    let screen = draw(&model, (80, 24), THEME);
+    assert!(
+        screen.to_string().contains("y removes 20231114_cube_003.mcap for good, any other key keeps it"),
+        "{screen}"
+    );
+    // The next episode has begun, and ended as it should.
+    end.recording = Some(recording(0));
+    end.short_episode = None;
+    assert!(!draw(&measured(&end), (80, 24), THEME).to_string().contains("drops it"));
+    end.recording = None;
+    assert!(!draw(&measured(&end), (80, 24), THEME).to_string().contains("drops it"));
 }
 
 #[test]
@@ -339,4 +367,31 @@ async fn a_terminal_that_goes_away_is_an_error() {
     let hung_up = futures::stream::iter([]);
     let error = drive(&board, &sender, &CancellationToken::new(), hung_up, |_| Ok(())).await.unwrap_err();
     assert!(matches!(error, TuiError::Gone(_)), "{error}");
+}
+
+#[tokio::test]
+async fn pasted_text_drops_nothing_whether_the_terminal_marks_it_or_not() {
+    let board = board(&["cam"]);
+    let file = std::path::PathBuf::from("episodes/a_001.mcap");
+    board.set_short_episode(Some(ShortEpisode { file: file.clone(), length: Duration::ZERO }));
+    let key = |letter| Ok(Event::Key(KeyEvent::new(KeyCode::Char(letter), KeyModifiers::NONE)));
+    let pasted = vec![Ok(Event::Paste("xyxyaa qq".to_owned())), key('x'), key('y'), key('x'), key('x'), key('y')];
+    let (sender, mut commands) = mpsc::channel(16);
+    let shutdown = CancellationToken::new();
+    // All of it is there at once, before any frame is due.
+    let events = futures::stream::iter(pasted).chain(futures::stream::iter([key('q')]));
+    let events = events.chain(futures::stream::pending());
+    let mut asked = false;
+    let end = shutdown.clone();
+    let screen = drive(&board, &sender, &shutdown, events, |model| {
+        asked |= model.notice().is_some_and(|said| said.starts_with("y removes a_001.mcap"));
+        Ok(())
+    });
+    let app = async {
+        assert_eq!(commands.recv().await, Some(Command::Quit), "nothing but what was typed last");
+        end.cancel();
+    };
+    let (outcome, ()) = tokio::join!(screen, app);
+    outcome.unwrap();
+    assert!(asked);
 }

@@ -10,7 +10,7 @@ use crate::bus::TopicId;
 use crate::record::{RecorderConfig, Sink, Source};
 use crate::registry::Registry;
 use crate::sample::{Epoch, SampleHeader};
-use crate::status::{Grade, Level, Verdict};
+use crate::status::{Grade, Level, Snapshot, Verdict};
 
 /// How long a condition may take to come true.
 const PATIENCE: Duration = Duration::from_secs(30);
@@ -230,4 +230,55 @@ async fn an_end_that_came_while_the_run_ended_is_found_before_and_after_missed_e
         let error = bench.conductor.finish_episode().await.unwrap_err();
         assert_eq!(error.to_string(), "a.mcap: torn");
     }
+}
+
+/// Begins an episode and ends it at its first moment; its file.
+async fn moment(board: &Board, keys: &mpsc::UnboundedSender<Asked>) -> PathBuf {
+    keys.send(Asked::ToggleRecording(Stamp::now())).unwrap();
+    until(board, "an episode", |file| file.is_some()).await;
+    let file = board.snapshot().recording.unwrap().file;
+    keys.send(Asked::ToggleRecording(Stamp(0))).unwrap();
+    when(board, "an offer", |snapshot| snapshot.short_episode.is_some()).await;
+    assert_eq!(board.snapshot().short_episode.unwrap().file, file);
+    file
+}
+
+async fn when(board: &Board, what: &str, holds: impl Fn(&Snapshot) -> bool) {
+    let begun = std::time::Instant::now();
+    while !holds(&board.snapshot()) {
+        assert!(begun.elapsed() < PATIENCE, "{what} does not come true: {:?}", board.snapshot());
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
+}
+
+#[tokio::test]
+async fn the_last_episode_is_dropped_when_asked_for_and_no_other() {
+    let mut bench = Bench::new(false, None, |file| Box::new(file));
+    let keys = async {
+        let first = moment(&bench.board, &bench.keys).await;
+        let second = moment(&bench.board, &bench.keys).await;
+        // Not the last one; a file that is no episode.
+        let foreign = first.with_file_name("notes.mcap");
+        std::fs::write(&foreign, "precious").unwrap();
+        for file in [&first, &foreign] {
+            bench.keys.send(Asked::DropEpisode(file.clone())).unwrap();
+        }
+        // What is asked for is done in turn: both were refused when this one has begun.
+        let third = moment(&bench.board, &bench.keys).await;
+        assert!(first.exists() && foreign.exists() && second.exists());
+        bench.keys.send(Asked::DropEpisode(third.clone())).unwrap();
+        when(&bench.board, "its file is gone", |snapshot| snapshot.last_episode.is_none()).await;
+        assert!(!third.exists() && bench.board.snapshot().short_episode.is_none());
+        // One that is asked for when the next has begun.
+        let fourth = moment(&bench.board, &bench.keys).await;
+        bench.keys.send(Asked::ToggleRecording(Stamp::now())).unwrap();
+        bench.keys.send(Asked::DropEpisode(fourth.clone())).unwrap();
+        bench.keys.send(Asked::ToggleRecording(Stamp::now())).unwrap();
+        bench.keys.send(Asked::Quit).unwrap();
+        fourth
+    };
+    let (outcome, fourth) = tokio::join!(bench.conductor.conduct(&mut bench.running), keys);
+    outcome.unwrap();
+    assert!(fourth.exists());
+    assert_eq!(bench.files().len(), 5, "{:?}", bench.files());
 }

@@ -5,6 +5,7 @@ use super::super::hole::Hole;
 use super::super::masks::MaskHistory;
 use super::super::provenance::Attached;
 use super::super::session::{Beginning, Session};
+use super::super::streams::Streams;
 use super::*;
 use crate::time::WallClock;
 
@@ -232,5 +233,71 @@ async fn a_device_that_is_plugged_in_and_never_sends_is_missed_by_recorder_and_i
         let never = said.modalities.iter().find(|modality| modality.name == "never").unwrap();
         let plugged = never.quality.unwrap().plugged;
         assert!(if missed { (0.49..0.51).contains(&plugged) } else { plugged < 0.4 }, "{plugged}");
+    }
+}
+
+/// As `registry`, with an actuator.
+fn with_actuator() -> Registry {
+    let arm = "[device.arm]\nvid = \"0001\"\npid = \"0009\"\nbit = 9\nnode = \"cat\"\n[device.arm.process]\n\
+               kind = \"bytes\"\n[device.arm.action]\nnames = [\"x\"]\nunits = [\"m\"]\nmin = [0]\nmax = [1]\n";
+    Registry::parse(&format!("{}{arm}", registry().text), None).unwrap().registry
+}
+
+/// Actions that arrive, by number and time in ms.
+type Arrivals = &'static [(u64, u64)];
+
+/// An episode of a second, from 1000 ms on, of a sensor without fault, and of those actions that arrive.
+fn acted(folder: &Path, actions: Arrivals) -> EpisodeReport {
+    let registry = with_actuator();
+    let board = Arc::new(Board::new(&registry));
+    let mut streams = Streams::new();
+    streams.masks.push(&scalars(1, 990, 990), PhysicalMask(0b10), 1);
+    let mut session = session_of(registry, folder, &board, &streams.masks);
+    session.end_at(Stamp(2000 * MS));
+    for ms in 900..2200 {
+        if ms % 10 == 0 {
+            let header = scalars(ms / 10, ms, ms);
+            streams.take(Some(&mut session), TopicId::Modality(id(TOF)), &header, &[0; 16]);
+        }
+        for (number, _) in actions.iter().filter(|(_, at)| *at == ms) {
+            streams.take(Some(&mut session), TopicId::Action, &scalars(*number, ms, ms), &[0; 8]);
+        }
+        session.advance(Stamp(ms * MS), &streams.masks);
+    }
+    let report = session.finish(Stamp(2200 * MS), &streams.masks, Closing::default());
+    assert_eq!((report.error.as_deref(), report.seconds), (None, 1.0));
+    report
+}
+
+#[test]
+fn lost_actions_are_suspect_by_the_recorder_and_by_inspect_with_and_without_its_count() {
+    let table: [(&str, Arrivals, Option<u64>); 6] = [
+        ("all arrive", &[(7, 1000), (8, 1100), (9, 1900)], None),
+        ("one is lost", &[(7, 1000), (9, 1100), (10, 1900)], Some(1)),
+        ("two holes", &[(7, 1000), (9, 1100), (12, 1900)], Some(3)),
+        ("lost before the episode", &[(3, 910), (7, 990), (8, 1100)], None),
+        ("lost after it", &[(7, 1100), (8, 2000), (12, 2100)], None),
+        ("a publisher that began anew", &[(70, 1100), (0, 1200), (1, 1300)], None),
+    ];
+    for (what, actions, lost) in table {
+        let folder = tempfile::tempdir().unwrap();
+        let report = acted(folder.path(), actions);
+        let within = actions.iter().filter(|(_, at)| (1000..2000).contains(at)).count();
+        assert_eq!(read(&report.file).on(crate::action::ACTION_TOPIC).count(), within, "{what}");
+        let reasons: Vec<_> =
+            lost.map(|lost| format!("{lost} actions are not in the file (limit 0)")).into_iter().collect();
+        let grade = if lost.is_some() { Grade::Suspect } else { Grade::Good };
+        assert_eq!((report.verdict.grade, &report.verdict.reasons), (grade, &reasons), "{what}");
+        let said = inspect::inspect(&report.file).unwrap();
+        assert_eq!(said.verdict.verdict(), Some(&report.verdict), "{what}");
+        // Without the summary: of a killed run, whose numbers are all there is.
+        let bytes = std::fs::read(&report.file).unwrap();
+        let summary = bytes.windows(13).position(|window| window == b"rapid/summary").unwrap();
+        let killed = folder.path().join("killed.mcap");
+        std::fs::write(&killed, &bytes[..summary]).unwrap();
+        let said = inspect::inspect(&killed).unwrap();
+        let mut of_actions = said.verdict.reasons();
+        of_actions.retain(|reason| reason.contains("actions"));
+        assert_eq!(of_actions, reasons, "{what}, killed");
     }
 }

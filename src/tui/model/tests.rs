@@ -1,7 +1,7 @@
 use super::*;
 use crate::mask::PhysicalMask;
-use crate::status::Level;
 use crate::status::literal::{TAKEN, every_state, id, line, recording, three_streaming};
+use crate::status::{Level, ShortEpisode};
 
 fn press(code: KeyCode) -> Msg {
     Msg::Key(KeyEvent::new(code, KeyModifiers::NONE))
@@ -157,4 +157,90 @@ fn an_answer_fades() {
     assert!(model.notice().is_some());
     model.update(after(&three_streaming(), 4_100));
     assert_eq!(model.notice(), None);
+}
+
+/// A key, its time in ms since the first one, and the snapshot of then.
+type Timed = (u64, Msg, Snapshot);
+
+/// After an episode that was too short.
+fn with_short(file: &str) -> Snapshot {
+    let mut snapshot = three_streaming();
+    snapshot.short_episode = Some(ShortEpisode { file: file.into(), length: Duration::from_millis(200) });
+    snapshot
+}
+
+#[test]
+fn a_short_episode_is_dropped_by_a_key_and_another_soon_after() {
+    let (x, y) = (KeyCode::Char('x'), KeyCode::Char('y'));
+    let dropped = Effect::Send(Command::DropEpisode("a_003.mcap".into()));
+    let short = with_short("a_003.mcap");
+    let table: Vec<(&str, Vec<Timed>, Effect)> = vec![
+        ("x, y", vec![(0, press(x), short.clone()), (400, press(y), short.clone())], dropped.clone()),
+        (
+            "x, any key, x, y",
+            vec![
+                (0, press(x), short.clone()),
+                (400, press(KeyCode::Down), short.clone()),
+                (800, press(x), short.clone()),
+                (1200, press(y), short.clone()),
+            ],
+            dropped,
+        ),
+        ("y alone", vec![(0, press(y), short.clone())], Effect::None),
+        ("x twice", vec![(0, press(x), short.clone()), (400, press(x), short.clone())], Effect::None),
+        ("x held down", vec![(0, press(x), short.clone()), (400, repeated(x), short.clone())], Effect::None),
+        ("y held down", vec![(0, press(x), short.clone()), (400, repeated(y), short.clone())], Effect::None),
+        ("ctrl-y", vec![(0, press(x), short.clone()), (400, control('y'), short.clone())], Effect::None),
+        ("both at once", vec![(0, press(x), short.clone()), (0, press(y), short.clone())], Effect::None),
+        ("too late", vec![(0, press(x), short.clone()), (4_100, press(y), short.clone())], Effect::None),
+        (
+            "another key between them",
+            vec![
+                (0, press(x), short.clone()),
+                (300, press(KeyCode::Up), short.clone()),
+                (600, press(y), short.clone()),
+            ],
+            Effect::None,
+        ),
+        ("the next one began", vec![(0, press(x), short.clone()), (400, press(y), three_streaming())], Effect::None),
+        (
+            "another one ended meanwhile",
+            vec![(0, press(x), short.clone()), (400, press(y), with_short("a_004.mcap"))],
+            Effect::None,
+        ),
+        ("none is short", vec![(0, press(x), three_streaming()), (400, press(y), three_streaming())], Effect::None),
+        (
+            "from the help",
+            vec![
+                (0, press(KeyCode::Char('?')), short.clone()),
+                (300, press(x), short.clone()),
+                (600, press(y), short.clone()),
+            ],
+            Effect::None,
+        ),
+    ];
+    for (what, keys, expected) in table {
+        let mut model = Model::new(short.clone());
+        let mut effects = Vec::new();
+        for (ms, key, snapshot) in keys {
+            model.update(after(&snapshot, ms));
+            effects.push(model.update(key));
+        }
+        assert_eq!(effects.pop(), Some(expected), "{what}");
+        assert!(effects.iter().all(|effect| *effect == Effect::None), "{what}");
+    }
+}
+
+#[test]
+fn the_question_names_the_file_and_fades() {
+    let mut model = Model::new(with_short("out/a_003.mcap"));
+    model.update(press(KeyCode::Char('x')));
+    assert_eq!(model.notice(), Some("y removes a_003.mcap for good, any other key keeps it"));
+    model.update(after(&with_short("out/a_003.mcap"), 4_100));
+    assert_eq!(model.notice(), None);
+    model.update(press(KeyCode::Char('y')));
+    assert_eq!(model.notice(), Some("nothing dropped"));
+    let mut model = Model::new(three_streaming());
+    model.update(press(KeyCode::Char('x')));
+    assert_eq!(model.notice(), Some("nothing to drop: the last episode is not a short one"));
 }
