@@ -11,6 +11,7 @@ mod header;
 mod index;
 mod names;
 pub(crate) mod op;
+pub(crate) mod own;
 mod resync;
 mod source;
 mod structure;
@@ -48,8 +49,6 @@ pub(crate) const SUMMARY: &str = "rapid/summary";
 /// Metadata record of an episode that was repaired.
 pub(crate) const RECOVERED: &str = "rapid/recovered";
 
-/// Attachment of an episode: its channels and schemas once more, as records, for a file whose first chunk is damaged.
-pub(crate) const CHANNELS: &str = "rapid/channels";
 /// Key of [`ABOUT`]: the boot of the machine in which the episode was recorded.
 pub(crate) const BOOT_ID: &str = "boot_id";
 

@@ -1,15 +1,14 @@
 //! What the channels and schemas of a file are, wherever in it that stands.
 //!
 //! A chunk need not repeat what an earlier one defined, and that one may be damaged: what is defined at another place,
-//! the summary or an attachment of ours, is shown in its stead, before the first message that needs it.
+//! the summary or the record at the head of a chunk of ours, is shown in its stead, before the first message that needs it.
 //!
 //! Invariant: memory holds at most [`LARGEST`] bytes of definitions.
 
 use std::collections::{BTreeMap, VecDeque};
 
-use super::CHANNELS;
-use super::chunk::{is_sound, take};
 use super::op;
+use super::own::Owner;
 use super::wire::Fields;
 
 /// Bytes of definitions that wait to be shown: a hundred times what an episode of 64 devices has.
@@ -22,11 +21,18 @@ pub(super) struct Names {
     known: BTreeMap<(u8, u16), u32>,
     waiting: VecDeque<(u8, Vec<u8>)>,
     waiting_bytes: usize,
+    /// The episode that the file is, and the one that the chunk shown last says it belongs to.
+    pub(super) owner: Owner,
+    pub(super) last: Owner,
     /// Messages not shown because their channel is not known, by its number.
     pub(super) unknown: BTreeMap<u16, u64>,
 }
 
 impl Names {
+    pub(super) fn of(owner: Owner) -> Self {
+        Self { owner, ..Self::default() }
+    }
+
     /// Is this record to be shown? Definitions are remembered; a message of an unknown channel is counted.
     pub(super) fn admit(&mut self, opcode: u8, data: &[u8]) -> bool {
         let Some(id) = Fields(data).u16() else { return opcode != op::MESSAGE };
@@ -66,29 +72,10 @@ impl Names {
         }
     }
 
-    /// Has the definitions of an attachment of ours wait, if it is one and its check value is right.
-    pub(super) fn attached(&mut self, attachment: &[u8]) {
-        let Some(mut records) = definitions(attachment) else { return };
-        while let Some((opcode, data)) = take(&mut records) {
-            self.wait(opcode, data);
-        }
-    }
-
     /// The next definition that waits.
     pub(super) fn next(&mut self) -> Option<(u8, Vec<u8>)> {
         let (opcode, data) = self.waiting.pop_front()?;
         self.waiting_bytes = self.waiting_bytes.saturating_sub(data.len());
         Some((opcode, data))
     }
-}
-
-/// The records of an attachment of channels and schemas.
-fn definitions(attachment: &[u8]) -> Option<Fields<'_>> {
-    let (content, crc) = attachment.split_last_chunk()?;
-    let crc = u32::from_le_bytes(*crc);
-    let mut fields = Fields(content);
-    let _ = (fields.u64()?, fields.u64()?);
-    let (name, _media_type, count) = (fields.string()?, fields.string()?, fields.u64()?);
-    let records = fields.bytes(count)?;
-    (name == CHANNELS && crc != 0 && is_sound(content, crc)).then_some(Fields(records))
 }

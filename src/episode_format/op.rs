@@ -17,3 +17,5 @@ pub(crate) const SUMMARY_OFFSET: u8 = 0x0e;
 pub(crate) const DATA_END: u8 = 0x0f;
 /// From here on opcodes are private.
 pub(crate) const PRIVATE: u8 = 0x80;
+/// Ours, at the head of every chunk: see [`own`](super::own).
+pub(crate) const OWN: u8 = 0xf2;

@@ -5,7 +5,8 @@
 //! 3. Otherwise the next place is searched at which a chunk may begin and whose check value is right. Nothing is searched
 //!    within what is known to be whole: in the records of a right chunk, in an attachment, in the records of a damaged
 //!    chunk as far as one follows the other. A chunk found within what is left, damaged, may be the payload of a
-//!    message: it is taken unless it shows that it is another file's, by a channel or schema that contradicts one
+//!    message: of an episode of ours only a chunk that says it belongs to it is taken (see `own`). In another
+//!    file a chunk is taken unless it shows that it is another one's, by a channel or schema that contradicts one
 //!    of this file's, or by messages from before this episode began: a file is recorded before it is sent.
 //! 4. Metadata have no check value. They are taken where the index names them, or before the first chunk.
 //!
@@ -13,7 +14,7 @@
 
 use std::io;
 
-use super::chunk::{self, ChunkHead, Opened, Packing, Records, may_begin, take};
+use super::chunk::{self, ChunkHead, Opened, Packing, may_begin, take};
 use super::index::{Index, Place, TAIL, footer};
 use super::op;
 use super::source::ReadAt;
@@ -132,7 +133,7 @@ impl<R: ReadAt> Walk<R> {
             return Ok(());
         }
         let file: &dyn ReadAt = &self.source.file;
-        let Some(mut walk) = Walk::begin(file, self.source.size, true)? else { return Ok(()) };
+        let Some(mut walk) = Walk::begin(file, self.source.size, Some(self.names.owner))? else { return Ok(()) };
         while let Some(record) = walk.next()? {
             self.names.wait(record.opcode, record.data);
         }
@@ -177,7 +178,8 @@ impl<R: ReadAt> Walk<R> {
     pub(super) fn hides(&mut self, at: u64, end: u64) -> io::Result<bool> {
         self.read_index()?;
         let from = match self.within(at)? {
-            Some(within) if within.is_whole => return Ok(false),
+            // What says whose it is may be searched for anywhere.
+            Some(within) if within.is_whole && !self.is_episode()? => return Ok(false),
             Some(within) => within.sure,
             None => at,
         };
@@ -195,8 +197,9 @@ impl<R: ReadAt> Walk<R> {
     fn scan(&mut self, mut at: u64, end: u64) -> io::Result<bool> {
         // A file in which another lies, such as an archive: not this one's beginning is damaged.
         let is_foreign = self.at == 0;
+        let mut is_behind = false;
         loop {
-            let is_early = !self.chunked;
+            let is_early = !self.chunked && !is_behind;
             let window = self.source.peek(at, LOOK)?;
             if window.len() < LEAST || at >= end {
                 return Ok(false);
@@ -213,9 +216,11 @@ impl<R: ReadAt> Walk<R> {
             let is_chunk = window.get(place..).is_some_and(may_be_chunk);
             let is_begun = window.get(place..).is_some_and(|bytes| bytes.starts_with(&MAGIC));
             at += place as u64;
-            if at >= end || is_begun && is_foreign && at > 0 {
+            if at >= end || is_begun && is_foreign && at > 0 && !self.is_episode()? {
                 return Ok(false);
             }
+            // What follows may be another file's.
+            is_behind |= is_begun && is_foreign;
             if is_chunk && self.try_at(at)? || !is_chunk && self.is_early(at)? {
                 return Ok(true);
             }
@@ -262,7 +267,7 @@ impl<R: ReadAt> Walk<R> {
         let opened = chunk::open(head, &self.buffer, &mut self.unpacked, &mut self.budget.0);
         self.walked.left_out.swollen_chunks += u64::from(matches!(opened, Opened::TooMuch));
         let records = match opened {
-            Opened::Right(records) if named || self.is_own(&records) => records,
+            Opened::Right(records) if named || self.is_own(&records)? => records,
             _ => {
                 self.budget.1 = self.budget.1.saturating_sub(length.max(self.unpacked.len() as u64));
                 return Ok(false);
@@ -273,14 +278,13 @@ impl<R: ReadAt> Walk<R> {
         let is_headed = (before.u8(), before.u64()) == (Some(op::CHUNK), Some(length));
         self.walked.bytes += length + if is_headed { HEAD } else { 0 };
         self.at = at + length;
-        self.show(*head, records);
+        self.show(*head, records)?;
         Ok(true)
     }
 
     /// Does nothing in these records show that they are another file's?
-    fn is_own(&self, records: &Records) -> bool {
-        let bytes = if records.unpacked { &self.unpacked } else { &self.buffer };
-        let mut fields = Fields(bytes.get(records.range.clone()).unwrap_or_default());
+    pub(super) fn is_consistent(&self, records: &[u8]) -> bool {
+        let mut fields = Fields(records);
         let earliest = self.begin_ns.unwrap_or(0).saturating_sub(BEFORE);
         while let Some((opcode, data)) = take(&mut fields) {
             let foreign = match opcode {

@@ -21,6 +21,7 @@ use super::chunk::{Records, take};
 use super::header;
 use super::index::Index;
 use super::names::Names;
+use super::own::Owner;
 use super::source::{ReadAt, Source};
 use super::structure::{Fit, is_known};
 use super::wire::Fields;
@@ -123,10 +124,11 @@ enum Found {
 impl<R: ReadAt> Walk<R> {
     /// Begins to read a file of `size` bytes. `None`: no MCAP file.
     pub(crate) fn new(file: R, size: u64) -> io::Result<Option<Self>> {
-        Self::begin(file, size, false)
+        Self::begin(file, size, None)
     }
 
-    pub(super) fn begin(file: R, size: u64, defining: bool) -> io::Result<Option<Self>> {
+    /// With an owner only the definitions of its chunks are of use.
+    pub(super) fn begin(file: R, size: u64, owner: Option<Owner>) -> io::Result<Option<Self>> {
         let allowed = |(least, each): (u64, u64)| size.saturating_mul(each).saturating_add(least);
         let mut walk = Self {
             source: Source::new(file, size),
@@ -148,9 +150,9 @@ impl<R: ReadAt> Walk<R> {
             with_checks: false,
             cut: false,
             seen: BTreeSet::new(),
-            names: Names::default(),
+            names: Names::of(owner.unwrap_or_default()),
             summarised: Vec::new(),
-            defining,
+            defining: owner.is_some(),
             budget: (allowed(UNPACKED), allowed(TRIED)),
             boot: None,
             same_boot: false,
@@ -349,11 +351,8 @@ impl<R: ReadAt> Walk<R> {
         Ok(step)
     }
 
-    /// What the file says of itself at its beginning, and definitions beside the chunks.
+    /// What the file says of itself at its beginning.
     fn remember(&mut self, opcode: u8) {
-        if opcode == op::ATTACHMENT {
-            self.names.attached(&self.buffer);
-        }
         if opcode != op::METADATA || self.begin_ns.is_some() {
             return;
         }

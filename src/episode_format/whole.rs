@@ -38,7 +38,7 @@ impl<R: ReadAt> Walk<R> {
         };
         self.proven &= head.crc != 0 || head.size == 0;
         self.walked.bytes += HEAD + length;
-        self.show(head, records);
+        self.show(head, records)?;
         Ok(Step::Again)
     }
 
@@ -68,16 +68,17 @@ impl<R: ReadAt> Walk<R> {
     }
 
     /// Shows the chunk in the buffers next, unless it was there before.
-    pub(super) fn show(&mut self, head: ChunkHead, records: Records) {
+    pub(super) fn show(&mut self, head: ChunkHead, records: Records) -> io::Result<()> {
         self.sure = self.at;
         (self.chunked, self.with_checks) = (true, self.with_checks || head.crc != 0);
         // Nothing is recorded twice; without a clock it cannot be told.
         let is_new = self.seen.insert((head.size, head.packed, head.crc)) || head.crc == 0 || head.times == (0, 0);
         if is_new {
-            self.chunk = Some(records);
+            self.chunk = self.learn(&records)?.then_some(records);
         } else {
             self.walked.left_out.repeated_chunks += 1;
             self.checked = false;
         }
+        Ok(())
     }
 }

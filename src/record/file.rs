@@ -3,24 +3,25 @@
 //! Invariant: every channel the registry lets expect is in the file from the start, so that a
 //! modality that never appears is still named.
 //! Invariant: only whole chunks reach the file: what a crash leaves ends between two records, save
-//! for a write that the crash cut in two.
+//! for a write that the crash cut in two. Each of them can be read without the others.
 //! Invariant: only [`EpisodeFile::finish`] gives a file its end; after an error it never gets one.
 
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{self, BufWriter, Write};
+use std::io::{self, Write};
 use std::ops::Range;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
-use mcap::records::{MessageHeader, Metadata};
-use mcap::write::NoSeek;
-use mcap::{Attachment, McapError, WriteOptions, Writer};
+use mcap::Attachment;
+use mcap::records::MessageHeader;
 
+use super::chunks::{self, Chunks, io_error};
 use super::encode::{self, EventText};
 use super::guard::Guard;
 use super::schema::{self, PROTOBUF, SampleSchema, Schema};
 use crate::action::ACTION_TOPIC;
+use crate::episode_format::own::EpisodeId;
 use crate::episode_format::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, SUMMARY};
 use crate::mask::{MASK_TOPIC, PhysicalMask};
 use crate::modality::{MAX_MODALITIES, ModalityId};
@@ -29,11 +30,6 @@ use crate::sample::SampleHeader;
 use crate::status::Level;
 use crate::sync::Observation;
 use crate::time::{Stamp, WallClock};
-
-/// Uncompressed bytes after which a chunk is closed. The writer keeps one chunk in memory.
-const CHUNK_BYTES: u64 = 1 << 20;
-/// Gathers the small records between chunks (message indexes) into one write.
-const BUFFER_BYTES: usize = 64 << 10;
 
 /// What an episode's bytes go to.
 pub trait Sink: Write + Send {
@@ -55,7 +51,7 @@ pub(super) struct EpisodeFile {
     /// Before the writer, which writes an end of its own when it is dropped.
     #[expect(dead_code, reason = "held to be dropped")]
     shut: Shut,
-    writer: Writer<NoSeek<BufWriter<Latch>>>,
+    writer: Chunks<Latch>,
     /// Bytes that the sink took.
     written: Arc<AtomicU64>,
     /// None where nobody else can reach the file.
@@ -146,9 +142,10 @@ impl EpisodeFile {
         metadata: BTreeMap<String, String>,
     ) -> io::Result<Self> {
         let (shut, written) = (Shut::default(), Arc::<AtomicU64>::default());
-        let mut writer = writer(Latch { sink, shut: Arc::clone(&shut.0), written: Arc::clone(&written) })?;
-        writer.write_metadata(&Metadata { name: ABOUT.to_owned(), metadata }).map_err(io_error)?;
         let wall_ns = clock.wall_ns(begin);
+        let latch = Latch { sink, shut: Arc::clone(&shut.0), written: Arc::clone(&written) };
+        let mut writer = Chunks::new(latch, Some(EpisodeId::new(wall_ns, begin.0)))?;
+        writer.metadata(ABOUT, metadata).map_err(io_error)?;
         writer
             .attach(&Attachment {
                 log_time: wall_ns,
@@ -234,7 +231,7 @@ impl EpisodeFile {
         track.newest = Some(encode::sample(&mut track.message, schema, log_time, &track.name, header, payload));
         self.bytes += payload.len() as u64;
         let message = message_header(channel, header.seq, log_time, self.clock.wall_ns(Stamp(header.recv_ns)));
-        self.writer.write_to_known_channel(&message, &track.message).map_err(io_error)?;
+        self.writer.message(&message, &track.message).map_err(io_error)?;
         self.messages += 1;
         Ok(())
     }
@@ -291,19 +288,15 @@ impl EpisodeFile {
     /// Ends the file with the summary and waits for the disk. A file that is dropped instead, or
     /// that cannot be ended, stays as it is: nothing more is written to it.
     pub(super) fn finish(mut self, summary: BTreeMap<String, String>) -> io::Result<()> {
-        let summary = Metadata { name: SUMMARY.to_owned(), metadata: summary };
-        self.writer.write_metadata(&summary).map_err(io_error)?;
-        self.writer.finish().map_err(io_error)?;
-        let buffered = self.writer.into_inner().into_inner();
-        let mut latch = buffered.into_inner().map_err(io::IntoInnerError::into_error)?;
-        latch.sync()?;
+        self.writer.metadata(SUMMARY, summary).map_err(io_error)?;
+        self.writer.finish()?;
         let written = self.written.load(Ordering::Relaxed);
         self.guard.map_or(Ok(()), |guard| guard.verify(written))
     }
 
     fn write(&mut self, channel_id: u16, sequence: u64, log_time: u64, published: Stamp) -> io::Result<()> {
         let header = message_header(channel_id, sequence, log_time, self.clock.wall_ns(published));
-        self.writer.write_to_known_channel(&header, &self.message).map_err(io_error)?;
+        self.writer.message(&header, &self.message).map_err(io_error)?;
         self.messages += 1;
         Ok(())
     }
@@ -315,21 +308,8 @@ fn message_header(channel_id: u16, sequence: u64, log_time: u64, publish_time: u
     MessageHeader { channel_id, sequence, log_time, publish_time }
 }
 
-/// The writer of an episode's file.
-pub(super) fn writer<S: Sink>(sink: S) -> io::Result<Writer<NoSeek<BufWriter<S>>>> {
-    // JPEG does not compress and raw frames are rare: no codec, so that the thread's time goes
-    // into the disk and every reader can read. Without seeking the writer keeps a chunk in
-    // memory until it is whole.
-    let options = WriteOptions::new()
-        .compression(None)
-        .chunk_size(Some(CHUNK_BYTES))
-        .disable_seeking(true)
-        .library(concat!("rapid/", env!("CARGO_PKG_VERSION")));
-    Writer::with_options(NoSeek::new(BufWriter::with_capacity(BUFFER_BYTES, sink)), options).map_err(io_error)
-}
-
 impl Track {
-    fn channel(&mut self, writer: &mut Writer<NoSeek<BufWriter<Latch>>>, schema: SampleSchema) -> io::Result<u16> {
+    fn channel(&mut self, writer: &mut Chunks<Latch>, schema: SampleSchema) -> io::Result<u16> {
         if let Some(Some(channel)) = self.channels.get(schema.index()) {
             return Ok(*channel);
         }
@@ -342,19 +322,11 @@ impl Track {
 }
 
 fn add_channel(
-    writer: &mut Writer<NoSeek<BufWriter<Latch>>>,
+    writer: &mut Chunks<Latch>,
     schema: Schema,
     topic: &str,
     metadata: &BTreeMap<String, String>,
 ) -> io::Result<u16> {
-    let schema_id = writer.add_schema(schema.name, PROTOBUF, schema.data).map_err(io_error)?;
-    writer.add_channel(schema_id, topic, PROTOBUF, metadata).map_err(io_error)
-}
-
-/// The system's own error where there is one: it says more than the writer's.
-pub(super) fn io_error(error: McapError) -> io::Error {
-    match error {
-        McapError::Io(error) => error,
-        other => io::Error::other(other),
-    }
+    let schema = writer.schema(None, schema.name, PROTOBUF, schema.data).map_err(io_error)?;
+    writer.channel(None, &chunks::Channel { schema, topic, encoding: PROTOBUF, metadata }).map_err(io_error)
 }

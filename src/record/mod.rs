@@ -10,6 +10,7 @@
 //! Invariant: what could not be recorded is counted and said.
 
 mod announce;
+mod chunks;
 mod configuration;
 mod describe;
 pub mod encode;

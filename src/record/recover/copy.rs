@@ -3,24 +3,25 @@
 //! Channels and schemas keep their numbers, messages their order; what the walk through the file leaves out is
 //! counted.
 
+use std::cell::{Cell, RefCell};
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{self, BufWriter};
+use std::io;
 use std::ops::ControlFlow;
 
-use mcap::records::{MessageHeader, Metadata};
-use mcap::write::{NoSeek, PrivateRecordOptions};
-use mcap::{Attachment, McapError, Writer};
+use mcap::records::MessageHeader;
+use mcap::{Attachment, McapError};
 use sha2::{Digest, Sha256};
 
-use super::super::file::{self, Sink};
+use super::super::chunks::{Channel, Chunks, io_error};
+use super::super::file::Sink;
 use super::super::walk::{Record, Walk, Walked, op};
 use super::super::wire::Fields;
 use super::said;
 use super::{Watch, summary::Summary};
-use crate::episode_format::{RECOVERED, ReadAt, SUMMARY, is_sound};
+use crate::episode_format::{RECOVERED, ReadAt, SUMMARY, is_sound, own};
 
-/// Bytes read between two calls of a [`Watch`].
+/// Bytes read between two calls of a [`Watch`]; what is read in vain, in search of a chunk, counts too.
 const WATCH_EVERY: u64 = 1 << 20;
 /// Bytes read at once where only their hash is wanted.
 const PIECE: usize = 256 << 10;
@@ -73,12 +74,12 @@ pub(super) struct Copied {
 
 /// What a file holds. `None`: no MCAP file.
 pub(super) fn summary(file: impl ReadAt, size: u64, watch: &mut Watch<'_>) -> Result<Option<Summary>, Error> {
-    let Some(mut walk) = Walk::new(file, size).map_err(Error::Read)? else { return Ok(None) };
+    let file = Watched::new(file, size, watch);
+    let Some(mut walk) = Walk::new(&file, size).map_err(|error| file.error(error))? else { return Ok(None) };
     let mut summary = Summary::default();
-    let mut watched = 0;
-    while let Some(record) = walk.next().map_err(Error::Read)? {
+    while let Some(record) = walk.next().map_err(|error| file.error(error))? {
         summary.record(record.opcode, record.data);
-        look(walk.walked().bytes, size, &mut watched, watch)?;
+        file.done.set(walk.walked().bytes);
     }
     summary.sound(walk.walked().sound);
     Ok(Some(summary))
@@ -93,13 +94,14 @@ pub(super) fn copy(
     sink: impl Sink,
     watch: &mut Watch<'_>,
 ) -> Result<Option<Copied>, Error> {
-    let Some(walk) = Walk::new(file, size).map_err(Error::Read)? else { return Ok(None) };
+    let file = Watched::new(file, size, watch);
+    let Some(walk) = Walk::new(&file, size).map_err(|error| file.error(error))? else { return Ok(None) };
     let mut walk = walk.of_boot(about.boot.clone());
     let mut copy = Copy::new(sink)?;
-    let mut watched = 0;
-    while let Some(record) = walk.next().map_err(Error::Read)? {
-        copy.take(&record)?;
-        look(walk.walked().bytes, size, &mut watched, watch)?;
+    while walk.advance().map_err(|error| file.error(error))? {
+        copy.writer.belong(walk.episode());
+        copy.take(&walk.record())?;
+        file.done.set(walk.walked().bytes);
     }
     let walked = walk.walked();
     let damage = Damage {
@@ -114,21 +116,22 @@ pub(super) fn copy(
 
 /// The SHA-256 of the first `size` bytes of `file`, hexadecimal.
 pub(super) fn sha256(file: &File, size: u64, watch: &mut Watch<'_>) -> Result<String, Error> {
+    let file = Watched::new(file, size, watch);
     let (mut hasher, mut piece) = (Sha256::new(), vec![0; PIECE]);
-    let (mut done, mut watched) = (0, 0);
+    let mut done = 0;
     while done < size {
         let count = usize::try_from(size - done).unwrap_or(usize::MAX).min(PIECE);
         let Some(room) = piece.get_mut(..count) else { break };
-        let read = match ReadAt::read_at(file, room, done) {
+        let read = match file.read_at(room, done) {
             Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
-            read => read.map_err(Error::Read)?,
+            read => read.map_err(|error| file.error(error))?,
         };
         if read == 0 {
             break;
         }
         hasher.update(room.get(..read).unwrap_or_default());
         done += read as u64;
-        look(done, size, &mut watched, watch)?;
+        file.done.set(done);
     }
     let digit = |nibble: u8| char::from_digit(nibble.into(), 16).unwrap_or_default();
     Ok(hasher.finalize().iter().flat_map(|byte| [digit(byte >> 4), digit(byte & 0xf)]).collect())
@@ -152,27 +155,54 @@ impl Sink for &mut Vec<u8> {
     }
 }
 
-fn look(done: u64, size: u64, watched: &mut u64, watch: &mut Watch<'_>) -> Result<(), Error> {
-    if done.saturating_sub(*watched) < WATCH_EVERY {
-        return Ok(());
+/// A file that has its [`Watch`] called while it is read, for whatever purpose.
+struct Watched<'a, 'w, R> {
+    file: R,
+    size: u64,
+    /// Bytes understood so far.
+    done: Cell<u64>,
+    /// Bytes read since the last call.
+    read: Cell<u64>,
+    interrupted: Cell<bool>,
+    watch: RefCell<&'a mut Watch<'w>>,
+}
+
+impl<'a, 'w, R> Watched<'a, 'w, R> {
+    fn new(file: R, size: u64, watch: &'a mut Watch<'w>) -> Self {
+        let (done, read, interrupted) = (Cell::default(), Cell::default(), Cell::default());
+        Self { file, size, done, read, interrupted, watch: RefCell::new(watch) }
     }
-    *watched = done;
-    match watch(done, size) {
-        ControlFlow::Continue(()) => Ok(()),
-        ControlFlow::Break(()) => Err(Error::Interrupted),
+
+    /// What an error of reading means.
+    fn error(&self, error: io::Error) -> Error {
+        if self.interrupted.get() { Error::Interrupted } else { Error::Read(error) }
+    }
+}
+
+impl<R: ReadAt> ReadAt for Watched<'_, '_, R> {
+    fn read_at(&self, buffer: &mut [u8], at: u64) -> io::Result<usize> {
+        let read = self.file.read_at(buffer, at)?;
+        self.read.set(self.read.get() + read as u64);
+        if self.read.get() >= WATCH_EVERY {
+            self.read.set(0);
+            let called = self.watch.try_borrow_mut().map(|mut watch| watch(self.done.get(), self.size));
+            self.interrupted.set(matches!(called, Ok(ControlFlow::Break(()))));
+        }
+        // Not the kind that is tried again.
+        if self.interrupted.get() { Err(io::Error::other("interrupted")) } else { Ok(read) }
     }
 }
 
 /// The file being written.
 struct Copy<S: Sink> {
-    writer: Writer<NoSeek<BufWriter<S>>>,
+    writer: Chunks<S>,
     summary: Summary,
     refused: u64,
 }
 
 impl<S: Sink> Copy<S> {
     fn new(sink: S) -> Result<Self, Error> {
-        let writer = file::writer(sink).map_err(Error::Write)?;
+        let writer = Chunks::new(sink, None).map_err(Error::Write)?;
         Ok(Self { writer, summary: Summary::default(), refused: 0 })
     }
 
@@ -185,9 +215,9 @@ impl<S: Sink> Copy<S> {
             op::MESSAGE => self.message(data),
             op::ATTACHMENT => self.attachment(data),
             op::METADATA => self.metadata(data),
-            op::PRIVATE.. => {
-                Some(self.writer.write_private_record(opcode, data, PrivateRecordOptions::IncludeInChunks.into()))
-            }
+            // The copy has chunks of its own.
+            op::OWN if own::is(data) => return Ok(()),
+            op::PRIVATE.. => Some(self.writer.private(opcode, data)),
             // The container's own, which has no place in a chunk.
             _ => return Ok(()),
         };
@@ -206,7 +236,7 @@ impl<S: Sink> Copy<S> {
                 self.refused += 1;
                 Ok(())
             }
-            Some(Err(error)) => Err(Error::Write(file::io_error(error))),
+            Some(Err(error)) => Err(Error::Write(io_error(error))),
         }
     }
 
@@ -216,7 +246,7 @@ impl<S: Sink> Copy<S> {
         let (name, encoding) = (fields.string()?, fields.string()?);
         let count = fields.u32()?;
         let data = fields.bytes(count.into())?;
-        Some(self.writer.add_schema_with_id(id, name, encoding, data).map(drop))
+        Some(self.writer.schema(Some(id), name, encoding, data).map(drop))
     }
 
     fn channel(&mut self, data: &[u8]) -> Option<Result<(), McapError>> {
@@ -224,11 +254,12 @@ impl<S: Sink> Copy<S> {
         let (id, schema) = (fields.u16()?, fields.u16()?);
         let (topic, encoding) = (fields.string()?, fields.string()?);
         let metadata = fields.map()?;
-        let added = match self.writer.add_channel_with_id(id, schema, topic, encoding, &metadata) {
+        let channel = Channel { schema, topic, encoding, metadata: &metadata };
+        let added = match self.writer.channel(Some(id), &channel) {
             // Better a channel that cannot be decoded than none.
             Err(McapError::UnknownSchema(..)) => {
                 self.refused += 1;
-                self.writer.add_channel_with_id(id, 0, topic, encoding, &metadata)
+                self.writer.channel(Some(id), &Channel { schema: 0, ..channel })
             }
             added => added,
         };
@@ -240,7 +271,7 @@ impl<S: Sink> Copy<S> {
         let (channel_id, sequence) = (fields.u16()?, fields.u32()?);
         let (log_time, publish_time) = (fields.u64()?, fields.u64()?);
         let header = MessageHeader { channel_id, sequence, log_time, publish_time };
-        Some(self.writer.write_to_known_channel(&header, fields.0))
+        Some(self.writer.message(&header, fields.0))
     }
 
     fn attachment(&mut self, data: &[u8]) -> Option<Result<(), McapError>> {
@@ -259,25 +290,22 @@ impl<S: Sink> Copy<S> {
 
     fn metadata(&mut self, data: &[u8]) -> Option<Result<(), McapError>> {
         let mut fields = Fields(data);
-        let name = fields.string()?.to_owned();
+        let name = fields.string()?;
         let metadata = fields.map()?;
-        Some(self.writer.write_metadata(&Metadata { name, metadata }))
+        Some(self.writer.metadata(name, metadata))
     }
 
     fn finish(mut self, damage: &Damage, about: &About<'_>, size: u64) -> Result<Summary, Error> {
         let finished = (|| {
             if !self.summary.has_end {
                 let metadata = said::end(&self.summary);
-                self.writer.write_metadata(&Metadata { name: SUMMARY.to_owned(), metadata })?;
+                self.writer.metadata(SUMMARY, metadata)?;
             }
             let metadata = said::recovered(&self.summary, damage, about, size);
-            self.writer.write_metadata(&Metadata { name: RECOVERED.to_owned(), metadata })?;
-            self.writer.finish()
+            self.writer.metadata(RECOVERED, metadata)
         })();
-        finished.map_err(|error| Error::Write(file::io_error(error)))?;
-        let buffered = self.writer.into_inner().into_inner();
-        let mut sink = buffered.into_inner().map_err(|error| Error::Write(error.into_error()))?;
-        sink.sync().map_err(Error::Write)?;
+        finished.map_err(|error| Error::Write(io_error(error)))?;
+        self.writer.finish().map_err(Error::Write)?;
         Ok(self.summary)
     }
 }

@@ -3,13 +3,15 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
-use std::ops::Range;
+use std::ops::{ControlFlow, Range};
 use std::os::unix::ffi::OsStringExt;
 
+use super::super::chunks::{Channel, Chunks};
 use super::copy::recover_bytes;
 use super::tests::{go_on, names, put, recorded};
-use super::{Outcome, left_behind, recover};
+use super::{Outcome, RecoverError, left_behind, recover};
 use crate::episode_format::op;
+use crate::episode_format::own::EpisodeId;
 use crate::episode_format::testing::{self, Message, metadata, strictly};
 use crate::episode_format::walk::MAGIC;
 
@@ -140,8 +142,10 @@ async fn of_every_file_every_message_of_every_right_chunk_is_kept_and_none_is_ma
                 let kept: BTreeSet<&Message> = repaired.iter().collect();
                 let right: Vec<&Chunk> =
                     chunks.iter().filter(|chunk| holds(&mutated, &whole[chunk.content.clone()])).collect();
-                // Without its channels a message is nobody's: they stand in the first chunk, and in the summary.
-                let names = right.iter().any(|chunk| chunk.content == chunks[0].content)
+                // Every chunk of ours defines its channels. Those of another writer stand in its first chunk and in the
+                // summary, and without them a message has no topic.
+                let names = name == "recorded"
+                    || right.iter().any(|chunk| chunk.content == chunks[0].content)
                     || holds(&mutated, &whole[end..]) && state == "finished";
                 let wanted = right.iter().flat_map(|chunk| &chunk.messages).filter(|_| names);
                 let missing = wanted.filter(|message| !kept.contains(message)).count();
@@ -287,58 +291,140 @@ fn foreign() -> Vec<u8> {
     bytes
 }
 
-#[test]
-fn a_file_that_is_the_payload_of_a_message_is_not_taken_for_part_of_the_episode() {
-    let payload = foreign();
+/// An episode of ours: its samples lie in chunks of their own.
+fn own(episode: EpisodeId, payloads: &[Vec<u8>]) -> Vec<u8> {
     let mut bytes = Vec::new();
-    let mut writer = testing::options().compression(None).create(std::io::Cursor::new(&mut bytes)).unwrap();
+    let mut file = Chunks::new(&mut bytes, Some(episode)).unwrap();
     let about = BTreeMap::from([("begin_wall_ns".to_owned(), testing::BEGIN.to_string())]);
-    writer.write_metadata(&mcap::records::Metadata { name: "rapid".into(), metadata: about }).unwrap();
-    let data = payload.as_slice().into();
-    let (name, media_type) = ("a.mcap".to_owned(), "application/mcap".to_owned());
-    writer.attach(&mcap::Attachment { log_time: 0, create_time: 0, name, media_type, data }).unwrap();
-    let schema = writer.add_schema("rapid.Bytes", "protobuf", b"").unwrap();
-    let channel = writer.add_channel(schema, "/rapid/bytes", "protobuf", &BTreeMap::new()).unwrap();
-    for sequence in 0..6 {
+    file.metadata("rapid", about).unwrap();
+    let schema = file.schema(None, "rapid.Bytes", "protobuf", b"").unwrap();
+    let none = BTreeMap::new();
+    let channel = Channel { schema, topic: "/rapid/bytes", encoding: "protobuf", metadata: &none };
+    let channel_id = file.channel(None, &channel).unwrap();
+    for (sequence, payload) in (0..).zip(payloads) {
         let log_time = testing::BEGIN + u64::from(sequence) * 1_000_000;
-        let header = mcap::records::MessageHeader { channel_id: channel, sequence, log_time, publish_time: log_time };
-        writer.write_to_known_channel(&header, &[&[7; 30][..], &payload].concat()).unwrap();
+        let header = mcap::records::MessageHeader { channel_id, sequence, log_time, publish_time: log_time };
+        file.message(&header, payload).unwrap();
+        file.flush().unwrap();
     }
-    writer.finish().unwrap();
-    drop(writer);
+    file.finish().unwrap();
+    bytes
+}
+
+/// Takes episodes of ours apart in which `payload`, a file, is part of every message: what is lost and what is invented.
+/// Of a payload that `is_ours` only what is invented counts, where a right chunk of the outer episode is left.
+fn nested(payload: &[u8], is_ours: bool, random: &mut Random) -> (usize, Vec<String>) {
+    let padding = |sequence: u8| [&[sequence; 30][..], payload].concat();
+    let bytes = own(EpisodeId::new(testing::BEGIN, 1), &(0..6).map(padding).collect::<Vec<_>>());
     let chunks = chunks(&bytes);
     let all: BTreeSet<Message> = chunks.iter().flat_map(|chunk| chunk.messages.clone()).collect();
     assert_eq!((all.len(), chunks.len()), (6, 6));
-    let mut random = Random(7);
-    let mut tried = 0;
+    let mut damaged = Vec::new();
     for state in [&bytes[..], unfinished(&bytes)] {
         for chunk in &chunks {
             let content = chunk.content.clone();
             // Its opcode, its length, its head, its first message, all but a part, its end and what follows.
             let start = content.start;
-            let parts = [start - 9..start - 8, start - 8..start - 4, start - 9..start + 40, start + 16..start + 80];
-            let ends = [start + 100..start + 101, start - 9..start + 700, content.end - 100..content.end + 200];
+            let parts = [start - 9..start - 8, start - 8..start - 4, start - 9..start + 40, start + 16..start + 280];
+            let ends = [start + 300..start + 301, start - 9..start + 700, content.end - 100..content.end + 200];
             for part in parts.into_iter().chain(ends) {
-                let mut damaged = state.to_vec();
-                let end = part.end.min(damaged.len());
-                damaged[part.start..end].iter_mut().for_each(|byte| *byte ^= 0x40);
-                let kept = strictly(&recover_bytes(&damaged).unwrap());
-                assert!(kept.iter().all(|message| all.contains(message)), "{part:?} of {content:?}");
-                tried += 1;
+                let end = part.end.min(state.len());
+                let mut bytes = state.to_vec();
+                bytes[part.start..end].iter_mut().for_each(|byte| *byte ^= 0x40);
+                damaged.push((format!("{part:?} of {content:?} changed"), bytes));
             }
         }
-        // Without an index and without the beginning nothing says when the episode was recorded.
-        let about = state.windows(13).position(|part| part == b"begin_wall_ns").unwrap() + 40;
-        for _ in 0..300 {
-            let (what, damaged) = mutate(&mut random, state);
-            if damaged.get(..about) != state.get(..about) {
-                continue;
-            }
-            let kept = recover_bytes(&damaged).map(|whole| strictly(&whole)).unwrap_or_default();
-            let invented = kept.iter().find(|message| !all.contains(*message));
-            assert!(invented.is_none(), "{what}: {:?}", invented.map(|message| (&message.0, message.1)));
-            tried += 1;
+        for end in (0..chunks[1].content.end).step_by(37) {
+            let mut bytes = state.to_vec();
+            bytes[..end].fill(0);
+            damaged.push((format!("zeros in 0..{end}"), bytes));
+            damaged.push((format!("0..{end} missing"), state[end..].to_vec()));
+        }
+        damaged.extend((0..300).map(|_| mutate(random, state)));
+    }
+    let mut wrong = Vec::new();
+    for (what, damaged) in &damaged {
+        let kept = recover_bytes(damaged).map(|whole| strictly(&whole)).unwrap_or_default();
+        let right: Vec<_> = chunks.iter().filter(|chunk| holds(damaged, &bytes[chunk.content.clone()])).collect();
+        let lost = right.iter().flat_map(|chunk| &chunk.messages).filter(|message| !kept.contains(message)).count();
+        let made = kept.iter().filter(|message| !all.contains(*message)).count();
+        // Without any right chunk of the outer file, nothing but the inner one says whose the chunks are.
+        let is_wrong = if is_ours { made > 0 && !right.is_empty() } else { lost + made > 0 };
+        if is_wrong {
+            wrong.push(format!("{what}: {lost} lost, {made} made"));
         }
     }
-    println!("{tried} ways to damage a file with a file in it, no message of the inner one taken");
+    (damaged.len(), wrong)
+}
+
+#[test]
+fn a_file_that_is_the_payload_of_a_message_is_not_taken_for_part_of_the_episode() {
+    // Another program's, and one of ours that began in the same moment and has the same channels.
+    let later = |sequence: u8| vec![0x80 | sequence; 40];
+    let payloads = [foreign(), own(EpisodeId::new(testing::BEGIN, 2), &(0..4).map(later).collect::<Vec<_>>())];
+    let mut random = Random(7);
+    for (payload, is_ours) in payloads.into_iter().zip([false, true]) {
+        let (tried, wrong) = nested(&payload, is_ours, &mut random);
+        println!("{tried} ways to damage an episode with a file in it, {} wrong", wrong.len());
+        assert!(wrong.is_empty(), "{} cases: {wrong:#?}", wrong.len());
+    }
+}
+
+#[tokio::test]
+async fn every_chunk_repeats_the_channels_as_the_summary_has_them() {
+    let (_folder, bytes) = recorded().await;
+    let chunks = chunks(&bytes);
+    let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
+    assert!(chunks.len() > 2 && summary.channels.len() > 5);
+    let last = &bytes[chunks.last().unwrap().content.clone()];
+    let own = last.windows(8).position(|part| part == b"rapid/1\n").unwrap();
+    assert_eq!(own, 40 + 9, "behind the heads of the chunk and of the record");
+    // The whole of the summary's definitions stands in the last chunk, byte for byte.
+    let footer = bytes.len() - 8 - 20;
+    let begin = usize::try_from(u64::from_le_bytes(bytes[footer..footer + 8].try_into().unwrap())).unwrap();
+    let (mut at, mut found) = (begin, 0);
+    while matches!(bytes[at], op::SCHEMA | op::CHANNEL) {
+        let end = at + 9 + usize::try_from(u64::from_le_bytes(bytes[at + 1..at + 9].try_into().unwrap())).unwrap();
+        assert!(last.windows(end - at).any(|part| *part == bytes[at..end]), "record at {at}");
+        (at, found) = (end, found + 1);
+    }
+    assert_eq!(found, summary.channels.len() + summary.schemas.len());
+}
+
+/// A file of what may be chunks, and none is: each is to be tried.
+fn hostile() -> Vec<u8> {
+    let mut bytes = MAGIC.to_vec();
+    bytes.extend([0x10; 30]);
+    while bytes.len() < 8 << 20 {
+        let head = [&[0; 16][..], &100_000_u64.to_le_bytes(), &[1; 4], &[0; 4], &100_000_u64.to_le_bytes()].concat();
+        bytes.extend(head);
+        bytes.extend([&[op::MESSAGE][..], &30_u64.to_le_bytes(), &[0; 30]].concat());
+    }
+    bytes
+}
+
+#[test]
+fn a_long_search_is_watched_and_ends_when_it_is_interrupted() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = put(&folder, "a_001.mcap.partial", &hostile());
+    let mut calls = 0_u64;
+    let said = recover(&path, &mut |_, _| {
+        calls += 1;
+        ControlFlow::Continue(())
+    });
+    assert!(matches!(said.unwrap().outcome, Outcome::Unreadable { .. }));
+    println!("{calls} calls for {} bytes", hostile().len());
+    // The hash alone reads each byte once; the search reads every candidate.
+    assert!(calls > 8 + 16);
+    for at in [1, 9, calls - 1] {
+        let path = put(&folder, "b_001.mcap.partial", &hostile());
+        let mut left = at;
+        let error = recover(&path, &mut |_, _| {
+            assert!(left > 0, "called again after it was interrupted");
+            left -= 1;
+            if left == 0 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        });
+        assert!(matches!(error.unwrap_err(), RecoverError::Interrupted(_)), "call {at} of {calls}");
+        assert_eq!(fs::read(&path).unwrap(), hostile());
+    }
 }

@@ -1,0 +1,185 @@
+//! The container of an episode as it is written: chunks of a bounded size, each of which begins with the record that
+//! says whose it is and what the channels are.
+//!
+//! Invariant: of a file whose episode is known every chunk can be read alone, whatever became of the others.
+//! Invariant: only whole chunks reach the sink.
+
+use std::collections::BTreeMap;
+use std::io::{self, BufWriter, Write};
+
+use mcap::records::{MessageHeader, Metadata};
+use mcap::write::{NoSeek, PrivateRecordOptions};
+use mcap::{Attachment, McapError, WriteOptions, Writer};
+
+use super::file::Sink;
+use crate::episode_format::op;
+use crate::episode_format::own::{EpisodeId, Own};
+
+/// Bytes of records after which a chunk is closed. The writer keeps one chunk in memory.
+const CHUNK_BYTES: u64 = 1 << 20;
+/// Gathers the small records between chunks (message indexes) into one write.
+const BUFFER_BYTES: usize = 64 << 10;
+/// Opcode and length of a record.
+const HEAD: u64 = 9;
+/// Bytes of a message before its data.
+const MESSAGE: usize = 22;
+
+/// See the module's comment.
+pub(super) struct Chunks<S: Write> {
+    writer: Writer<NoSeek<BufWriter<S>>>,
+    own: Option<Own>,
+    /// Bytes of records in the chunk that is open; none where none is.
+    open: u64,
+}
+
+impl<S: Sink> Chunks<S> {
+    /// Begins a file on `sink`. Without an `episode` its chunks say nothing of themselves.
+    pub(super) fn new(sink: S, episode: Option<EpisodeId>) -> io::Result<Self> {
+        // JPEG does not compress and raw frames are rare: no codec, so that the thread's time goes
+        // into the disk and every reader can read. Without seeking the writer keeps a chunk in
+        // memory until it is whole. Chunks are closed here, before the writer would: it does not say when it does.
+        let options = WriteOptions::new()
+            .compression(None)
+            .chunk_size(Some(CHUNK_BYTES + BUFFER_BYTES as u64))
+            .disable_seeking(true)
+            .library(concat!("rapid/", env!("CARGO_PKG_VERSION")));
+        let sink = NoSeek::new(BufWriter::with_capacity(BUFFER_BYTES, sink));
+        let writer = Writer::with_options(sink, options).map_err(io_error)?;
+        Ok(Self { writer, own: episode.map(Own::new), open: 0 })
+    }
+
+    /// Has every chunk from now on say that it belongs to `episode`, unless they do already or a channel is defined.
+    pub(super) fn belong(&mut self, episode: Option<EpisodeId>) {
+        if self.own.is_none() && self.open == 0 {
+            self.own = episode.map(Own::new);
+        }
+    }
+
+    /// Makes room for a record whose content has so many bytes.
+    fn room(&mut self, bytes: usize) -> Result<(), McapError> {
+        if self.open > CHUNK_BYTES {
+            self.flush()?;
+        }
+        if let Some(own) = self.own.as_ref().filter(|_| self.open == 0) {
+            let content = own.content();
+            self.writer.write_private_record(op::OWN, content, PrivateRecordOptions::IncludeInChunks.into())?;
+            self.open = HEAD + content.len() as u64;
+        }
+        self.open += HEAD + bytes as u64;
+        Ok(())
+    }
+
+    fn define(&mut self, opcode: u8, record: &[u8]) {
+        if let Some(own) = &mut self.own {
+            own.define(opcode, record);
+        }
+    }
+
+    /// Adds a schema, of the number `id` or of any; returns its number.
+    pub(super) fn schema(
+        &mut self,
+        id: Option<u16>,
+        name: &str,
+        encoding: &str,
+        data: &[u8],
+    ) -> Result<u16, McapError> {
+        let mut record = [&[0; 2][..], &text(name), &text(encoding), &counted(data)].concat();
+        self.room(record.len())?;
+        let id = match id {
+            Some(id) => self.writer.add_schema_with_id(id, name, encoding, data)?,
+            None => self.writer.add_schema(name, encoding, data)?,
+        };
+        number(&mut record, id);
+        self.define(op::SCHEMA, &record);
+        Ok(id)
+    }
+
+    /// Adds a channel, of the number `id` or of any; returns its number.
+    pub(super) fn channel(&mut self, id: Option<u16>, channel: &Channel<'_>) -> Result<u16, McapError> {
+        let Channel { schema, topic, encoding, metadata } = *channel;
+        let pairs: Vec<u8> = metadata.iter().flat_map(|(key, value)| [text(key), text(value)].concat()).collect();
+        let mut record = [&[0; 2][..], &schema.to_le_bytes(), &text(topic), &text(encoding), &counted(&pairs)].concat();
+        self.room(record.len())?;
+        let id = match id {
+            Some(id) => self.writer.add_channel_with_id(id, schema, topic, encoding, metadata)?,
+            None => self.writer.add_channel(schema, topic, encoding, metadata)?,
+        };
+        number(&mut record, id);
+        self.define(op::CHANNEL, &record);
+        Ok(id)
+    }
+
+    /// Writes a message on a channel that was added.
+    pub(super) fn message(&mut self, header: &MessageHeader, data: &[u8]) -> Result<(), McapError> {
+        self.room(MESSAGE + data.len())?;
+        self.writer.write_to_known_channel(header, data)
+    }
+
+    /// Writes another program's private record.
+    pub(super) fn private(&mut self, opcode: u8, data: &[u8]) -> Result<(), McapError> {
+        self.room(data.len())?;
+        self.writer.write_private_record(opcode, data, PrivateRecordOptions::IncludeInChunks.into())
+    }
+
+    /// Writes an attachment, which ends the chunk.
+    pub(super) fn attach(&mut self, attachment: &Attachment<'_>) -> Result<(), McapError> {
+        self.open = 0;
+        self.writer.attach(attachment)
+    }
+
+    /// Writes metadata, which end the chunk.
+    pub(super) fn metadata(&mut self, name: &str, metadata: BTreeMap<String, String>) -> Result<(), McapError> {
+        self.open = 0;
+        self.writer.write_metadata(&Metadata { name: name.to_owned(), metadata })
+    }
+
+    /// Ends the chunk and hands everything to the sink.
+    pub(super) fn flush(&mut self) -> Result<(), McapError> {
+        self.open = 0;
+        self.writer.flush()
+    }
+
+    /// Ends the file; returns once all of it is on the disk.
+    pub(super) fn finish(mut self) -> io::Result<()> {
+        self.writer.finish().map_err(io_error)?;
+        let buffered = self.writer.into_inner().into_inner();
+        let mut sink = buffered.into_inner().map_err(io::IntoInnerError::into_error)?;
+        sink.sync()
+    }
+}
+
+/// A channel to be added.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Channel<'a> {
+    /// Number of its schema.
+    pub(super) schema: u16,
+    pub(super) topic: &'a str,
+    /// Encoding of its messages.
+    pub(super) encoding: &'a str,
+    pub(super) metadata: &'a BTreeMap<String, String>,
+}
+
+/// Bytes with their count before them, as MCAP has them.
+fn counted(bytes: &[u8]) -> Vec<u8> {
+    let count = u32::try_from(bytes.len()).unwrap_or(u32::MAX);
+    [&count.to_le_bytes(), bytes].concat()
+}
+
+fn text(text: &str) -> Vec<u8> {
+    counted(text.as_bytes())
+}
+
+/// Writes the number of a definition into its record.
+fn number(record: &mut [u8], id: u16) {
+    if let Some(place) = record.first_chunk_mut() {
+        *place = id.to_le_bytes();
+    }
+}
+
+/// The system's own error where there is one: it says more than the writer's.
+pub(super) fn io_error(error: McapError) -> io::Error {
+    match error {
+        McapError::Io(error) => error,
+        other => io::Error::other(other),
+    }
+}
