@@ -21,7 +21,7 @@ use rapid::bus::{Bus, TopicId};
 use rapid::mask::{MaskRecord, PhysicalMask};
 use rapid::registry::Registry;
 use rapid::sample::{Encoding, SampleHeader};
-use support::{python, until};
+use support::{python, sweep_bus, until};
 
 /// What the simulated wrist camera would send.
 const PAYLOAD: &[u8] = b"\xff\xd8\xff\xe0 a picture";
@@ -81,6 +81,8 @@ impl Drop for Camera {
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
         }
+        // iceoryx2 for Python leaves the file that counts its nodes.
+        sweep_bus(&self.instance);
     }
 }
 
@@ -129,12 +131,14 @@ fn a_subscriber_in_python_sees_headers_and_payloads() {
 #[test]
 fn a_topic_that_is_not_there_is_said() {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/subscribe.py");
+    let instance = format!("pynone{}", std::process::id());
     let ended = Command::new(python())
         .arg(script)
         .args(["/rapid/camera/wrist", "1", "0.1"])
-        .env("RAPID_INSTANCE", format!("pynone{}", std::process::id()))
+        .env("RAPID_INSTANCE", &instance)
         .output()
         .expect("python");
+    sweep_bus(&instance);
     assert_eq!(ended.status.code(), Some(3));
     assert!(String::from_utf8_lossy(&ended.stderr).contains("no such topic"), "{ended:?}");
 }

@@ -48,14 +48,18 @@ pub(crate) struct Place {
 /// A run that was killed leaves what it had in shared memory, and no test leaves it to the next run.
 impl Drop for Place {
     fn drop(&mut self) {
-        for file in self.shared_memory() {
-            let _ = std::fs::remove_file(Path::new("/dev/shm").join(file));
-        }
+        sweep_bus(&self.instance);
         let mask = self.mask_file();
         for file in [mask.with_extension(format!("{}.json", self.instance)), mask] {
             let _ = std::fs::remove_file(file);
         }
-        sweep(Path::new(BUS_FILES), &format!("iox2_{}_", self.instance));
+    }
+}
+
+/// Removes all that programs of an instance have left of their bus.
+pub(crate) fn sweep_bus(instance: &str) {
+    for folder in ["/dev/shm", BUS_FILES] {
+        sweep(Path::new(folder), &format!("iox2_{instance}_"));
     }
 }
 

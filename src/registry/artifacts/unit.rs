@@ -121,6 +121,8 @@ UMask=0027
 KillSignal=SIGINT
 KillMode=mixed
 TimeoutStopSec=30
+# An episode that is BAD is no failure of the service.
+SuccessExitStatus=4
 Restart=on-failure
 RestartSec=2
 # The thread `mask` asks for real-time scheduling.
