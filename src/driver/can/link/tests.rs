@@ -65,12 +65,13 @@ fn slcan_carries_frames_both_ways() {
     adapter.read_exact(&mut sent).unwrap();
     assert_eq!(sent, *b"t12380102030405060708\r");
 
+    let before = Stamp::now();
     adapter.write_all(b"z\rt0052AABB\r\x07T00000005").unwrap();
     let mut frame = CanFrame::default();
-    let before = Stamp::now();
     let Arrival { at, from_kernel } = link.recv_until(soon(), &mut frame).unwrap().unwrap();
     assert_eq!((frame.id, frame.data()), (5, &[0xaa, 0xbb][..]));
-    assert!(at <= Stamp::now() && at >= before && !from_kernel);
+    // Ten bytes came behind it, which no line carries at once, as this one of the test does.
+    assert!(at <= Stamp::now() && at.after(Duration::from_micros(10)) >= before && !from_kernel);
     assert_eq!(link.recv_until(Stamp::now(), &mut frame), Ok(None));
     assert_eq!((link.take_refused(), link.take_refused(), link.take_lost()), (1, 0, 0));
     adapter.write_all(b"0\r").unwrap();
