@@ -26,6 +26,20 @@ impl Delays {
         delays
     }
 
+    /// The first effect of each cause, as in [`Self::between`], as time from the cause's own `moment`; negative where the
+    /// effect came first. So two listeners to one event are compared: neither always hears of it before the other.
+    pub fn beside(causes: &[u64], moments: &[u64], effects: &[u64]) -> Self {
+        let (mut found, mut missing) = (Vec::new(), 0);
+        for (place, (cause, moment)) in causes.iter().zip(moments).enumerate() {
+            let end = causes.get(place + 1).copied().unwrap_or(u64::MAX);
+            match effects.iter().find(|effect| (*cause..end).contains(effect)) {
+                Some(effect) => found.push((*effect as f64 - *moment as f64) / 1e6),
+                None => missing += 1,
+            }
+        }
+        Self { missing, ..Self::of(found) }
+    }
+
     /// These, ms.
     pub fn of(mut found: Vec<f64>) -> Self {
         found.sort_by(f64::total_cmp);
@@ -72,6 +86,13 @@ mod tests {
         let delays = Delays::between(&ms(&[100, 200, 300]), &ms(&[50, 130, 140, 310]));
         assert_eq!(delays.to_string(), "n=2/3 min=10.0 p50=10.0 p95=30.0 max=30.0 ms");
         assert_eq!(Delays::between(&[], &[]).to_string(), "n=0/0 ms");
+    }
+
+    #[test]
+    fn an_effect_may_come_before_another_listener_hears_of_the_cause() {
+        let ms = |all: &[u64]| all.iter().map(|value| value * 1_000_000).collect::<Vec<_>>();
+        let delays = Delays::beside(&ms(&[100, 200, 300]), &ms(&[110, 210, 310]), &ms(&[108, 213]));
+        assert_eq!(delays.to_string(), "n=2/3 min=-2.0 p50=-2.0 p95=3.0 max=3.0 ms");
     }
 
     #[test]

@@ -279,7 +279,12 @@ impl Seen {
                 "plug -> the kernel has made the node",
             ),
             ("stage_udev", Delays::between(&self.firsts(&kernel_nodes), &nodes), None, "-> udev has processed it"),
-            ("stage_told", Delays::between(&told, &self.attached), None, "-> rapid has matched it to its entry"),
+            (
+                "stage_told",
+                Delays::beside(&self.firsts(&kernel_nodes), &told, &self.attached),
+                None,
+                "-> rapid has matched it to its entry; below 0 it heard of it before the listener of the bench",
+            ),
             (
                 "stage_open",
                 Delays::between(&self.firsts(&self.attached), &self.stream_on),
