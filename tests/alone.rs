@@ -28,7 +28,7 @@ fn linked_with(file: &Path) -> BTreeSet<PathBuf> {
 fn root(place: &Place) -> PathBuf {
     let root = place.path("root");
     let program = Path::new(env!("CARGO_BIN_EXE_rapid"));
-    for folder in ["proc", "dev", "tmp", "work/in/a/folder"] {
+    for folder in ["proc", "dev", "tmp", "data/in/a/folder"] {
         std::fs::create_dir_all(root.join(folder)).expect("folder");
     }
     std::fs::copy(program, root.join("rapid")).expect("the program");
@@ -48,7 +48,7 @@ fn run_in(root: &Path, arguments: &[&str]) -> Output {
     let script = "mount --rbind /proc \"$0/proc\" && mount --rbind /dev \"$0/dev\" && exec chroot \"$0\" \"$@\"";
     let mut command = Command::new("unshare");
     command.args(["--map-root-user", "--mount", "sh", "-c", script]).arg(root).arg("/rapid").args(arguments);
-    command.env_clear().env("PATH", "/usr/sbin:/usr/bin:/sbin:/bin").env("HOME", "/work");
+    command.env_clear().env("PATH", "/usr/sbin:/usr/bin:/sbin:/bin").env("HOME", "/data");
     command.output().expect("unshare")
 }
 
@@ -76,7 +76,7 @@ fn one_file_runs_a_policy_on_a_machine_without_the_c_plus_plus_library() {
     let place = Place::new();
     let root = root(&place);
     let run = ["--json", "--instance", &place.instance, "--infer", "--sim", "task"];
-    let record = ["--duration", "5s", "--record", "--out", "/work/in/a/folder"];
+    let record = ["--duration", "5s", "--record", "--out", "/data/in/a/folder"];
     let output = run_in(&root, &[&run[..], &record].concat());
     let errors = String::from_utf8_lossy(&output.stderr).into_owned();
     let printed = String::from_utf8_lossy(&output.stdout);
@@ -85,7 +85,7 @@ fn one_file_runs_a_policy_on_a_machine_without_the_c_plus_plus_library() {
     assert!(said.iter().any(|event| event["event"] == "act"), "{said:?}");
     let policy = said.iter().find(|event| event["event"] == "policy").expect("the policy");
     assert_eq!((&policy["folder"], &policy["library"]), (&"inside rapid".into(), &"the library inside rapid".into()));
-    let folder = root.join("work/in/a/folder");
+    let folder = root.join("data/in/a/folder");
     let file = std::fs::read_dir(&folder).expect("the folder").flatten().next().expect("an episode");
     assert!(Episode::read(&file.path()).topic("/action").count() > 0);
 }
