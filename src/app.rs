@@ -1,8 +1,8 @@
 //! The program: puts the stages together, runs them, and takes them down in order.
 //!
 //! Taking down: the episode ends, the policy holds and actuators are disarmed, the last samples of the episode arrive,
-//! streams stop, the recorder finishes its file, the programs of devices are waited for, the mask says 0 and its files
-//! go, the screen says what was recorded and gives the terminal back.
+//! streams stop, the recorder finishes its file, the programs of devices are waited for, the mask is 0 and its files
+//! go, the screen shows what was recorded and gives the terminal back.
 //!
 //! Invariant: only this module sees every stage.
 //! Invariant: whatever ends the run, an episode in progress is finished first.
@@ -160,7 +160,7 @@ pub enum AppError {
 fn bad(count: u64, file: &Path) -> String {
     let file = file.display();
     let many = if count > 1 { format!(", and {} before it", count - 1) } else { String::new() };
-    format!("{file} is BAD{many}: its verdict above says why; see `rapid inspect`")
+    format!("{file} is BAD{many}: its verdict above has the reasons; see `rapid inspect`")
 }
 
 /// Where the mask of an instance is published.

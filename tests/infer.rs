@@ -107,7 +107,7 @@ fn a_pulled_sensor_is_left_out_at_the_next_tick_and_actions_go_on() {
     let place = Place::new();
     let (code, said, stderr) = infer(&place, BUNDLE, PULLED, &["--record", "--duration", "8s", "--out", "out"]);
     assert_eq!(code, recorded_code(&said), "{stderr}");
-    let policy = of(&said, "policy").next().expect("the policy says what it is");
+    let policy = of(&said, "policy").next().expect("an event of the policy");
     assert_eq!((&policy["policy"], &policy["dry_run"]), (&"tactile-id".into(), &false.into()));
     assert!(holds(&said).is_empty(), "{:?}", holds(&said));
     let masks: Vec<_> =
@@ -226,7 +226,7 @@ fn a_policy_that_is_none_or_not_for_this_rig_is_refused_by_name() {
     assert!(stderr.contains(&format!("{text} (--ort-lib): it cannot be loaded: ")), "{stderr}");
 }
 
-/// A device that does not move is no actuator, whatever the registry says.
+/// A device that does not move is no actuator, whatever the registry states.
 #[test]
 fn what_does_not_move_is_refused_before_anything_starts() {
     let place = Place::new();
@@ -251,7 +251,7 @@ fn what_does_not_move_is_refused_before_anything_starts() {
     assert!(said.contains("actuator \"arm\" takes no actions"), "{said}");
 }
 
-/// The policy that the program carries fits the simulated task, and says so on any other rig.
+/// The policy that the program carries fits the simulated task, and reports it on any other rig.
 #[test]
 fn the_policy_inside_is_there_from_any_folder_and_names_the_rig_it_fits() {
     let place = Place::new();
@@ -259,7 +259,7 @@ fn the_policy_inside_is_there_from_any_folder_and_names_the_rig_it_fits() {
     let output = place.run(&arguments);
     let said = events(&String::from_utf8_lossy(&output.stdout));
     assert_eq!(output.status.code(), recorded_code(&said), "{}", String::from_utf8_lossy(&output.stderr));
-    let policy = of(&said, "policy").next().expect("the policy says what it is");
+    let policy = of(&said, "policy").next().expect("an event of the policy");
     assert_eq!((&policy["policy"], &policy["folder"]), (&"tactile-id".into(), &"inside rapid".into()));
     assert!(of(&said, "act").count() > 0, "{said:?}");
     let folder = rapid::policy::bundle::Bundle::load(Path::new(BUNDLE)).expect("the same as a folder");

@@ -114,7 +114,7 @@ fn a_deaf_program_is_unplugged_at_once_and_killed_later_and_its_successor_waits(
 
     let files = place.files("out");
     let episode = Episode::read(&place.path("out").join(&files[0]));
-    // The mask goes on while the program is being ended: no publication is missing, and none of the five
+    // The mask continues while the program is being ended: no publication is missing, and none of the five
     // seconds is without one, however busy the machine.
     let masks: Vec<u32> = episode.topic("/rapid/mask").map(|message| message.sequence).collect();
     assert!(masks.windows(2).all(|pair| pair[1] == pair[0] + 1), "a hole in the mask");

@@ -1,5 +1,5 @@
 //! Another program of the same user publishes on topics of a run that records: nothing of it is taken for ours, and
-//! the episode says so.
+//! the episode's verdict has it as a reason.
 
 #![allow(clippy::expect_used, reason = "what fails here fails a test")]
 mod support;

@@ -134,8 +134,8 @@ number of threads, round differently, so that another machine gets weights that 
 """
 DOES = {
     "tactile-id": "it grasps a block, tells by touch whether its surface is a triangular or a hexagonal lattice, and "
-    "puts it to the left or to the front. Without the tactile sensor it goes on and has to guess; without the wrist "
-    "camera it goes on and rarely finds the block; without both it holds.",
+    "puts it to the left or to the front. Without the tactile sensor it continues and has to guess; without the wrist "
+    "camera it continues and rarely finds the block; without both it holds.",
 }
 
 

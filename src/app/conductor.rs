@@ -29,7 +29,7 @@ const SETTLE_LEAST: Duration = Duration::from_millis(100);
 /// How often it is looked whether they deliver.
 const SETTLE_LOOK: Duration = Duration::from_millis(20);
 
-/// That no device is plugged in is said after this time.
+/// That no device is plugged in is reported after this time.
 const NONE_AFTER: Duration = Duration::from_secs(3);
 /// The last samples of an episode have this long to arrive: the longest `latency` of a device is a second.
 const LAST_SAMPLES: Duration = Duration::from_secs(2);

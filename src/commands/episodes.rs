@@ -1,6 +1,6 @@
 //! Many episodes judged at once, on all processors.
 //!
-//! Every file is read whole, whatever its recorder said of it: what changed since then shows.
+//! Every file is read whole, whatever its recorder wrote about it: what changed since then shows.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -30,7 +30,7 @@ pub(super) fn each<T: Send, E>(
             scope.spawn(move || {
                 loop {
                     let index = next.fetch_add(1, Ordering::Relaxed);
-                    // Nobody takes results any more after an error.
+                    // Results have no reader any more after an error.
                     let Some(file) = files.get(index) else { break };
                     if done.send((index, read(file))).is_err() {
                         break;

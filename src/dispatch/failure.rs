@@ -142,7 +142,7 @@ impl Failure {
     }
 }
 
-/// What the failure says, with its cause where that is a limit of this process: whatever could not be opened then is not
+/// The failure's text, with its cause where that is a limit of this process: whatever could not be opened then is not
 /// what is wrong.
 pub(super) fn with_cause(text: String) -> String {
     // EMFILE and ENFILE, as the standard library words them.

@@ -159,7 +159,7 @@ impl Sim {
         }
     }
 
-    /// Ends its recording, and takes as long as the scenario says.
+    /// Ends its recording, and takes as long as the scenario states.
     pub(super) async fn close(mut self) {
         self.record(false);
         tokio::time::sleep(self.device.faults.close).await;

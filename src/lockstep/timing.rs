@@ -33,7 +33,7 @@ impl Timing {
     /// It captures at the ticks and is seen at once, as in a demonstration.
     pub const LOCKED: Self = Self { phase: Duration::ZERO, latency: Duration::ZERO };
 
-    /// Of each device of a registry in trial `seed`, which begins with those plugged in that `scenario` says.
+    /// Of each device of a registry in trial `seed`, which begins with those that `scenario` states as plugged in.
     #[must_use]
     pub fn of_trial(seed: u64, registry: &Registry, scenario: &Scenario) -> Vec<Self> {
         let plugged = |name: &str| scenario.devices.iter().any(|device| device.name == name && device.plugged);
@@ -41,7 +41,7 @@ impl Timing {
         Self::draw(seed, &there)
     }
 
-    /// Of each sensor of trial `seed`. `there` says which of them are plugged in when the policy begins: on
+    /// Of each sensor of trial `seed`. `there` states which of them are plugged in when the policy begins: on
     /// these the control grid waits.
     #[must_use]
     pub fn draw(seed: u64, there: &[bool]) -> Vec<Self> {

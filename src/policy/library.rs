@@ -184,7 +184,7 @@ fn load(origin: &Origin) -> Result<ort::environment::Environment, Cause> {
 }
 
 fn start(path: &Path) -> Result<ort::environment::Environment, Cause> {
-    // Before `ort` does it, whose error does not say what is missing.
+    // Before `ort` does it, whose error does not name what is missing.
     let name = CString::new(path.as_os_str().as_bytes()).map_err(|_| Cause::Missing)?;
     loader::load_onnxruntime(&name)?;
     let builder = ort::init_from(path).map_err(|error| match error {

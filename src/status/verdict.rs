@@ -39,7 +39,7 @@ pub struct Verdict {
     /// Why it is not GOOD, the gravest first: sentences for people, each with modality, figure and
     /// limit. Empty exactly if it is GOOD.
     pub reasons: Vec<String>,
-    /// Which sensors took part; unknown (`null`) where the file does not say which were registered.
+    /// Which sensors took part; unknown (`null`) where the file does not state which were registered.
     pub sensors: Option<Sensors>,
 }
 

@@ -18,7 +18,7 @@ const KEYS: [(&str, &str); 11] = [
     ("r", "restart the selected device, if it failed"),
     ("a, a", "arm the actuator: motors follow actions"),
     ("d", "disarm it: motors are disabled"),
-    ("p", "pause the view; everything else goes on"),
+    ("p", "pause the view; everything else continues"),
     ("pgup, pgdn", "scroll the log; esc goes to its end"),
     ("?", "this help"),
     ("q, ctrl-c", "quit"),

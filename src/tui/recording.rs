@@ -89,7 +89,7 @@ fn idle(area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
     // The reasons beside the name as far as there is room; the log has all of them.
     let room = width.saturating_sub(label.width() + word.width());
     let name_width = last.file_name().map_or(0, |name| text::width(&name.to_string_lossy()));
-    // The offer says of a short one what the first reason does.
+    // The offer repeats the first reason of a short one.
     let why = offer.unwrap_or_else(|| theme.safe(&reasons.join("; ")));
     let room_why = room.saturating_sub(name_width + 2);
     let path = file(last, if why.is_empty() { room } else { name_width.min(room) }, theme);

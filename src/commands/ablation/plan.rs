@@ -10,14 +10,14 @@ use crate::registry::ablation::AblationPlan;
 use crate::registry::{DeviceSpec, Mount, NodeSpec, Registry, did_you_mean};
 use crate::status::Grade;
 
-/// What a recorded file says of itself, and what it is worth.
+/// What a recorded file states about itself, and what it is worth.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Recorded {
     /// The task in the user's words.
     pub(super) task: String,
     /// Tags of the user and of the modules.
     pub(super) tags: BTreeMap<String, String>,
-    /// Modalities that were present when it began, if it says so.
+    /// Modalities that were present when it began, if the file states it.
     pub(super) present: Option<BTreeSet<String>>,
     /// The word of its verdict; none if it is not an episode of rapid.
     pub(super) grade: Option<Grade>,

@@ -95,7 +95,7 @@ pub(super) fn check(model: &[u8]) -> Result<(), Refused> {
     Ok(())
 }
 
-/// Either the flag or the name of a file, whatever the other says.
+/// Either the flag or the name of a file, whatever the other holds.
 fn is_external(number: u64, value: Proto<'_>) -> bool {
     number == EXTERNAL_DATA || (number == DATA_LOCATION && value.number() != 0)
 }

@@ -14,7 +14,7 @@ use crate::registry::Diagnostic;
 /// A checked bundle.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Bundle {
-    /// The folder it was read from; of the one inside the program a word that says so.
+    /// The folder it was read from; of the one inside the program a word for it.
     pub folder: PathBuf,
     /// It is the one inside the program.
     pub inside: bool,

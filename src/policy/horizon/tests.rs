@@ -352,7 +352,7 @@ proptest! {
     }
 }
 
-/// In training one of several pictures was always there: what the policy does without any nobody has taught it.
+/// In training one of several pictures was always there: what the policy does without any is not in its training.
 #[test]
 fn without_any_picture_it_holds_and_without_one_of_two_it_goes_on() {
     const NO_PICTURE: PhysicalMask = PhysicalMask(0b100);

@@ -154,7 +154,7 @@ impl LanPicture {
 }
 
 impl LanSpec {
-    /// Takes over what the rig says of the disk.
+    /// Takes over the rig's settings for the disk.
     pub(in crate::registry) fn keep_free(&mut self, disk_reserve: Option<u64>) {
         if let LanProtocol::Gopro { reserve, .. } = &mut self.protocol {
             *reserve = disk_reserve;

@@ -10,7 +10,7 @@ use super::{Effect, Model, NOTICE_SHOWN};
 use crate::status::{Command, Snapshot};
 use crate::time::Stamp;
 
-/// Least time between question and confirmation: nobody reads faster, and what is pasted comes at once.
+/// Least time between question and confirmation: a person does not read faster, and pasted text arrives at once.
 const LEAST: Duration = Duration::from_millis(150);
 
 /// The question that was put to the user.

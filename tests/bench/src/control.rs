@@ -1,6 +1,6 @@
 //! How well a control loop keeps its grid while chunks are computed, against a bare thread at the same time.
 //!
-//! A recorded action says when its tick was due (`log_time`) and when it was published (`publish_time`).
+//! A recorded action holds when its tick was due (`log_time`) and when it was published (`publish_time`).
 
 use std::path::{Path, PathBuf};
 use std::process::Command;

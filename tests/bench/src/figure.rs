@@ -1,6 +1,6 @@
 //! Figures: what was measured, beside its baseline and its target, as a table or as JSON.
 //!
-//! Invariant: a figure that could not be measured is shown with the reason, and says whether the machine lacks what it
+//! Invariant: a figure that could not be measured is shown with the reason, and states whether the machine lacks what it
 //! needs; nothing here fails on a value.
 
 use std::fmt::Write as _;

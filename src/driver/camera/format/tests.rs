@@ -145,7 +145,7 @@ fn the_kernels_time_is_used_where_it_can_be_true() {
     assert_eq!(progress.stamp(&frame(4, Some(145)), Stamp(150)), (Stamp(145), true));
 }
 
-/// What a kernel says wrongly of a picture.
+/// What a kernel reports wrongly about a picture.
 #[derive(Debug, Clone, Copy)]
 enum Wrong {
     Nothing,

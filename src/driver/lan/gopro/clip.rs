@@ -228,7 +228,7 @@ struct Part {
     path: PathBuf,
     /// Bytes that are there.
     there: u64,
-    /// What is to stay free on the disk, if the registry says so.
+    /// What is to stay free on the disk, if the registry asks for it.
     reserve: Option<u64>,
 }
 
@@ -295,7 +295,7 @@ impl Part {
     }
 }
 
-/// Why so many bytes more do not fit on the disk of `file`; `None` if they do, or the disk does not say. Episodes keep
+/// Why so many bytes more do not fit on the disk of `file`; `None` if they do, or the file system does not report it. Episodes keep
 /// their room: twice the registry's `disk_reserve`, as an episode that comes near the reserve is warned of.
 fn full(file: &File, bytes: u64, reserve: Option<u64>) -> Option<String> {
     let disk = Disk::of(file).ok().filter(|disk| disk.lacks_room_beside_an_episode(bytes, reserve))?;
