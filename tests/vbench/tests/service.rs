@@ -52,6 +52,8 @@ grown() {
   local file; file=$(ls /var/lib/rapid/*.partial | tail -n 1)
   wait_for 60 larger_than $(($(stat -c %s "$file") + 400000)) "$file" || give_up "$file does not grow"
 }
+# The repair in the background works at the lowest priority: one partial file is that of the episode in progress.
+repaired() { [ "$(ls /var/lib/rapid | grep -c '\.partial$')" = 1 ]; }
 restarts() { systemctl show rapid --property=NRestarts --value; }
 
 emu plug 0 1 2
@@ -83,6 +85,7 @@ wait_for 60 is 1 restarts || give_up 'systemd does not start it again'
 wait_for 60 is 3 count || give_up 'no third episode'
 wait_for 60 streams || give_up 'not everything streams after the kill'
 grown
+wait_for 180 repaired || give_up 'the killed episode is not repaired'
 systemctl stop rapid || give_up 'systemctl stop rapid'
 systemctl show rapid --property=Result,ExecMainStatus,NRestarts >$out/result
 journal
