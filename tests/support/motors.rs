@@ -145,9 +145,10 @@ pub(crate) fn spec(count: u16) -> DamiaoSpec {
         ..motor_spec::motor(id)
     };
     DamiaoSpec {
-        disable_after: Duration::from_millis(500),
-        // The terminals of a busy machine are slower than a bus.
-        silent_after: Duration::from_millis(400),
+        // A busy machine may not run a test, or the terminal between, for a second.
+        disable_after: Duration::from_secs(5),
+        timeout: Duration::from_secs(2),
+        silent_after: Duration::from_secs(2),
         ..motor_spec::bus((1..=count).map(motor).collect())
     }
 }
