@@ -13,6 +13,7 @@ mod autopilot;
 mod conductor;
 mod screen;
 pub(crate) mod signals;
+mod watch;
 
 use std::panic::AssertUnwindSafe;
 use std::path::{Path, PathBuf};
@@ -27,7 +28,7 @@ use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
 use crate::action::Order;
-use crate::bus::{Bus, BusError, TopicId};
+use crate::bus::{self, Bus, BusError, TopicId};
 use crate::driver;
 use crate::fault;
 use crate::hotplug::lan::LanMonitor;
@@ -192,6 +193,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     }
     let signals = Signals::listen()?;
 
+    bus::check_memory()?;
     // First of all: are we the only one? A registry has at most 64 devices.
     let count = u8::try_from(registry.devices.len()).unwrap_or(u8::MAX);
     let claim = Claim::new(&mask_path(options.instance.as_deref()), count)?;
@@ -273,7 +275,13 @@ pub async fn run(options: Options) -> Result<(), AppError> {
         autopilot,
     };
     // A panic here ends the run like any other: what it leaves is taken down in order.
-    let conducted = AssertUnwindSafe(conductor.conduct(&mut running)).catch_unwind().await;
+    let conducted = async {
+        tokio::select! {
+            outcome = conductor.conduct(&mut running) => outcome,
+            never = watch::over(bus.watchman()) => never,
+        }
+    };
+    let conducted = AssertUnwindSafe(conducted).catch_unwind().await;
     let outcome = conducted.unwrap_or(Err(AppError::Panicked("the main task")));
     finish(running, conductor, outcome).await
 }

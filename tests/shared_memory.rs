@@ -17,6 +17,7 @@ use rustix::process::Signal;
 use support::{Episode, Place, Running, python, until};
 
 const RECORD: [&str; 6] = ["--sim", "--headless", "--json", "--record", "--out", "out"];
+const RUN: [&str; 5] = ["--sim", "--headless", "--json", "--duration", "300ms"];
 const RECORDING: &str = "\"event\":\"recording\"";
 /// Where iceoryx2 keeps what is no memory.
 const FOLDER: &str = "/tmp/iceoryx2";
@@ -199,24 +200,147 @@ fn memory_in_use_that_is_lost_ends_the_run_in_order() {
     running.signal(Signal::CONT);
     let (code, output, errors) = running.end();
     assert_eq!(code, Some(1), "{errors}");
-    let reason = "/dev/shm: shared memory that is in use cannot be written";
-    assert!(errors.contains(&format!("error: {reason}")), "{errors}");
+    let reason = ".data: shared memory that is in use cannot be used any more";
+    assert!(is_named(&errors, reason), "{errors}");
     let told = support::events(&output);
     let ended = told.iter().find(|event| event["event"] == "episode").expect("the end of the episode");
     assert!(ended["error"].as_str().is_some_and(|error| error.contains(reason)), "{ended}");
     assert!(whole_episode(&place).topic("/rapid/mask").count() > 0);
 }
 
+/// Does the run's error name a file of the bus? It may be that of the episode, which ends for the same reason.
+fn is_named(errors: &str, reason: &str) -> bool {
+    errors
+        .lines()
+        .filter(|line| line.starts_with("error: "))
+        .any(|line| line.contains("/dev/shm/iox2_") && line.contains(reason))
+}
+
+/// What another program does to tables of iceoryx2 that a run uses.
+fn damage(path: &Path, truncate: bool) {
+    let mut file = File::options().write(true).open(path).expect("a file in use");
+    if truncate {
+        file.set_len(0).expect("truncated");
+    } else {
+        let page = file.metadata().expect("a file in use").len().min(4096);
+        file.write_all(&vec![0; usize::try_from(page).expect("a page")]).expect("overwritten");
+    }
+}
+
+#[test]
+fn tables_of_the_bus_that_are_damaged_end_the_run_in_order_and_the_file_is_named() {
+    for (suffix, truncate) in [
+        ("dynamic", true),
+        ("dynamic", false),
+        ("data", true),
+        ("data", false),
+        ("connection", true),
+        ("connection", false),
+        ("event_mgmt", true),
+        ("event_mgmt", false),
+    ] {
+        let place = Place::new();
+        let running = place.start(&RECORD, RECORDING);
+        running.signal(Signal::STOP);
+        for path in files(&place).iter().filter(|path| path.extension().is_some_and(|found| found == suffix)) {
+            damage(path, truncate);
+        }
+        running.signal(Signal::CONT);
+        let (code, output, errors) = running.end();
+        let case = format!("{suffix} {truncate}: {errors}");
+        assert_eq!(code, Some(1), "{case}");
+        let named = format!(".{suffix}: shared memory that is in use cannot be used any more");
+        assert!(is_named(&errors, &named), "{case}");
+        let told = support::events(&output);
+        let ended = told.iter().find(|event| event["event"] == "episode").expect("the end of the episode");
+        assert!(ended["error"].as_str().is_some_and(|error| error.contains(&named)), "{case}{ended}");
+        assert!(whole_episode(&place).topic("/rapid/mask").count() > 0, "{case}");
+        assert_eq!(files(&place), [] as [PathBuf; 0], "{case}");
+    }
+}
+
+#[test]
+fn files_that_are_removed_during_a_run_are_named_and_the_mask_is_made_anew() {
+    let place = Place::new();
+    let running = place.start_as(after(&place, "exec 2>log", &RECORD), RECORDING);
+    std::fs::remove_file(place.mask_file()).expect("the mask");
+    let dynamic = files(&place).into_iter().find(|path| path.extension().is_some_and(|found| found == "dynamic"));
+    let dynamic = dynamic.expect("a file of the bus");
+    std::fs::remove_file(&dynamic).expect("a file of the bus");
+    let log = || std::fs::read_to_string(place.path("log")).expect("standard error");
+    let anew = format!("{}: removed or replaced during the run; made anew", place.mask_file().display());
+    until("the mask", || log().contains(&anew) && place.mask_file().exists());
+    until("the warning", || log().contains(&format!("{}: removed during the run", dynamic.display())));
+    running.signal(Signal::INT);
+    let (code, output, errors) = running.end();
+    assert_eq!(code, support::recorded_code(&output), "{errors}");
+    assert_eq!((files(&place), place.mask_file().exists()), (Vec::new(), false));
+}
+
+/// `rapid ARGUMENTS` after `first` has changed mounts of its own.
+fn among_mounts(place: &Place, first: &str, arguments: &[&str]) -> Output {
+    let shell = after(place, first, arguments);
+    let mut command = Command::new("unshare");
+    command.args(["-m", "--propagation", "private"]).arg(shell.get_program()).args(shell.get_args());
+    command.envs(shell.get_envs().filter_map(|(name, value)| Some((name, value?))));
+    command.current_dir(place.folder.path()).output().expect("unshare")
+}
+
+#[test]
+fn what_is_not_mounted_is_named_with_the_fix() {
+    const NO_MEMORY: &str = "mkdir dev && mount -t tmpfs tmpfs dev && cp -a /dev/null /dev/zero /dev/urandom dev && \
+                             mount --move dev /dev";
+    if !may_mount() {
+        return;
+    }
+    for (first, wanted) in [
+        (NO_MEMORY, ["/dev/shm: there is no shared memory; ", "sudo mount -t tmpfs"]),
+        ("mount -t tmpfs -o ro tmpfs /dev/shm", ["/dev/shm: it is mounted read-only; ", "sudo mount -o remount,rw"]),
+        ("mount -t tmpfs tmpfs /proc", ["/proc: it is not mounted", "sudo mount -t proc"]),
+    ] {
+        for arguments in [&RUN[..], &["disarm"]] {
+            let place = Place::new();
+            let ended = among_mounts(&place, first, arguments);
+            let error = said(&ended);
+            assert_eq!(ended.status.code(), Some(1), "{first}: {ended:?}");
+            assert!(wanted.iter().all(|wanted| error.contains(wanted)), "{first}: {ended:?}");
+        }
+    }
+}
+
+#[test]
+fn a_run_that_finds_no_udev_says_so() {
+    if !may_mount() {
+        return;
+    }
+    let place = Place::new();
+    place.write("devices.toml", include_str!("../devices.toml"));
+    let run = &["--headless", "--duration", "100ms"][..];
+    let ended = among_mounts(&place, "mount -t tmpfs tmpfs /run", run);
+    let errors = String::from_utf8_lossy(&ended.stderr);
+    let warned = |errors: &str| errors.contains("no udev runs here (/run/udev/control is missing)");
+    assert!(warned(&errors) && errors.contains("start systemd-udevd"), "{errors}");
+    let there = "mount -t tmpfs tmpfs /run && mkdir /run/udev && : > /run/udev/control";
+    let errors = String::from_utf8_lossy(&among_mounts(&place, there, run).stderr).into_owned();
+    assert!(!warned(&errors), "{errors}");
+}
+
 #[test]
 fn a_limit_of_the_process_is_named_and_a_start_that_fails_leaves_nothing() {
     let limits = (24..120).step_by(4).map(|count| (format!("ulimit -n {count}"), "limit of"));
-    let limits = limits.chain([("ulimit -v 400000".to_owned(), "address space is limited to")]);
+    let limits = limits.chain([
+        ("ulimit -v 400000".to_owned(), "address space is limited to"),
+        ("ulimit -f 100".to_owned(), "files are limited to"),
+    ]);
     let mut refused = 0;
     for (limit, wanted) in limits {
         let place = Place::new();
         let ended = after(&place, &limit, &["--sim", "--headless", "--duration", "100ms"]).output().expect("a shell");
         assert_eq!(ended.status.signal(), None, "{limit}: {ended:?}");
         let error = said(&ended);
+        if limit.starts_with("ulimit -f") {
+            assert!(error.contains(wanted) && error.contains("LimitFSIZE="), "{limit}: {error}");
+        }
         if error.contains("topic ") || error.contains("shared-memory") {
             refused += 1;
             assert!(error.contains(wanted), "{limit}: {error}");

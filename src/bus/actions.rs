@@ -5,6 +5,7 @@ use iceoryx2::node::Node;
 use iceoryx2::port::subscriber::Subscriber;
 
 use super::error::topic_error;
+use super::guard::{Guarded, contained};
 use super::orders::Orders;
 use super::{BusError, Service, TopicFactory, TopicSpec, sigbus};
 use crate::action::{MAX_ACTION, Order};
@@ -15,7 +16,7 @@ use crate::time::Stamp;
 pub struct Actions {
     topic: String,
     depth: usize,
-    subscriber: Subscriber<Service, [u8], SampleHeader>,
+    subscriber: Guarded<Subscriber<Service, [u8], SampleHeader>>,
     orders: Orders,
 }
 
@@ -29,6 +30,7 @@ impl Actions {
     pub(super) fn open(node: &Node<Service>, spec: &TopicSpec, factory: &TopicFactory) -> Result<Self, BusError> {
         let subscriber = factory.subscriber_builder().buffer_size(spec.depth).create();
         let subscriber = subscriber.map_err(|error| topic_error(&spec.name, &error))?;
+        let subscriber = Guarded::new(subscriber);
         Ok(Self { topic: spec.name.clone(), depth: spec.depth, subscriber, orders: Orders::open(node)? })
     }
 
@@ -54,7 +56,8 @@ impl Actions {
     pub fn newest<'a>(&self, action: &'a mut [f64; MAX_ACTION]) -> Option<(&'a [f64], Stamp)> {
         let mut newest = None;
         for _ in 0..self.depth {
-            let Ok(Some(sample)) = self.subscriber.receive() else { break };
+            let Ok(Ok(Some(sample))) = contained(|| self.subscriber.receive()) else { break };
+            let sample = Guarded::new(sample);
             let (numbers, rest) = sample.payload().as_chunks::<8>();
             let is_numbers = sample.user_header().encoding == Encoding::F64 as u32 && rest.is_empty();
             let finite = numbers.iter().all(|number| f64::from_le_bytes(*number).is_finite());

@@ -75,11 +75,33 @@ pub enum BusError {
     },
     /// Shared memory in use could not be written.
     #[error(
-        "{}: shared memory that is in use cannot be written: it is full, or another program has truncated a file of \
-         the bus",
-        room::PLACE
+        "{}: shared memory that is in use cannot be used any more: {} is full, or another program has truncated or \
+         overwritten a file of the bus; end that program and start again", file.display(), room::PLACE
     )]
-    Lost,
+    Lost {
+        /// The file, or the folder where it cannot be told.
+        file: PathBuf,
+    },
+    /// There is no shared memory, or it cannot be used.
+    #[error("{}: {what}; {fix}", room::PLACE)]
+    Memory {
+        /// What is wrong with it.
+        what: String,
+        /// What to do.
+        fix: &'static str,
+    },
+    /// The system tells nothing about the process.
+    #[error("/proc: it is not mounted, and rapid needs it; mount it: sudo mount -t proc proc /proc")]
+    NoProc,
+    /// The process may make no file that is large enough.
+    #[error(
+        "{}: files are limited to {}, and a segment of shared memory is larger; raise the limit (`ulimit -f \
+         unlimited`, or LimitFSIZE=infinity in the unit)", room::PLACE, text::size(*limit)
+    )]
+    FileSize {
+        /// The limit in bytes.
+        limit: u64,
+    },
     /// The process may open no more files.
     #[error(
         "shared-memory bus: the limit of {limit} open files is reached; raise it (`ulimit -n 4096`, or LimitNOFILE= in \

@@ -9,19 +9,26 @@ use iceoryx2::prelude::*;
 use rustix::fs::{FlockOperation, flock};
 
 use super::error::{addresses, lacking, or_damage};
+use super::guard::{Guarded, contained};
 use super::leftovers::Files;
 use super::service::Service;
 use super::{BusError, place, room, sigbus};
 
 /// Whoever looks through the files takes milliseconds.
-const TURN_LIMIT: Duration = Duration::from_secs(1);
+const TURN_LIMIT: Duration = Duration::from_millis(500);
 const TURN_LOOK: Duration = Duration::from_millis(5);
+/// How long another process may take to fill a file that it has made.
+const FILL_LIMIT: Duration = Duration::from_millis(400);
+/// How long iceoryx2 waits for another process to finish what it makes.
+const CREATION_LIMIT: Duration = Duration::from_millis(400);
+// Damage is said within two seconds, which others waiting for their turn and the rest of a start share.
+const _: () = assert!(FILL_LIMIT.as_millis() + CREATION_LIMIT.as_millis() < 1000, "damage is said too late");
 
 /// A node. When it goes, so do the files of the bus that nobody else uses.
 #[derive(Debug)]
 pub(super) struct Home {
     // Declared in the order they must be dropped.
-    node: Node<Service>,
+    node: Guarded<Node<Service>>,
     files: Leaving,
 }
 
@@ -39,6 +46,7 @@ impl Home {
     /// When what the bus lives in is not ours, is damaged, or has too little room.
     pub(super) fn open(instance: Option<&str>, need: u64) -> Result<Self, BusError> {
         sigbus::install()?;
+        place::memory()?;
         let config = config(instance)?;
         // Its path ends in a slash, behind which a link could not be told from what it means.
         let root: PathBuf = PathBuf::from(config.global.root_path().to_string()).components().collect();
@@ -48,35 +56,45 @@ impl Home {
         let files = Leaving { files: Files::new(prefix.clone(), root.clone()), root };
         // Until the node is there: who looks through the files meanwhile would take its first ones for a dead one's.
         let turn = take_turn(&files.root);
-        files.files.clear()?;
+        files.files.clear(FILL_LIMIT)?;
+        files.files.clear_others();
         room::check(need)?;
         addresses(need)?;
-        let node = NodeBuilder::new()
-            .config(&config)
-            // Signals belong to the program, not to a library.
-            .signal_handling_mode(SignalHandlingMode::Disabled)
-            .create::<Service>();
+        // Signals belong to the program, not to a library.
+        let builder = NodeBuilder::new().config(&config).signal_handling_mode(SignalHandlingMode::Disabled);
+        let node = contained(|| builder.create::<Service>())?;
         files.files.make_counter();
         drop(turn);
         let node = node.map_err(|error| {
             let cause = lacking().or_else(|| place::in_the_way(&prefix));
             cause.unwrap_or_else(|| or_damage(BusError::Node(error.to_string()), &files.files))
         })?;
-        Ok(Self { node, files })
+        sigbus::watch_over(files.files.clone());
+        Ok(Self { node: Guarded::new(node), files })
     }
 
-    pub(super) const fn node(&self) -> &Node<Service> {
+    pub(super) fn node(&self) -> &Node<Service> {
         &self.node
     }
 
     /// `error`, or the damaged file it comes from, or the room that was not there.
     pub(super) fn explain(&self, error: BusError) -> BusError {
-        if sigbus::happened() { BusError::Lost } else { or_damage(error, &self.files.files) }
+        if sigbus::happened() { sigbus::error() } else { or_damage(error, &self.files.files) }
+    }
+
+    /// A file that iceoryx2 cannot read, if there is one.
+    pub(super) fn unreadable(&self) -> Option<BusError> {
+        self.files.files.unreadable()
+    }
+
+    /// The files that this process needs for as long as it takes part.
+    pub(super) fn needed(&self) -> Vec<PathBuf> {
+        self.files.files.needed()
     }
 
     /// Gives back what programs that were killed held. Blocks for as long as files are looked through.
     pub(super) fn sweep(&self) {
-        let _ = self.node.try_cleanup_dead_nodes();
+        let _ = contained(|| self.node.try_cleanup_dead_nodes());
         self.files.clear();
     }
 }
@@ -85,7 +103,7 @@ impl Leaving {
     /// What cannot be cleared now is reported by the next start.
     fn clear(&self) {
         let _turn = take_turn(&self.root);
-        let _ = self.files.clear();
+        let _ = self.files.clear(Duration::ZERO);
     }
 }
 
@@ -112,6 +130,7 @@ fn take_turn(root: &Path) -> Option<File> {
 /// Begins the names of all files of a bus.
 fn config(instance: Option<&str>) -> Result<Config, BusError> {
     let mut config = Config::global_config().clone();
+    config.global.creation_timeout = CREATION_LIMIT;
     if let Some(instance) = instance {
         let prefix = format!("iox2_{instance}_");
         config.global.prefix = FileName::new(prefix.as_bytes())

@@ -16,13 +16,14 @@ use iceoryx2::port::subscriber::{Subscriber, SubscriberCreateError};
 use iceoryx2::unique_id_generator::unique_system_id::UniqueSystemId;
 
 use super::error::topic_error;
+use super::guard::{Guarded, contained};
 use super::{BusError, EventFactory, Service, TopicFactory, TopicId, TopicSpec, Writer, sigbus};
 use crate::sample::SampleHeader;
 
 /// A consumer of every topic. Samples wait in shared memory until they are drained.
 pub struct Inbox {
     topics: Vec<Subscription>,
-    wake: Listener<Service>,
+    wake: Guarded<Listener<Service>>,
 }
 
 struct Subscription {
@@ -30,7 +31,7 @@ struct Subscription {
     name: String,
     /// Samples that can wait here.
     depth: usize,
-    subscriber: Subscriber<Service, [u8], SampleHeader>,
+    subscriber: Guarded<Subscriber<Service, [u8], SampleHeader>>,
     /// Of the topic's one writer.
     writer: UniquePublisherId,
     /// The writer has published since this inbox was opened.
@@ -76,11 +77,11 @@ impl std::fmt::Debug for Inbox {
 impl Inbox {
     /// `writers` are those of `topics`, in the same order.
     pub(super) fn open<'a>(
-        topics: &[(TopicSpec, TopicFactory)],
+        topics: &[(TopicSpec, Guarded<TopicFactory>)],
         writers: impl Iterator<Item = &'a Writer>,
         wake: &EventFactory<Service>,
     ) -> Result<Self, BusError> {
-        let subscribe = |((spec, factory), writer): (&(TopicSpec, TopicFactory), &Writer)| {
+        let subscribe = |((spec, factory), writer): (&(TopicSpec, Guarded<TopicFactory>), &Writer)| {
             let subscriber =
                 factory.subscriber_builder().buffer_size(spec.depth).create().map_err(|error| match error {
                     SubscriberCreateError::ExceedsMaxSupportedSubscribers => {
@@ -92,7 +93,7 @@ impl Inbox {
                 id: spec.id,
                 name: spec.name.clone(),
                 depth: spec.depth,
-                subscriber,
+                subscriber: Guarded::new(subscriber),
                 writer: writer.id(),
                 is_written: Cell::new(false),
                 other: Cell::new(None),
@@ -100,7 +101,7 @@ impl Inbox {
         };
         let topics = topics.iter().zip(writers).map(subscribe).collect::<Result<Vec<_>, BusError>>()?;
         let wake = wake.listener_builder().create().map_err(|error| topic_error(super::WAKE_SERVICE, &error))?;
-        Ok(Self { topics, wake })
+        Ok(Self { topics, wake: Guarded::new(wake) })
     }
 
     /// Blocks until a modality was published or `timeout` passed, whichever is first. The mask alone
@@ -109,13 +110,14 @@ impl Inbox {
     /// # Errors
     /// When the event service is broken.
     pub fn wait(&self, timeout: Duration) -> Result<(), BusError> {
-        self.wake.timed_wait(|_| {}, timeout).map(|_| ()).map_err(|error| topic_error(super::WAKE_SERVICE, &error))
+        let waited = contained(|| self.wake.timed_wait(|_| {}, timeout))?;
+        waited.map(|_| ()).map_err(|error| topic_error(super::WAKE_SERVICE, &error))
     }
 
     /// An error as soon as memory of the bus has been lost: samples may have parts of others, or none, from then on.
     #[must_use]
     pub fn lost(&self) -> Option<BusError> {
-        sigbus::happened().then_some(BusError::Lost)
+        sigbus::happened().then(sigbus::error)
     }
 
     /// Hands over every sample that waits at the time of the call, oldest first within a topic; the
@@ -133,8 +135,9 @@ impl Inbox {
             // No more than this wait at any time: a topic that is filled faster than `take` empties
             // it must not keep the others, or the caller, waiting.
             for _ in 0..topic.depth {
-                match topic.subscriber.receive() {
+                match contained(|| topic.subscriber.receive())? {
                     Ok(Some(sample)) => {
+                        let sample = Guarded::new(sample);
                         if !topic.is_foreign(sample.header().publisher_id()) || topic.id == TopicId::Action {
                             take(topic.id, sample.user_header(), sample.payload());
                         }

@@ -19,6 +19,7 @@ use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
 use super::error::topic_error;
+use super::guard::{Guarded, contained};
 use super::{BusError, MAX_NODES, Service, service_name};
 use crate::registry::DeviceSpec;
 use crate::sample::SampleHeader;
@@ -39,8 +40,8 @@ const LARGE: usize = 64 << 10;
 pub struct Ingress {
     topic: String,
     depth: usize,
-    subscriber: Subscriber<Service, [u8], SampleHeader>,
-    listener: Listener<Service>,
+    subscriber: Guarded<Subscriber<Service, [u8], SampleHeader>>,
+    listener: Guarded<Listener<Service>>,
 }
 
 impl std::fmt::Debug for Ingress {
@@ -78,6 +79,7 @@ impl Ingress {
             .open_or_create()
             .map_err(|error| failed(&error))?;
         let listener = wake.listener_builder().create().map_err(|error| failed(&error))?;
+        let (subscriber, listener) = (Guarded::new(subscriber), Guarded::new(listener));
         Ok(Self { topic, depth, subscriber, listener })
     }
 
@@ -98,8 +100,11 @@ impl Ingress {
     /// # Errors
     /// When the topic cannot be read.
     pub fn take(&self) -> Result<Option<Given>, BusError> {
-        match self.subscriber.receive() {
-            Ok(sample) => Ok(sample.map(|sample| Given { header: *sample.user_header(), sample })),
+        match contained(|| self.subscriber.receive())? {
+            Ok(sample) => {
+                let sample = sample.map(Guarded::new);
+                Ok(sample.map(|sample| Given { header: *sample.user_header(), sample }))
+            }
             Err(error) => Err(BusError::Transfer { topic: self.topic.clone(), reason: format!("{error:?}") }),
         }
     }
@@ -129,7 +134,7 @@ impl Ingress {
 /// A sample as its program gave it; nothing in it has been checked.
 pub struct Given {
     header: SampleHeader,
-    sample: Sample<Service, [u8], SampleHeader>,
+    sample: Guarded<Sample<Service, [u8], SampleHeader>>,
 }
 
 impl std::fmt::Debug for Given {
@@ -163,7 +168,7 @@ impl Watch {
     pub async fn wait(&self) {
         let Ok(Ok(mut ready)) = tokio::time::timeout(LOOK, self.ear.readable()).await else { return };
         // What is taken here was published before; the caller looks now.
-        if !matches!(self.ear.get_ref().0.listener.try_wait(|_| {}), Ok(1..)) {
+        if !matches!(contained(|| self.ear.get_ref().0.listener.try_wait(|_| {})), Ok(Ok(1..))) {
             ready.clear_ready();
         }
     }

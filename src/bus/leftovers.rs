@@ -14,17 +14,17 @@
 //! Invariant: a lock file of this process is never opened: closing it would give up the lock.
 
 use std::collections::BTreeSet;
-use std::fs::{File, Metadata, Permissions};
+use std::fs::{File, FileType, Metadata, Permissions};
 use std::io::{ErrorKind, Read, Write};
 use std::os::unix::fs::{FileTypeExt, MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use rustix::fs::{Mode, OFlags};
 use rustix::process::{Flock, FlockType, fcntl_getlk};
 use rustix::time::{ClockId, clock_gettime};
 
-use super::{BusError, room};
+use super::{BusError, room, sigbus};
 
 /// The first 8 bytes of each file of iceoryx2 0.10.0 in shared memory: major, minor and patch, 16 bits each.
 const VERSION: u64 = 10 << 16;
@@ -33,9 +33,8 @@ const VERSION: u64 = 10 << 16;
 const COUNTER: &str = "9204dd183d1c4d8e1ff592a30766ffa6765aa8b5_node.0_10_0.global_mgmt";
 /// A key of every service's file.
 const SERVICE_KEY: &str = "messaging_pattern";
-/// How long another process may take to fill a file that it has made.
-const LOOKS: u32 = 20;
-const LOOK: Duration = Duration::from_millis(50);
+/// How often it is looked whether a file has been filled.
+const LOOK: Duration = Duration::from_millis(20);
 /// Access of anybody but the owner.
 const OTHERS: u32 = 0o077;
 
@@ -68,11 +67,13 @@ impl Files {
         Self { prefix, root }
     }
 
-    /// Removes what nobody uses, and takes away what others may do with the rest.
+    /// Removes what nobody uses, and takes away what others may do with the rest. A file that another process has made
+    /// and not filled is waited for up to `patience`, once for all of them.
     ///
     /// # Errors
     /// When something that is no use to anybody cannot be removed, or something damaged may be in use.
-    pub(super) fn clear(&self) -> Result<(), BusError> {
+    pub(super) fn clear(&self, patience: Duration) -> Result<(), BusError> {
+        let until = Instant::now() + patience;
         // First the files, then who lives: whoever begins meanwhile has made none of these.
         let entries = self.entries();
         let living = self.living(&entries);
@@ -84,7 +85,7 @@ impl Files {
                 Ok(there) if dead => remove(&path, &there)?,
                 Ok(there) => {
                     narrow(&path, &there);
-                    usable(&path, &used)?;
+                    usable(&path, &used, until)?;
                 }
                 Err(_) => {}
             }
@@ -109,11 +110,16 @@ impl Files {
 
     /// A file that iceoryx2 cannot read, if there is one.
     pub(super) fn unreadable(&self) -> Option<BusError> {
-        self.entries().into_iter().find_map(|Entry { path, .. }| {
-            let what = match path.extension()?.to_str()? {
+        self.entries().into_iter().find_map(|Entry { path, used }| {
+            let suffix = path.extension().and_then(|suffix| suffix.to_str());
+            let kind = std::fs::symlink_metadata(&path).ok()?.file_type();
+            if !is_kind_of(&used, suffix, kind) {
+                return Some(strange(path));
+            }
+            let what = match suffix? {
                 "data" | "connection" | "dynamic" | "event_mgmt" => {
-                    let found = head(&path)?.first_chunk().copied().map_or(0, u64::from_le_bytes);
-                    (found != VERSION).then_some("another version of iceoryx2 made it, or it is damaged")
+                    let is_whole = head(&path)?.first_chunk().copied().is_some_and(is_head);
+                    (!is_whole).then_some("another version of iceoryx2 made it, or it is damaged")
                 }
                 "service" => {
                     let readable = String::from_utf8(head(&path)?).is_ok_and(|text| text.contains(SERVICE_KEY));
@@ -123,6 +129,45 @@ impl Files {
             };
             Some(BusError::Damaged { what: what?.to_owned(), path })
         })
+    }
+
+    /// The same, by its name alone.
+    pub(super) fn damaged(&self) -> Option<PathBuf> {
+        match self.unreadable()? {
+            BusError::Damaged { path, .. } => Some(path),
+            _ => None,
+        }
+    }
+
+    /// What this process needs for as long as it takes part. Connections come and go with others.
+    pub(super) fn needed(&self) -> Vec<PathBuf> {
+        let own = std::process::id();
+        let is_needed = |used: &Use| match used {
+            Use::Ports(owners) => owners.as_slice() == [own],
+            Use::Node(node) => process(*node) == own,
+            Use::Common => true,
+        };
+        self.entries().into_iter().filter(|entry| is_needed(&entry.used)).map(|entry| entry.path).collect()
+    }
+
+    /// Removes what dead processes left of other buses. One with no node in our folder may have its nodes elsewhere.
+    pub(super) fn clear_others(&self) {
+        let monitors = std::fs::read_dir(self.root.join("nodes")).into_iter().flatten().flatten();
+        let prefixes = monitors.filter_map(|entry| prefix_of(entry.file_name().to_str()?).map(str::to_owned));
+        for prefix in prefixes.filter(|prefix| *prefix != self.prefix).collect::<BTreeSet<_>>() {
+            let other = Self { prefix, root: self.root.clone() };
+            // First the files, then who lives, as above.
+            let entries = other.entries();
+            if !other.living(&entries).is_empty() {
+                continue;
+            }
+            for Entry { path, .. } in entries {
+                if let Some(there) = std::fs::symlink_metadata(&path).ok().filter(is_ours) {
+                    // What cannot be removed is reported by that instance's next start.
+                    let _ = remove(&path, &there);
+                }
+            }
+        }
     }
 
     fn entries(&self) -> Vec<Entry> {
@@ -164,7 +209,9 @@ impl Files {
         let nodes = self.root.join("nodes");
         let lock = nodes.join(format!("{}{node}.node_monitor", self.prefix));
         if process(node) == std::process::id() {
-            return std::fs::symlink_metadata(&lock).is_ok_and(|lock| is_locked_by_us(lock.ino()));
+            // Once memory has been lost, a node is left where it stands.
+            let is_locked = |lock: Metadata| is_locked_by_us(lock.ino());
+            return !sigbus::happened() && std::fs::symlink_metadata(&lock).is_ok_and(is_locked);
         }
         let flags = OFlags::RDWR | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::NOCTTY | OFlags::CLOEXEC;
         let asked = Flock::from(FlockType::WriteLock);
@@ -207,6 +254,14 @@ fn socket(name: &str) -> Option<Use> {
 fn monitor(name: &str) -> Option<Use> {
     let (node, suffix) = name.split_once('.')?;
     suffix.starts_with("node_monitor").then_some(Use::Node(number(node)?))
+}
+
+/// The prefix of a bus of which this is a node's file.
+fn prefix_of(name: &str) -> Option<&str> {
+    let (node, _) = name.split_once(".node_monitor")?;
+    let at = node.rfind('_')? + 1;
+    number(node.get(at..)?)?;
+    node.get(..at).filter(|prefix| prefix.starts_with("iox2_"))
 }
 
 fn is_hash(text: &str) -> bool {
@@ -280,18 +335,13 @@ fn narrow(path: &Path, there: &Metadata) {
 }
 
 /// Fails for what iceoryx2 would wait for without end: what is not the kind of file it makes, and what stays empty.
-fn usable(path: &Path, used: &Use) -> Result<(), BusError> {
+fn usable(path: &Path, used: &Use, until: Instant) -> Result<(), BusError> {
     let suffix = path.extension().and_then(|suffix| suffix.to_str());
     let may_be_empty = matches!(used, Use::Node(_)) || suffix == Some("event");
-    for _ in 0..LOOKS {
+    loop {
         let Ok(there) = std::fs::symlink_metadata(path) else { return Ok(()) };
         let kind = there.file_type();
-        let right = match (used, suffix) {
-            (Use::Node(_), None) => kind.is_dir(),
-            (_, Some("event")) => kind.is_socket(),
-            _ => kind.is_file(),
-        };
-        if !right {
+        if !is_kind_of(used, suffix, kind) {
             return Err(strange(path.to_owned()));
         }
         if kind.is_dir() {
@@ -302,13 +352,29 @@ fn usable(path: &Path, used: &Use) -> Result<(), BusError> {
         if may_be_empty || there.len() > 0 {
             return Ok(());
         }
+        if Instant::now() >= until {
+            return Err(BusError::Damaged { path: path.to_owned(), what: "it is empty".to_owned() });
+        }
         std::thread::sleep(LOOK);
     }
-    Err(BusError::Damaged { path: path.to_owned(), what: "it is empty".to_owned() })
+}
+
+/// Is a file of this use and suffix of such a kind?
+fn is_kind_of(used: &Use, suffix: Option<&str>, kind: FileType) -> bool {
+    match (used, suffix) {
+        (Use::Node(_), None) => kind.is_dir(),
+        (_, Some("event")) => kind.is_socket(),
+        _ => kind.is_file(),
+    }
 }
 
 fn strange(path: PathBuf) -> BusError {
     BusError::Damaged { path, what: "it is no file of iceoryx2".to_owned() }
+}
+
+/// Are these the first bytes of a file in shared memory?
+pub(super) fn is_head(bytes: [u8; 8]) -> bool {
+    u64::from_le_bytes(bytes) == VERSION
 }
 
 /// The first bytes of a file that may be read.

@@ -18,6 +18,7 @@
 
 mod actions;
 mod error;
+mod guard;
 mod home;
 mod inbox;
 mod ingress;
@@ -31,6 +32,7 @@ mod sigbus;
 mod topic;
 mod writer;
 
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use iceoryx2::prelude::*;
@@ -41,6 +43,7 @@ use crate::registry::{MAX_BORROWED, MAX_SUBSCRIBERS, NodeSpec, Registry};
 use crate::sample::SampleHeader;
 
 use error::topic_error;
+use guard::{Guarded, contained};
 use home::Home;
 use service::Service;
 
@@ -49,6 +52,7 @@ pub use error::BusError;
 pub use inbox::{Foreign, Inbox};
 pub use ingress::{Given, Ingress, Watch};
 pub use orders::give as give_order;
+pub use place::memory as check_memory;
 pub use sigbus::lost;
 pub use topic::{TopicId, TopicSpec};
 pub use writer::Writer;
@@ -77,8 +81,8 @@ pub struct Bus {
     writers: Vec<(TopicId, Arc<Writer>)>,
     /// None without an actuator.
     actions: Option<Arc<Actions>>,
-    topics: Vec<(TopicSpec, TopicFactory)>,
-    wake: EventFactory<Service>,
+    topics: Vec<(TopicSpec, Guarded<TopicFactory>)>,
+    wake: Guarded<EventFactory<Service>>,
     ingresses: Vec<(ModalityId, Arc<Ingress>)>,
     instance: Option<String>,
     home: Arc<Home>,
@@ -104,10 +108,10 @@ impl Bus {
         let need = specs.iter().map(TopicSpec::room).fold(room::BOOKS, u64::saturating_add);
         error::addresses(need.saturating_add(OTHER_ADDRESSES))?;
         let home = Arc::new(Home::open(instance, need)?);
-        let opened = Self::open_at(&home, registry, specs, instance);
+        let opened = contained(|| Self::open_at(&home, registry, specs, instance)).and_then(|opened| opened);
         match opened {
             Err(error) => Err(home.explain(error)),
-            Ok(_) if sigbus::happened() => Err(BusError::Lost),
+            Ok(_) if sigbus::happened() => Err(sigbus::error()),
             opened => opened,
         }
     }
@@ -120,15 +124,16 @@ impl Bus {
     ) -> Result<Self, BusError> {
         let node = home.node();
         let topics = specs.into_iter().map(|spec| open_topic(node, spec)).collect::<Result<Vec<_>, _>>()?;
-        let wake = node
-            .service_builder(&service_name(WAKE_SERVICE)?)
-            .event()
-            .max_notifiers(crate::modality::MAX_MODALITIES + 1 + MAX_NODES)
-            .max_listeners(MAX_NODES)
-            .max_nodes(MAX_NODES)
-            .event_id_max_value(255)
-            .open_or_create()
-            .map_err(|error| topic_error(WAKE_SERVICE, &error))?;
+        let wake = Guarded::new(
+            node.service_builder(&service_name(WAKE_SERVICE)?)
+                .event()
+                .max_notifiers(crate::modality::MAX_MODALITIES + 1 + MAX_NODES)
+                .max_listeners(MAX_NODES)
+                .max_nodes(MAX_NODES)
+                .event_id_max_value(255)
+                .open_or_create()
+                .map_err(|error| topic_error(WAKE_SERVICE, &error))?,
+        );
         let writers = topics
             .iter()
             .map(|(spec, factory)| Ok((spec.id, Arc::new(Writer::open(spec, factory, &wake)?))))
@@ -174,7 +179,7 @@ impl Bus {
     /// # Errors
     /// When more programs subscribe than the topics have room for.
     pub fn inbox(&self) -> Result<Inbox, BusError> {
-        Inbox::open(&self.topics, self.writers.iter().map(|(_, writer)| writer.as_ref()), &self.wake)
+        contained(|| Inbox::open(&self.topics, self.writers.iter().map(|(_, writer)| writer.as_ref()), &self.wake))?
     }
 
     /// What the actuator is told; `None` without an actuator in the registry.
@@ -183,10 +188,30 @@ impl Bus {
         self.actions.clone()
     }
 
+    /// Watches over the files of the bus that this process needs, from now on.
+    #[must_use]
+    pub fn watchman(&self) -> Watchman {
+        Watchman { files: self.home.needed() }
+    }
+
     /// Bytes of shared memory that the pools of all topics reserve.
     #[must_use]
     pub fn reserved_bytes(&self) -> u64 {
         self.topics.iter().map(|(spec, _)| spec.pool_bytes()).sum()
+    }
+}
+
+/// Notices when files of the bus are removed: programs that come later cannot take part then, and are not told why.
+#[derive(Debug)]
+pub struct Watchman {
+    files: Vec<PathBuf>,
+}
+
+impl Watchman {
+    /// What has been removed since the last look.
+    pub fn removed(&mut self) -> Vec<PathBuf> {
+        let is_gone = |path: &mut PathBuf| std::fs::symlink_metadata(path).is_err();
+        self.files.extract_if(.., is_gone).collect()
     }
 }
 
@@ -222,7 +247,7 @@ fn specs(registry: &Registry) -> impl Iterator<Item = TopicSpec> {
     registry.devices.iter().map(TopicSpec::of_device).chain([TopicSpec::mask()]).chain(action)
 }
 
-fn open_topic(node: &Node<Service>, spec: TopicSpec) -> Result<(TopicSpec, TopicFactory), BusError> {
+fn open_topic(node: &Node<Service>, spec: TopicSpec) -> Result<(TopicSpec, Guarded<TopicFactory>), BusError> {
     let factory = node
         .service_builder(&service_name(&spec.name)?)
         .publish_subscribe::<[u8]>()
@@ -236,7 +261,7 @@ fn open_topic(node: &Node<Service>, spec: TopicSpec) -> Result<(TopicSpec, Topic
         .enable_safe_overflow(true)
         .open_or_create()
         .map_err(|error| topic_error(&spec.name, &error))?;
-    Ok((spec, factory))
+    Ok((spec, Guarded::new(factory)))
 }
 
 fn service_name(name: &str) -> Result<ServiceName, BusError> {

@@ -40,6 +40,32 @@ pub(super) fn check(folder: &Path) -> Result<(), BusError> {
     }
 }
 
+/// Refuses shared memory that is not there or may not be written to.
+///
+/// # Errors
+/// As said, with the fix.
+pub fn memory() -> Result<(), BusError> {
+    usable(Path::new(PLACE))
+}
+
+fn usable(place: &Path) -> Result<(), BusError> {
+    const MOUNT: &str = "mount it: sudo mkdir -p /dev/shm && sudo mount -t tmpfs -o mode=1777 tmpfs /dev/shm";
+    let failed = |what: &str, fix| Err(BusError::Memory { what: what.to_owned(), fix });
+    match std::fs::metadata(place) {
+        Err(error) if error.kind() == ErrorKind::NotFound => return failed("there is no shared memory", MOUNT),
+        Err(error) => return failed(&error.to_string(), MOUNT),
+        Ok(there) if !there.is_dir() => return failed("it is not a folder; remove it", MOUNT),
+        Ok(_) => {}
+    }
+    match rustix::fs::access(place, Access::WRITE_OK | Access::EXEC_OK) {
+        Ok(()) => Ok(()),
+        Err(rustix::io::Errno::ROFS) => {
+            failed("it is mounted read-only", "mount it for writing: sudo mount -o remount,rw /dev/shm")
+        }
+        Err(_) => failed("this user may not write to it", "allow it: sudo chmod 1777 /dev/shm"),
+    }
+}
+
 /// Makes the folders that iceoryx2 keeps files in, for their owner alone.
 pub(super) fn make(root: &Path) -> Result<(), BusError> {
     for folder in [root.to_owned(), root.join("nodes"), root.join("services")] {
@@ -85,6 +111,19 @@ mod tests {
     use std::os::unix::fs::{chown, lchown, symlink};
 
     use super::*;
+
+    #[test]
+    fn shared_memory_that_cannot_be_used_is_an_error_with_its_fix() {
+        let dir = tempfile::tempdir().unwrap();
+        let file = dir.path().join("file");
+        std::fs::write(&file, "").unwrap();
+        assert!(usable(dir.path()).is_ok());
+        for (place, what) in [(dir.path().join("none"), "there is no shared memory"), (file, "not a folder")] {
+            let error = usable(&place).unwrap_err().to_string();
+            assert!(error.starts_with("/dev/shm: ") && error.contains(what), "{error}");
+            assert!(error.contains("sudo mount -t tmpfs"), "{error}");
+        }
+    }
 
     #[test]
     fn only_a_folder_of_ours_is_used() {

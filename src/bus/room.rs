@@ -7,9 +7,10 @@
 //! Invariant: a segment on tmpfs that this program made, at the start or for a subscriber that came later, has all
 //! its pages; or it was not made, and iceoryx2 reports it.
 
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicI32, Ordering};
 
 use libc::{c_int, off_t};
+use rustix::process::{Resource, getrlimit};
 
 use super::BusError;
 
@@ -20,8 +21,8 @@ const TMPFS_MAGIC: i64 = 0x0102_1994;
 /// Bytes for iceoryx2's own books of one topic or node, at most.
 pub(super) const BOOKS: u64 = 128 << 10;
 
-/// A segment was not made for want of room, and nobody has asked yet.
-static REFUSED: AtomicBool = AtomicBool::new(false);
+/// Why a segment was not made, an `errno`, until it is asked for; 0 if all were.
+static REFUSED: AtomicI32 = AtomicI32::new(0);
 
 /// Fails where fewer than `need` bytes are free.
 pub(super) fn check(need: u64) -> Result<(), BusError> {
@@ -33,8 +34,10 @@ pub(super) fn check(need: u64) -> Result<(), BusError> {
 
 /// The error of a segment that was not made since the last call.
 pub(super) fn lacking() -> Option<BusError> {
-    if !REFUSED.swap(false, Ordering::Relaxed) {
-        return None;
+    match REFUSED.swap(0, Ordering::Relaxed) {
+        0 => return None,
+        libc::EFBIG => return Some(BusError::FileSize { limit: getrlimit(Resource::Fsize).current.unwrap_or(0) }),
+        _ => {}
     }
     let (size, free) = space()?;
     Some(BusError::Room { need: free + BOOKS, free, size })
@@ -73,8 +76,8 @@ unsafe extern "C" fn ftruncate(descriptor: c_int, length: off_t) -> c_int {
                 // Nothing to reserve with: not Linux's own tmpfs.
                 Some(libc::EOPNOTSUPP | libc::ENOSYS) => break,
                 // `errno` is the caller's answer.
-                _ => {
-                    REFUSED.store(true, Ordering::Relaxed);
+                refused => {
+                    REFUSED.store(refused.unwrap_or(libc::ENOSPC), Ordering::Relaxed);
                     return -1;
                 }
             }

@@ -5,25 +5,31 @@
 //! so that the thread continues, and wakes whoever waits in [`lost`]: the run ends in order, with motors disabled
 //! and the episode closed.
 //!
+//! The same end comes when iceoryx2 panics over a table that was overwritten (`guard`).
+//!
 //! Invariant: what the handler calls is safe in a signal handler: system calls and atomics.
 //! Invariant: a SIGBUS of any other memory is left to the handler before this one; that of the standard library
 //! ends the process.
 
+use std::ffi::OsStr;
 use std::mem::MaybeUninit;
 use std::os::fd::{AsRawFd, IntoRawFd, RawFd};
+use std::os::unix::ffi::OsStrExt;
+use std::path::{Path, PathBuf};
 use std::ptr;
 use std::sync::OnceLock;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 
 use libc::{c_int, c_void, siginfo_t};
 use rustix::event::{EventfdFlags, eventfd};
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
+use super::leftovers::Files;
 use super::{BusError, room};
 
-/// Bytes of a line of `/proc/self/maps` that are looked at: its numbers and the beginning of the path.
-const LINE: usize = 160;
+/// Bytes of a line of `/proc/self/maps` that are looked at: its numbers and the path.
+const LINE: usize = 320;
 /// Bytes read at a time: a signal stack is small.
 const PIECE: usize = 512;
 /// `si_code` of memory that is mapped and has no page, see `sigaction(2)`.
@@ -31,6 +37,11 @@ const BUS_ADRERR: c_int = 2;
 
 static HAPPENED: AtomicBool = AtomicBool::new(false);
 static HANDLER: OnceLock<Handler> = OnceLock::new();
+/// The path of the file whose page was missing, ended by a zero.
+static FILE: [AtomicU8; LINE] = [const { AtomicU8::new(0) }; LINE];
+/// The bus of this process, in which a damaged file is looked for.
+static FILES: OnceLock<Files> = OnceLock::new();
+static ERROR: OnceLock<PathBuf> = OnceLock::new();
 
 /// What the handler needs, made before it is one.
 struct Handler {
@@ -44,6 +55,34 @@ struct Handler {
 /// Has memory of the bus been lost?
 pub(super) fn happened() -> bool {
     HAPPENED.load(Ordering::Relaxed)
+}
+
+/// Where a damaged file is to be looked for.
+pub(super) fn watch_over(files: Files) {
+    // A process of this program is on one bus.
+    let _ = FILES.set(files);
+}
+
+/// Memory of the bus is there, and holds nothing that can be used: ends its use, as if it had been lost.
+pub(super) fn damaged() {
+    HAPPENED.store(true, Ordering::Relaxed);
+    if let Some(handler) = HANDLER.get() {
+        handler.wake();
+    }
+}
+
+/// What has been lost, with the file if it can be told.
+pub(super) fn error() -> BusError {
+    let file = ERROR.get_or_init(|| {
+        let bytes = FILE.iter().map(|byte| byte.load(Ordering::Relaxed)).take_while(|byte| *byte != 0);
+        let bytes: Vec<u8> = bytes.collect();
+        if !bytes.is_empty() {
+            let bytes = bytes.strip_suffix(b" (deleted)").unwrap_or(&bytes);
+            return Path::new(OsStr::from_bytes(bytes)).to_owned();
+        }
+        FILES.get().and_then(Files::damaged).unwrap_or_else(|| PathBuf::from(room::PLACE))
+    });
+    BusError::Lost { file: file.clone() }
 }
 
 /// Returns as soon as memory of the bus has been lost; needs tokio's I/O. Cancel-safe.
@@ -62,7 +101,7 @@ pub async fn lost() -> BusError {
             ready.clear_ready();
         }
     }
-    BusError::Lost
+    error()
 }
 
 /// Installs the handler, once for the process.
@@ -74,7 +113,10 @@ pub(super) fn install() -> Result<(), BusError> {
         return Ok(());
     }
     let failed = |error: std::io::Error| BusError::Node(format!("/proc/self/maps: {error}"));
-    let maps = std::fs::File::open("/proc/self/maps").map_err(failed)?;
+    let maps = std::fs::File::open("/proc/self/maps").map_err(|error| match error.kind() {
+        std::io::ErrorKind::NotFound => BusError::NoProc,
+        _ => failed(error),
+    })?;
     let wake = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK).map_err(|error| failed(error.into()))?;
     // SAFETY: all zeros is the default action, and the kernel writes the whole struct.
     let before = unsafe {
@@ -107,9 +149,7 @@ extern "C" fn handle(signal: c_int, info: *mut siginfo_t, context: *mut c_void) 
     let (code, address) = unsafe { ((*info).si_code, (*info).si_addr() as usize) };
     if code == BUS_ADRERR && handler.is_of_the_bus(address) && handler.replace(address) {
         HAPPENED.store(true, Ordering::Relaxed);
-        let one = 1_u64;
-        // SAFETY: eight bytes of this stack frame.
-        unsafe { libc::write(handler.wake, (&raw const one).cast(), size_of::<u64>()) };
+        handler.wake();
     } else {
         handler.pass_on(signal, info, context);
     }
@@ -118,6 +158,12 @@ extern "C" fn handle(signal: c_int, info: *mut siginfo_t, context: *mut c_void) 
 }
 
 impl Handler {
+    fn wake(&self) {
+        let one = 1_u64;
+        // SAFETY: eight bytes of this stack frame.
+        unsafe { libc::write(self.wake, (&raw const one).cast(), size_of::<u64>()) };
+    }
+
     /// Is this address in a mapping of a file in shared memory?
     fn is_of_the_bus(&self, address: usize) -> bool {
         let (mut line, mut length, mut at) = ([0; LINE], 0, 0);
@@ -129,7 +175,9 @@ impl Handler {
             at += got as libc::off_t;
             for byte in piece.iter().take(read) {
                 if *byte == b'\n' {
-                    if covers(line.get(..length).unwrap_or_default(), address) {
+                    let line = line.get(..length).unwrap_or_default();
+                    if covers(line, address) {
+                        note(line);
                         return true;
                     }
                     length = 0;
@@ -183,6 +231,17 @@ fn covers(line: &[u8], address: usize) -> bool {
     let shared = permissions.get(3) == Some(&b's');
     // Offset, device and inode come before the path.
     shared && (first..end).contains(&address) && words.nth(3).is_some_and(|path| path.starts_with(b"/dev/shm/"))
+}
+
+/// Keeps the path of this line, if it is the first.
+fn note(line: &[u8]) {
+    let path = line.iter().position(|byte| *byte == b'/').and_then(|at| line.get(at..)).unwrap_or_default();
+    if !happened() {
+        // The last place stays zero.
+        for (place, byte) in FILE.iter().take(LINE - 1).zip(path) {
+            place.store(*byte, Ordering::Relaxed);
+        }
+    }
 }
 
 fn hexadecimal(digits: &[u8]) -> Option<usize> {

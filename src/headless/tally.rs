@@ -32,16 +32,23 @@ pub(super) struct Tally {
 struct Presence {
     since: Option<Stamp>,
     total: Duration,
+    /// The last time it was present, if it is not now.
+    last: Option<(Stamp, Stamp)>,
+    stalled: bool,
 }
 
 impl Presence {
     fn set(&mut self, state: SlotState, at: Stamp) {
         // A stalled device is attached and running: its bit in the mask stays.
         let running = matches!(state, SlotState::Streaming | SlotState::Stalled);
+        if running {
+            self.stalled = state == SlotState::Stalled;
+        }
         match (self.since, running) {
             (None, true) => self.since = Some(at),
             (Some(since), false) => {
                 self.total += at.since(since);
+                self.last = Some((since, at));
                 self.since = None;
             }
             _ => {}
@@ -50,6 +57,20 @@ impl Presence {
 
     fn until(self, end: Stamp) -> Duration {
         self.total + self.since.map_or(Duration::ZERO, |since| end.since(since))
+    }
+
+    /// In which it sent `samples`: without the time that it took to close it, of which nothing tells but that the
+    /// newest is older. The silence of a device that has stalled counts.
+    fn sending(self, end: Stamp, newest: Option<Stamp>, samples: u64) -> Duration {
+        let present = self.until(end);
+        let last = self.since.map(|since| (since, end)).or(self.last);
+        let (Some((since, until)), Some(newest)) = (last, newest) else { return present };
+        if self.stalled || newest <= since || newest >= until || samples < 2 {
+            return present;
+        }
+        // The newest stands for the time until the next.
+        let sent = present.saturating_sub(until.since(newest)).as_secs_f64();
+        present.min(Duration::from_secs_f64(sent * samples as f64 / (samples - 1) as f64))
     }
 }
 
@@ -96,7 +117,7 @@ struct Row {
     device: String,
     bit: u8,
     samples: u64,
-    /// Mean rate while present.
+    /// Mean rate while present and not being closed.
     hz: f64,
     /// Part of the run in which the device was present, 0 to 1.
     present: f64,
@@ -159,13 +180,14 @@ impl Tally {
         let row = |device: &DeviceStatus| {
             let before = self.before.iter().find(|before| before.id == device.id);
             let samples = device.samples - before.map_or(0, |before| before.samples).min(device.samples);
-            let present = self.present.get(device.id.index()).copied().unwrap_or_default().until(end.taken);
-            let present = present.as_secs_f64();
+            let presence = self.present.get(device.id.index()).copied().unwrap_or_default();
+            let sending = presence.sending(end.taken, device.newest, samples).as_secs_f64();
+            let present = presence.until(end.taken).as_secs_f64();
             Row {
                 device: device.name.clone(),
                 bit: device.id.bit(),
                 samples,
-                hz: round(if present > 0.0 { samples as f64 / present } else { 0.0 }),
+                hz: round(if sending > 0.0 { samples as f64 / sending } else { 0.0 }),
                 present: round(if seconds > 0.0 { (present / seconds).min(1.0) } else { 0.0 }),
                 gaps: device.gaps - before.map_or(0, |before| before.gaps).min(device.gaps),
                 bytes: device.bytes - before.map_or(0, |before| before.bytes).min(device.bytes),

@@ -310,6 +310,30 @@ fn chunks_in_time_are_lines_in_json_alone() {
 }
 
 #[test]
+fn the_mean_rate_is_not_over_the_time_that_closing_takes() {
+    let start = three_streaming();
+    let at = |ms: u64| Stamp(start.taken.0 + ms * 1_000_000);
+    // 20 Hz for 2 s; then closing takes 2 s, after which the device is announced as gone, or the run ends first.
+    for announced in [true, false] {
+        let mut tally = Tally::new(&start);
+        if announced {
+            tally.count(&Event { stamp: at(4000), what: state("cam_wrist", 0, SlotState::Absent, "") });
+        }
+        // Silence is none of closing.
+        tally.count(&Event { stamp: at(3000), what: state("cam_top", 1, SlotState::Stalled, "") });
+        let mut end = start.clone();
+        end.taken = at(4000);
+        for device in &mut end.devices {
+            device.samples += 40;
+            device.newest = Some(at(1950));
+        }
+        let object = serde_json::to_value(tally.summary(&end)).unwrap();
+        assert_eq!((&object["devices"][0]["hz"], &object["devices"][1]["hz"]), (&20.0.into(), &10.0.into()));
+        assert_eq!(object["devices"][0]["present"], 1.0);
+    }
+}
+
+#[test]
 fn the_summary_counts_from_its_beginning_and_means_while_present() {
     let start = three_streaming();
     let mut tally = Tally::new(&start);

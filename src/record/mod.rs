@@ -76,8 +76,8 @@ pub enum RecordError {
     Folder(crate::folder::FolderError),
     /// There is no room for an episode.
     #[error(
-        "{}: the disk is full: {} free, and {} of it are kept free (disk_reserve under [rig] in devices.toml): remove \
-         or move recordings, choose another folder with --out, or lower disk_reserve",
+        "{}: the disk is full: {} free, and an episode needs more than {}, which are kept free (disk_reserve under \
+         [rig] in devices.toml): remove or move recordings, choose another folder with --out, or lower disk_reserve",
         folder.display(), text::size(*free), text::size(*reserve)
     )]
     NoRoom {

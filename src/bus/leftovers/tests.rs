@@ -6,7 +6,7 @@ use std::os::unix::process::CommandExt;
 use std::process::{Child, Command, Stdio};
 use std::sync::mpsc;
 
-use rustix::fs::{CWD, FileType, mknodat};
+use rustix::fs::{CWD, mknodat};
 
 use super::*;
 use crate::bus::Bus;
@@ -119,11 +119,12 @@ enum Damage {
     Zeros,
     Folder,
     Fifo,
+    Link,
     Gone,
 }
 
 impl Damage {
-    const ALL: [Self; 6] = [Self::Empty, Self::Random, Self::Zeros, Self::Folder, Self::Fifo, Self::Gone];
+    const ALL: [Self; 7] = [Self::Empty, Self::Random, Self::Zeros, Self::Folder, Self::Fifo, Self::Link, Self::Gone];
 
     fn apply(self, path: &Path) {
         let there = std::fs::symlink_metadata(path).unwrap();
@@ -145,7 +146,8 @@ impl Damage {
             }
             Self::Zeros => write(&vec![0; usize::try_from(there.len()).unwrap()]),
             Self::Folder => std::fs::create_dir(path).unwrap(),
-            Self::Fifo => mknodat(CWD, path, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap(),
+            Self::Fifo => mknodat(CWD, path, rustix::fs::FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap(),
+            Self::Link => std::os::unix::fs::symlink("/proc/self/stat", path).unwrap(),
             Self::Gone => {}
         }
     }
@@ -188,6 +190,50 @@ fn what_killed_processes_left_is_removed_in_every_state_of_damage() {
     }
 }
 
+#[test]
+fn a_damaged_file_is_found_whatever_it_has_become() {
+    let name = format!("found{}", std::process::id());
+    killed(&name);
+    let all = Files::new(format!("iox2_{name}_"), PathBuf::from("/tmp/iceoryx2"));
+    assert_eq!(all.damaged(), None);
+    for kind in ["data", "connection", "dynamic", "event_mgmt", "service"] {
+        let (_, path) = kinds(&name).into_iter().find(|(found, _)| *found == kind).unwrap();
+        for damage in Damage::ALL.into_iter().filter(|damage| !matches!(damage, Damage::Gone)) {
+            let there = std::fs::symlink_metadata(&path).unwrap();
+            let kept = Kept::aside(&path);
+            damage.make(&path, &there);
+            assert_eq!(all.damaged().as_ref(), Some(&path), "{kind} {damage:?}");
+            drop(kept);
+        }
+    }
+    all.clear(Duration::ZERO).unwrap();
+}
+
+#[test]
+fn a_start_removes_what_dead_processes_left_of_other_instances_and_nothing_of_living_ones() {
+    for (name, prefix) in [
+        (format!("iox2_{PORT}.node_monitor"), Some("iox2_")),
+        (format!("iox2_a_b_{PORT}.node_monitor_owner_lock"), Some("iox2_a_b_")),
+        (format!("other_{PORT}.node_monitor"), None),
+        ("iox2_a_7.node_monitor".to_owned(), None),
+        (format!("iox2_a_{PORT}.details"), None),
+        (PORT.to_owned(), None),
+    ] {
+        assert_eq!(prefix_of(&name), prefix, "{name}");
+    }
+    let [dead, living, new] = ["da", "lb", "nc"].map(|which| format!("oth{which}{}", std::process::id()));
+    let (mut stays, said) = member(&living, true);
+    assert_eq!(said, "opened");
+    killed(&dead);
+    let used = files(&living);
+    assert!(!files(&dead).is_empty());
+    drop(Home::open(Some(&new), 0).unwrap());
+    assert_eq!((files(&dead), files(&living)), (Vec::new(), used));
+    stays.kill().unwrap();
+    stays.wait().unwrap();
+    Files::new(format!("iox2_{living}_"), PathBuf::from("/tmp/iceoryx2")).clear(Duration::ZERO).unwrap();
+}
+
 /// A file that is put back when this goes.
 struct Kept {
     path: PathBuf,
@@ -196,7 +242,7 @@ struct Kept {
 
 impl Kept {
     fn aside(path: &Path) -> Self {
-        let folder = if path.starts_with(room::PLACE) { room::PLACE } else { "/tmp" };
+        let folder = if path.starts_with(room::PLACE) { room::PLACE } else { "/tmp/iceoryx2" };
         let aside = Path::new(folder).join(format!("rapid_test_aside_{}", std::process::id()));
         std::fs::rename(path, &aside).unwrap();
         Self { path: path.to_owned(), aside }
@@ -246,6 +292,6 @@ fn what_a_living_process_uses_stays_and_damage_to_it_is_named() {
     }
     first.kill().unwrap();
     first.wait().unwrap();
-    Files::new(format!("iox2_{name}_"), PathBuf::from("/tmp/iceoryx2")).clear().unwrap();
+    Files::new(format!("iox2_{name}_"), PathBuf::from("/tmp/iceoryx2")).clear(Duration::ZERO).unwrap();
     assert_eq!(files(&name), [] as [PathBuf; 0]);
 }

@@ -7,6 +7,30 @@ use Order::{Arm, Disarm};
 
 const PATIENCE: Duration = Duration::from_secs(30);
 
+/// `give` with a limit that no test waits for.
+fn give_patiently(home: Home, damaged: Option<BusError>) -> Result<bool, BusError> {
+    let (tell, told) = std::sync::mpsc::channel();
+    let damaged = std::sync::Mutex::new(damaged);
+    std::thread::spawn(move || {
+        let damaged = || damaged.lock().expect("one thread").take();
+        let _ = tell.send(give_through(home.node(), Disarm, 100 * PATIENCE, &damaged));
+    });
+    told.recv_timeout(PATIENCE).expect("an answer without the wait for one")
+}
+
+#[test]
+fn nobody_is_waited_for_where_nobody_receives_and_damage_is_said_before_the_wait_is_over() {
+    let home = |test: &str| Home::open(Some(&format!("orders{test}{}", std::process::id())), 0).expect("node");
+    assert!(matches!(give_patiently(home("f"), None), Ok(false)));
+    let damage = || BusError::Damaged { path: "/dev/shm/iox2_a.dynamic".into(), what: "it is damaged".to_owned() };
+    let said = |given: Result<bool, BusError>| given.expect_err("it is damaged").to_string();
+    assert!(said(give_patiently(home("g"), Some(damage()))).contains("iox2_a.dynamic"));
+    // One that receives, and does not answer.
+    let (instance, _home, _orders) = open("h");
+    let client = Home::open(Some(&instance), 0).expect("node");
+    assert!(said(give_patiently(client, Some(damage()))).contains("iox2_a.dynamic"));
+}
+
 fn open(test: &str) -> (String, Home, Orders) {
     let instance = format!("orders{test}{}", std::process::id());
     let home = Home::open(Some(&instance), 0).expect("node");

@@ -142,7 +142,8 @@ pub(super) fn disk(facts: &Facts, registry: Option<&Registry>) -> Vec<Finding> {
     let folder = text::plain(&disk.folder.display().to_string()).into_owned();
     let mut found = Vec::new();
     let entries = registry.map(|registry| registry.devices.as_slice()).unwrap_or_default();
-    let wanted: f64 = entries.iter().filter_map(most).sum();
+    // The sum of none is -0.0.
+    let wanted = entries.iter().filter_map(most).fold(0.0, |sum, most| sum + most);
     let unknown = entries.iter().filter(|entry| most(entry).is_none());
     let unknown = unknown.map(|entry| format!("[device.{}]", entry.name)).collect::<Vec<_>>().join(", ");
     match &disk.rate {

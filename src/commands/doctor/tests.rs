@@ -349,6 +349,8 @@ fn what_only_a_device_knows_is_not_said_to_be_the_most() {
         let found = judge::judge(&facts, Some(&registry), None).into_iter();
         found.filter(|finding| finding.about == "disk").map(|finding| finding.what).collect()
     };
+    let none = judge::judge(&facts, None, None).into_iter().find(|finding| finding.about == "disk").unwrap();
+    assert!(none.what.contains("at most 0.0 MB/s"), "{}", none.what);
     let known = said(camera);
     assert_eq!(known[0], "/data took 500.0 MB/s; the devices send at most 1.0 MB/s (estimated)");
     assert!(known[1].ends_with("min of everything at most"), "{known:?}");

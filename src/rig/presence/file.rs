@@ -106,6 +106,26 @@ impl MaskFile {
         Ok(Self { path: path.to_owned(), file, record })
     }
 
+    /// Makes the file anew where somebody has removed or replaced it; says whether it did. What is published next is in
+    /// it.
+    pub(super) fn restore(&mut self) -> Result<bool, PresenceError> {
+        if self.is_there() {
+            return Ok(false);
+        }
+        self.file = take(&self.path)?;
+        Ok(true)
+    }
+
+    pub(super) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Does the name lead to our file?
+    fn is_there(&self) -> bool {
+        let (Ok(ours), Ok(named)) = (self.file.metadata(), std::fs::symlink_metadata(&self.path)) else { return false };
+        (ours.dev(), ours.ino()) == (named.dev(), named.ino())
+    }
+
     /// Publishes `mask`; the sequence number it got.
     pub(super) fn publish(&mut self, mask: PhysicalMask, realtime_ns: u64) -> std::io::Result<u64> {
         self.record.generation = self.record.generation.wrapping_add(2);
@@ -132,6 +152,9 @@ impl Drop for MaskFile {
     fn drop(&mut self) {
         // For readers that hold it open.
         let _ = self.publish(PhysicalMask::EMPTY, realtime_ns());
+        if !self.is_there() {
+            return;
+        }
         // While the lock is held, so that nobody else's files are removed. Another user's stays: it may not
         // be removed where everybody may write.
         let _ = std::fs::remove_file(json_path(&self.path));

@@ -34,6 +34,8 @@ use file::MaskFile;
 
 /// Time between two publications: 500 Hz (paper, section "Physical Mask Generator").
 pub const PERIOD: Duration = Duration::from_millis(2);
+/// Beats between two looks whether the file is still there: a second.
+const LOOK_EVERY: u32 = 500;
 /// `SampleHeader::id` of a mask sample: no modality.
 pub const MASK_ID: u32 = u32::MAX;
 
@@ -165,7 +167,7 @@ impl Beat {
         }
         let mut due = Stamp::now();
         let mut published = None;
-        let mut failed = false;
+        let (mut failed, mut lost, mut beats) = (false, false, 0_u32);
         loop {
             fault::point("mask");
             let stop = self.shared.stop.load(Ordering::Acquire);
@@ -174,6 +176,10 @@ impl Beat {
             if now < due && published == Some(mask) && !stop {
                 std::thread::park_timeout(due.since(now));
                 continue;
+            }
+            beats = (beats + 1) % LOOK_EVERY;
+            if beats == 0 {
+                lost = self.look(lost);
             }
             match self.publish(mask, now) {
                 Ok(()) => failed = false,
@@ -195,6 +201,23 @@ impl Beat {
                     due = now.after(PERIOD);
                 }
             }
+        }
+    }
+
+    /// Makes the file anew if it is gone. True while that fails, which is said once.
+    fn look(&mut self, failed: bool) -> bool {
+        match self.file.restore() {
+            Ok(false) => false,
+            Ok(true) => {
+                let path = self.file.path().display();
+                tracing::warn!("{path}: removed or replaced during the run; made anew: its readers must open it again");
+                false
+            }
+            Err(error) if !failed => {
+                tracing::warn!(%error, "the physical mask was removed during the run, and cannot be made anew");
+                true
+            }
+            Err(_) => true,
         }
     }
 

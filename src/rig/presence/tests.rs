@@ -24,6 +24,27 @@ fn what_is_published_is_read_back_and_goes_with_the_publisher() {
 }
 
 #[test]
+fn a_file_that_is_removed_or_replaced_is_made_anew_and_another_programs_is_left() {
+    let path = path();
+    let mut file = MaskFile::create(&path, 1).expect("create");
+    assert!(!file.restore().expect("it is there"));
+    for replace in [false, true] {
+        std::fs::remove_file(&path).expect("removed");
+        if replace {
+            std::fs::write(&path, "something").expect("replaced");
+        }
+        assert!(file.restore().expect("it may be made"));
+        file.publish(PhysicalMask(5), 1).expect("publish");
+        assert_eq!(read_mask(&path).expect("a whole record").mask.0, 5);
+    }
+    std::fs::remove_file(&path).expect("removed");
+    std::fs::create_dir(&path).expect("replaced");
+    assert!(file.restore().expect_err("a folder").to_string().contains("it is a folder"));
+    drop(file);
+    std::fs::remove_dir(&path).expect("it is not ours to remove");
+}
+
+#[test]
 fn a_second_publisher_is_told_the_pid_of_the_first() {
     let path = path();
     let _first = MaskFile::create(&path, 1).expect("first");
