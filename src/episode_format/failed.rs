@@ -64,7 +64,7 @@ mod tests {
     #[test]
     fn it_is_found_behind_whatever_is_there_and_nowhere_else() {
         let long = "ü".repeat(LONGEST);
-        for before in [&b""[..], b"x", &[0; 100_000]] {
+        for before in [&b""[..], b"x", &[0; 9000]] {
             for why in ["", "another program cut it", &long] {
                 let bytes = [before, &Failed::mark(why)].concat();
                 let found = Failed::of(&bytes[..], bytes.len() as u64).unwrap().unwrap();

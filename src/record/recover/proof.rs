@@ -13,6 +13,9 @@ use crate::episode_format::testing::{Message, metadata, strictly};
 use crate::episode_format::walk::MAGIC;
 use crate::record::inspect::{Inspection, inspect};
 
+/// Makes something of this name.
+type Plant<'a> = &'a dyn Fn(&Path);
+
 /// Where the check value of a chunk lies in its content.
 const CRC: std::ops::Range<usize> = 24..28;
 
@@ -20,7 +23,7 @@ const CRC: std::ops::Range<usize> = 24..28;
 async fn a_whole_episode_whose_name_is_taken_gets_a_free_one_and_stays_as_it_is() {
     let (_folder, bytes) = recorded().await;
     let (_folder, other) = recorded().await;
-    let plant: [(&str, &dyn Fn(&Path)); 4] = [
+    let plant: [(&str, Plant<'_>); 4] = [
         ("a file", &|at| fs::write(at, "of somebody else").unwrap()),
         ("another episode", &|at| fs::write(at, &other).unwrap()),
         ("a link that leads nowhere", &|at| std::os::unix::fs::symlink("nowhere", at).unwrap()),
@@ -248,13 +251,8 @@ async fn recover_and_inspect_agree_on_what_is_whole() {
     let (folder, whole) = recorded().await;
     let footer = whole.len() - MAGIC.len() - 20;
     let begin = usize::try_from(u64::from_le_bytes(whole[footer..footer + 8].try_into().unwrap())).unwrap();
-    let data_end = begin - 4..begin;
-    let summary = footer + 16..footer + 20;
-    for (what, missing) in [
-        ("of the data", &[data_end.clone()][..]),
-        ("of the summary", &[summary.clone()]),
-        ("both", &[data_end, summary]),
-    ] {
+    let both = [begin - 4..begin, footer + 16..footer + 20];
+    for (what, missing) in [("of the data", &both[..1]), ("of the summary", &both[1..]), ("both", &both[..])] {
         let mut bytes = whole.clone();
         for range in missing {
             bytes[range.clone()].fill(0);
