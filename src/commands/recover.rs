@@ -9,7 +9,7 @@ use serde::Serialize;
 use serde_json::json;
 
 use super::Format;
-use crate::record::recover::{RecoverError, Recovered, left_behind, recover};
+use crate::record::recover::{RecoverError, Recovered, Watch, finished, is_damaged, left_behind, recover};
 use crate::text;
 
 /// How it went, of all files together.
@@ -49,41 +49,52 @@ pub fn run(
 ) -> (Outcome, io::Result<()>) {
     let mut teller = Teller { outcome: Outcome::default(), format, out, written: Ok(()), err };
     for path in paths {
-        let files = match unfinished(path) {
-            Some(Ok(files)) if files.is_empty() => {
-                if format == Format::Text {
-                    teller.line(&format!("{}: nothing to repair", path.display()));
-                }
-                continue;
-            }
-            Some(Ok(files)) => files,
-            Some(Err(source)) => {
+        let work = match Work::of(path) {
+            Ok(work) => work,
+            Err(source) => {
                 teller.failed(path, &RecoverError::Io { path: path.clone(), source });
                 continue;
             }
-            None => vec![path.clone()],
         };
-        for file in files {
-            if stop.load(Ordering::Relaxed) {
-                teller.failed(&file, &RecoverError::Interrupted(file.clone()));
-                continue;
-            }
-            let mut bar = Progress { file: &file, shown: None };
-            let mut watch = |done, size| {
-                if progress {
-                    bar.show(done, size, teller.err);
-                }
-                if stop.load(Ordering::Relaxed) { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
-            };
-            let recovered = recover(&file, &mut watch);
-            bar.clear(teller.err);
-            match recovered {
+        let is_idle = work.unfinished.is_empty();
+        for file in work.unfinished {
+            match teller.watched(&file, progress, stop, recover) {
                 Ok(recovered) => teller.done(&recovered),
                 Err(error) => teller.failed(&file, &error),
             }
         }
+        let mut is_sound = true;
+        for file in work.finished {
+            let damaged = teller.watched(&file, progress, stop, is_damaged);
+            is_sound &= matches!(damaged, Ok(false));
+            match damaged {
+                Ok(false) => {}
+                Ok(true) => teller.damaged(&file),
+                Err(error) => teller.failed(&file, &error),
+            }
+        }
+        if is_idle && is_sound && format == Format::Text {
+            teller.line(&format!("{}: nothing to repair", path.display()));
+        }
     }
     teller.end()
+}
+
+/// What of a path is to be repaired, and of a folder what is only looked at: a finished file is repaired where it is
+/// named itself.
+struct Work {
+    unfinished: Vec<PathBuf>,
+    finished: Vec<PathBuf>,
+}
+
+impl Work {
+    fn of(path: &Path) -> io::Result<Self> {
+        if !path.is_dir() {
+            return Ok(Self { unfinished: vec![path.to_owned()], finished: Vec::new() });
+        }
+        // Before anything is repaired: what that makes is whole.
+        Ok(Self { unfinished: left_behind(path)?, finished: finished(path)? })
+    }
 }
 
 /// What is said of each file, and how it went so far.
@@ -97,6 +108,40 @@ struct Teller<'a, O, E> {
 }
 
 impl<O: Write, E: Write> Teller<'_, O, E> {
+    /// Does `work` on a file, with its progress shown if that is wanted, until `stop` interrupts it.
+    fn watched<T>(
+        &mut self,
+        file: &Path,
+        progress: bool,
+        stop: &AtomicBool,
+        work: fn(&Path, &mut Watch<'_>) -> Result<T, RecoverError>,
+    ) -> Result<T, RecoverError> {
+        if stop.load(Ordering::Relaxed) {
+            return Err(RecoverError::Interrupted(file.to_owned()));
+        }
+        let mut bar = Progress { file, shown: None };
+        let mut watch = |done, size| {
+            if progress {
+                bar.show(done, size, self.err);
+            }
+            if stop.load(Ordering::Relaxed) { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        };
+        let done = work(file, &mut watch);
+        bar.clear(self.err);
+        done
+    }
+
+    /// A finished file that is damaged: it stays as it is unless somebody asks for it.
+    fn damaged(&mut self, file: &Path) {
+        let name = file.display();
+        match self.format {
+            Format::Json => self.json(&json!({"file": file.to_string_lossy(), "outcome": "damaged"})),
+            Format::Text => self.line(&text::plain(&format!(
+                "{name}: damaged; `rapid recover {name}` makes a whole file of what can be read of it"
+            ))),
+        }
+    }
+
     fn done(&mut self, recovered: &Recovered) {
         match self.format {
             Format::Json => self.json(recovered),
@@ -133,11 +178,6 @@ impl<O: Write, E: Write> Teller<'_, O, E> {
         let Self { outcome, out, written, .. } = self;
         (outcome, written.and_then(|()| out.flush()))
     }
-}
-
-/// What of a folder is to be repaired; `None`: it is none.
-fn unfinished(path: &Path) -> Option<io::Result<Vec<PathBuf>>> {
-    path.is_dir().then(|| left_behind(path))
 }
 
 /// One line that is written over, whenever the percentage changes.
@@ -178,6 +218,35 @@ mod tests {
 
         fn flush(&mut self) -> io::Result<()> {
             Ok(())
+        }
+    }
+
+    #[test]
+    fn a_finished_file_that_is_damaged_is_named_with_what_to_do() {
+        let bytes = crate::episode_format::testing::episode(crate::episode_format::testing::options());
+        let whole = crate::record::recover::recover_bytes(&bytes).expect("an episode");
+        let mut flipped = whole.clone();
+        flipped[whole.len() / 2] ^= 1;
+        for (what, bytes, is_named) in
+            [("whole", &whole[..], false), ("flipped", &flipped, true), ("cut", &whole[..whole.len() / 2], true)]
+        {
+            let folder = tempfile::tempdir().expect("a folder");
+            let file = folder.path().join("a_001.mcap");
+            std::fs::write(&file, bytes).expect("a file");
+            let said = |path: &Path, format| {
+                let (mut out, mut err) = (Vec::new(), Vec::new());
+                let (outcome, _) = run(&[path.to_owned()], format, false, &AtomicBool::new(false), &mut out, &mut err);
+                assert!(outcome.is_done() && err.is_empty(), "{what}: {outcome:?}");
+                String::from_utf8(out).expect("text")
+            };
+            let text = said(folder.path(), Format::Text);
+            let command = format!("`rapid recover {}`", file.display());
+            assert_eq!((text.contains(&command), text.contains("nothing to repair")), (is_named, !is_named), "{text}");
+            assert_eq!(said(folder.path(), Format::Json).contains("\"damaged\""), is_named, "{what}");
+            assert_eq!(std::fs::read(&file).expect("the file"), bytes, "{what}");
+            // Once that is done there is nothing left to do.
+            said(&file, Format::Text);
+            assert!(said(folder.path(), Format::Text).contains("nothing to repair"), "{what}");
         }
     }
 

@@ -33,6 +33,7 @@ impl<R: ReadAt> Walk<R> {
             self.read(at, left)?;
             let begin = usize::try_from(torn.begin - at - HEAD).unwrap_or(usize::MAX).min(self.buffer.len());
             self.chunk = Some(Records { unpacked: false, range: begin..self.buffer.len() });
+            self.walked.bytes += torn.begin - at;
             self.cut = true;
             return Ok(Step::Again);
         }

@@ -7,6 +7,7 @@
 
 mod chunk;
 mod ends;
+mod failed;
 mod header;
 mod index;
 mod names;
@@ -25,6 +26,7 @@ mod whole;
 pub(crate) mod wire;
 
 pub(crate) use chunk::is_sound;
+pub(crate) use failed::Failed;
 pub(crate) use header::Writer;
 pub(crate) use source::ReadAt;
 
@@ -48,6 +50,9 @@ pub(crate) const ABOUT: &str = "rapid";
 pub(crate) const SUMMARY: &str = "rapid/summary";
 /// Metadata record of an episode that was repaired.
 pub(crate) const RECOVERED: &str = "rapid/recovered";
+
+/// Key of [`RECOVERED`]: why the original's recorder called it BAD.
+pub(crate) const FAILED: &str = "failed";
 
 /// Key of [`ABOUT`]: the boot of the machine in which the episode was recorded.
 pub(crate) const BOOT_ID: &str = "boot_id";

@@ -113,7 +113,12 @@ impl<R: ReadAt> Walk<R> {
         Ok(matches!(self.names.owner, Owner::Episode(_) | Owner::Any))
     }
 
-    fn bytes(&self, records: &Records) -> &[u8] {
+    /// Do these records say that they are an episode's of ours?
+    pub(super) fn is_owned(&self, records: &Records) -> bool {
+        first(self.bytes(records)).is_some()
+    }
+
+    pub(super) fn bytes(&self, records: &Records) -> &[u8] {
         let bytes = if records.unpacked { &self.unpacked } else { &self.buffer };
         bytes.get(records.range.clone()).unwrap_or_default()
     }

@@ -266,6 +266,7 @@ impl<R: ReadAt> Walk<R> {
             }
             let end = chunk.range.end - fields.0.len();
             chunk.range.start = end;
+            self.walked.bytes += if self.cut { HEAD + data.len() as u64 } else { 0 };
             if self.names.admit(opcode, data) {
                 self.walked.ordered_messages += u64::from(self.cut && opcode == op::MESSAGE);
                 return Some(Found::Chunk { opcode, unpacked: chunk.unpacked, range: end - data.len()..end });

@@ -87,8 +87,8 @@ pub(crate) struct Walked {
     pub(crate) damaged_chunks: u64,
     /// What else is left out.
     pub(crate) left_out: LeftOut,
-    /// Whole messages of a chunk that the end of the file cuts, shown because the kernel that was running when they
-    /// were written still is: it has kept their order.
+    /// Whole messages of a chunk that the end of the file cuts, shown although their check value is not there: the kernel
+    /// that was running when they were written still is, and has kept their order.
     pub(crate) ordered_messages: u64,
     /// The file is whole: finished, nothing behind its end, every check value right, nothing left out.
     pub(crate) sound: bool,

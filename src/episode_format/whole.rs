@@ -3,6 +3,7 @@
 use std::io;
 
 use super::chunk::{self, ChunkHead, Opened, Records};
+use super::header::Writer;
 use super::op;
 use super::source::ReadAt;
 use super::walk::{HEAD, Step, Walk};
@@ -18,7 +19,7 @@ impl<R: ReadAt> Walk<R> {
         });
         self.chunked = true;
         let (head, records) = match opened {
-            Some((head, Opened::Right(records))) if head.crc != 0 || !self.with_checks => (head, records),
+            Some((head, Opened::Right(records))) if self.is_verified(&head, &records) => (head, records),
             Some((_, Opened::TooMuch)) => {
                 self.walked.left_out.swollen_chunks += 1;
                 self.walked.bytes += HEAD + length;
@@ -40,6 +41,13 @@ impl<R: ReadAt> Walk<R> {
         self.walked.bytes += HEAD + length;
         self.show(head, records)?;
         Ok(Step::Again)
+    }
+
+    /// Are these records under a check value? The format has zero for "not computed", which this writer always does: in
+    /// a file of ours a chunk without one is damaged.
+    fn is_verified(&self, head: &ChunkHead, records: &Records) -> bool {
+        let is_ours = self.with_checks || self.walked.writer == Writer::Rapid || self.is_owned(records);
+        head.crc != 0 || !is_ours || crc32fast::hash(self.bytes(records)) == 0
     }
 
     /// Is the record in the buffer, behind which reading continues, not one that lacks some of its bytes and has some of

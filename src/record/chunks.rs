@@ -17,6 +17,8 @@ use crate::episode_format::own::{EpisodeId, Own};
 
 /// Bytes of records after which a chunk is closed. The writer keeps one chunk in memory.
 const CHUNK_BYTES: u64 = 1 << 20;
+/// Bytes of records up to which a chunk is small.
+const SMALL_BYTES: u64 = 64 << 10;
 /// Gathers the small records between chunks (message indexes) into one write.
 const BUFFER_BYTES: usize = 64 << 10;
 /// Opcode and length of a record.
@@ -131,6 +133,11 @@ impl<S: Sink> Chunks<S> {
     pub(super) fn metadata(&mut self, name: &str, metadata: BTreeMap<String, String>) -> Result<(), McapError> {
         self.open = 0;
         self.writer.write_metadata(&Metadata { name: name.to_owned(), metadata })
+    }
+
+    /// Ends the chunk if it is not small: what is copied keeps the size of the chunks that it had.
+    pub(super) fn part(&mut self) -> Result<(), McapError> {
+        if self.open > SMALL_BYTES { self.flush() } else { Ok(()) }
     }
 
     /// Ends the chunk and hands everything to the sink.

@@ -14,7 +14,7 @@ use super::RecordError;
 use super::lock::{self, Lock};
 use super::publishers::Publisher;
 use crate::folder::{Folder, FolderError, Links, Missing};
-use crate::status::Verdict;
+use crate::status::{Board, Level, Verdict, What};
 use crate::{text, time};
 
 /// Extension of a file that is not finished.
@@ -83,6 +83,8 @@ pub(super) struct EpisodePath {
     pub(super) partial: PathBuf,
     /// The open file itself, whatever becomes of its names; it holds the lock.
     pub(super) file: Arc<File>,
+    /// Names that other programs know as another episode's.
+    pub(super) dropped: Vec<PathBuf>,
 }
 
 impl EpisodePath {
@@ -113,7 +115,15 @@ impl EpisodePath {
                 Ok(file) => {
                     let (finished, partial) = (out.join(name), out.join(partial));
                     match lock(&file, &partial) {
-                        Ok(true) => return Ok(Self { folder, finished, partial, file: Arc::new(file) }),
+                        Ok(true) => {
+                            return Ok(Self {
+                                folder,
+                                finished,
+                                partial,
+                                file: Arc::new(file),
+                                dropped: dropped.to_owned(),
+                            });
+                        }
                         // Somebody took the empty file for one that was left behind.
                         Ok(false) => {}
                         Err(source) => return Err(RecordError::Io { path: partial, source }),
@@ -126,9 +136,43 @@ impl EpisodePath {
         Err(refused(io::Error::new(io::ErrorKind::AlreadyExists, "no free number for this task")))
     }
 
-    /// Gives the finished file its name.
-    pub(super) fn publish(&self) -> io::Result<()> {
-        rename(&self.folder, &self.partial, &self.finished)
+    /// Gives the finished file its name, or the next free one where another file took that meanwhile; returns it.
+    pub(super) fn publish(&self) -> io::Result<PathBuf> {
+        match rename(&self.folder, &self.partial, &self.finished) {
+            Ok(()) => Ok(self.finished.clone()),
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => self.publish_as_next(),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// Announces that the file is not `self.finished` but beside it, if so.
+    pub(super) fn tell_name(&self, to: &Path, board: &Board) {
+        if to != self.finished && to.parent() == self.finished.parent() {
+            let (file, name) = (self.finished.display(), to.file_name().unwrap_or_default().to_string_lossy());
+            let why = "another program took this name while the episode was recorded";
+            board.announce(What::Log { level: Level::Warn, text: format!("{file}: {why}, which is {name} now") });
+        }
+    }
+
+    fn publish_as_next(&self) -> io::Result<PathBuf> {
+        let name = self.finished.file_stem().unwrap_or_default().to_string_lossy();
+        let numbered = name.rsplit_once('_').filter(|(_, number)| number.parse::<u32>().is_ok());
+        let stem = format!("{}_", numbered.map_or(&*name, |(stem, _)| stem));
+        let first = next_number(&self.folder, &stem)?;
+        for number in first..first.saturating_add(ATTEMPTS) {
+            let name = format!("{stem}{number:03}.mcap");
+            let to = self.finished.with_file_name(&name);
+            // Another recorder may be writing the file that is to have this name.
+            if self.dropped.contains(&to) || self.folder.has(format!("{name}.{PARTIAL}")) {
+                continue;
+            }
+            match rename(&self.folder, &self.partial, &to) {
+                Ok(()) => return Ok(to),
+                Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
+                Err(error) => return Err(error),
+            }
+        }
+        Err(io::Error::new(io::ErrorKind::AlreadyExists, "its name is taken, and no other number is free"))
     }
 }
 
@@ -270,11 +314,15 @@ mod tests {
         }
         let other = EpisodePath::create(&out, "other", WALL).unwrap();
         assert_eq!(other.finished.file_name().unwrap(), "20231114_other_001.mcap");
-        // A file that took the name meanwhile stays as it is.
+        // A file that took the name meanwhile stays as it is; what another recorder writes and what was dropped keep
+        // their names too.
         fs::write(&third.finished, "kept").unwrap();
-        assert_eq!(third.publish().unwrap_err().kind(), io::ErrorKind::AlreadyExists);
+        let mut third = third;
+        third.dropped = vec![out.join("20231114_t_082.mcap")];
+        let next = third.publish().unwrap();
+        assert_eq!(next.file_name().unwrap(), "20231114_t_083.mcap");
         assert_eq!(fs::read_to_string(&third.finished).unwrap(), "kept");
-        assert!(third.partial.exists());
+        assert!(!third.partial.exists());
     }
 
     #[test]
@@ -296,8 +344,10 @@ mod tests {
         assert_eq!(path.finished.file_name().unwrap(), "20231114_t_005.mcap");
         // Planted in the middle of the episode, under the name it was to get.
         symlink(&nowhere, &path.finished).unwrap();
-        assert_eq!(path.publish().unwrap_err().kind(), io::ErrorKind::AlreadyExists);
-        assert!(!nowhere.exists());
+        let to = path.publish().unwrap();
+        assert_eq!(to.file_name().unwrap(), "20231114_t_006.mcap");
+        assert!(!nowhere.exists() && fs::symlink_metadata(&path.finished).unwrap().is_symlink());
+        fs::rename(&to, &path.partial).unwrap();
         assert_eq!(fs::read_to_string(&victim).unwrap(), "precious");
         // The folder itself is exchanged: the episode stays where it began.
         fs::remove_file(&path.finished).unwrap();

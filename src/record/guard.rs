@@ -91,7 +91,7 @@ impl Guard {
         }
         let file = File::open(itself(&self.file))?;
         let walked = walk(file, written, None, &mut |_, _| {})?;
-        if walked.is_some_and(|walked| walked.sound) {
+        if walked.is_some_and(|walked| walked.proven) {
             return Ok(());
         }
         Err(io::Error::other("another program wrote into it while it was recorded: its check values are not right"))

@@ -5,14 +5,15 @@
 //!
 //! Invariant: a name that means another file is left alone.
 
-use std::fs::{self, File};
-use std::io::{self, Seek, SeekFrom};
+use std::fs;
+use std::io::{self, Seek, SeekFrom, Write};
 use std::os::fd::AsRawFd;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::episode::{EpisodePath, PARTIAL, lock};
+use crate::episode_format::Failed;
 use crate::folder::{Folder, Links, Missing};
 
 /// Names tried for a file that is written again, while others have taken them.
@@ -24,10 +25,7 @@ const ATTEMPTS: u32 = 100;
 /// When it keeps its partial name, or cannot be kept.
 pub(super) fn publish(path: &EpisodePath) -> io::Result<PathBuf> {
     match whereabouts(path)? {
-        Whereabouts::Here => {
-            path.publish()?;
-            Ok(path.finished.clone())
-        }
+        Whereabouts::Here => path.publish(),
         Whereabouts::Moved(partial) => {
             let (from, to) = (path.finished.display(), partial.display());
             tracing::warn!(%from, %to, "the episode was moved while it was recorded");
@@ -37,9 +35,7 @@ pub(super) fn publish(path: &EpisodePath) -> io::Result<PathBuf> {
             }
             let folder = open(partial.parent().unwrap_or(Path::new("")), Missing::Refused)?;
             let (finished, file) = (partial.with_extension(""), Arc::clone(&path.file));
-            let moved = EpisodePath { folder, finished, partial, file };
-            moved.publish()?;
-            Ok(moved.finished)
+            EpisodePath { folder, finished, partial, file, dropped: path.dropped.clone() }.publish()
         }
         Whereabouts::Removed => {
             let file = write_again(path, Content::Whole)?;
@@ -49,8 +45,15 @@ pub(super) fn publish(path: &EpisodePath) -> io::Result<PathBuf> {
     }
 }
 
-/// Where a file is that could not be finished; one that was removed is written again.
-pub(super) fn partial(path: &EpisodePath) -> PathBuf {
+/// Where a file is that could not be finished; one that was removed is written again. Behind it is written `why` it is
+/// BAD, so that whoever reads it later finds that again: its summary may say GOOD by then.
+pub(super) fn failed(path: &EpisodePath, why: &str) -> PathBuf {
+    let mut file = &*path.file;
+    let marked = file.seek(SeekFrom::End(0)).and_then(|_| file.write_all(&Failed::mark(why)));
+    if let Err(error) = marked.and_then(|()| file.sync_data()) {
+        let file = path.partial.display();
+        tracing::error!(%file, %error, "BAD, which the file itself may not say after a loss of power; remove it");
+    }
     let found = whereabouts(path).and_then(|whereabouts| match whereabouts {
         Whereabouts::Here => Ok(path.partial.clone()),
         Whereabouts::Moved(partial) => Ok(partial),
@@ -107,7 +110,7 @@ fn write_again(path: &EpisodePath, content: Content) -> io::Result<PathBuf> {
     let mut first = None;
     let folder = path.finished.parent().map(Path::to_owned).unwrap_or_default();
     for folder in [folder, std::env::temp_dir()] {
-        match write_into(&folder, &name.to_string_lossy(), content, &path.file) {
+        match write_into(&folder, &name.to_string_lossy(), content, path) {
             Ok(written) => return Ok(written),
             Err(error) => {
                 tracing::error!(folder = %folder.display(), %error, "the episode cannot be written again here");
@@ -118,7 +121,7 @@ fn write_again(path: &EpisodePath, content: Content) -> io::Result<PathBuf> {
     Err(first.unwrap_or_else(|| io::ErrorKind::NotFound.into()))
 }
 
-fn write_into(out: &Path, stem: &str, content: Content, file: &File) -> io::Result<PathBuf> {
+fn write_into(out: &Path, stem: &str, content: Content, path: &EpisodePath) -> io::Result<PathBuf> {
     for attempt in 1..=ATTEMPTS {
         let folder = open(out, Missing::All)?;
         let stem = if attempt == 1 { stem.to_owned() } else { format!("{stem}-{attempt}") };
@@ -135,7 +138,7 @@ fn write_into(out: &Path, stem: &str, content: Content, file: &File) -> io::Resu
         if !lock(&copy, &partial)? {
             continue;
         }
-        let mut source = file;
+        let mut source = &*path.file;
         let copied = source.seek(SeekFrom::Start(0)).and_then(|_| io::copy(&mut source, &mut copy));
         if let Err(error) = copied.and_then(|_| copy.sync_all()) {
             // Half of it is of no use while the whole may go elsewhere.
@@ -145,9 +148,8 @@ fn write_into(out: &Path, stem: &str, content: Content, file: &File) -> io::Resu
         if content == Content::Partial {
             return Ok(partial);
         }
-        let path = EpisodePath { folder, finished, partial, file: Arc::new(copy) };
-        path.publish()?;
-        return Ok(path.finished);
+        let dropped = path.dropped.clone();
+        return EpisodePath { folder, finished, partial, file: Arc::new(copy), dropped }.publish();
     }
     Err(io::Error::new(io::ErrorKind::AlreadyExists, "no free name"))
 }

@@ -324,15 +324,14 @@ impl Session {
         };
         let whole = ending.verdict;
         let (file, error, verdict) = match closed {
-            Ok(file) => (file, reason, whole),
+            Ok(file) => {
+                self.path.tell_name(&file, &self.board);
+                (file, reason, whole)
+            }
             Err(error) => {
-                let file = keep::partial(&self.path);
-                let text = match reason {
-                    Some(reason) => format!("{reason}; {}: {error}", file.display()),
-                    None => format!("{}: {error}", file.display()),
-                };
-                let verdict = verdict(FileState::Failed(&error.to_string()));
-                (file, Some(text), verdict)
+                let error = error.to_string();
+                let (verdict, file) = (verdict(FileState::Failed(&error)), keep::failed(&self.path, &error));
+                (file, Some(reason.into_iter().chain([error]).collect::<Vec<_>>().join("; ")), verdict)
             }
         };
         let bytes = std::fs::metadata(&file).map_or(0, |metadata| metadata.len());

@@ -136,14 +136,13 @@ pub(super) fn judge(facts: &Facts<'_>) -> Verdict {
         found.push((Grade::Bad, "nothing was received from any modality".to_owned()));
     }
     let missing = [
-        (facts.actions_dropped, "actions"),
-        (facts.masks_dropped, "publications of the mask"),
-        (facts.events_missed, "events"),
+        (facts.actions_dropped, "action is", "actions are"),
+        (facts.masks_dropped, "publication of the mask is", "publications of the mask are"),
+        (facts.events_missed, "event is", "events are"),
     ];
-    for (count, what) in missing {
-        if count > 0 {
-            found.push((Grade::Suspect, format!("{count} {what} are not in the file (limit 0)")));
-        }
+    for (count, is, are) in missing.into_iter().filter(|(count, ..)| *count > 0) {
+        let are = if count == 1 { is } else { are };
+        found.push((Grade::Suspect, format!("{count} {are} not in the file (limit 0)")));
     }
     found.extend(facts.publishers.iter().map(|publisher| (Grade::Suspect, publisher.reason())));
     // Stable: of one grade in the order above.

@@ -7,12 +7,12 @@ use super::super::configuration;
 use super::super::metadata::POLICY;
 use super::super::walk::{Walked, op};
 use super::super::wire::{Fields, protobuf, whole_protobuf};
-use super::judge::{Counted, Ending, Judge, recorded_verdict, without_metadata};
+use super::judge::{Counted, Ending, Judge, Missing, without_metadata};
 use super::policy::Gathered;
-use super::units;
 use super::{EventReport, Inspection, Judgement, Lateness, MaskEdge, ModalityReport, TopicReport};
+use super::{state, units};
 use crate::action::ACTION_TOPIC;
-use crate::episode_format::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, RECOVERED, SUMMARY, Writer};
+use crate::episode_format::{ABOUT, EVENT_TOPIC, FAILED, FRAME_TOPIC, Failed, LOG_TOPIC, RECOVERED, SUMMARY, Writer};
 use crate::mask::{MASK_TOPIC, PhysicalMask};
 use crate::modality::ModalityId;
 
@@ -190,10 +190,12 @@ impl Collected {
     }
 
     /// What was gathered, as a report on the file at `path`.
-    pub(super) fn report(mut self, path: &Path, size: u64, walked: Walked) -> Inspection {
+    pub(super) fn report(mut self, path: &Path, size: u64, walked: Walked, failed: Option<Failed>) -> Inspection {
+        let recorded = failed.as_ref().map_or(size, |failed| failed.at);
+        let failed = failed.map(|failed| failed.why).or_else(|| self.recovered.get(FAILED).cloned());
         let said = |map: &BTreeMap<String, String>, key: &str| map.get(key).cloned().unwrap_or_default();
         let begin_ns = said(&self.about, "begin_wall_ns").parse().ok().or(self.first).unwrap_or(0);
-        let is_ours = walked.writer == Writer::Rapid || self.is_ours;
+        let is_ours = walked.writer == Writer::Rapid || self.is_ours || failed.is_some();
         let told = said(&self.summary, "duration_s").parse().ok().filter(|seconds: &f64| seconds.is_finite());
         let seconds = told.unwrap_or_else(|| from(begin_ns, self.last)).max(0.0);
         let mut events = std::mem::take(&mut self.events);
@@ -210,11 +212,17 @@ impl Collected {
             std::mem::take(&mut self.policy).report(end_ns, [self.summary.get(POLICY), self.about.get(POLICY)]);
         let (mut modalities, topics) = self.topics(begin_ns, seconds);
         let (messages, frames, unread) = (self.messages, self.frames, self.unread);
-        let actions_missing =
-            topics.iter().filter(|topic| topic.topic == ACTION_TOPIC).map(|topic| topic.missing).sum();
-        let counted = Counted { messages, frames, unread, actions_missing };
-        let ending =
-            Ending { file: walked, seconds, summary: &self.summary, repaired: !self.recovered.is_empty(), counted };
+        let missing = |name| topics.iter().filter(|topic| topic.topic == name).map(|topic| topic.missing).sum();
+        let missing = Missing {
+            actions: missing(ACTION_TOPIC),
+            masks: missing(MASK_TOPIC),
+            events: missing(EVENT_TOPIC),
+            frames: missing(FRAME_TOPIC),
+        };
+        let counted = Counted { messages, frames, unread, missing };
+        let repaired = state::repaired(&self.recovered);
+        let (repaired, failed) = (repaired.as_deref(), failed.as_deref());
+        let ending = Ending { file: walked, seconds, summary: &self.summary, repaired, failed, counted };
         let verdict = match &judge {
             Some(judge) => Judgement::Episode(judge.judge(&mut modalities, &ending)),
             // What is damaged and has no name of its writer may be an episode.
@@ -232,8 +240,9 @@ impl Collected {
             bytes: size,
             end: walked.end,
             verdict,
-            recorded_verdict: recorded_verdict(&self.summary),
-            unread_bytes: size.saturating_sub(walked.bytes),
+            // What was said before it failed is void.
+            recorded_verdict: state::recorded_verdict(&self.summary).filter(|_| failed.is_none()),
+            unread_bytes: recorded.saturating_sub(walked.bytes),
             damaged_chunks: walked.damaged_chunks,
             left_out: walked.left_out,
             ordered_messages: walked.ordered_messages,
@@ -250,8 +259,8 @@ impl Collected {
             begin_ns,
             seconds,
             messages: self.messages,
-            dropped: said(&self.summary, "dropped").parse().ok(),
-            lost: said(&self.summary, "lost").parse().ok(),
+            dropped: state::sum(&self.summary, "dropped", &modalities, |quality| quality.dropped),
+            lost: state::sum(&self.summary, "lost", &modalities, |quality| quality.lost),
             damaged: said(&self.summary, "damaged").parse().ok(),
             frames: self.frames,
             skew: judge.and_then(|judge| judge.skew()),

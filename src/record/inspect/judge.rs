@@ -12,14 +12,14 @@ use std::time::Duration;
 
 use serde_json::{Map, Value};
 
-use super::super::metadata::CUT_SHORT;
 use super::super::publishers::Publishers;
 use super::super::quality::{Frames, Measured, Measures, Quality, Seen, Spread};
 use super::super::session::SETTLE;
 use super::super::verdict::{Facts, FileState, Finding, Judged, Losses, judge};
-use super::super::walk::{FileEnd, Walked};
+use super::super::walk::Walked;
 use super::super::wire::{Proto, protobuf};
 use super::ModalityReport;
+use super::state::{self, file_state};
 use crate::episode_format::{ABOUT, SUMMARY};
 use crate::mask::PhysicalMask;
 use crate::modality::{MAX_MODALITIES, ModalityId, ModalityKind};
@@ -41,8 +41,10 @@ pub(super) struct Ending<'a> {
     pub(super) seconds: f64,
     /// The recorder's summary; empty without one.
     pub(super) summary: &'a BTreeMap<String, String>,
-    /// It was made of one that was not whole.
-    pub(super) repaired: bool,
+    /// It was made of one that was not whole; the text says so.
+    pub(super) repaired: Option<&'a str>,
+    /// Why its recorder called it BAD after it had written its summary, or without one.
+    pub(super) failed: Option<&'a str>,
     /// What was counted in it.
     pub(super) counted: Counted,
 }
@@ -56,8 +58,17 @@ pub(super) struct Counted {
     pub(super) frames: u64,
     /// Records that could not be understood.
     pub(super) unread: u64,
-    /// Numbers missing between its actions.
-    pub(super) actions_missing: u64,
+    /// Numbers missing between its messages.
+    pub(super) missing: Missing,
+}
+
+/// Numbers missing between the messages of a topic.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Missing {
+    pub(super) actions: u64,
+    pub(super) masks: u64,
+    pub(super) events: u64,
+    pub(super) frames: u64,
 }
 
 /// Measures an episode while its file is read.
@@ -198,20 +209,25 @@ impl Judge {
             .iter()
             .map(|(known, quality)| Judged { name: &known.name, quality, limits: known.measured.limits })
             .collect();
-        let count = |key: &str| counted.count(key).unwrap_or(0);
+        // Of a file that lacks something the recorder did not count all that is missing.
+        let is_complete = counted.count("messages") == Some(ending.counted.messages) && ending.repaired.is_none();
+        let count = |key: &str, numbers: u64| {
+            let recorded = counted.count(key);
+            if is_complete { recorded.unwrap_or(numbers) } else { recorded.unwrap_or(0).max(numbers) }
+        };
         let publishers = self.publishers.clone().or_summed_up(ending.summary);
         let mut findings = self.not_judged(modalities, ending);
         findings.extend(counted.differences(&qualities, ending));
         let facts = Facts {
             publishers: publishers.list(),
             modalities: &judged,
-            masks_dropped: count("masks_dropped"),
-            actions_dropped: counted.count("actions_dropped").unwrap_or(ending.counted.actions_missing),
+            masks_dropped: count("masks_dropped", ending.counted.missing.masks),
+            actions_dropped: count("actions_dropped", ending.counted.missing.actions),
             expect: &self.expect,
-            events_missed: count("events_missed"),
+            events_missed: count("events_missed", ending.counted.missing.events),
             seconds: ending.seconds,
             // A repaired file's summary counts what is there.
-            losses: if counted.count("lost").is_some() { Losses::Apart } else { Losses::Together },
+            losses: if counted.count("lost").is_some() && is_complete { Losses::Apart } else { Losses::Together },
             file: file_state(ending),
             findings: &findings,
         };
@@ -223,8 +239,15 @@ impl Judge {
         let id = known.measured.id;
         let mut quality = self.measures.quality(id, end_ns)?;
         let missing = self.numbers.get(id.index()).map_or(0, |(_, missing)| *missing);
-        quality.lost = counted.of_modality(&known.name, "lost").unwrap_or(0);
-        quality.dropped = counted.of_modality(&known.name, "dropped").unwrap_or(missing);
+        let recorded = |key: &str| counted.of_modality(&known.name, key);
+        quality.lost = recorded("lost").unwrap_or(0);
+        quality.dropped = recorded("dropped").unwrap_or(missing);
+        let gone = recorded("samples").map_or(0, |samples| samples.saturating_sub(quality.samples));
+        if gone > 0 {
+            // Which of the numbers that are missing the device lost is no longer known.
+            let all = gone.saturating_add(quality.lost).saturating_add(quality.dropped);
+            (quality.lost, quality.dropped) = (0, all.max(missing));
+        }
         quality.damaged = quality.truncated.max(counted.of_modality(&known.name, "damaged").unwrap_or(0));
         Some(quality)
     }
@@ -239,8 +262,10 @@ impl Judge {
         }
         let passed_over = ending.counted.unread.saturating_add(ending.file.left_out.oversized_records);
         if passed_over > 0 {
-            findings.push(Finding::suspect(format!("{passed_over} records in the file cannot be understood")));
+            let records = if passed_over == 1 { "record" } else { "records" };
+            findings.push(Finding::suspect(format!("{passed_over} {records} in the file cannot be understood")));
         }
+        findings.extend(state::findings(ending));
         let has_channel = |known: &&Registered| !channels.iter().any(|of| of.bit == known.measured.id.bit());
         for known in self.modalities.iter().filter(has_channel) {
             findings.push(Finding::suspect(format!("{}: the file has no channel for it", known.name)));
@@ -259,7 +284,8 @@ pub(super) fn without_metadata(ending: &Ending<'_>) -> Verdict {
         format!("its metadata record {ABOUT:?} is missing or cannot be read, so that nothing in it can be judged");
     let reasons = match file_state(ending) {
         FileState::NotWhole(why) => vec![reason, format!("the file is not whole: {why}")],
-        FileState::Whole | FileState::Failed(_) => vec![reason],
+        FileState::Failed(why) => vec![reason, format!("the file could not be written: {why}")],
+        FileState::Whole => vec![reason],
     };
     Verdict { grade: Grade::Bad, reasons, sensors: None }
 }
@@ -286,8 +312,8 @@ impl<'a> Recorded<'a> {
 
     /// In what a finished file is not what its recorder says that it wrote.
     fn differences(&self, qualities: &[(&Registered, Quality)], ending: &Ending<'_>) -> Vec<Finding> {
-        // Without a summary the file is not whole, and that of a repaired one counts what is there.
-        if self.summary.is_empty() || ending.repaired {
+        // Without a summary the file is not whole, and that which a repair wrote counts what is there: it has no verdict.
+        if self.summary.is_empty() || ending.repaired.is_some() && !self.summary.contains_key("verdict") {
             return Vec::new();
         }
         let mut missing: Vec<String> = Vec::new();
@@ -330,42 +356,10 @@ impl<'a> Recorded<'a> {
     }
 }
 
-const DAMAGED: &str = "parts of it are damaged";
-const UNPROVEN: &str = "check values are missing in it, so that damage would not show";
-
-fn file_state<'a>(ending: &Ending<'a>) -> FileState<'a> {
-    let Ending { file: walked, summary, repaired, .. } = ending;
-    let cut_short = summary.get(CUT_SHORT);
-    match walked.end {
-        FileEnd::Finished if *repaired => FileState::NotWhole("it was repaired, and what came last may be missing"),
-        // A check value that is not right counts as much as a chunk that cannot be read.
-        FileEnd::Finished if walked.damaged_chunks == 0 && walked.sound => match cut_short {
-            Some(why) => FileState::NotWhole(why),
-            // Whoever wrote the footer: what the recorder ends, it sums up.
-            None if summary.is_empty() => FileState::NotWhole("the recorder has not finished it"),
-            None if !walked.proven => FileState::NotWhole(UNPROVEN),
-            None => FileState::Whole,
-        },
-        FileEnd::Finished => FileState::NotWhole(DAMAGED),
-        FileEnd::Unfinished => FileState::NotWhole("the recorder has not finished it"),
-        FileEnd::Torn => FileState::NotWhole("its last record is cut"),
-        FileEnd::Damaged => FileState::NotWhole("from some place on it cannot be read"),
-    }
-}
-
 /// The entries of an object that `about` holds as JSON; none if it is none.
 fn objects(about: &BTreeMap<String, String>, key: &str) -> impl Iterator<Item = (String, Value)> + use<> {
     let object = about.get(key).and_then(|text| serde_json::from_str::<Map<String, Value>>(text).ok());
     object.unwrap_or_default().into_iter()
-}
-
-/// What the recorder's summary says; `None` in a file that has no verdict.
-pub(super) fn recorded_verdict(summary: &BTreeMap<String, String>) -> Option<Verdict> {
-    let word = summary.get("verdict")?;
-    let grade = [Grade::Good, Grade::Suspect, Grade::Bad].into_iter().find(|grade| grade.word() == word)?;
-    let reasons = serde_json::from_str(summary.get("reasons")?).ok()?;
-    let sensors = summary.get("sensors").and_then(|sensors| serde_json::from_str(sensors).ok());
-    Some(Verdict { grade, reasons, sensors })
 }
 
 /// The modalities by the registry in the file, and the names of those that it expects.

@@ -13,6 +13,7 @@ mod judgement;
 mod list;
 mod policy;
 mod render;
+mod state;
 #[cfg(test)]
 mod tests;
 mod units;
@@ -25,7 +26,7 @@ use serde::Serialize;
 
 use super::quality::{Quality, Spread};
 use super::walk::walk;
-use crate::episode_format::{self, OpenError, ReadAt};
+use crate::episode_format::{self, Failed, OpenError, ReadAt};
 use crate::status::Verdict;
 use crate::text;
 use collect::Collected;
@@ -77,7 +78,8 @@ pub struct Inspection {
     /// What else of the file is left out.
     #[serde(flatten)]
     pub left_out: LeftOut,
-    /// Messages of a chunk that the end of the file cuts, taken because they were written since this machine was started.
+    /// Messages of a chunk that the end of the file cuts, taken without a check value because they were written since this
+    /// machine was started.
     pub ordered_messages: u64,
     /// What a repair said of this file when it made it: the metadata `rapid/recovered`.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
@@ -106,9 +108,10 @@ pub struct Inspection {
     pub seconds: f64,
     /// Messages on all topics.
     pub messages: u64,
-    /// Samples the recorder says were lost on the way to the file; unknown in an unfinished file.
+    /// Samples lost on the way to the file, and those missing in it since; unknown in an unfinished file.
     pub dropped: Option<u64>,
-    /// Samples the recorder says the devices lost themselves; unknown in an unfinished file.
+    /// Samples the recorder says the devices lost themselves; unknown in an unfinished file. Where samples are missing
+    /// that it wrote, it is not known which were whose: all are `dropped`.
     pub lost: Option<u64>,
     /// Samples the drivers called damaged; unknown in an unfinished file.
     pub damaged: Option<u64>,
@@ -227,7 +230,9 @@ pub fn inspect_bytes(bytes: &[u8]) -> Option<Inspection> {
 
 /// `None`: no MCAP file.
 fn inspect_from(file: impl ReadAt, size: u64, path: &Path, boot: Option<String>) -> io::Result<Option<Inspection>> {
+    let failed = Failed::of(&file, size)?;
+    let recorded = failed.as_ref().map_or(size, |failed| failed.at);
     let mut collected = Collected::default();
-    let walked = walk(file, size, boot, &mut |opcode, record| collected.record(opcode, record))?;
-    Ok(walked.map(|walked| collected.report(path, size, walked)))
+    let walked = walk(file, recorded, boot, &mut |opcode, record| collected.record(opcode, record))?;
+    Ok(walked.map(|walked| collected.report(path, size, walked, failed)))
 }

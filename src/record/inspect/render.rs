@@ -39,7 +39,7 @@ fn write_all(out: &mut String, inspection: &Inspection, width: usize, paint: Pai
         writeln!(out, "{}", colour(paint, RED, &text))?;
     }
     if inspection.ordered_messages > 0 {
-        let text = format!("{} messages of the chunk that is cut are taken", inspection.ordered_messages);
+        let text = super::state::unverified(inspection.ordered_messages);
         writeln!(out, "{}", colour(paint, YELLOW, &text))?;
     }
     if let Some(source) = inspection.recovered.get("source") {

@@ -19,7 +19,7 @@ use super::super::walk::{Record, Walk, Walked, op};
 use super::super::wire::Fields;
 use super::said;
 use super::{Watch, summary::Summary};
-use crate::episode_format::{RECOVERED, ReadAt, SUMMARY, is_sound, own};
+use crate::episode_format::{Failed, RECOVERED, ReadAt, SUMMARY, is_sound, own};
 
 /// Bytes read between two calls of a [`Watch`]; what is read in vain, in search of a chunk, counts too.
 const WATCH_EVERY: u64 = 1 << 20;
@@ -45,6 +45,8 @@ pub(super) struct About<'a> {
     pub(super) time_ns: u64,
     /// The present boot, if that is to prove what was written last: see [`Walk::of_boot`].
     pub(super) boot: Option<String>,
+    /// What the original's recorder wrote behind it.
+    pub(super) failed: Option<&'a Failed>,
 }
 
 /// What of the original is not in the copy.
@@ -56,6 +58,8 @@ pub(super) struct Damage {
     pub(super) refused_records: u64,
     /// Messages left out because nothing says what their channel is, by its number.
     pub(super) nameless: BTreeMap<u16, u64>,
+    /// Why the original's recorder called it BAD.
+    pub(super) failed: Option<String>,
 }
 
 impl Damage {
@@ -81,7 +85,7 @@ pub(super) fn summary(file: impl ReadAt, size: u64, watch: &mut Watch<'_>) -> Re
         summary.record(record.opcode, record.data);
         file.done.set(walk.walked().bytes);
     }
-    summary.sound(walk.walked().sound);
+    summary.walked(&walk.walked());
     Ok(Some(summary))
 }
 
@@ -95,10 +99,15 @@ pub(super) fn copy(
     watch: &mut Watch<'_>,
 ) -> Result<Option<Copied>, Error> {
     let file = Watched::new(file, size, watch);
-    let Some(walk) = Walk::new(&file, size).map_err(|error| file.error(error))? else { return Ok(None) };
+    let recorded = about.failed.map_or(size, |failed| failed.at);
+    let Some(walk) = Walk::new(&file, recorded).map_err(|error| file.error(error))? else { return Ok(None) };
     let mut walk = walk.of_boot(about.boot.clone());
-    let mut copy = Copy::new(sink)?;
+    let mut copy = Copy::new(sink, about.failed.map(|failed| failed.why.clone()))?;
     while walk.advance().map_err(|error| file.error(error))? {
+        // As in the original, one damaged byte costs no more than one of its chunks.
+        if walk.walked().bytes != file.done.get() {
+            copy.writer.part().map_err(|error| Error::Write(io_error(error)))?;
+        }
         copy.writer.belong(walk.episode());
         copy.take(&walk.record())?;
         file.done.set(walk.walked().bytes);
@@ -106,9 +115,11 @@ pub(super) fn copy(
     let walked = walk.walked();
     let damage = Damage {
         walked,
-        unread_bytes: size.saturating_sub(walked.bytes),
+        unread_bytes: recorded.saturating_sub(walked.bytes),
         refused_records: copy.refused,
         nameless: walk.nameless().clone(),
+        // Or of the file from which that one was made.
+        failed: copy.failed.take().or_else(|| copy.summary.failed.take()),
     };
     let summary = copy.finish(&damage, about, size)?;
     Ok(Some(Copied { summary, damage }))
@@ -142,7 +153,7 @@ pub(super) fn sha256(file: &File, size: u64, watch: &mut Watch<'_>) -> Result<St
 #[must_use]
 pub fn recover_bytes(bytes: &[u8]) -> Option<Vec<u8>> {
     let size = bytes.len() as u64;
-    let about = About { name: "bytes.mcap", sha256: String::new(), time_ns: 0, boot: None };
+    let about = About { name: "bytes.mcap", sha256: String::new(), time_ns: 0, boot: None, failed: None };
     let mut whole = Vec::new();
     // Memory takes what is written to it.
     copy(bytes, size, &about, &mut whole, &mut |_, _| ControlFlow::Continue(())).ok()??;
@@ -196,14 +207,16 @@ impl<R: ReadAt> ReadAt for Watched<'_, '_, R> {
 /// The file being written.
 struct Copy<S: Sink> {
     writer: Chunks<S>,
+    /// Why the original's recorder called it BAD.
+    failed: Option<String>,
     summary: Summary,
     refused: u64,
 }
 
 impl<S: Sink> Copy<S> {
-    fn new(sink: S) -> Result<Self, Error> {
+    fn new(sink: S, failed: Option<String>) -> Result<Self, Error> {
         let writer = Chunks::new(sink, None).map_err(Error::Write)?;
-        Ok(Self { writer, summary: Summary::default(), refused: 0 })
+        Ok(Self { writer, failed, summary: Summary::default(), refused: 0 })
     }
 
     /// Writes a record; one that cannot be meant as it stands is counted.
@@ -291,7 +304,10 @@ impl<S: Sink> Copy<S> {
     fn metadata(&mut self, data: &[u8]) -> Option<Result<(), McapError>> {
         let mut fields = Fields(data);
         let name = fields.string()?;
-        let metadata = fields.map()?;
+        let mut metadata = fields.map()?;
+        if let Some(why) = self.failed.as_ref().filter(|_| name == SUMMARY) {
+            metadata.extend(said::failed(why));
+        }
         Some(self.writer.metadata(name, metadata))
     }
 

@@ -19,13 +19,13 @@ use crate::episode_format::walk::MAGIC;
 const CASES: usize = 120;
 
 /// A chunk of a whole file: where its record's content lies, and its messages.
-struct Chunk {
-    content: Range<usize>,
-    messages: Vec<Message>,
+pub(super) struct Chunk {
+    pub(super) content: Range<usize>,
+    pub(super) messages: Vec<Message>,
 }
 
 /// The chunks of a whole file, read without any of the code under test.
-fn chunks(bytes: &[u8]) -> Vec<Chunk> {
+pub(super) fn chunks(bytes: &[u8]) -> Vec<Chunk> {
     let channels = mcap::Summary::read(bytes).unwrap().unwrap().channels;
     let (mut at, mut chunks) = (MAGIC.len(), Vec::new());
     while bytes[at] != op::DATA_END {
@@ -169,13 +169,13 @@ async fn of_every_file_every_message_of_every_right_chunk_is_kept_and_none_is_ma
 }
 
 /// The largest chunk: which it is, and where its content lies.
-fn largest(chunks: &[Chunk]) -> (usize, &Range<usize>) {
+pub(super) fn largest(chunks: &[Chunk]) -> (usize, &Range<usize>) {
     let ranges = chunks.iter().map(|chunk| &chunk.content).enumerate();
     ranges.max_by_key(|(_, range)| range.len()).unwrap()
 }
 
 /// The bytes up to the end of the last chunk, as a killed recorder leaves them.
-fn unfinished(bytes: &[u8]) -> &[u8] {
+pub(super) fn unfinished(bytes: &[u8]) -> &[u8] {
     &bytes[..chunks(bytes).last().unwrap().content.end]
 }
 

@@ -15,8 +15,9 @@ use std::time::{Duration, Instant, SystemTime};
 
 use rustix::process::setpriority_process;
 
-use super::{Outcome, RecoverError, Recovered, recover};
+use super::{Names, Outcome, RecoverError, Recovered, Source, Watch, recover};
 use crate::disk::Disk;
+use crate::episode_format::{self, Failed};
 use crate::status::{Board, Level, What};
 use crate::text;
 
@@ -32,14 +33,39 @@ const NICE: i32 = 15;
 /// # Errors
 /// When the folder cannot be read.
 pub fn left_behind(folder: &Path) -> io::Result<Vec<PathBuf>> {
-    Ok(entries(folder)?.into_iter().map(|entry| entry.path()).collect())
+    Ok(entries(folder, b".mcap.partial")?.into_iter().map(|entry| entry.path()).collect())
 }
 
-fn entries(folder: &Path) -> io::Result<Vec<DirEntry>> {
+/// The finished files of `folder`, by name.
+///
+/// # Errors
+/// When the folder cannot be read.
+pub fn finished(folder: &Path) -> io::Result<Vec<PathBuf>> {
+    Ok(entries(folder, b".mcap")?.into_iter().map(|entry| entry.path()).collect())
+}
+
+/// Is this finished file damaged, and was no whole one made of it yet? Nothing is written.
+///
+/// # Errors
+/// When it cannot be read, or `watch` ends it.
+pub fn is_damaged(path: &Path, watch: &mut Watch<'_>) -> Result<bool, RecoverError> {
+    let io = |source| RecoverError::Io { path: path.to_owned(), source };
+    let (file, size) = episode_format::open(path)?;
+    let failed = Failed::of(&file, size).map_err(io)?;
+    let source = Source { path, file, size, failed };
+    let Some(known) = source.read(watch)? else { return Ok(false) };
+    if source.failed.is_none() && known.is_whole() {
+        return Ok(false);
+    }
+    let sha256 = source.sha256(watch)?;
+    Ok(source.repaired(&Names::of(path).finished, &sha256, watch)?.is_none())
+}
+
+fn entries(folder: &Path, ending: &[u8]) -> io::Result<Vec<DirEntry>> {
     let mut entries: Vec<DirEntry> = fs::read_dir(folder)?.collect::<Result<_, _>>()?;
     entries.retain(|entry| {
         let is_file = entry.file_type().is_ok_and(|kind| kind.is_file());
-        is_file && entry.file_name().as_bytes().ends_with(b".mcap.partial")
+        is_file && entry.file_name().as_bytes().ends_with(ending)
     });
     entries.sort_by_key(DirEntry::file_name);
     Ok(entries)
@@ -84,7 +110,7 @@ fn repair_all(folder: &Path, reserve: Option<u64>, begun: SystemTime, board: &Bo
     // Of this thread alone; refused, it is a neighbour like any other.
     let _ = setpriority_process(None, NICE);
     let log = |level, text| board.announce(What::Log { level, text });
-    let entries = match entries(folder) {
+    let entries = match entries(folder, b".mcap.partial") {
         Ok(entries) => entries,
         Err(error) if error.kind() == io::ErrorKind::NotFound => return,
         Err(error) => return log(Level::Warn, format!("{}: {error}; nothing in it is repaired", folder.display())),

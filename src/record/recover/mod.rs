@@ -7,12 +7,15 @@
 //!
 //! 1. Not whole, with something recorded: repaired into a file of the finished name. The `.partial`
 //!    is removed once that file has its name, or kept as `.damaged` if anything of it was left out. A finished file is never touched: the repaired one stands beside it, `.recovered.mcap`.
-//! 2. Whole, and only its name is missing (a kill at the very end): it gets its name.
+//! 2. Whole, and only its name is missing (a kill at the very end): it gets its name, or a free one beside the file
+//!    that has it by now, and stays as it is otherwise.
 //! 3. Of no bytes: removed, and said. Whole as far as it goes and without a sample: set aside as `.empty`. No MCAP file,
 //!    or damaged and without a message: set aside as `.damaged`. Both are said once, and their number stays taken.
 //!
-//! Invariant: every message of a repaired file is, byte for byte, one that was recorded: its chunk's check value is
-//! right, or the kernel that has kept the order of writes is still running.
+//! Invariant: the check value of every chunk of ours that is taken is right. Messages of a last chunk that is cut have
+//! none: they are taken only while the kernel runs that kept the order of their writes, which proves that they were
+//! written, not that no bit of them changed since. They are counted, said, and a reason not to call the file GOOD.
+//! Invariant: what the recorder called BAD stays BAD.
 //! Invariant: at every moment all that was recorded is in a file that a later repair finds or in the
 //! repaired file; a repair that ends in its middle leaves a `.recovering`, which the next one replaces.
 //! Invariant: a file somebody else writes or repairs is left alone.
@@ -23,6 +26,8 @@ mod copy;
 mod damage;
 mod folder;
 mod names;
+#[cfg(test)]
+mod proof;
 mod said;
 mod summary;
 #[cfg(test)]
@@ -36,15 +41,14 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use super::episode::publish;
 use super::lock::{self, Lock};
 use crate::episode_format::walk::MAGIC;
-use crate::episode_format::{self, OpenError};
+use crate::episode_format::{self, Failed, OpenError};
 use crate::{text, time};
 
 pub use self::copy::recover_bytes;
 use self::copy::{Copied, Damage};
-pub use self::folder::{Repairs, left_behind};
+pub use self::folder::{Repairs, finished, is_damaged, left_behind};
 use self::names::{Names, set_aside};
 use self::summary::{Made, Summary};
 pub use super::walk::{FileEnd, LeftOut};
@@ -78,6 +82,15 @@ pub enum RecoverError {
     /// The user ended it.
     #[error("{}: interrupted; it is as it was", .0.display())]
     Interrupted(PathBuf),
+}
+
+impl From<OpenError> for RecoverError {
+    fn from(error: OpenError) -> Self {
+        match error {
+            OpenError::Io { path, source } => Self::Io { path, source },
+            OpenError::NotFile(path) => Self::NotFile(path),
+        }
+    }
 }
 
 impl RecoverError {
@@ -160,11 +173,13 @@ pub struct Repaired {
     pub left_out: LeftOut,
     /// Messages left out because the definition of their channel is lost, by the channel's number.
     pub nameless: BTreeMap<u16, u64>,
-    /// Messages taken from a chunk that the end of the file cuts: written since this machine was started, they are
-    /// what was written.
+    /// Messages taken without a check value from a chunk that the end of the file cuts: they were written since this
+    /// machine was started.
     pub ordered_messages: u64,
     /// Records left out because they contradict others.
     pub refused_records: u64,
+    /// Why its recorder called it BAD, if it did so after the last message.
+    pub failed: Option<String>,
     /// Time of the last message, RFC 3339.
     pub last: String,
     /// The original, where it holds more than the repaired file, or where it is no `.partial`.
@@ -184,10 +199,7 @@ pub fn recover(path: &Path, watch: &mut Watch<'_>) -> Result<Recovered, RecoverE
     if fs::symlink_metadata(path).map_err(io)?.is_symlink() {
         return Err(RecoverError::NotFile(path.to_owned()));
     }
-    let (file, _) = episode_format::open(path).map_err(|error| match error {
-        OpenError::Io { path, source } => RecoverError::Io { path, source },
-        OpenError::NotFile(path) => RecoverError::NotFile(path),
-    })?;
+    let (file, _) = episode_format::open(path)?;
     let names = Names::of(path);
     match lock::take(&file, path).map_err(io)? {
         Lock::Ours => {}
@@ -199,7 +211,8 @@ pub fn recover(path: &Path, watch: &mut Watch<'_>) -> Result<Recovered, RecoverE
     }
     // From here on nobody else writes it.
     let size = file.metadata().map_err(io)?.len();
-    let mut source = Source { path, file, size };
+    let failed = Failed::of(&file, size).map_err(io)?;
+    let mut source = Source { path, file, size, failed };
     let outcome = if names.is_partial { source.partial(&names, watch) } else { source.finished(&names, watch) };
     outcome.map(|outcome| Recovered { file: path.to_owned(), outcome })
 }
@@ -209,6 +222,8 @@ struct Source<'a> {
     path: &'a Path,
     file: File,
     size: u64,
+    /// What its recorder wrote behind it.
+    failed: Option<Failed>,
 }
 
 impl Source<'_> {
@@ -219,12 +234,9 @@ impl Source<'_> {
         }
         // A footer at the end: perhaps the whole episode, perhaps one that was repaired already.
         let known = if self.ends_with_magic()? { self.read(watch)? } else { None };
-        if known.is_some_and(|known| known.is_whole()) {
-            match publish(self.path, &names.finished) {
-                Ok(()) => return Ok(Outcome::Whole { to: names.finished.clone() }),
-                Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
-                Err(error) => return Err(self.io(error)),
-            }
+        if self.failed.is_none() && known.is_some_and(|known| known.is_whole()) {
+            let to = names.publish(self.path).map_err(|source| self.io(source))?;
+            return Ok(Outcome::Whole { to });
         }
         let path = self.path;
         let aside = |ending| {
@@ -268,7 +280,7 @@ impl Source<'_> {
 
     fn finished(&mut self, names: &Names, watch: &mut Watch<'_>) -> Result<Outcome, RecoverError> {
         let Some(known) = self.read(watch)? else { return Err(RecoverError::NotMcap(self.path.to_owned())) };
-        if known.is_whole() {
+        if self.failed.is_none() && known.is_whole() {
             return Ok(Outcome::Whole { to: self.path.to_owned() });
         }
         let sha256 = self.sha256(watch)?;
@@ -290,7 +302,8 @@ impl Source<'_> {
     /// After an error there is no such file.
     fn copy(&self, to: &Path, sha256: String, watch: &mut Watch<'_>) -> Result<Option<Copied>, RecoverError> {
         let boot = episode_format::boot_id();
-        let about = copy::About { name: &self.name(), sha256, time_ns: time::realtime_ns(), boot };
+        let failed = self.failed.as_ref();
+        let about = copy::About { name: &self.name(), sha256, time_ns: time::realtime_ns(), boot, failed };
         let copied = names::create(to).map_err(copy::Error::Write).and_then(|file| {
             let copied = copy::copy(&self.file, self.size, &about, file, watch);
             if !matches!(copied, Ok(Some(_))) {
@@ -334,18 +347,10 @@ impl Source<'_> {
 
     /// Gives the repaired file its name, another one if that is taken.
     fn publish(&self, names: &Names) -> Result<PathBuf, RecoverError> {
-        for to in names.candidates() {
-            match publish(&names.recovering, &to) {
-                Ok(()) => return Ok(to),
-                Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
-                Err(source) => {
-                    remove(&names.recovering);
-                    return Err(RecoverError::Io { path: to, source });
-                }
-            }
-        }
-        remove(&names.recovering);
-        Err(self.io(io::Error::new(io::ErrorKind::AlreadyExists, "no free name for the repaired file")))
+        names.publish(&names.recovering).map_err(|source| {
+            remove(&names.recovering);
+            self.io(source)
+        })
     }
 
     fn ends_with_magic(&mut self) -> Result<bool, RecoverError> {
@@ -374,7 +379,7 @@ fn remove(recovering: &Path) {
 
 impl Copied {
     fn repaired(&self, to: PathBuf, original: Option<PathBuf>) -> Repaired {
-        let Damage { walked, unread_bytes, refused_records, ref nameless } = self.damage;
+        let Damage { walked, unread_bytes, refused_records, ref nameless, ref failed } = self.damage;
         Repaired {
             to,
             seconds: self.summary.seconds(),
@@ -386,6 +391,7 @@ impl Copied {
             nameless: nameless.clone(),
             ordered_messages: walked.ordered_messages,
             refused_records,
+            failed: failed.clone(),
             last: time::rfc3339(self.summary.last_ns),
             original,
         }

@@ -38,9 +38,21 @@ impl Names {
         Self { is_partial: partial.is_some(), finished, recovering, base }
     }
 
-    /// Names for the repaired file, the best first. The finished name of a `.partial` can only be
+    /// Gives `file` the first of its [`Self::candidates`] that is free; returns it.
+    pub(super) fn publish(&self, file: &Path) -> io::Result<PathBuf> {
+        for to in self.candidates() {
+            match publish(file, &to) {
+                Ok(()) => return Ok(to),
+                Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
+                Err(error) => return Err(error),
+            }
+        }
+        Err(io::Error::new(io::ErrorKind::AlreadyExists, "no free name for the whole file"))
+    }
+
+    /// Names for the whole file, the best first. The finished name of a `.partial` can only be
     /// taken by a file that somebody else put there.
-    pub(super) fn candidates(&self) -> impl Iterator<Item = PathBuf> {
+    fn candidates(&self) -> impl Iterator<Item = PathBuf> {
         let first = self.is_partial.then(|| self.finished.clone());
         first.into_iter().chain((1..ATTEMPTS).map(|number| beside(&self.base, number)))
     }

@@ -7,7 +7,8 @@ use serde_json::{Map, Value, json};
 use super::copy::{About, Damage};
 use super::summary::{LOSSLESS, SHA256, Summary};
 use super::{FileEnd, Outcome, Recovered, Repaired};
-use crate::status::Level;
+use crate::episode_format::FAILED;
+use crate::status::{Grade, Level};
 use crate::text;
 use crate::time;
 
@@ -34,7 +35,7 @@ pub(super) fn end(summary: &Summary) -> BTreeMap<String, String> {
 /// is not: the keys of [`LeftOut`](super::LeftOut), and as JSON `nameless` `{channel: messages}`. `ordered_messages` were
 /// taken without a check value, because the machine has not been started anew since they were written.
 pub(super) fn recovered(summary: &Summary, damage: &Damage, about: &About<'_>, size: u64) -> BTreeMap<String, String> {
-    let Damage { walked, unread_bytes, refused_records, nameless } = damage;
+    let Damage { walked, unread_bytes, refused_records, nameless, failed } = damage;
     let end = serde_json::to_value(walked.end).ok();
     let mut said = text_map([
         ("software", concat!("rapid ", env!("CARGO_PKG_VERSION")).to_owned()),
@@ -56,7 +57,13 @@ pub(super) fn recovered(summary: &Summary, damage: &Damage, about: &About<'_>, s
     if let Ok(Value::Object(left_out)) = serde_json::to_value(walked.left_out) {
         said.extend(left_out.into_iter().map(|(key, count)| (key, count.to_string())));
     }
+    said.extend(failed.iter().map(|why| (FAILED.to_owned(), why.clone())));
     said
+}
+
+/// What `rapid/summary` says of an episode that its recorder called BAD only after it had written that.
+pub(super) fn failed(why: &str) -> BTreeMap<String, String> {
+    text_map([("verdict", Grade::Bad.word().to_owned()), ("reasons", json!([why]).to_string())])
 }
 
 fn text_map<const N: usize>(pairs: [(&str, String); N]) -> BTreeMap<String, String> {
@@ -70,7 +77,7 @@ impl Recovered {
         let name = |path: &std::path::Path| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
         let (level, text) = match &self.outcome {
             Outcome::Repaired(repaired) => {
-                let whole = repaired.original.is_none();
+                let whole = repaired.original.is_none() && repaired.failed.is_none();
                 let mut said = repaired.sentence();
                 if repaired.to != self.file.with_extension("") {
                     said = format!("{said}; now {}", name(&repaired.to));
@@ -106,10 +113,14 @@ impl Repaired {
             said.push_str("; ");
             said.push_str(&text);
         };
+        if let Some(why) = &self.failed {
+            but(format!("BAD: {why}"));
+        }
         let unread = counted(self.unread_bytes, "byte");
         match self.end {
             FileEnd::Finished => {}
             FileEnd::Unfinished => but("the last second may be missing".to_owned()),
+            FileEnd::Torn if self.unread_bytes == 0 => but("the last second may be missing".to_owned()),
             FileEnd::Torn => {
                 let were = if self.unread_bytes == 1 { "was" } else { "were" };
                 but(format!("the last second may be missing: {unread} at the end {were} torn"));
@@ -118,7 +129,9 @@ impl Repaired {
         }
         if self.ordered_messages > 0 {
             let messages = counted(self.ordered_messages, "message");
-            but(format!("{messages} of a torn chunk taken, written since this machine was started"));
+            but(format!(
+                "{messages} of a torn chunk taken without a check value, written since this machine was started"
+            ));
         }
         self.left_out.sentences(self.damaged_chunks).into_iter().for_each(&mut but);
         if !self.nameless.is_empty() {
@@ -159,6 +172,7 @@ mod tests {
                 nameless: BTreeMap::from([(7, count)]),
                 ordered_messages: 0,
                 refused_records: count,
+                failed: None,
             };
             repaired.sentence()
         };

@@ -2,9 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use super::super::walk::op;
+use super::super::walk::{Walked, op};
 use super::super::wire::Fields;
-use crate::episode_format::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, RECOVERED, SUMMARY};
+use crate::episode_format::{ABOUT, EVENT_TOPIC, FAILED, FRAME_TOPIC, LOG_TOPIC, RECOVERED, SUMMARY};
 
 /// Key of `rapid/recovered`: "true" where nothing of the original is left out but a torn end.
 pub(super) const LOSSLESS: &str = "lossless";
@@ -24,8 +24,11 @@ pub(super) struct Summary {
     pub(super) frames: u64,
     /// The recorder wrote its own summary.
     pub(super) has_end: bool,
-    /// The file is whole, as a container.
+    /// The file is whole, as a container, and what proves it is there.
     is_sound: bool,
+    is_proven: bool,
+    /// Why the recorder of the file that this one was made of called it BAD.
+    pub(super) failed: Option<String>,
     /// Channels, by number.
     pub(super) channels: BTreeMap<u16, Channel>,
     /// When the episode began, as the recorder says.
@@ -95,14 +98,14 @@ impl Summary {
     }
 
     /// Says whether every byte of the file was understood and is right.
-    pub(super) fn sound(&mut self, sound: bool) {
-        self.is_sound = sound;
+    pub(super) fn walked(&mut self, walked: &Walked) {
+        (self.is_sound, self.is_proven) = (walked.sound, walked.proven);
     }
 
-    /// Is the file whole, and an episode of ours to its end? A recorder that gave up has written no
-    /// summary, whatever became of the file's end.
+    /// Is the file whole, and an episode of ours to its end, with every check value? A recorder that gave up has written
+    /// no summary, whatever became of the file's end.
     pub(super) fn is_whole(&self) -> bool {
-        self.is_sound && (self.has_end || self.begin_ns.is_none())
+        self.is_sound && (self.has_end && self.is_proven || self.begin_ns.is_none())
     }
 
     fn channel(&mut self, mut fields: Fields<'_>) -> Option<()> {
@@ -142,6 +145,7 @@ impl Summary {
             _ => {
                 let lossless = map.get(LOSSLESS).is_some_and(|said| said == "true");
                 let bytes = map.get("source_bytes").and_then(|bytes| bytes.parse().ok());
+                self.failed = map.remove(FAILED).or(self.failed.take());
                 let origin = |(sha256, bytes)| Origin { sha256, bytes, lossless };
                 self.origin = map.remove(SHA256).zip(bytes).map(origin);
             }

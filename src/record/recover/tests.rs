@@ -17,7 +17,7 @@ pub(super) fn go_on(_: u64, _: u64) -> ControlFlow<()> {
     ControlFlow::Continue(())
 }
 
-fn repaired(path: &Path) -> Repaired {
+pub(super) fn repaired(path: &Path) -> Repaired {
     match recover(path, &mut go_on).unwrap().outcome {
         Outcome::Repaired(repaired) => repaired,
         other => panic!("{other:?}"),
@@ -64,7 +64,7 @@ async fn a_torn_episode_becomes_a_whole_one_with_all_that_was_in_it() {
     let (level, sentence) = said.sentence();
     let expected = format!(
         "20261121_t_003.mcap.partial: repaired, {:.1} s, {} messages; the last second may be missing: {} bytes at the end were torn; \
-         {} messages of a torn chunk taken, written since this machine was started",
+         {} messages of a torn chunk taken without a check value, written since this machine was started",
         repaired.seconds,
         crate::text::count(repaired.messages),
         crate::text::count(repaired.unread_bytes),
@@ -102,8 +102,11 @@ async fn a_torn_episode_becomes_a_whole_one_with_all_that_was_in_it() {
     assert_eq!((inspected.end, inspected.messages), (FileEnd::Finished, messages.len() as u64));
     assert!((inspected.seconds - seconds).abs() < 1e-9 && inspected.dropped.is_none());
     assert_eq!(inspected.verdict.grade().unwrap(), Grade::Bad, "a modality of the test never delivers");
-    let reason = "the file is not whole: it was repaired, and what came last may be missing";
-    assert!(inspected.verdict.reasons().contains(&reason), "{:?}", inspected.verdict);
+    let reason = format!(
+        "the file is not whole: it was repaired; what came last may be missing; {} messages at its end are taken without a check value",
+        crate::text::count(repaired.ordered_messages)
+    );
+    assert!(inspected.verdict.reasons().contains(&reason.as_str()), "{:?}", inspected.verdict);
 }
 
 #[tokio::test]
@@ -299,7 +302,7 @@ impl Sink for SmallDisk {
 #[test]
 fn a_disk_that_is_full_at_any_byte_is_said() {
     let bytes = testing::episode(testing::options().compression(None));
-    let about = About { name: "bytes.mcap", sha256: String::new(), time_ns: 0, boot: None };
+    let about = About { name: "bytes.mcap", sha256: String::new(), time_ns: 0, boot: None, failed: None };
     let needed = recover_bytes(&bytes).unwrap().len();
     for room in (0..needed).step_by(13) {
         let disk = SmallDisk(Vec::new(), room);

@@ -1,6 +1,7 @@
 //! Disks that fail, kills and panics.
 
 use super::*;
+use crate::episode_format::Failed;
 
 /// A disk of few bytes.
 struct SmallDisk(File, usize);
@@ -38,11 +39,14 @@ async fn a_full_disk_ends_the_episode_and_not_the_recorder() {
     for seq in 0..4000 {
         bench.sample(CAM, 1, seq, Stamp::now().0, 0);
     }
-    let What::Episode { file, bytes, error, .. } = bench.until_closed(&mut events).await else { unreachable!() };
+    let closed = bench.until_closed(&mut events).await;
+    let sentence = closed.sentence().unwrap().1;
+    let What::Episode { file, bytes, error, .. } = closed else { unreachable!() };
     assert_eq!(file, finished.with_extension("mcap.partial"));
-    assert_eq!(bytes, 100_000);
+    assert_eq!(bytes, 100_000 + Failed::mark("no storage space").len() as u64);
     let error = error.unwrap();
-    assert!(error.contains("no storage space") && error.contains("place-block_001.mcap.partial"), "{error}");
+    assert!(error.contains("no storage space"), "{error}");
+    assert_eq!(sentence.matches("place-block_001.mcap.partial").count(), 1, "{sentence}");
     assert!(!finished.exists() && bench.board.snapshot().recording.is_none());
     // The next one goes well.
     let second = bench.recorder.start(bench.request(None)).await.unwrap();
@@ -83,7 +87,10 @@ async fn nothing_is_written_behind_a_write_that_failed() {
     }
     let What::Episode { file, bytes, error, .. } = bench.until_closed(&mut events).await else { unreachable!() };
     assert!(error.is_some());
-    assert_eq!(bytes, 100_000);
+    // Nothing of the episode: only that it failed.
+    let mark = Failed::mark("no storage space");
+    assert_eq!(bytes, 100_000 + mark.len() as u64);
+    assert!(std::fs::read(&file).unwrap().ends_with(&mark));
     assert_eq!(inspect::inspect(&file).unwrap().end, inspect::FileEnd::Torn);
 }
 
@@ -167,7 +174,7 @@ async fn a_footer_without_our_summary_makes_no_episode_whole() {
 }
 
 /// A disk that takes everything and keeps nothing for sure.
-struct Unsure(File);
+pub(super) struct Unsure(pub(super) File);
 
 impl Write for Unsure {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {

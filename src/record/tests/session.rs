@@ -284,8 +284,12 @@ fn lost_actions_are_suspect_by_the_recorder_and_by_inspect_with_and_without_its_
         let report = acted(folder.path(), actions);
         let within = actions.iter().filter(|(_, at)| (1000..2000).contains(at)).count();
         assert_eq!(read(&report.file).on(crate::action::ACTION_TOPIC).count(), within, "{what}");
-        let reasons: Vec<_> =
-            lost.map(|lost| format!("{lost} actions are not in the file (limit 0)")).into_iter().collect();
+        let reasons: Vec<_> = lost
+            .map(|lost| {
+                format!("{lost} {} not in the file (limit 0)", if lost == 1 { "action is" } else { "actions are" })
+            })
+            .into_iter()
+            .collect();
         let grade = if lost.is_some() { Grade::Suspect } else { Grade::Good };
         assert_eq!((report.verdict.grade, &report.verdict.reasons), (grade, &reasons), "{what}");
         let said = inspect::inspect(&report.file).unwrap();
@@ -297,7 +301,7 @@ fn lost_actions_are_suspect_by_the_recorder_and_by_inspect_with_and_without_its_
         std::fs::write(&killed, &bytes[..summary]).unwrap();
         let said = inspect::inspect(&killed).unwrap();
         let mut of_actions = said.verdict.reasons();
-        of_actions.retain(|reason| reason.contains("actions"));
+        of_actions.retain(|reason| reason.contains("action"));
         assert_eq!(of_actions, reasons, "{what}, killed");
     }
 }

@@ -94,6 +94,8 @@ async fn a_file_that_is_cut_or_replaced_while_it_is_recorded_ends_the_episode_an
         assert_eq!(verdict.grade, Grade::Bad, "{what}");
         assert!(verdict.why().contains(why), "{what}: {}", verdict.why());
         assert!(!finished.exists() && file.extension().is_some_and(|extension| extension == "partial"), "{what}");
+        assert_eq!(error.matches(".mcap").count(), 0, "{what}: whoever shows it names the file beside it: {error}");
+        found_again(what, why, &file);
         if why.contains("place") {
             let partial = finished.with_extension("mcap.partial");
             assert_eq!(std::fs::read_to_string(partial).unwrap(), "of somebody else", "{what}");
@@ -126,6 +128,96 @@ async fn a_file_that_is_changed_within_while_it_is_recorded_is_not_called_good()
         assert!(error.contains("another program") && error.contains("while it was recorded"), "{what}: {error}");
         assert_eq!(report.verdict.grade, Grade::Bad, "{what}");
         assert!(!finished.exists(), "{what}");
+        found_again(what, "another program", &report.file);
+    }
+}
+
+/// What the recorder said of a file is said by whoever reads it later, and of what a repair makes of it.
+fn found_again(what: &str, why: &str, file: &Path) {
+    let is_found = |file: &Path| {
+        let said = inspect::list(file).verdict;
+        assert_eq!(said.grade(), Some(Grade::Bad), "{what}: {}: {said:?}", file.display());
+        assert!(said.reasons().iter().any(|reason| reason.contains(why)), "{what}: {}: {said:?}", file.display());
+    };
+    is_found(file);
+    // In another folder: a test may still have to see what is in this one.
+    let folder = tempfile::tempdir().unwrap();
+    let partial = folder.path().join(file.file_name().unwrap());
+    std::fs::copy(file, &partial).unwrap();
+    let said = recover::recover(&partial, &mut |_, _| std::ops::ControlFlow::Continue(())).unwrap();
+    let recover::Outcome::Repaired(repaired) = &said.outcome else { panic!("{what}: {said:?}") };
+    assert!(said.sentence().1.contains(why), "{what}: {}", said.sentence().1);
+    is_found(&repaired.to);
+    // Once more, as it is repaired again or given its name.
+    let again = recover::recover(&repaired.to, &mut |_, _| std::ops::ControlFlow::Continue(())).unwrap();
+    assert!(matches!(again.outcome, recover::Outcome::Whole { .. }), "{what}: {again:?}");
+    is_found(&repaired.to);
+}
+
+#[tokio::test]
+async fn an_episode_that_is_whole_when_the_disk_refuses_it_stays_bad() {
+    // The last write of all: the summary says GOOD by then.
+    let bench = Bench::with_sink(|file| Box::new(super::faults::Unsure(file)));
+    bench.recorder.start(bench.request(None)).await.unwrap();
+    bench.sample(TOF, 1, 0, Stamp::now().0, 0);
+    let report = bench.recorder.stop().await.unwrap();
+    assert_eq!(report.verdict.grade, Grade::Bad);
+    found_again("not on the disk", "cable of the disk pulled", &report.file);
+}
+
+#[tokio::test]
+async fn an_episode_whose_name_was_taken_gets_the_next_one_and_keeps_its_verdict() {
+    let deeds: [(&str, Deed); 5] = [
+        ("a file", |file| Some(File::create_new(file.with_extension("")).unwrap())),
+        ("an episode", |file| {
+            std::fs::copy(file, file.with_extension("")).unwrap();
+            None
+        }),
+        ("a link that leads nowhere", |file| {
+            std::os::unix::fs::symlink("nowhere", file.with_extension("")).unwrap();
+            None
+        }),
+        ("a folder", |file| {
+            std::fs::create_dir(file.with_extension("")).unwrap();
+            None
+        }),
+        ("two files", |file| {
+            std::fs::write(file.with_extension(""), "first").unwrap();
+            std::fs::write(
+                file.with_file_name(
+                    file.file_name().unwrap().to_str().unwrap().replace("_001.mcap.partial", "_002.mcap"),
+                ),
+                "second",
+            )
+            .unwrap();
+            None
+        }),
+    ];
+    for (what, deed) in deeds {
+        let (bench, finished, _kept, mut events) = recorded(deed).await;
+        let planted = std::fs::symlink_metadata(&finished).unwrap();
+        let report = bench.recorder.stop().await.unwrap();
+        assert_eq!(report.error, None, "{what}");
+        let number = if what == "two files" { "_003.mcap" } else { "_002.mcap" };
+        let expected = finished.to_str().unwrap().replace("_001.mcap", number);
+        assert_eq!(report.file, Path::new(&expected), "{what}");
+        let said = inspect::inspect(&report.file).unwrap();
+        assert_eq!(said.verdict.verdict(), Some(&report.verdict), "{what}");
+        assert!(!report.verdict.why().contains("not whole") && !report.verdict.why().contains("written"), "{what}");
+        assert_eq!(read(&report.file).on("/rapid/cam_wrist").count(), 400, "{what}");
+        let there = std::fs::symlink_metadata(&finished).unwrap();
+        let is = |it: &std::fs::Metadata| (it.file_type(), it.len(), std::os::unix::fs::MetadataExt::ino(it));
+        assert_eq!(is(&there), is(&planted), "{what}");
+        assert!(!finished.with_extension("mcap.partial").exists(), "{what}");
+        let mut logged = Vec::new();
+        while let Ok(event) = events.try_recv() {
+            if let What::Log { level: Level::Warn, text } = event.what {
+                logged.push(text);
+            }
+        }
+        let names =
+            [finished.file_name().unwrap(), report.file.file_name().unwrap()].map(|name| name.to_str().unwrap());
+        assert!(logged.iter().any(|text| names.iter().all(|name| text.contains(name))), "{what}: {logged:?}");
     }
 }
 

@@ -228,8 +228,7 @@ fn the_file_and_what_is_missing_in_it_count_and_the_gravest_comes_first() {
     let of = |file| Facts { masks_dropped: 2, events_missed: 1, ..facts(&modalities, file) };
     let said = judge(&of(FileState::NotWhole("it was recovered")));
     let lost = "cam: 5 of 215 samples lost by the device (limit 1 %)";
-    let missing =
-        ["2 publications of the mask are not in the file (limit 0)", "1 events are not in the file (limit 0)"];
+    let missing = ["2 publications of the mask are not in the file (limit 0)", "1 event is not in the file (limit 0)"];
     assert_eq!(said.reasons, ["the file is not whole: it was recovered", lost, missing[0], missing[1]]);
     assert_eq!(said.grade, Grade::Suspect);
     let said = judge(&of(FileState::Failed("no space left on device")));
