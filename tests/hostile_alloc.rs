@@ -144,12 +144,12 @@ fn files() -> Vec<(&'static str, Vec<u8>)> {
     let wide = [&u32::try_from(wide.len()).unwrap().to_le_bytes()[..], &wide].concat();
     let definitions = |number: u32| channel(u16::try_from(number).unwrap_or(0), "/a", &wide);
     let metadata = |number: u32| record(0x0c, &[text(&format!("m{number}")), wide.clone()].concat());
-    let pictures: Vec<u8> = (0..14_u16)
+    let pictures: Vec<u8> = (0..14_u8)
         .flat_map(|n| {
             let size = [0x80, 0x80, 0x80, 0x04];
-            let picture = message(n + 1, 0, 0, &[&[0x12][..], &size, &vec![n as u8; 8 << 20]].concat());
+            let picture = message(u16::from(n) + 1, 0, 0, &[&[0x12][..], &size, &vec![n; 8 << 20]].concat());
             let bit = n.to_string();
-            let defined = channel(n + 1, "/c", &map(&[("modality", &format!("c{n}")), ("bit", &bit)]));
+            let defined = channel(u16::from(n) + 1, "/c", &map(&[("modality", &format!("c{n}")), ("bit", &bit)]));
             chunk(&[defined, picture].concat())
         })
         .collect();
