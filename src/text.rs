@@ -187,6 +187,12 @@ pub fn count(number: u64) -> String {
     text
 }
 
+/// So many of something: `1 message`, `9,312 messages`.
+#[must_use]
+pub fn counted(number: u64, what: &str) -> String {
+    format!("{} {what}{}", count(number), if number == 1 { "" } else { "s" })
+}
+
 /// Samples per second, with one decimal below 1000.
 #[must_use]
 pub fn hertz(hz: f64) -> String {

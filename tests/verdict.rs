@@ -1,6 +1,8 @@
 //! GOOD is earned: whatever is changed in the file of a good episode, no way to ask calls it GOOD any more.
 
 #![allow(clippy::expect_used, reason = "what fails here fails a test")]
+#[path = "verdict/edits.rs"]
+mod edits;
 mod support;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -185,7 +187,16 @@ fn no_changed_file_is_good_by_any_way_to_ask() {
     let name = good(&place);
     let whole = std::fs::read(place.path("episodes").join(&name)).expect("episode");
     assert_eq!(counted_as_good(&place, "episodes"), 1, "the episode itself counts");
-    let mutants = mutants(&whole, &foreign(50));
+    let other = std::fs::read(place.path("episodes").join(good(&place))).expect("episode");
+    let mut mutants = mutants(&whole, &foreign(50));
+    let (same, edits) = edits::edits(&whole, &other);
+    let same = inspect::inspect_bytes(&same).expect("an episode");
+    assert_eq!(same.verdict.reasons(), Vec::<&str>::new(), "written once more, it is what it was");
+    for (name, bytes) in &edits {
+        let said = inspect::inspect_bytes(bytes).map(|said| said.verdict.reasons().join("; "));
+        println!("{name}: {}", said.unwrap_or_default());
+    }
+    mutants.extend(edits);
     assert!(mutants.len() >= 600, "{} mutations", mutants.len());
     let folder = place.path("mutants");
     std::fs::create_dir(&folder).expect("folder");

@@ -72,8 +72,12 @@ pub(super) enum Opened {
     TooMuch,
 }
 
+/// What a record of a compressed chunk counts, bytes decompressed: it is shown and judged, however short it is. Samples
+/// of a 1 kHz sensor compress to six bytes and more.
+const RECORD: u64 = 400;
+
 /// Opens `content`, which begins with `head`. What has to be decompressed is in `unpacked` then and is taken off
-/// `budget`, bytes.
+/// `budget`, bytes, with [`RECORD`] for each of its records.
 pub(super) fn open(head: &ChunkHead, content: &[u8], unpacked: &mut Vec<u8>, budget: &mut u64) -> Opened {
     let packed = usize::try_from(head.bytes).ok().and_then(|begin| Some((begin, content.get(begin..)?)));
     let Some((begin, rest)) = packed else { return Opened::Damaged };
@@ -81,7 +85,7 @@ pub(super) fn open(head: &ChunkHead, content: &[u8], unpacked: &mut Vec<u8>, bud
         return Opened::Damaged;
     };
     if head.packing == Packing::Plain {
-        let right = head.size == head.packed && is_sound(packed, head.crc) && fits(packed);
+        let right = head.size == head.packed && is_sound(packed, head.crc) && count(packed).is_some();
         let range = begin..begin + packed.len();
         return if right { Opened::Right(Records { unpacked: false, range }) } else { Opened::Damaged };
     }
@@ -94,8 +98,12 @@ pub(super) fn open(head: &ChunkHead, content: &[u8], unpacked: &mut Vec<u8>, bud
     }
     let whole = unpack(head.packing, packed, head.size, unpacked).is_some();
     *budget = budget.saturating_sub(unpacked.len() as u64);
-    let right = whole && is_sound(unpacked, head.crc) && fits(unpacked);
-    if right { Opened::Right(Records { unpacked: true, range: 0..unpacked.len() }) } else { Opened::Damaged }
+    let Some(records) = count(unpacked).filter(|_| whole && is_sound(unpacked, head.crc)) else {
+        return Opened::Damaged;
+    };
+    let Some(left) = budget.checked_sub(records.saturating_mul(RECORD)) else { return Opened::TooMuch };
+    *budget = left;
+    Opened::Right(Records { unpacked: true, range: 0..unpacked.len() })
 }
 
 /// Are `bytes` as they were written? A check value of zero says that there is none.
@@ -109,15 +117,14 @@ pub(super) fn take<'a>(records: &mut Fields<'a>) -> Option<(u8, &'a [u8])> {
     Some((opcode, records.bytes(length)?))
 }
 
-/// Do whole records fill these bytes?
-fn fits(records: &[u8]) -> bool {
-    let mut fields = Fields(records);
+/// How many records fill these bytes; `None` if the last is not whole.
+fn count(records: &[u8]) -> Option<u64> {
+    let (mut fields, mut count) = (Fields(records), 0);
     while !fields.0.is_empty() {
-        if take(&mut fields).is_none() {
-            return false;
-        }
+        take(&mut fields)?;
+        count += 1;
     }
-    true
+    Some(count)
 }
 
 /// May a record of a chunk begin like this: opcode and length, and of a message `begin`, the first of its bytes?

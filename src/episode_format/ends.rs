@@ -67,6 +67,7 @@ impl<R: ReadAt> Walk<R> {
         let is_crc_right = self.data_ended && footer.is_some_and(|(_, _, crc)| crc == summary);
         let is_right = footer.is_some_and(|(begin, _, crc)| begins(begin) && (crc == 0 || crc == summary));
         self.checked &= self.data_ended && is_right;
+        self.walked.indexed = footer.is_some_and(|(begin, ..)| begin != 0);
         self.proven &= is_crc_right;
         if !is_crc_right {
             self.summarised.clear();

@@ -12,8 +12,8 @@ use super::wire::Fields;
 
 /// The footer's record and the magic number behind it, bytes.
 pub(super) const TAIL: u64 = 9 + 20 + 8;
-/// Bytes of a summary: what lists twenty million chunks.
-const LARGEST: u64 = 2 << 30;
+/// Bytes of a summary: what lists two million chunks, 2 TB of an episode. Without one the chunks are searched for.
+const LARGEST: u64 = 256 << 20;
 /// Bytes read at once.
 const PIECE: u64 = 1 << 20;
 

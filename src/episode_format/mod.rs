@@ -13,6 +13,8 @@ mod index;
 mod names;
 pub(crate) mod op;
 pub(crate) mod own;
+mod owners;
+mod passed;
 mod resync;
 mod source;
 mod structure;

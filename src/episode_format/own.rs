@@ -8,17 +8,20 @@
 //! Layout: private opcode [`op::OWN`], which other readers pass over; its content is [`MARK`], 16 bytes of the episode,
 //! then schema and channel records with their heads, each schema before the channels that need it.
 //!
-//! Which episode a file is follows from its first chunk if everything before that is right. Otherwise it follows from its
-//! last right chunk: what lies in a message of an episode is followed by the rest of that episode.
+//! Which episode a file is follows from its metadata `rapid`, or from its first chunk, if everything before that is right.
+//! Otherwise from all of its right chunks, see `owners`.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 
 use super::chunk::{Records, take};
+use super::header::Writer;
 use super::op;
+use super::owners;
 use super::source::ReadAt;
 use super::walk::Walk;
 use super::wire::Fields;
+use super::{ABOUT, BOOT_ID};
 
 /// Tells the record from another program's of the same opcode.
 const MARK: [u8; 8] = *b"rapid/1\n";
@@ -35,6 +38,12 @@ impl EpisodeId {
     pub(crate) fn new(wall_ns: u64, monotonic_ns: u64) -> Self {
         Self((u128::from(wall_ns) << 64 | u128::from(monotonic_ns)).to_le_bytes())
     }
+
+    /// Of the episode whose metadata [`ABOUT`] are these.
+    pub(crate) fn of(about: &BTreeMap<String, String>) -> Option<Self> {
+        let number = |key: &str| about.get(key)?.parse().ok();
+        Some(Self::new(number("begin_wall_ns")?, number("begin_monotonic_ns")?))
+    }
 }
 
 /// Which episode the chunks of a file belong to.
@@ -50,7 +59,7 @@ pub(super) enum Owner {
 }
 
 impl Owner {
-    fn of(episode: Option<EpisodeId>) -> Self {
+    pub(super) fn of(episode: Option<EpisodeId>) -> Self {
         episode.map_or(Self::Unnamed, Self::Episode)
     }
 }
@@ -71,6 +80,11 @@ impl Own {
     /// The record's content.
     pub(crate) fn content(&self) -> &[u8] {
         &self.content
+    }
+
+    /// The record's content without the definitions.
+    pub(crate) fn episode(&self) -> &[u8] {
+        self.content.get(..MARK.len() + 16).unwrap_or_default()
     }
 
     /// Adds the definition whose record has this content, unless its number is known. Those beyond [`LARGEST`] bytes are
@@ -125,24 +139,44 @@ impl<R: ReadAt> Walk<R> {
 
     /// Learns from a right chunk, where the records of this file lie; `false`: it is not this file's.
     pub(super) fn learn(&mut self, records: &Records) -> io::Result<bool> {
-        if !self.checked {
-            self.look_for_owner()?;
-        }
         let bytes = if records.unpacked { &self.unpacked } else { &self.buffer };
-        let own = first(bytes.get(records.range.clone()).unwrap_or_default());
-        let owner = Owner::of(own.map(|(episode, _)| episode));
-        self.names.last = owner;
-        if self.names.owner == Owner::Unknown && self.checked {
-            self.names.owner = owner;
+        let owner = Owner::of(first(bytes.get(records.range.clone()).unwrap_or_default()).map(|(episode, _)| episode));
+        if self.names.owner == Owner::Unknown {
+            // The metadata at the beginning name the episode; without them its first chunk does.
+            let is_named = self.names.named.is_none_or(|named| owner == Owner::Episode(named));
+            if self.checked && is_named {
+                self.names.owner = owner;
+            } else {
+                self.look_for_owner()?;
+            }
         }
         if matches!(self.names.owner, Owner::Episode(_)) && self.names.owner != owner {
-            return Ok(self.checked);
+            self.walked.left_out.other_chunks += 1;
+            self.checked = false;
+            return Ok(false);
         }
-        let mut definitions = own.map_or(Fields(&[]), |(_, definitions)| definitions);
+        let bytes = if records.unpacked { &self.unpacked } else { &self.buffer };
+        let bytes = bytes.get(records.range.clone()).unwrap_or_default();
+        if self.names.owner == Owner::Any {
+            self.names.owners.take(owner, bytes);
+        }
+        let mut definitions = first(bytes).map_or(Fields(&[]), |(_, definitions)| definitions);
         while let Some((opcode, data)) = take(&mut definitions) {
             self.names.wait(opcode, data);
         }
         Ok(true)
+    }
+
+    /// What the file says of itself at its beginning.
+    pub(super) fn remember(&mut self, opcode: u8) {
+        if opcode != op::METADATA || self.begin_ns.is_some() {
+            return;
+        }
+        let Some(about) = about(&self.buffer) else { return };
+        self.begin_ns = about.get("begin_wall_ns").and_then(|ns| ns.parse().ok());
+        self.same_boot = self.boot.is_some() && about.get(BOOT_ID) == self.boot.as_ref();
+        // What stands behind damage may be another file's.
+        self.names.named = if self.checked && !self.chunked { EpisodeId::of(&about) } else { None };
     }
 
     /// Are these records, found behind damage, this file's? Where no chunk says, it is those that contradict nothing.
@@ -157,17 +191,46 @@ impl<R: ReadAt> Walk<R> {
         })
     }
 
-    /// Reads the file once more, for its last right chunk, unless it is known or was looked for.
+    /// Reads the file once more, for whose it is, unless that is known or was looked for.
     fn look_for_owner(&mut self) -> io::Result<()> {
         if self.names.owner != Owner::Unknown {
             return Ok(());
         }
-        let file: &dyn ReadAt = &self.source.file;
-        let walk = Walk::begin(file, self.source.size, Some(Owner::Any))?;
         self.names.owner = Owner::Unnamed;
-        let Some(mut walk) = walk else { return Ok(()) };
+        let Some(mut walk) = Walk::begin(self.source.again(), Some(Owner::Any))? else { return Ok(()) };
         while walk.advance()? {}
-        self.names.owner = if walk.names.last == Owner::Unknown { Owner::Unnamed } else { walk.names.last };
+        let owners = walk.names.owners;
+        let is_foreign = self.walked.writer == Writer::Another;
+        self.names.owner = owners.owner(self.names.named, self.checked, is_foreign, &mut self.source)?;
         Ok(())
     }
+
+    /// Where the episode begins of which a chunk was found, if its beginning stands before that, behind something else.
+    pub(super) fn beginning(&mut self) -> io::Result<Option<u64>> {
+        let Some(episode) = self.episode() else { return Ok(None) };
+        let begun = owners::beginnings(&mut self.source, self.at)?;
+        Ok(begun.into_iter().find_map(|(at, begun)| (begun == episode).then_some(at)))
+    }
+}
+
+/// The metadata [`ABOUT`], if the content of a metadata record is those.
+pub(super) fn about(content: &[u8]) -> Option<BTreeMap<String, String>> {
+    let mut fields = Fields(content);
+    fields.string().filter(|name| *name == ABOUT)?;
+    fields.map()
+}
+
+/// The episode that each [`MARK`] in `bytes` behind the first names.
+pub(super) fn marks(bytes: &[u8]) -> impl Iterator<Item = EpisodeId> {
+    let mut rest = bytes;
+    std::iter::from_fn(move || {
+        while let Some(at) = rest.iter().position(|byte| *byte == MARK[0]) {
+            let here = rest.get(at..)?;
+            rest = here.get(1..)?;
+            if let Some((episode, _)) = here.strip_prefix(&MARK).and_then(<[u8]>::split_first_chunk) {
+                return Some(EpisodeId(*episode));
+            }
+        }
+        None
+    })
 }

@@ -132,8 +132,8 @@ impl<R: ReadAt> Walk<R> {
         if self.defining {
             return Ok(());
         }
-        let file: &dyn ReadAt = &self.source.file;
-        let Some(mut walk) = Walk::begin(file, self.source.size, Some(self.names.owner))? else { return Ok(()) };
+        let owner = Some(self.names.owner);
+        let Some(mut walk) = Walk::begin(self.source.again(), owner)? else { return Ok(()) };
         while let Some(record) = walk.next()? {
             self.names.wait(record.opcode, record.data);
         }
@@ -199,7 +199,7 @@ impl<R: ReadAt> Walk<R> {
         let is_foreign = self.at == 0;
         let mut is_behind = false;
         loop {
-            let is_early = !self.chunked && !is_behind;
+            let is_early = !self.chunked && !is_behind && self.early > 0;
             let window = self.source.peek(at, LOOK)?;
             if window.len() < LEAST || at >= end {
                 return Ok(false);
@@ -233,6 +233,8 @@ impl<R: ReadAt> Walk<R> {
 
     /// Does a whole record without a check value of its own stand at `at`, before any chunk?
     fn is_early(&mut self, at: u64) -> io::Result<bool> {
+        // What it says of its fields is looked for anywhere in the file.
+        self.early = self.early.saturating_sub(1);
         let mut head = Fields(self.source.peek(at, 9)?);
         let (Some(opcode), Some(length)) = (head.u8(), head.u64()) else { return Ok(false) };
         let is_there = length <= MAX_RECORD.min(self.source.size.saturating_sub(at + HEAD));

@@ -41,6 +41,8 @@ impl<T: ReadAt + ?Sized> ReadAt for &T {
 /// A file and what of it was read last.
 pub(super) struct Source<R> {
     pub(super) file: R,
+    /// Bytes before the file: places are counted from there.
+    base: u64,
     /// Bytes of the file: no more are read, whatever it grows to; fewer once its end is met.
     pub(super) size: u64,
     window: Vec<u8>,
@@ -49,7 +51,18 @@ pub(super) struct Source<R> {
 
 impl<R: ReadAt> Source<R> {
     pub(super) fn new(file: R, size: u64) -> Self {
-        Self { file, size, window: Vec::new(), at: 0 }
+        Self { file, base: 0, size, window: Vec::new(), at: 0 }
+    }
+
+    /// The same, once more.
+    pub(super) fn again(&self) -> Source<&dyn ReadAt> {
+        Source { file: &self.file, base: self.base, size: self.size, window: Vec::new(), at: 0 }
+    }
+
+    /// What begins at `base`.
+    pub(super) fn from(self, base: u64) -> Self {
+        let size = self.size.saturating_sub(base);
+        Self { base: self.base.saturating_add(base), size, window: Vec::new(), ..self }
     }
 
     /// The bytes from `at` on: `count` of them or more, fewer only at the end of the file. `count` is at most
@@ -87,7 +100,7 @@ impl<R: ReadAt> Source<R> {
             into.resize(have + usize::try_from(piece).unwrap_or(usize::MAX), 0);
             let Some(room) = into.get_mut(have..) else { break };
             let read = loop {
-                match self.file.read_at(room, at + have as u64) {
+                match self.file.read_at(room, self.base.saturating_add(at + have as u64)) {
                     Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
                     read => break read?,
                 }

@@ -25,7 +25,6 @@ use super::own::Owner;
 use super::source::{ReadAt, Source};
 use super::structure::{Fit, is_known};
 use super::wire::Fields;
-use super::{ABOUT, BOOT_ID};
 
 pub(crate) use super::op;
 pub use super::walked::{FileEnd, LeftOut};
@@ -37,12 +36,13 @@ pub(crate) const MAGIC: [u8; 8] = *b"\x89MCAP0\r\n";
 pub(crate) const MAX_RECORD: u64 = 256 << 20;
 /// An opcode, and the length of what follows as u64.
 pub(super) const HEAD: u64 = 9;
-/// Bytes read at once of what is passed over.
-const PIECE: u64 = 64 << 10;
-/// Bytes that may be decompressed: of any file, and for each of its bytes.
+/// Bytes that may be decompressed, what each record counts among them: of any file, and for each of its bytes.
 const UNPACKED: (u64, u64) = (256 << 20, 200);
 /// Bytes that may be tried in vain for a chunk in any file, and for each of its bytes.
 const TRIED: (u64, u64) = (64 << 20, 2);
+
+/// Records without a check value that may be tried before the first chunk: of any file, and one for so many of its bytes.
+const EARLY: (u64, u64) = (4096, 64 << 10);
 
 /// A file being read.
 #[allow(clippy::struct_excessive_bools, reason = "each is a fact of its own about the file")]
@@ -86,8 +86,10 @@ pub(crate) struct Walk<R> {
     pub(super) defining: bool,
     /// Bytes that may still be decompressed, and be tried in vain.
     pub(super) budget: (u64, u64),
+    /// Records without a check value that may still be tried before the first chunk.
+    pub(super) early: u64,
     /// The boot of this machine, if that is to prove anything; then, whether the episode was recorded in it.
-    boot: Option<String>,
+    pub(super) boot: Option<String>,
     pub(super) same_boot: bool,
     /// When the episode began, ns since 1970.
     pub(super) begin_ns: Option<u64>,
@@ -124,14 +126,40 @@ enum Found {
 impl<R: ReadAt> Walk<R> {
     /// Begins to read a file of `size` bytes. `None`: no MCAP file.
     pub(crate) fn new(file: R, size: u64) -> io::Result<Option<Self>> {
-        Self::begin(file, size, None)
+        Self::begin(Source::new(file, size), None)
     }
 
     /// With an owner only the definitions of its chunks are of use.
-    pub(super) fn begin(file: R, size: u64, owner: Option<Owner>) -> io::Result<Option<Self>> {
-        let allowed = |(least, each): (u64, u64)| size.saturating_mul(each).saturating_add(least);
-        let mut walk = Self {
-            source: Source::new(file, size),
+    pub(super) fn begin(source: Source<R>, owner: Option<Owner>) -> io::Result<Option<Self>> {
+        let mut walk = Self::of(source, owner);
+        if walk.source.peek(0, MAGIC.len())?.starts_with(&MAGIC) {
+            walk.begin_read();
+            return Ok(Some(walk));
+        }
+        // Its beginning may be damaged, or stand behind something else: then there is a chunk of it somewhere.
+        if !walk.resync(0, 0)? {
+            return Ok(None);
+        }
+        let Some(base) = walk.beginning()? else { return Ok(Some(walk)) };
+        let mut walk = Self::of(walk.source.from(base), owner);
+        walk.begin_read();
+        walk.walked.left_out.bytes_before = base;
+        Ok(Some(walk))
+    }
+
+    /// The magic number was read.
+    fn begin_read(&mut self) {
+        self.crc.update(&MAGIC);
+        self.at = MAGIC.len() as u64;
+        (self.sure, self.walked.bytes) = (self.at, self.at);
+    }
+
+    fn of(source: Source<R>, owner: Option<Owner>) -> Self {
+        let allowed = |(least, each): (u64, u64)| source.size.saturating_mul(each).saturating_add(least);
+        let budget = (allowed(UNPACKED), allowed(TRIED));
+        let early = EARLY.0 + source.size / EARLY.1;
+        Self {
+            source,
             at: 0,
             sure: 0,
             walked: Walked::nothing(),
@@ -153,21 +181,14 @@ impl<R: ReadAt> Walk<R> {
             names: Names::of(owner.unwrap_or_default()),
             summarised: Vec::new(),
             defining: owner.is_some(),
-            budget: (allowed(UNPACKED), allowed(TRIED)),
+            budget,
+            early,
             boot: None,
             same_boot: false,
             begin_ns: None,
             index: Known::NotYet,
             looked: false,
-        };
-        if walk.source.peek(0, MAGIC.len())?.starts_with(&MAGIC) {
-            walk.crc.update(&MAGIC);
-            walk.at = MAGIC.len() as u64;
-            (walk.sure, walk.walked.bytes) = (walk.at, walk.at);
-            return Ok(Some(walk));
         }
-        // Its beginning may be damaged: then there is a chunk of it somewhere.
-        Ok(walk.resync(0, 0)?.then_some(walk))
     }
 
     /// Lets `boot`, the present boot of this machine, prove what was written last: the kernel keeps the order of writes.
@@ -244,6 +265,8 @@ impl<R: ReadAt> Walk<R> {
         self.ended = true;
         self.walked.end = end;
         self.walked.left_out.nameless_messages = self.names.unknown.values().sum();
+        self.walked.left_out.excess_records = self.names.excess;
+        self.walked.episode = self.episode();
         self.walked.sound = self.checked
             && end == FileEnd::Finished
             && self.walked.bytes == self.source.size
@@ -267,6 +290,10 @@ impl<R: ReadAt> Walk<R> {
             let end = chunk.range.end - fields.0.len();
             chunk.range.start = end;
             self.walked.bytes += if self.cut { HEAD + data.len() as u64 } else { 0 };
+            if matches!(opcode, op::METADATA | op::ATTACHMENT) {
+                self.names.excess += 1;
+                continue;
+            }
             if self.names.admit(opcode, data) {
                 self.walked.ordered_messages += u64::from(self.cut && opcode == op::MESSAGE);
                 return Some(Found::Chunk { opcode, unpacked: chunk.unpacked, range: end - data.len()..end });
@@ -330,7 +357,7 @@ impl<R: ReadAt> Walk<R> {
             }
             op::SCHEMA | op::CHANNEL if self.data_ended => {
                 self.read(at, length.min(MAX_RECORD))?;
-                if self.defining {
+                if self.defining && self.names.has_room(&self.buffer) {
                     self.summarised.push((opcode, self.buffer.clone()));
                 }
                 Step::Again
@@ -350,50 +377,5 @@ impl<R: ReadAt> Walk<R> {
         };
         self.walked.bytes += HEAD + length;
         Ok(step)
-    }
-
-    /// What the file says of itself at its beginning.
-    fn remember(&mut self, opcode: u8) {
-        if opcode != op::METADATA || self.begin_ns.is_some() {
-            return;
-        }
-        let mut fields = Fields(&self.buffer);
-        let about = fields.string().filter(|name| *name == ABOUT).and_then(|_| fields.map());
-        let Some(about) = about else { return };
-        self.begin_ns = about.get("begin_wall_ns").and_then(|ns| ns.parse().ok());
-        self.same_boot = self.boot.is_some() && about.get(BOOT_ID) == self.boot.as_ref();
-    }
-
-    fn skip(&mut self, at: u64, length: u64) -> io::Result<Step> {
-        let (mut at, end) = (at + HEAD, at + HEAD + length);
-        while self.counts() && at < end {
-            let piece = (end - at).min(PIECE);
-            if !self.source.read(at, piece, &mut self.buffer)? {
-                break;
-            }
-            self.crc.update(&self.buffer);
-            at += piece;
-        }
-        Ok(Step::Again)
-    }
-
-    /// Reads the content of the record at `at` into the buffer.
-    pub(super) fn read(&mut self, at: u64, length: u64) -> io::Result<()> {
-        self.source.read(at + HEAD, length, &mut self.buffer)?;
-        if self.counts() {
-            self.crc.update(&self.buffer);
-        }
-        Ok(())
-    }
-
-    /// Is the check value of what is being read of use? Behind damage only that of the summary.
-    fn counts(&self) -> bool {
-        self.checked || self.data_ended
-    }
-
-    /// Continues with the summary, at `at`.
-    pub(super) fn summary_at(&mut self, at: u64) {
-        (self.at, self.summary, self.data_ended) = (at, at, true);
-        self.crc = crc32fast::Hasher::new();
     }
 }

@@ -3,6 +3,7 @@
 use std::io;
 
 use super::header::Writer;
+use super::own::EpisodeId;
 use super::source::ReadAt;
 use super::walk::Walk;
 use crate::text;
@@ -30,6 +31,8 @@ pub struct LeftOut {
     pub oversized_records: u64,
     /// Chunks that would decompress to more than is allowed for a file of this size.
     pub swollen_chunks: u64,
+    /// Definitions of channels and metadata beyond 8 MiB, channels beyond 4096, and metadata within a chunk.
+    pub excess_records: u64,
     /// Chunks that were there before.
     pub repeated_chunks: u64,
     /// Messages of right chunks whose channel nothing in the file defines.
@@ -38,6 +41,10 @@ pub struct LeftOut {
     pub unproven_messages: u64,
     /// Bytes of that chunk.
     pub unproven_bytes: u64,
+    /// Chunks of another episode.
+    pub other_chunks: u64,
+    /// Bytes before the beginning of the file: an archive's, or a mail's.
+    pub bytes_before: u64,
     /// Bytes behind the end of a finished file: they are another file's, or belong to none.
     pub bytes_behind: u64,
 }
@@ -46,15 +53,18 @@ impl LeftOut {
     /// What it is and how much, for people, one part after the other; of `damaged_chunks` too.
     #[must_use]
     pub fn sentences(&self, damaged_chunks: u64) -> Vec<String> {
-        let Self { gaps, oversized_records, swollen_chunks, repeated_chunks, nameless_messages, bytes_behind, .. } =
-            *self;
+        let Self { gaps, oversized_records, swollen_chunks, excess_records, repeated_chunks, .. } = *self;
+        let Self { nameless_messages, other_chunks, bytes_before, bytes_behind, .. } = *self;
         let said = [
             (damaged_chunks, "damaged chunk", "left out"),
             (gaps, "place", "not readable"),
             (oversized_records, "record", "left out: larger than 256 MiB"),
             (swollen_chunks, "chunk", "left out: too large when decompressed"),
+            (excess_records, "record", "left out: too many definitions, or none where they belong"),
             (repeated_chunks, "chunk", "left out: a repetition"),
             (nameless_messages, "message", "left out: the definition of the channel is lost"),
+            (other_chunks, "chunk", "left out: another episode's"),
+            (bytes_before, "byte", "left out: before the beginning of the file"),
             (bytes_behind, "byte", "left out: behind the end of the file"),
         ];
         let said = said.into_iter().filter(|(count, ..)| *count > 0);
@@ -73,7 +83,7 @@ impl LeftOut {
 
 /// `1 place is`, `2,000 places are`.
 fn is(count: u64, what: &str) -> String {
-    if count == 1 { format!("1 {what} is") } else { format!("{} {what}s are", text::count(count)) }
+    format!("{} {}", text::counted(count, what), if count == 1 { "is" } else { "are" })
 }
 
 /// What a walk has found so far.
@@ -96,6 +106,10 @@ pub(crate) struct Walked {
     pub(crate) proven: bool,
     /// Which program wrote it.
     pub(crate) writer: Writer,
+    /// Its end says where its index lies.
+    pub(crate) indexed: bool,
+    /// The episode that its chunks say they belong to.
+    pub(crate) episode: Option<EpisodeId>,
 }
 
 impl Walked {
@@ -110,6 +124,8 @@ impl Walked {
             sound: false,
             proven: false,
             writer: Writer::Unknown,
+            indexed: false,
+            episode: None,
         }
     }
 

@@ -21,6 +21,9 @@ const CHUNK_BYTES: u64 = 1 << 20;
 const SMALL_BYTES: u64 = 64 << 10;
 /// Gathers the small records between chunks (message indexes) into one write.
 const BUFFER_BYTES: usize = 64 << 10;
+/// Bytes that may be spent on saying whose a chunk is: of any file, and for each byte of its other records. A hostile file
+/// of many short chunks would otherwise become thousands of times as long when it is repaired.
+const REPEATED: (u64, u64) = (16 << 20, 8);
 /// Opcode and length of a record.
 const HEAD: u64 = 9;
 /// Bytes of a message before its data.
@@ -32,6 +35,8 @@ pub(super) struct Chunks<S: Write> {
     own: Option<Own>,
     /// Bytes of records in the chunk that is open; none where none is.
     open: u64,
+    /// Bytes that may still be spent on saying whose a chunk is; beyond them it says no more than the episode.
+    spare: u64,
 }
 
 impl<S: Sink> Chunks<S> {
@@ -47,7 +52,7 @@ impl<S: Sink> Chunks<S> {
             .library(concat!("rapid/", env!("CARGO_PKG_VERSION")));
         let sink = NoSeek::new(BufWriter::with_capacity(BUFFER_BYTES, sink));
         let writer = Writer::with_options(sink, options).map_err(io_error)?;
-        Ok(Self { writer, own: episode.map(Own::new), open: 0 })
+        Ok(Self { writer, own: episode.map(Own::new), open: 0, spare: REPEATED.0 })
     }
 
     /// Has every chunk from now on say that it belongs to `episode`, unless they do already or a channel is defined.
@@ -63,11 +68,13 @@ impl<S: Sink> Chunks<S> {
             self.flush()?;
         }
         if let Some(own) = self.own.as_ref().filter(|_| self.open == 0) {
-            let content = own.content();
+            let content = if own.content().len() as u64 <= self.spare { own.content() } else { own.episode() };
+            self.spare = self.spare.saturating_sub(content.len() as u64);
             self.writer.write_private_record(op::OWN, content, PrivateRecordOptions::IncludeInChunks.into())?;
             self.open = HEAD + content.len() as u64;
         }
         self.open += HEAD + bytes as u64;
+        self.spare = self.spare.saturating_add(REPEATED.1.saturating_mul(bytes as u64));
         Ok(())
     }
 

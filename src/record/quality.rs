@@ -27,14 +27,17 @@ use crate::sync::Grid;
 use crate::time::{Stamp, nanoseconds};
 use plugged::Plugged;
 use presence::Presence;
-use tally::Tally;
 
 pub(super) use meter::{Counts, Meter, Seen};
 pub use tally::Spread;
+pub(super) use tally::Tally;
 
 /// Room for intervals without a sample until the mask of their time is known; a reader that is further
 /// behind has a disk that stands still, and may allocate.
 const PENDING: usize = 32;
+/// Most of them; then they are judged by the masks there are. A sensor at 1 kHz has so many in four seconds, in which the
+/// mask is published two thousand times.
+const MOST_PENDING: usize = 4096;
 
 /// A modality as it is to be measured.
 #[derive(Debug, Clone)]
@@ -190,6 +193,9 @@ impl Measures {
         let Some(Some(lane)) = self.lanes.get_mut(id.index()) else { return };
         let Some((from, to)) = lane.meter.sample(seen, deadline) else { return };
         if to - from > lane.longest_gap_ns {
+            if lane.pending.len() >= MOST_PENDING {
+                lane.settle(&self.presence);
+            }
             lane.pending.push((from, to));
         }
     }

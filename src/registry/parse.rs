@@ -21,6 +21,7 @@ mod node;
 mod process;
 mod program;
 mod verdict;
+mod window;
 
 use std::path::Path;
 use std::time::Duration;
@@ -104,8 +105,10 @@ impl Registry {
         warnings.extend(budget::fit(&mut drafts, rig.memory_budget, root.at_of("rig"), &mut problems));
         let modules = module::modules(&root, &drafts, &mut problems);
         problems.check()?;
+        let entries = window::entries(&drafts);
         let mut devices: Vec<_> = drafts.into_iter().filter_map(|draft| draft.finish(&verdict)).collect();
         devices.sort_by_key(|device| device.id);
+        warnings.extend(window::too_narrow(&devices, &entries, rig.sync_window, &problems));
         for device in &mut devices {
             if let NodeSpec::Lan(lan) = &mut device.node {
                 lan.keep_free(rig.disk_reserve);

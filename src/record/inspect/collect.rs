@@ -1,4 +1,6 @@
 //! Gathering an [`Inspection`] from the records of a file, in the order they lie in it.
+//!
+//! Invariant: memory is bounded, whatever the file holds; what is not kept and would be judged is counted, and is a reason.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -7,17 +9,25 @@ use super::super::configuration;
 use super::super::metadata::POLICY;
 use super::super::walk::{Walked, op};
 use super::super::wire::{Fields, protobuf, whole_protobuf};
-use super::judge::{Counted, Ending, Judge, Missing, without_metadata};
+use super::channel::Channel;
+use super::doubts::{Counted, Missing};
+use super::judge::{Ending, Judge, without_metadata};
 use super::policy::Gathered;
-use super::{EventReport, Inspection, Judgement, Lateness, MaskEdge, ModalityReport, TopicReport};
+use super::{EventReport, Inspection, Judgement, MaskEdge, ModalityReport, TopicReport};
 use super::{state, units};
 use crate::action::ACTION_TOPIC;
 use crate::episode_format::{ABOUT, EVENT_TOPIC, FAILED, FRAME_TOPIC, Failed, LOG_TOPIC, RECOVERED, SUMMARY, Writer};
 use crate::mask::{MASK_TOPIC, PhysicalMask};
 use crate::modality::ModalityId;
 
-/// Events kept: a rig that flaps all day must not fill the memory.
+/// Events and changes of the mask kept: a rig that flaps all day must not fill the memory.
 const MAX_EVENTS: usize = 10_000;
+/// Bytes of all of them.
+const MAX_EVENT_BYTES: usize = 16 << 20;
+/// Bytes that each counts beside its text.
+const EVENT: usize = 128;
+/// Bytes of an event that is read; those of ours have up to a few kB.
+const MAX_EVENT: usize = 64 << 10;
 
 /// See the module's comment.
 #[derive(Debug, Default)]
@@ -26,16 +36,17 @@ pub(super) struct Collected {
     about: BTreeMap<String, String>,
     summary: BTreeMap<String, String>,
     recovered: BTreeMap<String, String>,
-    messages: u64,
-    /// Records that are not what their kind has to be.
-    unread: u64,
+    counted: Counted,
     /// A topic or a record of metadata that only this program writes.
     is_ours: bool,
     first: Option<u64>,
     last: u64,
+    /// Bytes of the events kept.
+    event_bytes: usize,
+    /// Events that a device was plugged in or out.
+    plugs: usize,
     /// Time and value of the first mask and of every change.
     masks: Vec<(u64, u64)>,
-    frames: u64,
     /// Frames in which each bit is valid and stale.
     slots: BTreeMap<u8, (u64, u64)>,
     events: Vec<(u64, EventReport)>,
@@ -44,23 +55,6 @@ pub(super) struct Collected {
     /// Of those, what `opened` says as JSON.
     opened: Vec<(u64, String)>,
     policy: Gathered,
-}
-
-#[derive(Debug, Default)]
-struct Channel {
-    topic: String,
-    /// The modality, if it is one's.
-    id: Option<ModalityId>,
-    metadata: BTreeMap<String, String>,
-    messages: u64,
-    first: u64,
-    previous: u64,
-    latest: u64,
-    longest_gap: u64,
-    next: u32,
-    missing: u64,
-    /// Receipt minus capture, microseconds.
-    lateness: Vec<u32>,
 }
 
 impl Collected {
@@ -72,24 +66,21 @@ impl Collected {
             op::CHANNEL => self.channel(fields),
             op::METADATA => self.metadata(fields),
             op::MESSAGE => self.message(fields),
+            op::ATTACHMENT => self.attachment(fields),
             _ => Some(()),
         };
-        self.unread += u64::from(read.is_none());
+        self.counted.unread += u64::from(read.is_none());
     }
 
     fn channel(&mut self, mut fields: Fields<'_>) -> Option<()> {
         let (id, _schema) = (fields.u16()?, fields.u16()?);
         let (topic, _encoding) = (fields.string()?, fields.string()?);
-        let metadata = fields.map()?;
-        let modality = metadata.get("bit").and_then(|bit| bit.parse().ok()).and_then(ModalityId::new);
+        let mut metadata = fields.map()?;
+        let of = metadata.get("bit").and_then(|bit| bit.parse().ok()).and_then(ModalityId::new);
         self.is_ours |= [MASK_TOPIC, FRAME_TOPIC, EVENT_TOPIC, LOG_TOPIC].contains(&topic);
         // The summary repeats the channels.
-        self.channels.entry(id).or_insert_with(|| Channel {
-            topic: topic.to_owned(),
-            id: modality,
-            metadata,
-            ..Channel::default()
-        });
+        let known = self.channels.entry(id);
+        known.or_insert_with(|| Channel::new(topic.to_owned(), of, metadata.remove("modality")));
         Some(())
     }
 
@@ -99,12 +90,31 @@ impl Collected {
         let map = fields.map()?;
         match name {
             ABOUT => {
-                self.judge = Judge::of(&map);
-                self.about = map;
+                self.counted.abouts += 1;
+                // Of two the first: it was there when the episode began.
+                if self.counted.abouts == 1 {
+                    self.judge = Judge::of(&map);
+                    self.about = map;
+                }
             }
-            SUMMARY => self.summary = map,
+            SUMMARY => {
+                self.counted.summaries += 1;
+                self.summary = map;
+            }
             RECOVERED => self.recovered = map,
             _ => {}
+        }
+        Some(())
+    }
+
+    /// The registry, whose text the metadata before it repeat.
+    fn attachment(&mut self, mut fields: Fields<'_>) -> Option<()> {
+        let _times = (fields.u64()?, fields.u64()?);
+        let (name, _media_type) = (fields.string()?, fields.string()?);
+        let count = fields.u64()?;
+        let data = fields.bytes(count)?;
+        if name == "devices.toml" && self.counted.attached.is_none() {
+            self.counted.attached = Some(self.about.get("registry").is_some_and(|text| text.as_bytes() == data));
         }
         Some(())
     }
@@ -114,18 +124,20 @@ impl Collected {
         let (captured, received) = (fields.u64()?, fields.u64()?);
         let channel = self.channels.get_mut(&id)?;
         channel.count(sequence, captured, received);
-        self.messages += 1;
+        self.counted.messages += 1;
         self.first = Some(self.first.map_or(captured, |first| first.min(captured)));
         self.last = self.last.max(captured);
-        if self.judge.is_some() && whole_protobuf(fields.0).any(|field| field.is_none()) {
-            self.unread += 1;
+        let is_whole = !fields.0.is_empty() && whole_protobuf(fields.0).all(|field| field.is_some());
+        if self.judge.is_some() && !is_whole {
+            self.counted.unread += 1;
         }
         if let (Some(id), Some(judge)) = (channel.id, &mut self.judge) {
-            judge.sample(id, sequence, captured, received, fields.0);
+            let bytes = judge.sample(id, sequence, captured, received, fields.0);
+            self.counted.empty += u64::from(bytes == 0);
         }
         match channel.topic.as_str() {
             MASK_TOPIC => self.mask(captured, fields.0),
-            FRAME_TOPIC => self.frame(fields.0),
+            FRAME_TOPIC => self.frame(captured, fields.0),
             EVENT_TOPIC => self.event(captured, fields.0),
             _ => {}
         }
@@ -134,16 +146,22 @@ impl Collected {
 
     fn mask(&mut self, at: u64, message: &[u8]) {
         let mask = protobuf(message).filter(|(field, _)| *field == 2).last().map_or(0, |(_, value)| value.number());
+        if self.masks.last().is_some_and(|(_, last)| *last == mask) {
+            return;
+        }
+        if self.masks.len() == MAX_EVENTS {
+            self.counted.unjudged += 1;
+            return;
+        }
+        self.masks.push((at, mask));
         if let Some(judge) = &mut self.judge {
             judge.mask(at, PhysicalMask(mask));
         }
-        if self.masks.last().is_none_or(|(_, last)| *last != mask) {
-            self.masks.push((at, mask));
-        }
     }
 
-    fn frame(&mut self, message: &[u8]) {
-        self.frames += 1;
+    fn frame(&mut self, at: u64, message: &[u8]) {
+        self.counted.last_frame = self.counted.last_frame.max(at);
+        self.counted.frames += 1;
         if let Some(judge) = &mut self.judge {
             judge.frame(message);
         }
@@ -165,13 +183,20 @@ impl Collected {
     }
 
     fn event(&mut self, at: u64, message: &[u8]) {
+        if message.len() > MAX_EVENT {
+            self.counted.unread += 1;
+            return;
+        }
         let mut event = EventReport { at: 0.0, kind: String::new(), device: String::new(), text: String::new() };
         for (field, value) in protobuf(message) {
             match field {
                 2 => event.kind = value.text(),
                 3 => event.device = value.text(),
                 4 => event.text = value.text(),
-                5 if event.kind == "opened" && self.opened.len() < MAX_EVENTS => self.opened.push((at, value.text())),
+                5 if event.kind == "opened" && self.event_bytes < MAX_EVENT_BYTES => {
+                    self.event_bytes += EVENT + value.bytes().len();
+                    self.opened.push((at, value.text()));
+                }
                 5 if event.kind == "publisher" => {
                     if let Some(judge) = &mut self.judge {
                         judge.publisher(&value.text());
@@ -182,9 +207,15 @@ impl Collected {
             }
         }
         if let (Some(judge), "attach" | "detach") = (&mut self.judge, event.kind.as_str()) {
-            judge.plugged(&event.device, at, event.kind == "attach");
+            self.plugs += 1;
+            if self.plugs <= MAX_EVENTS {
+                judge.plugged(&event.device, at, event.kind == "attach");
+            } else {
+                self.counted.unjudged += 1;
+            }
         }
-        if self.events.len() < MAX_EVENTS {
+        if self.events.len() < MAX_EVENTS && self.event_bytes < MAX_EVENT_BYTES {
+            self.event_bytes += EVENT + message.len();
             self.events.push((at, event));
         }
     }
@@ -211,18 +242,17 @@ impl Collected {
         let policy =
             std::mem::take(&mut self.policy).report(end_ns, [self.summary.get(POLICY), self.about.get(POLICY)]);
         let (mut modalities, topics) = self.topics(begin_ns, seconds);
-        let (messages, frames, unread) = (self.messages, self.frames, self.unread);
         let missing = |name| topics.iter().filter(|topic| topic.topic == name).map(|topic| topic.missing).sum();
-        let missing = Missing {
+        self.counted.missing = Missing {
             actions: missing(ACTION_TOPIC),
             masks: missing(MASK_TOPIC),
             events: missing(EVENT_TOPIC),
             frames: missing(FRAME_TOPIC),
         };
-        let counted = Counted { messages, frames, unread, missing };
         let repaired = state::repaired(&self.recovered);
         let (repaired, failed) = (repaired.as_deref(), failed.as_deref());
-        let ending = Ending { file: walked, seconds, summary: &self.summary, repaired, failed, counted };
+        let (about, summary, counted) = (&self.about, &self.summary, self.counted);
+        let ending = Ending { file: walked, seconds, about, summary, repaired, failed, counted };
         let verdict = match &judge {
             Some(judge) => Judgement::Episode(judge.judge(&mut modalities, &ending)),
             // What is damaged and has no name of its writer may be an episode.
@@ -258,11 +288,11 @@ impl Collected {
             present_at_begin,
             begin_ns,
             seconds,
-            messages: self.messages,
+            messages: counted.messages,
             dropped: state::sum(&self.summary, "dropped", &modalities, |quality| quality.dropped),
             lost: state::sum(&self.summary, "lost", &modalities, |quality| quality.lost),
             damaged: said(&self.summary, "damaged").parse().ok(),
-            frames: self.frames,
+            frames: counted.frames,
             skew: judge.and_then(|judge| judge.skew()),
             modalities,
             units,
@@ -275,7 +305,7 @@ impl Collected {
 
     fn topics(&mut self, begin_ns: u64, seconds: f64) -> (Vec<ModalityReport>, Vec<TopicReport>) {
         let (mut modalities, mut topics) = (Vec::new(), Vec::new());
-        for mut channel in std::mem::take(&mut self.channels).into_values() {
+        for channel in std::mem::take(&mut self.channels).into_values() {
             let topic = channel.report();
             let Some(id) = channel.id else {
                 topics.push(topic);
@@ -285,7 +315,7 @@ impl Collected {
             let together: f64 = present.iter().map(|(begin, end)| end - begin).sum();
             let (frames_valid, frames_stale) = self.slots.get(&id.bit()).copied().unwrap_or_default();
             modalities.push(ModalityReport {
-                name: channel.metadata.get("modality").unwrap_or(&channel.topic).clone(),
+                name: channel.modality.unwrap_or(channel.topic),
                 bit: id.bit(),
                 topic,
                 presence: (!self.masks.is_empty() && seconds > 0.0).then(|| (together / seconds).clamp(0.0, 1.0)),
@@ -320,48 +350,8 @@ impl Collected {
     }
 }
 
-impl Channel {
-    fn count(&mut self, sequence: u32, captured: u64, received: u64) {
-        if self.messages == 0 {
-            (self.first, self.latest) = (captured, captured);
-        } else {
-            self.longest_gap = self.longest_gap.max(captured.saturating_sub(self.previous));
-            // Numbers wrap after 32 bits; a step of more than half of that goes backwards.
-            let step = sequence.wrapping_sub(self.next);
-            self.missing += u64::from(if step <= u32::MAX / 2 { step } else { 0 });
-        }
-        self.messages += 1;
-        self.next = sequence.wrapping_add(1);
-        self.previous = captured;
-        self.first = self.first.min(captured);
-        self.latest = self.latest.max(captured);
-        self.lateness.push(u32::try_from(received.saturating_sub(captured) / 1000).unwrap_or(u32::MAX));
-    }
-
-    fn report(&mut self) -> TopicReport {
-        let span = from(self.first, self.latest);
-        let hz = if self.messages > 1 && span > 0.0 { (self.messages - 1) as f64 / span } else { 0.0 };
-        self.lateness.sort_unstable();
-        let at = |percent: usize| {
-            let last = self.lateness.len().checked_sub(1)?;
-            self.lateness.get(last * percent / 100).map(|us| f64::from(*us) / 1e3)
-        };
-        // A frame waits for its deadline, always as long.
-        let shown = self.topic != FRAME_TOPIC;
-        let lateness = (|| Some(Lateness { p50: at(50)?, p99: at(99)?, max: at(100)? }))().filter(|_| shown);
-        TopicReport {
-            topic: self.topic.clone(),
-            messages: self.messages,
-            hz,
-            missing: self.missing,
-            longest_gap: self.longest_gap as f64 / 1e9,
-            lateness,
-        }
-    }
-}
-
 /// Seconds from one wall time to another, negative if it lies before.
-fn from(begin_ns: u64, at_ns: u64) -> f64 {
+pub(super) fn from(begin_ns: u64, at_ns: u64) -> f64 {
     let distance = begin_ns.abs_diff(at_ns) as f64 / 1e9;
     if at_ns < begin_ns { -distance } else { distance }
 }

@@ -19,18 +19,13 @@ use super::super::verdict::{Facts, FileState, Finding, Judged, Losses, judge};
 use super::super::walk::Walked;
 use super::super::wire::{Proto, protobuf};
 use super::ModalityReport;
+use super::doubts::{self, Counted};
+use super::registered::{Registered, listed, registered};
 use super::state::{self, file_state};
 use crate::episode_format::{ABOUT, SUMMARY};
 use crate::mask::PhysicalMask;
-use crate::modality::{MAX_MODALITIES, ModalityId, ModalityKind};
-use crate::registry::{Registry, VerdictSpec};
+use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::status::{Grade, Verdict};
-use crate::time::nanoseconds;
-
-/// No registry is longer; the text of a hostile file may be.
-const LONGEST_REGISTRY: usize = 1 << 20;
-/// Patience with a modality of which the registry says nothing.
-const STALL_AFTER: Duration = Duration::from_millis(500);
 
 /// How a file came to its end.
 #[derive(Debug)]
@@ -39,6 +34,8 @@ pub(super) struct Ending<'a> {
     pub(super) file: Walked,
     /// Length of the episode, seconds.
     pub(super) seconds: f64,
+    /// What it says of itself at its beginning.
+    pub(super) about: &'a BTreeMap<String, String>,
     /// The recorder's summary; empty without one.
     pub(super) summary: &'a BTreeMap<String, String>,
     /// It was made of one that was not whole; the text says so.
@@ -47,28 +44,6 @@ pub(super) struct Ending<'a> {
     pub(super) failed: Option<&'a str>,
     /// What was counted in it.
     pub(super) counted: Counted,
-}
-
-/// What was counted in a file.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Counted {
-    /// Messages on all topics.
-    pub(super) messages: u64,
-    /// Ticks of the frame index.
-    pub(super) frames: u64,
-    /// Records that could not be understood.
-    pub(super) unread: u64,
-    /// Numbers missing between its messages.
-    pub(super) missing: Missing,
-}
-
-/// Numbers missing between the messages of a topic.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Missing {
-    pub(super) actions: u64,
-    pub(super) masks: u64,
-    pub(super) events: u64,
-    pub(super) frames: u64,
 }
 
 /// Measures an episode while its file is read.
@@ -86,13 +61,6 @@ pub(super) struct Judge {
     numbers: Vec<(Option<u32>, u64)>,
     /// By the events of the file.
     publishers: Publishers,
-}
-
-/// A modality of the registry in the file.
-#[derive(Debug)]
-struct Registered {
-    name: String,
-    measured: Measured,
 }
 
 impl Judge {
@@ -131,8 +99,15 @@ impl Judge {
         self.publishers.event(json);
     }
 
-    /// Takes the message of a sample.
-    pub(super) fn sample(&mut self, id: ModalityId, sequence: u32, captured: u64, received: u64, message: &[u8]) {
+    /// Takes the message of a sample; how many bytes it has.
+    pub(super) fn sample(
+        &mut self,
+        id: ModalityId,
+        sequence: u32,
+        captured: u64,
+        received: u64,
+        message: &[u8],
+    ) -> usize {
         if let Some((next, missing)) = self.numbers.get_mut(id.index()) {
             // Numbers wrap after 32 bits; a step of more than half of that goes backwards.
             let step = next.map_or(0, |next| sequence.wrapping_sub(next));
@@ -158,6 +133,7 @@ impl Judge {
             repeated: None,
         };
         self.measures.sample(id, &seen);
+        payload.len()
     }
 
     /// Takes a mask.
@@ -260,11 +236,7 @@ impl Judge {
                 "this version does not understand the registry in the file: judged by the usual limits",
             ));
         }
-        let passed_over = ending.counted.unread.saturating_add(ending.file.left_out.oversized_records);
-        if passed_over > 0 {
-            let records = if passed_over == 1 { "record" } else { "records" };
-            findings.push(Finding::suspect(format!("{passed_over} {records} in the file cannot be understood")));
-        }
+        findings.extend(doubts::of(ending));
         findings.extend(state::findings(ending));
         let has_channel = |known: &&Registered| !channels.iter().any(|of| of.bit == known.measured.id.bit());
         for known in self.modalities.iter().filter(has_channel) {
@@ -360,35 +332,4 @@ impl<'a> Recorded<'a> {
 fn objects(about: &BTreeMap<String, String>, key: &str) -> impl Iterator<Item = (String, Value)> + use<> {
     let object = about.get(key).and_then(|text| serde_json::from_str::<Map<String, Value>>(text).ok());
     object.unwrap_or_default().into_iter()
-}
-
-/// The modalities by the registry in the file, and the names of those that it expects.
-fn registered(about: &BTreeMap<String, String>) -> Option<(Vec<Registered>, Vec<String>)> {
-    let text = about.get("registry").filter(|text| text.len() <= LONGEST_REGISTRY)?;
-    let registry = Registry::parse(text, None).ok()?.registry;
-    // Nothing is reserved: how large payloads are, a file is not believed.
-    let measured = registry.devices.iter().map(|device| Registered {
-        name: device.name.clone(),
-        measured: Measured { id: device.id, limits: device.verdict, latency_ns: nanoseconds(device.latency) },
-    });
-    Some((measured.collect(), registry.rig.expect))
-}
-
-/// The modalities by their list, where this version does not understand the registry.
-fn listed(about: &BTreeMap<String, String>) -> Option<Vec<Registered>> {
-    let list: Vec<Value> = serde_json::from_str(about.get("modalities")?).ok()?;
-    let measured = |entry: &Value| {
-        let name = entry.get("name")?.as_str()?.to_owned();
-        let id = ModalityId::new(u8::try_from(entry.get("bit")?.as_u64()?).ok()?)?;
-        let kind: ModalityKind = serde_json::from_value(entry.get("kind")?.clone()).ok()?;
-        // Files of earlier versions have no latencies.
-        let latency_ns = entry.get("latency_ns").and_then(Value::as_u64).unwrap_or(0);
-        let measured = Measured { id, limits: VerdictSpec::of(kind, STALL_AFTER, None), latency_ns };
-        Some(Registered { name, measured })
-    };
-    let mut modalities: Vec<Registered> = list.iter().map(measured).collect::<Option<_>>()?;
-    modalities.sort_by_key(|modality| modality.measured.id);
-    // A hostile list may name one twice.
-    modalities.dedup_by_key(|modality| modality.measured.id);
-    Some(modalities)
 }

@@ -5,13 +5,16 @@
 //! Reads any file the recorder wrote, finished or not, from its beginning to where it ends.
 //!
 //! Invariant: GOOD is proven: see [`judge`]. What cannot be read or judged is never GOOD.
-//! Invariant: no file makes this panic, and memory does not grow with a file's payloads.
+//! Invariant: no file makes this panic, and memory does not grow with what it holds.
 
+mod channel;
 mod collect;
+mod doubts;
 mod judge;
 mod judgement;
 mod list;
 mod policy;
+mod registered;
 mod render;
 mod state;
 #[cfg(test)]

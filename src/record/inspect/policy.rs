@@ -1,5 +1,6 @@
 //! What a policy did in an episode, as its events say.
 //!
+//! Invariant: memory is bounded: texts are those of events, which are short, and of few reasons.
 //! Invariant: no text of a file makes this panic; what is not as the recorder writes it is left out.
 
 use std::collections::BTreeMap;
@@ -7,10 +8,14 @@ use std::collections::BTreeMap;
 use serde::Serialize;
 use serde_json::Value;
 
+use super::super::quality::Tally;
 use super::Lateness;
+use crate::text;
 
 /// Reasons kept apart; a file may hold any number of them.
 const MAX_REASONS: usize = 32;
+/// Latencies kept one by one: an hour of chunks at 18 Hz.
+const MAX_LATENCIES: usize = 1 << 16;
 const OTHER_REASONS: &str = "other reasons";
 /// Digits by which a bundle is told from another.
 const HASH: usize = 12;
@@ -52,8 +57,10 @@ pub(super) struct Gathered {
     told: Option<Value>,
     seen: bool,
     late: u64,
-    /// From the observation to the chunk, microseconds.
+    /// From the observation to the chunk, microseconds: of the first [`MAX_LATENCIES`] chunks, and of all.
     latencies: Vec<u32>,
+    all_latencies: Option<Tally>,
+    chunks: u64,
     /// How often each reason, and how long together, ns.
     holds: BTreeMap<String, (u64, u64)>,
     /// The hold in force, with its beginning.
@@ -87,7 +94,12 @@ impl Gathered {
     fn chunk(&mut self, said: &Value) {
         let ms = said.get("latency_ms").and_then(Value::as_f64).unwrap_or(0.0);
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saturates, as wanted")]
-        self.latencies.push((ms * 1e3).round() as u32);
+        let us = (ms * 1e3).round() as u32;
+        if self.latencies.len() < MAX_LATENCIES {
+            self.latencies.push(us);
+        }
+        self.all_latencies.get_or_insert_with(Tally::new).push(u64::from(us) * 1000);
+        self.chunks += 1;
         self.late += u64::from(said.get("skipped").and_then(Value::as_u64).is_some_and(|skipped| skipped > 0));
     }
 
@@ -97,6 +109,19 @@ impl Gathered {
         let (count, total) = self.holds.entry(if known { reason } else { OTHER_REASONS.to_owned() }).or_default();
         *count += 1;
         *total = total.saturating_add(at_ns.saturating_sub(since));
+    }
+
+    /// Exact of as many as are kept one by one, otherwise to one part in a hundred.
+    fn latency(&mut self) -> Option<Lateness> {
+        if self.chunks > MAX_LATENCIES as u64 {
+            return self.all_latencies.as_ref().and_then(Lateness::of);
+        }
+        self.latencies.sort_unstable();
+        let at = |percent: usize| {
+            let last = self.latencies.len().checked_sub(1)?;
+            self.latencies.get(last * percent / 100).map(|us| f64::from(*us) / 1e3)
+        };
+        Some(Lateness { p50: at(50)?, p99: at(99)?, max: at(100)? })
     }
 
     /// What the policy did until the end of the episode; `None` if there was none. What no event says
@@ -114,11 +139,7 @@ impl Gathered {
             told.or_else(|| recorded.as_ref()?.get(record)).cloned().unwrap_or_default()
         };
         let text = |event, record| of(event, record).as_str().unwrap_or_default().to_owned();
-        self.latencies.sort_unstable();
-        let at = |percent: usize| {
-            let last = self.latencies.len().checked_sub(1)?;
-            self.latencies.get(last * percent / 100).map(|us| f64::from(*us) / 1e3)
-        };
+        let latency = self.latency();
         let mut holds: Vec<_> = self
             .holds
             .into_iter()
@@ -129,9 +150,9 @@ impl Gathered {
             name: text("policy", "name"),
             hash: text("hash", "hash"),
             dry_run: of("dry_run", "dry_run").as_bool().unwrap_or(false),
-            chunks: self.latencies.len() as u64,
+            chunks: self.chunks,
             late_chunks: self.late,
-            latency: (|| Some(Lateness { p50: at(50)?, p99: at(99)?, max: at(100)? }))(),
+            latency,
             holds,
         })
     }
@@ -143,7 +164,7 @@ pub(super) fn words(policy: &PolicyReport) -> (Vec<String>, Vec<String>) {
     let hash: String = policy.hash.chars().take(HASH).collect();
     let mut words = vec![or(&policy.name), format!("hash {}", or(&hash))];
     words.extend(policy.dry_run.then(|| "dry run: nothing moved".to_owned()));
-    words.push(counted(policy.chunks, "chunk"));
+    words.push(text::counted(policy.chunks, "chunk"));
     words.extend((policy.late_chunks > 0).then(|| format!("{} late", policy.late_chunks)));
     words.extend(policy.latency.map(|Lateness { p50, p99, max }| format!("latency {p50:.1}/{p99:.1}/{max:.1} ms")));
     let (mut count, mut seconds) = (0_u64, 0.0);
@@ -151,15 +172,15 @@ pub(super) fn words(policy: &PolicyReport) -> (Vec<String>, Vec<String>) {
         count = count.saturating_add(hold.count);
         seconds += hold.seconds;
     }
-    words.push(if count > 0 { format!("{}, {seconds:.1} s", counted(count, "hold")) } else { "no holds".to_owned() });
+    words.push(if count > 0 {
+        format!("{}, {seconds:.1} s", text::counted(count, "hold"))
+    } else {
+        "no holds".to_owned()
+    });
     let reasons = policy.holds.iter();
     let reasons =
-        reasons.map(|hold| format!("{:.1} s in {}: {}", hold.seconds, counted(hold.count, "hold"), hold.reason));
+        reasons.map(|hold| format!("{:.1} s in {}: {}", hold.seconds, text::counted(hold.count, "hold"), hold.reason));
     (words, reasons.collect())
-}
-
-fn counted(count: u64, what: &str) -> String {
-    if count == 1 { format!("1 {what}") } else { format!("{count} {what}s") }
 }
 
 #[cfg(test)]

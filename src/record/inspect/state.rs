@@ -1,4 +1,4 @@
-//! The state of a file: whether it is whole, what a repair said of it, and what of it is counted.
+//! The state of a file: whether it is whole, what a repair recorded about it, and what of it is counted.
 
 use std::collections::BTreeMap;
 
@@ -55,10 +55,13 @@ pub(super) fn repaired(recovered: &BTreeMap<String, String>) -> Option<String> {
         gaps: count("gaps"),
         oversized_records: count("oversized_records"),
         swollen_chunks: count("swollen_chunks"),
+        excess_records: count("excess_records"),
         repeated_chunks: count("repeated_chunks"),
         nameless_messages: count("nameless_messages"),
         unproven_messages: count("unproven_messages"),
         unproven_bytes: count("unproven_bytes"),
+        other_chunks: count("other_chunks"),
+        bytes_before: count("bytes_before"),
         bytes_behind: count("bytes_behind"),
     };
     let mut said = vec!["it was repaired".to_owned()];

@@ -1,7 +1,8 @@
 //! What is counted of one modality, sample by sample.
 //!
-//! Invariant: taking a sample allocates nothing once the largest payload has been seen, and neither
-//! locks nor logs.
+//! Invariant: taking a sample neither allocates nor locks nor logs.
+
+use std::hash::{DefaultHasher, Hasher};
 
 use super::drift::Drift;
 use super::jpeg;
@@ -22,7 +23,7 @@ pub(in crate::record) struct Seen<'a> {
     pub(in crate::record) jpeg: bool,
     /// Its bytes.
     pub(in crate::record) payload: &'a [u8],
-    /// They are those of the sample before; `None`: to be found out here, with a copy of each.
+    /// They are those of the sample before; `None`: to be found out here, by a hash of each.
     pub(in crate::record) repeated: Option<bool>,
 }
 
@@ -92,8 +93,9 @@ pub(in crate::record) struct Meter {
     run_began_ns: u64,
     /// Are samples compared with the one before?
     compares: bool,
-    /// The bytes of the newest sample, unless whoever brings samples compares them.
-    newest: Vec<u8>,
+    /// Length and hash of the bytes of the newest sample, unless whoever brings samples compares them. Samples that are
+    /// equal have equal ones; whoever makes two others to have them makes an episode worse, never better.
+    newest: Option<(usize, u64)>,
 }
 
 impl Meter {
@@ -118,7 +120,7 @@ impl Meter {
             seq: None,
             run_began_ns: begin_ns,
             compares,
-            newest: Vec::new(),
+            newest: None,
         }
     }
 
@@ -167,13 +169,10 @@ impl Meter {
             return;
         }
         let repeated = seen.repeated.unwrap_or_else(|| {
-            // Equal bytes need no copy; of unequal pictures mostly the lengths differ already.
-            let equal = self.newest == seen.payload;
-            if !equal {
-                self.newest.clear();
-                self.newest.extend_from_slice(seen.payload);
-            }
-            equal
+            let mut hasher = DefaultHasher::new();
+            hasher.write(seen.payload);
+            let newest = Some((seen.payload.len(), hasher.finish()));
+            std::mem::replace(&mut self.newest, newest) == newest
         });
         if repeated && self.counts.samples > 1 {
             self.counts.repeated += 1;

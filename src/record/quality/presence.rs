@@ -38,7 +38,9 @@ impl Presence {
     pub(super) fn spans(&self, id: ModalityId, from: u64, to: u64) -> impl Iterator<Item = (u64, u64)> {
         // The edge in force at `from` is the last one at or before it.
         let first = self.edges.partition_point(|(at, _)| *at <= from).saturating_sub(1);
-        let edges = self.edges.get(first..).unwrap_or_default();
+        // None behind `to` is looked at: the work for spans that do not overlap is bounded by the number of edges.
+        let end = self.edges.partition_point(|(at, _)| *at < to).max(first);
+        let edges = self.edges.get(first..end).unwrap_or_default();
         let mut index = 0;
         std::iter::from_fn(move || {
             while edges.get(index).is_some_and(|(_, mask)| !mask.contains(id)) {

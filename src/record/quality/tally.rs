@@ -10,7 +10,7 @@ const DIGITS: u8 = 2;
 
 /// Times of one kind.
 #[derive(Debug)]
-pub(super) struct Tally {
+pub(in crate::record) struct Tally {
     /// `None` only if the bounds above made no sense.
     times: Option<Histogram<u32>>,
     longest_ns: u64,
@@ -31,11 +31,11 @@ pub struct Spread {
 }
 
 impl Tally {
-    pub(super) fn new() -> Self {
+    pub(in crate::record) fn new() -> Self {
         Self { times: Histogram::new_with_bounds(1, LONGEST_US, DIGITS).ok(), longest_ns: 0, count: 0 }
     }
 
-    pub(super) fn push(&mut self, time_ns: u64) {
+    pub(in crate::record) fn push(&mut self, time_ns: u64) {
         self.longest_ns = self.longest_ns.max(time_ns);
         self.count += 1;
         if let Some(times) = &mut self.times {
@@ -44,7 +44,7 @@ impl Tally {
     }
 
     /// What the times come to; `None` without any.
-    pub(super) fn spread(&self) -> Option<Spread> {
+    pub(in crate::record) fn spread(&self) -> Option<Spread> {
         let times = self.times.as_ref().filter(|_| self.count > 0)?;
         let max = self.longest_ns as f64 / 1e6;
         // The histogram answers with the upper end of a cell.

@@ -325,3 +325,19 @@ fn a_frame_at_the_edge_of_a_presence_may_lack_a_sample_and_no_other() {
         assert_eq!(meter.frames_missed, missed, "{frames}");
     }
 }
+
+#[test]
+fn what_waits_for_the_mask_is_bounded_and_judged_all_the_same() {
+    let mut measures = measures(ModalityKind::Scalars);
+    measures.mask(BEGIN, PhysicalMask(1));
+    let mut at = 0;
+    for seq in 0..3 * MOST_PENDING as u64 {
+        // Longer from one to the next.
+        at += seq;
+        measures.sample(id(0), &seen(seq, at, 0, b"x"));
+        assert!(measures.lanes[0].as_ref().is_some_and(|lane| lane.pending.len() <= MOST_PENDING));
+    }
+    // The last is the longest.
+    let longest = (3 * MOST_PENDING as u64 - 1) as f64 / 1e3;
+    assert_eq!(format!("{:.3}", quality_at(&measures, at).longest_gap), format!("{longest:.3}"));
+}

@@ -108,7 +108,7 @@ impl Recovered {
 
 impl Repaired {
     fn sentence(&self) -> String {
-        let mut said = format!("repaired, {:.1} s, {}", self.seconds, counted(self.messages, "message"));
+        let mut said = format!("repaired, {:.1} s, {}", self.seconds, text::counted(self.messages, "message"));
         let mut but = |text: String| {
             said.push_str("; ");
             said.push_str(&text);
@@ -116,7 +116,7 @@ impl Repaired {
         if let Some(why) = &self.failed {
             but(format!("BAD: {why}"));
         }
-        let unread = counted(self.unread_bytes, "byte");
+        let unread = text::counted(self.unread_bytes, "byte");
         match self.end {
             FileEnd::Finished => {}
             FileEnd::Unfinished => but("the last second may be missing".to_owned()),
@@ -128,7 +128,7 @@ impl Repaired {
             FileEnd::Damaged => but("the end cannot be read".to_owned()),
         }
         if self.ordered_messages > 0 {
-            let messages = counted(self.ordered_messages, "message");
+            let messages = text::counted(self.ordered_messages, "message");
             but(format!(
                 "{messages} of a torn chunk taken without a check value, written since this machine was started"
             ));
@@ -145,10 +145,6 @@ impl Repaired {
         }
         said
     }
-}
-
-fn counted(count: u64, what: &str) -> String {
-    format!("{} {what}{}", text::count(count), if count == 1 { "" } else { "s" })
 }
 
 #[cfg(test)]

@@ -71,6 +71,14 @@ pub enum PresenceError {
         /// Why not.
         error: MaskRecordError,
     },
+    /// It is shorter than a mask.
+    #[error(
+        "{path}: only part of a mask is there: it was cut, or its disk was full; the next start of rapid writes it anew"
+    )]
+    Cut {
+        /// The file.
+        path: PathBuf,
+    },
     /// A write was in progress at every look: its writer died in it.
     #[error("{path}: the record is torn: its writer died while writing")]
     Torn {
@@ -236,6 +244,10 @@ pub fn read_mask(path: &Path) -> Result<MaskRecord, PresenceError> {
         ErrorKind::NotFound => PresenceError::NotPublished { path: path.to_owned() },
         _ => PresenceError::Io { path: path.to_owned(), error },
     };
+    let cut = |error: std::io::Error| match error.kind() {
+        ErrorKind::UnexpectedEof => PresenceError::Cut { path: path.to_owned() },
+        _ => io(error),
+    };
     let foreign = |what: &str| PresenceError::Foreign { path: path.to_owned(), what: what.to_owned() };
     // Nothing that was planted there is followed or waited for.
     let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::NOCTTY | OFlags::CLOEXEC;
@@ -250,10 +262,10 @@ pub fn read_mask(path: &Path) -> Result<MaskRecord, PresenceError> {
     let begun = Stamp::now();
     for look in 0_u32.. {
         let mut bytes = [0; RECORD_LEN];
-        file.read_exact_at(&mut bytes, 0).map_err(io)?;
+        file.read_exact_at(&mut bytes, 0).map_err(cut)?;
         fence(Ordering::SeqCst);
         let mut generation = [0; 2];
-        file.read_exact_at(&mut generation, 6).map_err(io)?;
+        file.read_exact_at(&mut generation, 6).map_err(cut)?;
         if bytes[6] % 2 == 0 && bytes[6..8] == generation {
             return MaskRecord::from_bytes(&bytes)
                 .map_err(|error| PresenceError::Record { path: path.to_owned(), error });

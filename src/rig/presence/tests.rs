@@ -200,3 +200,15 @@ fn the_json_document_has_the_papers_fields() {
     let timestamp = document["timestamp"].as_str().expect("text");
     assert!(timestamp.starts_with("20") && timestamp.ends_with('Z'), "{timestamp}");
 }
+
+#[test]
+fn a_part_of_a_mask_is_named_with_its_cause() {
+    let folder = tempfile::tempdir().expect("folder");
+    let path = folder.path().join("mask");
+    for bytes in [0, 1, crate::mask::RECORD_LEN / 2, crate::mask::RECORD_LEN - 1] {
+        std::fs::write(&path, vec![0; bytes]).expect("write");
+        let said = read_mask(&path).expect_err("a part of a mask").to_string();
+        let name = path.display().to_string();
+        assert!(said.starts_with(&name) && said.contains("only part of a mask is there"), "{bytes} bytes: {said}");
+    }
+}
