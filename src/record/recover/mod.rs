@@ -121,7 +121,7 @@ pub struct Recovered {
 #[serde(tag = "outcome", rename_all = "snake_case")]
 pub enum Outcome {
     /// A whole file was made of it.
-    Repaired(Repaired),
+    Repaired(Box<Repaired>),
     /// Nothing was missing but its name, which it has now; or nothing at all.
     Whole {
         /// Its name.
@@ -275,7 +275,7 @@ impl Source<'_> {
         } else {
             Some(aside("damaged")?)
         };
-        Ok(Outcome::Repaired(copied.repaired(to, original)))
+        Ok(Outcome::Repaired(Box::new(copied.repaired(to, original))))
     }
 
     fn finished(&mut self, names: &Names, watch: &mut Watch<'_>) -> Result<Outcome, RecoverError> {
@@ -295,7 +295,7 @@ impl Source<'_> {
             return Err(RecoverError::Nothing(self.path.to_owned()));
         }
         let to = self.publish(names)?;
-        Ok(Outcome::Repaired(copied.repaired(to, Some(self.path.to_owned()))))
+        Ok(Outcome::Repaired(Box::new(copied.repaired(to, Some(self.path.to_owned())))))
     }
 
     /// Copies what can be read into a whole file of the name `to`; `None` if this is no MCAP file.

@@ -19,7 +19,7 @@ pub(super) fn go_on(_: u64, _: u64) -> ControlFlow<()> {
 
 pub(super) fn repaired(path: &Path) -> Repaired {
     match recover(path, &mut go_on).unwrap().outcome {
-        Outcome::Repaired(repaired) => repaired,
+        Outcome::Repaired(repaired) => *repaired,
         other => panic!("{other:?}"),
     }
 }
