@@ -1,5 +1,5 @@
-//! Says when files of the bus are removed under a run: the run goes on with the memory that it has, and nobody else
-//! gets to it.
+//! Reports when files of the bus are removed during a run: the run continues with the memory that it has, and no
+//! other program gets to it.
 
 use std::time::Duration;
 

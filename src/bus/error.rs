@@ -79,7 +79,7 @@ pub enum BusError {
          overwritten a file of the bus; end that program and start again", file.display(), room::PLACE
     )]
     Lost {
-        /// The file, or the folder where it cannot be told.
+        /// The file, or the folder where it is not known.
         file: PathBuf,
     },
     /// There is no shared memory, or it cannot be used.
@@ -90,7 +90,7 @@ pub enum BusError {
         /// What to do.
         fix: &'static str,
     },
-    /// The system tells nothing about the process.
+    /// The system gives no information about the process.
     #[error("/proc: it is not mounted, and rapid needs it; mount it: sudo mount -t proc proc /proc")]
     NoProc,
     /// The process may make no file that is large enough.

@@ -21,10 +21,10 @@ const TURN_LOOK: Duration = Duration::from_millis(5);
 const FILL_LIMIT: Duration = Duration::from_millis(400);
 /// How long iceoryx2 waits for another process to finish what it makes.
 const CREATION_LIMIT: Duration = Duration::from_millis(400);
-// Damage is said within two seconds, which others waiting for their turn and the rest of a start share.
-const _: () = assert!(FILL_LIMIT.as_millis() + CREATION_LIMIT.as_millis() < 1000, "damage is said too late");
+// Damage is reported within two seconds, which others waiting for their turn and the rest of a start share.
+const _: () = assert!(FILL_LIMIT.as_millis() + CREATION_LIMIT.as_millis() < 1000, "damage is reported too late");
 
-/// A node. When it goes, so do the files of the bus that nobody else uses.
+/// A node. When it goes, so do the files of the bus that no other process uses.
 #[derive(Debug)]
 pub(super) struct Home {
     // Declared in the order they must be dropped.

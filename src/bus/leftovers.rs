@@ -1,4 +1,4 @@
-//! The files of a bus: which there are, which of them somebody uses, and their removal.
+//! The files of a bus: which there are, which of them are in use, and their removal.
 //!
 //! iceoryx2 0.10 keeps a bus in `/dev/shm` and in a folder of its own. It gives back what a killed process held
 //! node by node, reading the files of both: what is damaged stays for ever, makes every start fail, or holds it
@@ -9,7 +9,7 @@
 //! `services/<hash>.service`, `nodes/<node>.node_monitor*` and `nodes/<node>/*` in the folder. A hash has 40
 //! digits; nodes and ports are numbers with the process id in their third 32 bits.
 //!
-//! Invariant: no file is removed that a living process may use. A file is that of nobody when its names are of
+//! Invariant: no file is removed that a living process may use. A file is unused when its names are of
 //! processes without a node, or when the bus has no node at all.
 //! Invariant: a lock file of this process is never opened: closing it would give up the lock.
 
@@ -67,7 +67,7 @@ impl Files {
         Self { prefix, root }
     }
 
-    /// Removes what nobody uses, and takes away what others may do with the rest. A file that another process has made
+    /// Removes what no process uses, and takes away what others may do with the rest. A file that another process has made
     /// and not filled is waited for up to `patience`, once for all of them.
     ///
     /// # Errors
@@ -219,7 +219,7 @@ impl Files {
             // Whoever holds it may be in another namespace of process ids.
             matches!(fcntl_getlk(lock, &asked), Ok(Some(_)))
         });
-        // One that begins has not locked yet; of another, somebody has exchanged the lock.
+        // One that begins has not locked yet; of another, the lock has been exchanged.
         locked || has_lived_since(node)
     }
 }

@@ -201,7 +201,7 @@ impl Bus {
     }
 }
 
-/// Notices when files of the bus are removed: programs that come later cannot take part then, and are not told why.
+/// Notices when files of the bus are removed: programs that come later cannot take part then, and get no reason.
 #[derive(Debug)]
 pub struct Watchman {
     files: Vec<PathBuf>,

@@ -43,7 +43,7 @@ pub(super) fn check(folder: &Path) -> Result<(), BusError> {
 /// Refuses shared memory that is not there or may not be written to.
 ///
 /// # Errors
-/// As said, with the fix.
+/// In these cases, with the fix.
 pub fn memory() -> Result<(), BusError> {
     usable(Path::new(PLACE))
 }

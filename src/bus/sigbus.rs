@@ -71,7 +71,7 @@ pub(super) fn damaged() {
     }
 }
 
-/// What has been lost, with the file if it can be told.
+/// What has been lost, with the file if it is known.
 pub(super) fn error() -> BusError {
     let file = ERROR.get_or_init(|| {
         let bytes = FILE.iter().map(|byte| byte.load(Ordering::Relaxed)).take_while(|byte| *byte != 0);

@@ -131,7 +131,7 @@ impl<O: Write, E: Write> Teller<'_, O, E> {
         done
     }
 
-    /// A finished file that is damaged: it stays as it is unless somebody asks for it.
+    /// A finished file that is damaged: it stays as it is unless it is named itself.
     fn damaged(&mut self, file: &Path) {
         let name = file.display();
         match self.format {

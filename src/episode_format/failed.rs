@@ -1,6 +1,6 @@
-//! What a recorder writes behind a file that it called BAD because the disk or another program spoilt it: the file may
-//! say GOOD by then, and its name may be given back. What is spoilt is unknown, so that this stands behind everything else
-//! and is found from the end of the file alone: the reason, its length and check value, [`MARK`].
+//! What a recorder writes behind a file that it called BAD because the disk or another program damaged it: the summary
+//! may be GOOD by then, and its name may be given back. What is damaged is unknown, so that this stands behind
+//! everything else and is found from the end of the file alone: the reason, its length and check value, [`MARK`].
 //!
 //! Invariant: to every other reader these are bytes behind the end, which make no file whole.
 

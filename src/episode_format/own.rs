@@ -127,7 +127,7 @@ impl<R: ReadAt> Walk<R> {
         Ok(matches!(self.names.owner, Owner::Episode(_) | Owner::Any))
     }
 
-    /// Do these records say that they are an episode's of ours?
+    /// Do these records name an episode of ours?
     pub(super) fn is_owned(&self, records: &Records) -> bool {
         first(self.bytes(records)).is_some()
     }
@@ -167,7 +167,7 @@ impl<R: ReadAt> Walk<R> {
         Ok(true)
     }
 
-    /// What the file says of itself at its beginning.
+    /// What the file states about itself at its beginning.
     pub(super) fn remember(&mut self, opcode: u8) {
         if opcode != op::METADATA || self.begin_ns.is_some() {
             return;

@@ -1,7 +1,7 @@
 //! Whose file it is in which chunks of several episodes lie: one may be the payload of a message of another, or all of
 //! them lie in an archive.
 //!
-//! 1. The metadata at its undamaged beginning say it.
+//! 1. The metadata at its undamaged beginning name it.
 //! 2. An episode is not the file if it lies within a right chunk of another.
 //! 3. An episode that has its own beginning in the file lies in it; one whose beginning is lost is the file. Of several
 //!    it is the last: what lies in a message of an episode is followed by the rest of that episode.
@@ -19,7 +19,7 @@ use super::source::{ReadAt, Source};
 use super::walk::{HEAD, MAGIC};
 use super::wire::Fields;
 
-/// Episodes that are told apart in a file, and beginnings that are looked at.
+/// Episodes that are distinguished in a file, and beginnings that are looked at.
 const MOST: usize = 64;
 /// Metadata at a beginning have less.
 const LARGEST: u64 = 4 << 20;
@@ -65,7 +65,7 @@ impl Owners {
         }
     }
 
-    /// Whose file it is. `named`: what the metadata at its beginning say; `checked`: what was read so far is right;
+    /// Whose file it is. `named`: what the metadata at its beginning name; `checked`: what was read so far is right;
     /// `is_foreign`: its header names another program.
     pub(super) fn owner<R: ReadAt>(
         self,
@@ -91,7 +91,7 @@ impl Owners {
     }
 }
 
-/// Where episodes begin that say which they are: magic number, header and metadata, before `end`.
+/// Where episodes begin that have a name of their own: magic number, header and metadata, before `end`.
 pub(super) fn beginnings<R: ReadAt>(source: &mut Source<R>, end: u64) -> io::Result<Vec<(u64, EpisodeId)>> {
     let (mut at, mut begun) = (0, Vec::new());
     while at < end && begun.len() < MOST {

@@ -233,7 +233,7 @@ impl<R: ReadAt> Walk<R> {
 
     /// Does a whole record without a check value of its own stand at `at`, before any chunk?
     fn is_early(&mut self, at: u64) -> io::Result<bool> {
-        // What it says of its fields is looked for anywhere in the file.
+        // What it needs is looked for anywhere in the file.
         self.early = self.early.saturating_sub(1);
         let mut head = Fields(self.source.peek(at, 9)?);
         let (Some(opcode), Some(length)) = (head.u8(), head.u64()) else { return Ok(false) };

@@ -106,9 +106,9 @@ pub(crate) struct Walked {
     pub(crate) proven: bool,
     /// Which program wrote it.
     pub(crate) writer: Writer,
-    /// Its end says where its index lies.
+    /// Its end states where its index lies.
     pub(crate) indexed: bool,
-    /// The episode that its chunks say they belong to.
+    /// The episode that its chunks name.
     pub(crate) episode: Option<EpisodeId>,
 }
 

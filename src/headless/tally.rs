@@ -59,7 +59,7 @@ impl Presence {
         self.total + self.since.map_or(Duration::ZERO, |since| end.since(since))
     }
 
-    /// In which it sent `samples`: without the time that it took to close it, of which nothing tells but that the
+    /// In which it sent `samples`: without the time that it took to close it, of which the only sign is that the
     /// newest is older. The silence of a device that has stalled counts.
     fn sending(self, end: Stamp, newest: Option<Stamp>, samples: u64) -> Duration {
         let present = self.until(end);

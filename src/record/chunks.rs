@@ -1,5 +1,5 @@
 //! The container of an episode as it is written: chunks of a bounded size, each of which begins with the record that
-//! says whose it is and what the channels are.
+//! names its episode and defines the channels.
 //!
 //! Invariant: of a file whose episode is known every chunk can be read alone, whatever became of the others.
 //! Invariant: only whole chunks reach the sink.
@@ -35,12 +35,12 @@ pub(super) struct Chunks<S: Write> {
     own: Option<Own>,
     /// Bytes of records in the chunk that is open; none where none is.
     open: u64,
-    /// Bytes that may still be spent on saying whose a chunk is; beyond them it says no more than the episode.
+    /// Bytes that may still be spent on definitions in chunks; beyond them a chunk names the episode alone.
     spare: u64,
 }
 
 impl<S: Sink> Chunks<S> {
-    /// Begins a file on `sink`. Without an `episode` its chunks say nothing of themselves.
+    /// Begins a file on `sink`. Without an `episode` its chunks carry no such record.
     pub(super) fn new(sink: S, episode: Option<EpisodeId>) -> io::Result<Self> {
         // JPEG does not compress and raw frames are rare: no codec, so that the thread's time goes
         // into the disk and every reader can read. Without seeking the writer keeps a chunk in
@@ -55,7 +55,7 @@ impl<S: Sink> Chunks<S> {
         Ok(Self { writer, own: episode.map(Own::new), open: 0, spare: REPEATED.0 })
     }
 
-    /// Has every chunk from now on say that it belongs to `episode`, unless they do already or a channel is defined.
+    /// Has every chunk from now on name `episode`, unless they do already or a channel is defined.
     pub(super) fn belong(&mut self, episode: Option<EpisodeId>) {
         if self.own.is_none() && self.open == 0 {
             self.own = episode.map(Own::new);

@@ -54,7 +54,7 @@ pub(super) struct EpisodeFile {
     writer: Chunks<Latch>,
     /// Bytes that the sink took.
     written: Arc<AtomicU64>,
-    /// None where nobody else can reach the file.
+    /// None where no other program can reach the file.
     guard: Option<Guard>,
     clock: WallClock,
     message: Vec<u8>,

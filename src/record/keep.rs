@@ -46,13 +46,13 @@ pub(super) fn publish(path: &EpisodePath) -> io::Result<PathBuf> {
 }
 
 /// Where a file is that could not be finished; one that was removed is written again. Behind it is written `why` it is
-/// BAD, so that whoever reads it later finds that again: its summary may say GOOD by then.
+/// BAD, so that whoever reads it later finds that again: its summary may be GOOD by then.
 pub(super) fn failed(path: &EpisodePath, why: &str) -> PathBuf {
     let mut file = &*path.file;
     let marked = file.seek(SeekFrom::End(0)).and_then(|_| file.write_all(&Failed::mark(why)));
     if let Err(error) = marked.and_then(|()| file.sync_data()) {
         let file = path.partial.display();
-        tracing::error!(%file, %error, "BAD, which the file itself may not say after a loss of power; remove it");
+        tracing::error!(%file, %error, "BAD, and after a loss of power the file itself may not show it; remove it");
     }
     let found = whereabouts(path).and_then(|whereabouts| match whereabouts {
         Whereabouts::Here => Ok(path.partial.clone()),

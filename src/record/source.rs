@@ -19,7 +19,7 @@ pub trait Source: Send {
     /// When the bus cannot be read; the text says why.
     fn drain(&mut self, take: &mut dyn FnMut(TopicId, &SampleHeader, &[u8])) -> Result<(), String>;
 
-    /// Hands over who else has published on our topics since the last call; nobody, unless the source can say.
+    /// Hands over who else has published on our topics since the last call; none, unless the source can know.
     fn foreign(&mut self, take: &mut dyn FnMut(Foreign<'_>)) {
         let _ = take;
     }

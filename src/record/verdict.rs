@@ -9,9 +9,9 @@
 //! 4. A file that is not whole, or not proven to be as it was written, is SUSPECT; one that the disk did not
 //!    take is BAD. What could not be measured is a [`Finding`] of whoever could not.
 //! 5. An episode in which another program published on a topic of ours is SUSPECT.
-//! 6. One shorter than [`SHORTEST`] is BAD: nobody demonstrates anything in that time.
+//! 6. One shorter than [`SHORTEST`] is BAD: that is too short for a demonstration.
 //! 7. One without a sample of a modality that `expect` names is SUSPECT.
-//! 8. Of two checks that one fault breaks, the one that names the fault is told: a frozen camera also
+//! 8. Of two checks that one fault breaks, the one that names the fault is reported: a frozen camera also
 //!    repeats its pictures, a silent one also has a low rate.
 //!
 //! Invariant: pure.

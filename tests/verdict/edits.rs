@@ -1,4 +1,4 @@
-//! Edits of an episode after which every check value is right again: what makes them no good episode is what they say.
+//! Edits of an episode after which every check value is right again: what makes them no good episode is their content.
 
 use std::collections::BTreeMap;
 use std::io::Cursor;

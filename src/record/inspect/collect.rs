@@ -270,7 +270,7 @@ impl Collected {
             bytes: size,
             end: walked.end,
             verdict,
-            // What was said before it failed is void.
+            // A verdict from before it failed is void.
             recorded_verdict: state::recorded_verdict(&self.summary).filter(|_| failed.is_none()),
             unread_bytes: recorded.saturating_sub(walked.bytes),
             damaged_chunks: walked.damaged_chunks,

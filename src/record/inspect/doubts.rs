@@ -77,7 +77,7 @@ pub(super) fn of(ending: &Ending<'_>) -> Vec<Finding> {
     said.into_iter().map(Finding::suspect).collect()
 }
 
-/// Is the file as long as it says? A recorder that ends an episode writes every frame before its end.
+/// Is the file as long as its summary states? A recorder that ends an episode writes every frame before its end.
 fn length(ending: &Ending<'_>) -> Option<String> {
     if ending.repaired.is_some() || ending.summary.contains_key(CUT_SHORT) {
         return None;
@@ -94,5 +94,6 @@ fn length(ending: &Ending<'_>) -> Option<String> {
     let differs = grid.ticks_before(end).abs_diff(frames) > 1
         || frames > 0 && last.abs_diff(last_frame.saturating_sub(begin)) > ROUNDING
         || !hz.is_finite();
-    differs.then(|| format!("it says that it lasts {seconds} s at {hz} frames a second, and has {frames} frames"))
+    differs
+        .then(|| format!("its metadata give {seconds} s at {hz} frames a second, which its {frames} frames do not fit"))
 }

@@ -34,11 +34,11 @@ pub(super) struct Ending<'a> {
     pub(super) file: Walked,
     /// Length of the episode, seconds.
     pub(super) seconds: f64,
-    /// What it says of itself at its beginning.
+    /// What it states about itself at its beginning.
     pub(super) about: &'a BTreeMap<String, String>,
     /// The recorder's summary; empty without one.
     pub(super) summary: &'a BTreeMap<String, String>,
-    /// It was made of one that was not whole; the text says so.
+    /// It was made of one that was not whole: the reason.
     pub(super) repaired: Option<&'a str>,
     /// Why its recorder called it BAD after it had written its summary, or without one.
     pub(super) failed: Option<&'a str>,
@@ -282,7 +282,7 @@ impl<'a> Recorded<'a> {
         self.modalities.as_ref()?.get(modality)?.get(key)?.as_u64()
     }
 
-    /// In what a finished file is not what its recorder says that it wrote.
+    /// In what a finished file is not what its recorder counted.
     fn differences(&self, qualities: &[(&Registered, Quality)], ending: &Ending<'_>) -> Vec<Finding> {
         // Without a summary the file is not whole, and that which a repair wrote counts what is there: it has no verdict.
         if self.summary.is_empty() || ending.repaired.is_some() && !self.summary.contains_key("verdict") {
@@ -322,7 +322,7 @@ impl<'a> Recorded<'a> {
         }
         if !missing.is_empty() {
             let missing = missing.join(", ");
-            findings.push(Finding::suspect(format!("its record {SUMMARY:?} does not say {missing}")));
+            findings.push(Finding::suspect(format!("its record {SUMMARY:?} does not have {missing}")));
         }
         findings
     }

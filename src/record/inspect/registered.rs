@@ -12,7 +12,7 @@ use crate::time::nanoseconds;
 
 /// No registry is longer; the text of a hostile file may be.
 const LONGEST_REGISTRY: usize = 1 << 20;
-/// Patience with a modality of which the registry says nothing.
+/// Patience with a modality that the registry gives none.
 const STALL_AFTER: Duration = Duration::from_millis(500);
 
 /// A modality of the registry in the file.

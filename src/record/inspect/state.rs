@@ -37,7 +37,7 @@ pub(super) fn file_state<'a>(ending: &Ending<'a>) -> FileState<'a> {
     }
 }
 
-/// What is in the file without proof, and what its own numbers say is missing.
+/// What is in the file without proof, and what is missing by its own numbers.
 pub(super) fn findings(ending: &Ending<'_>) -> impl Iterator<Item = Finding> + use<> {
     let (unproven, frames) = (ending.file.ordered_messages, ending.counted.missing.frames);
     let are = if frames == 1 { "frame is" } else { "frames are" };
@@ -94,11 +94,11 @@ pub(super) fn sum(
 ) -> Option<u64> {
     let recorded = summary.get(key)?.parse().ok()?;
     let counted = modalities.iter().map(|modality| modality.quality.as_ref().map(count));
-    // Without a judge there is only what the recorder says.
+    // Without a judge there is only the recorder's count.
     Some(counted.sum::<Option<u64>>().filter(|_| !modalities.is_empty()).unwrap_or(recorded))
 }
 
-/// What the recorder's summary says; `None` in a file that has no verdict.
+/// The verdict of the recorder's summary; `None` in a file that has no verdict.
 pub(super) fn recorded_verdict(summary: &BTreeMap<String, String>) -> Option<Verdict> {
     let word = summary.get("verdict")?;
     let grade = [Grade::Good, Grade::Suspect, Grade::Bad].into_iter().find(|grade| grade.word() == word)?;

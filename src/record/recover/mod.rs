@@ -14,7 +14,7 @@
 //!
 //! Invariant: the check value of every chunk of ours that is taken is right. Messages of a last chunk that is cut have
 //! none: they are taken only while the kernel runs that kept the order of their writes, which proves that they were
-//! written, not that no bit of them changed since. They are counted, said, and a reason not to call the file GOOD.
+//! written, not that no bit of them changed since. They are counted, reported, and a reason not to call the file GOOD.
 //! Invariant: what the recorder called BAD stays BAD.
 //! Invariant: at every moment all that was recorded is in a file that a later repair finds or in the
 //! repaired file; a repair that ends in its middle leaves a `.recovering`, which the next one replaces.

@@ -1,4 +1,4 @@
-//! What a repair takes without proof, leaves out or gives a name: counted, said, and judged by what is left.
+//! What a repair takes without proof, leaves out or gives a name: counted, reported, and judged by what is left.
 
 use std::collections::BTreeMap;
 use std::fs;

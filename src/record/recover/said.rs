@@ -61,7 +61,7 @@ pub(super) fn recovered(summary: &Summary, damage: &Damage, about: &About<'_>, s
     said
 }
 
-/// What `rapid/summary` says of an episode that its recorder called BAD only after it had written that.
+/// The `rapid/summary` of an episode that its recorder called BAD only after it had written that.
 pub(super) fn failed(why: &str) -> BTreeMap<String, String> {
     text_map([("verdict", Grade::Bad.word().to_owned()), ("reasons", json!([why]).to_string())])
 }

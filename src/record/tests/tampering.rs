@@ -132,7 +132,7 @@ async fn a_file_that_is_changed_within_while_it_is_recorded_is_not_called_good()
     }
 }
 
-/// What the recorder said of a file is said by whoever reads it later, and of what a repair makes of it.
+/// The recorder's judgement is found again by whoever reads the file, and in what a repair makes of it.
 fn found_again(what: &str, why: &str, file: &Path) {
     let is_found = |file: &Path| {
         let said = inspect::list(file).verdict;
@@ -156,7 +156,7 @@ fn found_again(what: &str, why: &str, file: &Path) {
 
 #[tokio::test]
 async fn an_episode_that_is_whole_when_the_disk_refuses_it_stays_bad() {
-    // The last write of all: the summary says GOOD by then.
+    // The last write of all: the summary is GOOD by then.
     let bench = Bench::with_sink(|file| Box::new(super::faults::Unsure(file)));
     bench.recorder.start(bench.request(None)).await.unwrap();
     bench.sample(TOF, 1, 0, Stamp::now().0, 0);

@@ -114,7 +114,7 @@ impl MaskFile {
         Ok(Self { path: path.to_owned(), file, record })
     }
 
-    /// Makes the file anew where somebody has removed or replaced it; says whether it did. What is published next is in
+    /// Makes the file anew where it was removed or replaced; returns whether it did. What is published next is in
     /// it.
     pub(super) fn restore(&mut self) -> Result<bool, PresenceError> {
         if self.is_there() {

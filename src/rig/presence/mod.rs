@@ -204,7 +204,7 @@ impl Beat {
         }
     }
 
-    /// Makes the file anew if it is gone. True while that fails, which is said once.
+    /// Makes the file anew if it is gone. True while that fails, which is reported once.
     fn look(&mut self, failed: bool) -> bool {
         match self.file.restore() {
             Ok(false) => false,
