@@ -3,9 +3,9 @@
 //! 1. The file is only appended to, so that its size is what was written, unless another program cut it or wrote
 //!    behind it: then the size stays wrong, and every look sees it.
 //! 2. A file without a name whose name means another file was replaced.
-//! 3. The kernel reports that another program had the file open for writing (inotify(7), `IN_CLOSE_WRITE`): what it
-//!    did within the file is not visible from outside. Such a file, and one that another program has open, is read
-//!    back once it is finished, and all its check values must be right. Others are not read back.
+//! 3. The kernel reports that another program opened the file (inotify(7), `IN_OPEN`). Whether all that opened it have
+//!    closed it is not known, as equal events are merged, and what they wrote within it is not visible from outside.
+//!    Such a file is read back once it is finished, and all its check values must be right. Others are not read back.
 //!
 //! A removed file is no damage: it is written again when the episode ends (`keep`).
 //!
@@ -33,10 +33,10 @@ pub(super) struct Guard {
     partial: PathBuf,
     /// None where the system gives no inotify: then damage within the file is found by whoever reads it.
     events: Option<OwnedFd>,
-    /// Another program had the file open for writing, which was reported.
-    was_open: bool,
-    /// Another program has the file open, for reading or for writing.
-    is_open: bool,
+    /// Another program opened the file, for reading or for writing.
+    was_opened: bool,
+    /// Another program had it open for writing, which was reported.
+    was_written: bool,
 }
 
 impl Guard {
@@ -47,12 +47,18 @@ impl Guard {
             tracing::debug!(%error, "the file is not only appended to");
         }
         let events = inotify::init(CreateFlags::NONBLOCK | CreateFlags::CLOEXEC).and_then(|events| {
-            let watched = WatchFlags::OPEN | WatchFlags::CLOSE_WRITE | WatchFlags::CLOSE_NOWRITE;
+            let watched = WatchFlags::OPEN | WatchFlags::CLOSE_WRITE;
             inotify::add_watch(&events, itself(&path.file), watched)?;
             Ok(events)
         });
         let events = events.map_err(|error| tracing::debug!(%error, "other programs' writes are not watched")).ok();
-        Self { file: Arc::clone(&path.file), partial: path.partial.clone(), events, was_open: false, is_open: false }
+        Self {
+            file: Arc::clone(&path.file),
+            partial: path.partial.clone(),
+            events,
+            was_opened: false,
+            was_written: false,
+        }
     }
 
     /// Is the file what was written, `written` bytes of which the kernel has?
@@ -86,7 +92,7 @@ impl Guard {
     /// When it is not; the text says so.
     pub(super) fn verify(mut self, written: u64) -> io::Result<()> {
         self.look(written)?;
-        if !self.was_open && !self.is_open {
+        if !self.was_opened {
             return Ok(());
         }
         let file = File::open(itself(&self.file))?;
@@ -104,10 +110,9 @@ impl Guard {
         // Empty, or broken: then there is nothing to be learned.
         while let Ok(event) = reader.next() {
             let what = event.events();
-            self.is_open = (self.is_open || what.contains(ReadFlags::OPEN))
-                && !what.intersects(ReadFlags::CLOSE_NOWRITE | ReadFlags::CLOSE_WRITE);
-            let wrote = what.intersects(ReadFlags::CLOSE_WRITE | ReadFlags::QUEUE_OVERFLOW);
-            if wrote && !std::mem::replace(&mut self.was_open, true) {
+            let written = what.intersects(ReadFlags::CLOSE_WRITE | ReadFlags::QUEUE_OVERFLOW);
+            self.was_opened |= written || what.contains(ReadFlags::OPEN);
+            if written && !std::mem::replace(&mut self.was_written, true) {
                 let file = self.partial.display();
                 tracing::warn!(
                     %file,

@@ -69,6 +69,8 @@ pub(super) struct Frames {
     pub(super) begin_ns: u64,
     /// Ticks a second.
     pub(super) hz: f64,
+    /// Greatest distance of a frame's samples from its tick.
+    pub(super) window: Duration,
     /// How long after its tick a frame is evaluated.
     pub(super) wait: Duration,
 }
@@ -76,7 +78,8 @@ pub(super) struct Frames {
 impl Frames {
     /// The frames of an episode that begins at `begin`; each waits for its window and for `settle`.
     pub(super) fn of(registry: &Registry, begin: Stamp, settle: Duration) -> Self {
-        Self { begin_ns: begin.0, hz: registry.rig.observation_hz, wait: registry.rig.sync_window + settle }
+        let window = registry.rig.sync_window;
+        Self { begin_ns: begin.0, hz: registry.rig.observation_hz, window, wait: window + settle }
     }
 }
 
@@ -142,6 +145,7 @@ pub struct Quality {
 #[derive(Debug)]
 pub(super) struct Measures {
     grid: Grid,
+    window_ns: u64,
     wait_ns: u64,
     begin_ns: u64,
     presence: Presence,
@@ -177,6 +181,7 @@ impl Measures {
         }
         Self {
             grid: Grid::new(Stamp(frames.begin_ns), frames.hz),
+            window_ns: nanoseconds(frames.window),
             wait_ns: nanoseconds(frames.wait),
             begin_ns: frames.begin_ns,
             presence: Presence::new(frames.begin_ns),
@@ -189,7 +194,10 @@ impl Measures {
     pub(super) fn sample(&mut self, id: ModalityId, seen: &Seen<'_>) {
         let Some(Some(lane)) = self.lanes.get(id.index()) else { return };
         let shown = seen.capture_ns.saturating_sub(lane.measured.latency_ns);
-        let deadline = self.nearest_tick(shown).saturating_add(self.wait_ns);
+        let tick = self.nearest_tick(shown);
+        // No frame waits for one between the windows: it has the time that its own would give it.
+        let due = if shown.abs_diff(tick) <= self.window_ns { tick } else { shown };
+        let deadline = due.saturating_add(self.wait_ns);
         let Some(Some(lane)) = self.lanes.get_mut(id.index()) else { return };
         let Some((from, to)) = lane.meter.sample(seen, deadline) else { return };
         if to - from > lane.longest_gap_ns {

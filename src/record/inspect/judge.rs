@@ -77,7 +77,7 @@ impl Judge {
         let latency = Duration::from_nanos(all.iter().map(|measured| measured.latency_ns).max().unwrap_or(0));
         let window = Duration::from_nanos(number("sync_window_ns")?);
         let wait = window.saturating_add(SETTLE).saturating_add(latency);
-        let measures = Measures::new(&all, Frames { begin_ns, hz, wait });
+        let measures = Measures::new(&all, Frames { begin_ns, hz, window, wait });
         let numbers = vec![(None, 0); MAX_MODALITIES];
         let publishers = Publishers::default();
         let mut judge = Self { measures, begin_ns, modalities, usual_limits, expect, numbers, publishers };

@@ -16,9 +16,16 @@ fn id(bit: u8) -> ModalityId {
 }
 
 fn measures(kind: ModalityKind) -> Measures {
+    measures_at(30.0, kind)
+}
+
+fn measures_at(hz: f64, kind: ModalityKind) -> Measures {
     let limits = VerdictSpec::of(kind, Duration::from_millis(500), Some(30.0));
     let measured = [Measured { id: id(0), limits, latency_ns: 0 }, Measured { id: id(3), limits, latency_ns: 0 }];
-    Measures::new(&measured, Frames { begin_ns: BEGIN, hz: 30.0, wait: Duration::from_millis(125) })
+    Measures::new(
+        &measured,
+        Frames { begin_ns: BEGIN, hz, window: Duration::from_millis(25), wait: Duration::from_millis(125) },
+    )
 }
 
 /// A sample captured `at` ms after the beginning and received `late` ms later.
@@ -141,6 +148,20 @@ fn late_is_what_misses_the_deadline_of_the_nearest_tick() {
         let mut measures = measures(ModalityKind::Scalars);
         measures.sample(id(0), &seen(0, at, late_by, b""));
         assert_eq!(quality_at(&measures, 1000).late, late, "captured at {at} ms, {late_by} ms late");
+    }
+}
+
+/// A frame waits for the samples of its window; those between the windows of a slow grid are in none.
+#[test]
+fn a_sample_that_no_frame_waits_for_has_the_time_that_a_frame_would_give_it() {
+    for hz in [0.1, 1.0, 4.0, 10.0] {
+        for at in (0..1000).step_by(7) {
+            for (late_by, late) in [(2, 0), (99, 0), (200, 1)] {
+                let mut measures = measures_at(hz, ModalityKind::Scalars);
+                measures.sample(id(0), &seen(0, at, late_by, b""));
+                assert_eq!(quality_at(&measures, 1000).late, late, "{hz} Hz: captured at {at} ms, {late_by} ms late");
+            }
+        }
     }
 }
 

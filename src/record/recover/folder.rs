@@ -58,7 +58,7 @@ pub fn is_damaged(path: &Path, watch: &mut Watch<'_>) -> Result<bool, RecoverErr
         return Ok(false);
     }
     let sha256 = source.sha256(watch)?;
-    Ok(source.repaired(&Names::of(path).finished, &sha256, watch)?.is_none())
+    Ok(source.repaired(&Names::of(path), &sha256, watch)?.is_none())
 }
 
 fn entries(folder: &Path, ending: &[u8]) -> io::Result<Vec<DirEntry>> {

@@ -244,7 +244,7 @@ impl Source<'_> {
                 .map_err(|source| RecoverError::Io { path: path.to_owned(), source })
         };
         let sha256 = self.sha256(watch)?;
-        if let Some(made) = self.repaired(&names.finished, &sha256, watch)? {
+        if let Some((to, made)) = self.repaired(names, &sha256, watch)? {
             let kept = match made {
                 Made::OfAll => {
                     fs::remove_file(path).map_err(|source| self.io(source))?;
@@ -252,7 +252,7 @@ impl Source<'_> {
                 }
                 Made::OfParts => Some(aside("damaged")?),
             };
-            return Ok(Outcome::AlreadyRepaired { to: names.finished.clone(), kept });
+            return Ok(Outcome::AlreadyRepaired { to, kept });
         }
         let Some(copied) = self.copy(&names.recovering, sha256, watch)? else {
             return Ok(Outcome::Unreadable { kept: aside("damaged")? });
@@ -284,8 +284,8 @@ impl Source<'_> {
             return Ok(Outcome::Whole { to: self.path.to_owned() });
         }
         let sha256 = self.sha256(watch)?;
-        if self.repaired(&names.finished, &sha256, watch)?.is_some() {
-            return Ok(Outcome::AlreadyRepaired { to: names.finished.clone(), kept: None });
+        if let Some((to, _)) = self.repaired(names, &sha256, watch)? {
+            return Ok(Outcome::AlreadyRepaired { to, kept: None });
         }
         let Some(copied) = self.copy(&names.recovering, sha256, watch)? else {
             return Err(RecoverError::NotMcap(self.path.to_owned()));
@@ -338,11 +338,21 @@ impl Source<'_> {
         }
     }
 
-    /// Is `finished` a whole file that was made of this one, whose hash is `sha256`?
-    fn repaired(&self, finished: &Path, sha256: &str, watch: &mut Watch<'_>) -> Result<Option<Made>, RecoverError> {
-        let Ok((file, size)) = episode_format::open(finished) else { return Ok(None) };
-        let Some(summary) = self.summary_of(&file, size, watch)? else { return Ok(None) };
-        Ok(summary.made_of(self.size).and_then(|(of, made)| (of == sha256).then_some(made)))
+    /// A whole file that was made of this one, whose hash is `sha256`, under one of the names for it.
+    fn repaired(
+        &self,
+        names: &Names,
+        sha256: &str,
+        watch: &mut Watch<'_>,
+    ) -> Result<Option<(PathBuf, Made)>, RecoverError> {
+        for finished in names.candidates() {
+            let Ok((file, size)) = episode_format::open(&finished) else { continue };
+            let Some(summary) = self.summary_of(&file, size, watch)? else { continue };
+            if let Some((_, made)) = summary.made_of(self.size).filter(|(of, _)| *of == sha256) {
+                return Ok(Some((finished, made)));
+            }
+        }
+        Ok(None)
     }
 
     /// Gives the repaired file its name, another one if that is taken.

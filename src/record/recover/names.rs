@@ -52,7 +52,7 @@ impl Names {
 
     /// Names for the whole file, the best first. The finished name of a `.partial` can only be
     /// taken by a file that somebody else put there.
-    fn candidates(&self) -> impl Iterator<Item = PathBuf> {
+    pub(super) fn candidates(&self) -> impl Iterator<Item = PathBuf> {
         let first = self.is_partial.then(|| self.finished.clone());
         first.into_iter().chain((1..ATTEMPTS).map(|number| beside(&self.base, number)))
     }

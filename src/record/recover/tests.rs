@@ -324,6 +324,22 @@ async fn an_episode_that_only_lacks_its_name_gets_it() {
 }
 
 #[tokio::test]
+async fn a_repair_is_found_again_under_whatever_name_it_has() {
+    let (folder, bytes) = recorded().await;
+    let cut = put(&folder, "a_001.mcap", &bytes[..bytes.len() - 30]);
+    for number in [1, 2] {
+        let other = if number == 1 { "a_001.recovered.mcap" } else { "a_001.recovered-2.mcap" };
+        put(&folder, other, b"another file");
+        let made = repaired(&cut);
+        for _ in 0..2 {
+            let again = recover(&cut, &mut go_on).unwrap();
+            assert_eq!(again.outcome, Outcome::AlreadyRepaired { to: made.to.clone(), kept: None });
+        }
+        fs::remove_file(&made.to).unwrap();
+    }
+}
+
+#[tokio::test]
 async fn of_a_damaged_finished_file_a_whole_one_is_made_beside_it() {
     let (folder, bytes) = recorded().await;
     let original = strictly(&bytes);

@@ -107,7 +107,14 @@ async fn a_file_that_is_cut_or_replaced_while_it_is_recorded_ends_the_episode_an
 
 #[tokio::test]
 async fn a_file_that_is_changed_within_while_it_is_recorded_is_not_called_good() {
-    let deeds: [(&str, Deed); 3] = [
+    let deeds: [(&str, Deed); 4] = [
+        ("overwritten by one that has it open, after another has read it", |file| {
+            let mut writer = writable(file);
+            drop(File::open(file).unwrap());
+            writer.seek(SeekFrom::Start(file.metadata().unwrap().len() / 2)).unwrap();
+            writer.write_all(&[0; 4096]).unwrap();
+            Some(writer)
+        }),
         ("overwritten in the middle", |file| {
             overwrite(file);
             None
