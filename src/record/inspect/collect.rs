@@ -252,7 +252,8 @@ impl Collected {
         let repaired = state::repaired(&self.recovered);
         let (repaired, failed) = (repaired.as_deref(), failed.as_deref());
         let (about, summary, counted) = (&self.about, &self.summary, self.counted);
-        let ending = Ending { file: walked, seconds, about, summary, repaired, failed, counted };
+        let damage = &state::damage(&walked);
+        let ending = Ending { file: walked, seconds, about, summary, repaired, failed, damage, counted };
         let verdict = match &judge {
             Some(judge) => Judgement::Episode(judge.judge(&mut modalities, &ending)),
             // What is damaged and has no name of its writer may be an episode.

@@ -42,6 +42,8 @@ pub(super) struct Ending<'a> {
     pub(super) repaired: Option<&'a str>,
     /// Why its recorder called it BAD after it had written its summary, or without one.
     pub(super) failed: Option<&'a str>,
+    /// What is left out if parts of it are damaged.
+    pub(super) damage: &'a str,
     /// What was counted in it.
     pub(super) counted: Counted,
 }

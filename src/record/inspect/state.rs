@@ -4,18 +4,17 @@ use std::collections::BTreeMap;
 
 use super::super::metadata::CUT_SHORT;
 use super::super::verdict::{FileState, Finding};
-use super::super::walk::{FileEnd, LeftOut};
+use super::super::walk::{FileEnd, LeftOut, Walked};
 use super::ModalityReport;
 use super::judge::Ending;
 use crate::record::Quality;
 use crate::status::{Grade, Verdict};
 use crate::text;
 
-const DAMAGED: &str = "parts of it are damaged";
 const UNPROVEN: &str = "check values are missing in it, so that damage would not show";
 
 pub(super) fn file_state<'a>(ending: &Ending<'a>) -> FileState<'a> {
-    let Ending { file: walked, summary, repaired, failed, .. } = ending;
+    let Ending { file: walked, summary, repaired, failed, damage, .. } = ending;
     if let Some(why) = failed {
         return FileState::Failed(why);
     }
@@ -30,11 +29,17 @@ pub(super) fn file_state<'a>(ending: &Ending<'a>) -> FileState<'a> {
             None if !walked.proven => FileState::NotWhole(UNPROVEN),
             None => FileState::Whole,
         },
-        (FileEnd::Finished, None) => FileState::NotWhole(DAMAGED),
+        (FileEnd::Finished, None) => FileState::NotWhole(damage),
         (FileEnd::Unfinished, _) => FileState::NotWhole("the recorder has not finished it"),
         (FileEnd::Torn, _) => FileState::NotWhole("its last record is cut"),
         (FileEnd::Damaged, _) => FileState::NotWhole("from some place on it cannot be read"),
     }
+}
+
+/// What of a damaged file is left out, for people.
+pub(super) fn damage(walked: &Walked) -> String {
+    let left_out = walked.left_out.sentences(walked.damaged_chunks);
+    std::iter::once("parts of it are damaged".to_owned()).chain(left_out).collect::<Vec<_>>().join("; ")
 }
 
 /// What is in the file without proof, and what is missing by its own numbers.

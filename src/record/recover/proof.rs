@@ -282,3 +282,22 @@ async fn the_chunks_of_a_repaired_file_are_no_larger_than_those_recorded() {
     assert!(largest_of(&whole_again) <= largest_of(&whole) + (64 << 10), "{}", largest_of(&whole_again));
     println!("{} chunks, largest {}", chunks(&whole).len(), largest_of(&whole));
 }
+
+/// Half of an episode and a whole one behind it: the second is no part of the first.
+#[tokio::test]
+async fn what_is_not_read_is_shown_with_its_size_and_the_original_is_kept() {
+    let (folder, first) = recorded().await;
+    let (_other, second) = recorded().await;
+    let bytes = [&first[..first.len() / 2], &second].concat();
+    for name in ["a_001.mcap.partial", "b_001.mcap"] {
+        let file = put(&folder, name, &bytes);
+        let reasons = inspect(&file).unwrap().verdict.reasons().join("; ");
+        assert!(reasons.contains("not readable") || reasons.contains("left out"), "{name}: {reasons}");
+        let said = recover(&file, &mut go_on).unwrap();
+        let Outcome::Repaired(made) = &said.outcome else { panic!("{said:?}") };
+        assert!(made.unread_bytes >= second.len() as u64 / 2, "{name}: {said:?}");
+        let size = crate::text::counted(made.unread_bytes, "byte");
+        assert!(said.sentence().1.contains(&size), "{name}: {}", said.sentence().1);
+        assert_eq!(fs::read(made.original.as_ref().unwrap()).unwrap(), bytes, "{name}");
+    }
+}

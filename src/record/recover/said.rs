@@ -127,6 +127,9 @@ impl Repaired {
             }
             FileEnd::Damaged => but("the end cannot be read".to_owned()),
         }
+        if self.unread_bytes > 0 && self.end != FileEnd::Torn {
+            but(format!("{unread} could not be read"));
+        }
         if self.ordered_messages > 0 {
             let messages = text::counted(self.ordered_messages, "message");
             but(format!(
