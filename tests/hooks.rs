@@ -99,6 +99,30 @@ fn hooks_are_told_of_plugs_and_of_episodes_in_their_order() {
     assert_eq!(logged(&told, "motor: on_detach: hook says detach").len(), 1, "{told:#?}");
 }
 
+/// Another program takes the name that the episode is to get, or damages its file.
+#[test]
+fn the_hook_at_the_end_knows_the_file_as_it_ended() {
+    let take = "cp /bin/true \"$RAPID_EPISODE\"";
+    let cut = "sleep 2; : >\"$RAPID_EPISODE.partial\"";
+    for (what, begun, name) in [("taken", take, "_002.mcap"), ("cut", cut, "_001.mcap.partial")] {
+        let place = Place::new();
+        registry(&place, "on_record_start = [\"/bin/sh\", \"begun\"]\non_record_stop = [\"note\", \"stop\"]");
+        script(&place, "begun", begun);
+        let run = [&sim(&place, "")[..], &["--record", "--out", "out", "--duration", "4s"]].concat();
+        let output = place.run(&run);
+        let [Noted { told, .. }] = &notes(&place)[..] else { panic!("{what}: {:?}", notes(&place)) };
+        assert!(told["episode"].ends_with(name) && Path::new(&told["episode"]).is_file(), "{what}: {told:?}");
+        assert_eq!(format!("{}.mcap", told["session"]), name_of(&told["episode"]).trim_end_matches(".partial"));
+        let events = events(&String::from_utf8_lossy(&output.stdout));
+        let end = events.iter().find(|event| event["event"] == "episode").expect("the end of an episode");
+        assert_eq!(name_of(end["file"].as_str().expect("a name")), name_of(&told["episode"]), "{what}");
+    }
+}
+
+fn name_of(file: &str) -> &str {
+    file.rsplit('/').next().unwrap_or(file)
+}
+
 #[test]
 fn a_hook_that_hangs_or_fails_is_said_and_holds_up_nothing() {
     let place = Place::new();

@@ -312,9 +312,10 @@ impl Writer {
 
     fn finish(&mut self, now: Stamp, reason: Option<String>) {
         let Some(session) = self.session.take() else { return };
-        self.episode.send_replace(None);
+        let ended = self.episode.send_replace(None);
         let closing = Closing { reason, publishers: self.publishers.list() };
         let report = session.finish(now, &self.streams.masks, closing);
+        ended.inspect(|ended| ended.end(&report.file));
         if let Some(space) = self.space.take() {
             space.release();
         }

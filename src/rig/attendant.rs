@@ -2,7 +2,7 @@
 //!
 //! 1. `on_attach` when it is attached.
 //! 2. `on_record_start` when an episode begins, at once if one is in progress; `on_record_stop` when
-//!    that episode is over, the device is removed, or the run ends.
+//!    that episode is finished, the device is removed, or the run ends.
 //! 3. `on_detach` when it was removed and the program that read it has ended. Not at the end of the run:
 //!    the device stays where it is.
 //!
@@ -97,7 +97,10 @@ impl Attendant {
         while let Some(episode) = self.begun().await {
             self.run("on_record_start", spec.hooks.record_start.as_ref(), Some(&episode)).await;
             self.over(&episode).await;
-            self.run("on_record_stop", spec.hooks.record_stop.as_ref(), Some(&episode)).await;
+            if spec.hooks.record_stop.is_some() {
+                let ended = self.ended(&episode).await;
+                self.run("on_record_stop", spec.hooks.record_stop.as_ref(), Some(&ended)).await;
+            }
         }
         if self.gone.is_cancelled() {
             if let Some(node) = &self.node {
@@ -129,7 +132,7 @@ impl Attendant {
 
     /// Waits until this episode is over, for this device.
     async fn over(&mut self, episode: &Arc<Episode>) {
-        let other = |now: &Option<Arc<Episode>>| now.as_ref().is_none_or(|now| now != episode);
+        let other = |now: &Option<Arc<Episode>>| now.as_ref().is_none_or(|now| !Arc::ptr_eq(now, episode));
         tokio::select! {
             biased;
             () = self.gone.cancelled() => {}
@@ -138,7 +141,19 @@ impl Attendant {
         }
     }
 
-    /// Runs a hook to its end. What goes wrong is said and changes nothing else.
+    /// An episode that is over, as it ended; for a device that was removed before that, as it is to be.
+    async fn ended(&self, episode: &Episode) -> Episode {
+        let file = tokio::select! {
+            biased;
+            file = episode.ended() => file,
+            () = self.gone.cancelled() => &episode.file,
+            // The disk takes longer, or the recorder has failed.
+            () = sleep(HOOK_LIMIT) => &episode.file,
+        };
+        Episode::new(file)
+    }
+
+    /// Runs a hook to its end. What goes wrong is reported and changes nothing else.
     async fn run(&self, key: &str, hook: Option<&Hook>, episode: Option<&Episode>) {
         let Some(hook) = hook else { return };
         if let Err(reason) = self.run_hook(key, hook, episode).await {

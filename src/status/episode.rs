@@ -6,15 +6,17 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use serde::Serialize;
-use tokio::sync::watch;
+use tokio::sync::{SetOnce, watch};
 
 use crate::text;
 
 /// An episode in progress.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug)]
 pub struct Episode {
-    /// The file it will be once it is finished, an absolute path.
+    /// The file it is to be once it is finished, an absolute path.
     pub file: PathBuf,
+    /// The file that it has become.
+    ended: SetOnce<PathBuf>,
 }
 
 /// The last episode, while it may be dropped because it is too short to be used.
@@ -34,14 +36,26 @@ impl Episode {
     /// The episode that will be `file`.
     #[must_use]
     pub fn new(file: &Path) -> Self {
-        // Without a working folder there is nothing better than the path as it was given.
-        Self { file: std::path::absolute(file).unwrap_or_else(|_| file.to_owned()) }
+        Self { file: absolute(file), ended: SetOnce::new() }
     }
 
-    /// What it is called: the name of its file without `.mcap`.
+    /// It has become `file`, which may have another name than it was to get. Only the first call counts.
+    pub fn end(&self, file: &Path) {
+        let _ = self.ended.set(absolute(file));
+    }
+
+    /// Waits until it has ended, whether it is whole or not; returns its file. Cancel-safe.
+    pub async fn ended(&self) -> &Path {
+        self.ended.wait().await
+    }
+
+    /// What it is called: the name of its file without `.mcap`, or `.mcap.partial`.
     #[must_use]
     pub fn id(&self) -> String {
-        self.file.file_stem().unwrap_or_default().to_string_lossy().into_owned()
+        let stem = Path::new(self.file.file_stem().unwrap_or_default());
+        let is_whole = stem.extension().is_none_or(|extension| extension != "mcap");
+        let name = if is_whole { stem.as_os_str() } else { stem.file_stem().unwrap_or_default() };
+        name.to_string_lossy().into_owned()
     }
 
     /// The folder of its file.
@@ -49,6 +63,11 @@ impl Episode {
     pub fn folder(&self) -> &Path {
         self.file.parent().unwrap_or(Path::new("/"))
     }
+}
+
+/// Without a working folder there is nothing better than the path as it was given.
+fn absolute(file: &Path) -> PathBuf {
+    std::path::absolute(file).unwrap_or_else(|_| file.to_owned())
 }
 
 #[cfg(test)]
@@ -60,6 +79,7 @@ mod tests {
         let episode = Episode::new(Path::new("out/2026-11-21_place-block_001.mcap"));
         assert!(episode.file.is_absolute());
         assert_eq!(episode.id(), "2026-11-21_place-block_001");
+        assert_eq!(Episode::new(Path::new("a.b_001.mcap.partial")).id(), "a.b_001");
         assert!(episode.folder().ends_with("out"));
     }
 }
