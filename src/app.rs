@@ -197,6 +197,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     // First of all: are we the only one? A registry has at most 64 devices.
     let count = u8::try_from(registry.devices.len()).unwrap_or(u8::MAX);
     let claim = Claim::new(&mask_path(options.instance.as_deref()), count)?;
+    Bus::clear_others(options.instance.as_deref());
     let bus = Bus::open(&registry, options.instance.as_deref())?;
     let Some(mask_writer) = bus.writer(TopicId::Mask) else { return Err(AppError::Panicked("the bus")) };
     let presence = Presence::start(claim, mask_writer, Arc::clone(&board))?;

@@ -48,8 +48,7 @@ impl Home {
         sigbus::install()?;
         place::memory()?;
         let config = config(instance)?;
-        // Its path ends in a slash, behind which a link could not be told from what it means.
-        let root: PathBuf = PathBuf::from(config.global.root_path().to_string()).components().collect();
+        let root = root(&config);
         place::check(&root)?;
         place::make(&root)?;
         let prefix = config.global.prefix.to_string();
@@ -57,7 +56,6 @@ impl Home {
         // Until the node is there: who looks through the files meanwhile would take its first ones for a dead one's.
         let turn = take_turn(&files.root);
         files.files.clear(FILL_LIMIT)?;
-        files.files.clear_others();
         room::check(need)?;
         addresses(need)?;
         // Signals belong to the program, not to a library.
@@ -111,6 +109,23 @@ impl Drop for Leaving {
     fn drop(&mut self) {
         self.clear();
     }
+}
+
+/// Removes what instances other than `instance` left behind of which no process lives. What cannot be removed is
+/// reported by that instance's next start.
+pub(super) fn clear_others(instance: Option<&str>) {
+    let Ok(config) = config(instance) else { return };
+    let root = root(&config);
+    if place::check(&root).is_ok() {
+        let _turn = take_turn(&root);
+        Files::new(config.global.prefix.to_string(), root).clear_others();
+    }
+}
+
+/// The folder of iceoryx2.
+fn root(config: &Config) -> PathBuf {
+    // Its path ends in a slash, behind which a link could not be distinguished from what it means.
+    PathBuf::from(config.global.root_path().to_string()).components().collect()
 }
 
 /// Keeps the processes of this program from looking through the files at the same time; `None` where another takes

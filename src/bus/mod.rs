@@ -95,6 +95,12 @@ impl std::fmt::Debug for Bus {
 }
 
 impl Bus {
+    /// Removes what instances other than `instance` left behind of which no process lives: their memory is free for
+    /// this one. Blocks for as long as files are looked through.
+    pub fn clear_others(instance: Option<&str>) {
+        home::clear_others(instance);
+    }
+
     /// Opens the node and every topic of `registry`, with room in shared memory for all of them. What killed
     /// processes left behind is removed.
     ///

@@ -167,8 +167,15 @@ fn kinds(name: &str) -> Vec<(String, PathBuf)> {
     kinds
 }
 
+/// What one test left behind of dead processes is what another one clears.
+fn alone() -> std::sync::MutexGuard<'static, ()> {
+    static ALONE: std::sync::Mutex<()> = std::sync::Mutex::new(());
+    ALONE.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+}
+
 #[test]
 fn what_killed_processes_left_is_removed_in_every_state_of_damage() {
+    let _alone = alone();
     let name = format!("dead{}", std::process::id());
     killed(&name);
     let all = kinds(&name);
@@ -192,6 +199,7 @@ fn what_killed_processes_left_is_removed_in_every_state_of_damage() {
 
 #[test]
 fn a_damaged_file_is_found_whatever_it_has_become() {
+    let _alone = alone();
     let name = format!("found{}", std::process::id());
     killed(&name);
     let all = Files::new(format!("iox2_{name}_"), PathBuf::from("/tmp/iceoryx2"));
@@ -211,6 +219,7 @@ fn a_damaged_file_is_found_whatever_it_has_become() {
 
 #[test]
 fn a_start_removes_what_dead_processes_left_of_other_instances_and_nothing_of_living_ones() {
+    let _alone = alone();
     for (name, prefix) in [
         (format!("iox2_{PORT}.node_monitor"), Some("iox2_")),
         (format!("iox2_a_b_{PORT}.node_monitor_owner_lock"), Some("iox2_a_b_")),
@@ -227,7 +236,7 @@ fn a_start_removes_what_dead_processes_left_of_other_instances_and_nothing_of_li
     killed(&dead);
     let used = files(&living);
     assert!(!files(&dead).is_empty());
-    drop(Home::open(Some(&new), 0).unwrap());
+    super::super::home::clear_others(Some(&new));
     assert_eq!((files(&dead), files(&living)), (Vec::new(), used));
     stays.kill().unwrap();
     stays.wait().unwrap();
