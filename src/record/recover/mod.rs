@@ -1,16 +1,17 @@
 //! Repair of episodes that were not finished: a `.partial` left by a kill or a full disk, a file cut
 //! or damaged later.
 //!
-//! `copy` reads what is there and writes a whole file of it, `names` says how the files are called,
+//! `copy` reads what is there and writes a whole file of it, `names` has the names of the files,
 //! `folder` goes through a folder, in the background if asked. What becomes of a file is an
 //! [`Outcome`]:
 //!
 //! 1. Not whole, with something recorded: repaired into a file of the finished name. The `.partial`
-//!    is removed once that file has its name, or kept as `.damaged` if anything of it was left out. A finished file is never touched: the repaired one stands beside it, `.recovered.mcap`.
+//!    is removed once that file has its name, or kept as `.damaged` if anything of it was left out. A finished file is
+//!    never touched: the repaired one stands beside it, `.recovered.mcap`.
 //! 2. Whole, and only its name is missing (a kill at the very end): it gets its name, or a free one beside the file
 //!    that has it by now, and stays as it is otherwise.
-//! 3. Of no bytes: removed, and said. Whole as far as it goes and without a sample: set aside as `.empty`. No MCAP file,
-//!    or damaged and without a message: set aside as `.damaged`. Both are said once, and their number stays taken.
+//! 3. Of no bytes: removed, and reported. Whole as far as it goes and without a sample: set aside as `.empty`. No MCAP file,
+//!    or damaged and without a message: set aside as `.damaged`. Both are reported once, and their number stays taken.
 //!
 //! Invariant: the check value of every chunk of ours that is taken is right. Messages of a last chunk that is cut have
 //! none: they are taken only while the kernel runs that kept the order of their writes, which proves that they were
@@ -18,12 +19,13 @@
 //! Invariant: what the recorder called BAD stays BAD.
 //! Invariant: at every moment all that was recorded is in a file that a later repair finds or in the
 //! repaired file; a repair that ends in its middle leaves a `.recovering`, which the next one replaces.
-//! Invariant: a file somebody else writes or repairs is left alone.
+//! Invariant: a file that another process writes or repairs is left alone.
 //! Invariant: memory does not grow with the file, but for the index of its chunks.
 
 mod copy;
 #[cfg(test)]
 mod damage;
+mod error;
 mod folder;
 mod names;
 #[cfg(test)]
@@ -43,67 +45,16 @@ use serde::Serialize;
 
 use super::lock::{self, Lock};
 use crate::episode_format::walk::MAGIC;
-use crate::episode_format::{self, Failed, OpenError};
+use crate::episode_format::{self, Failed};
 use crate::{text, time};
 
 pub use self::copy::recover_bytes;
 use self::copy::{Copied, Damage};
+pub use self::error::RecoverError;
 pub use self::folder::{Repairs, finished, is_damaged, left_behind};
 use self::names::{Names, set_aside};
 use self::summary::{Made, Summary};
 pub use super::walk::{FileEnd, LeftOut};
-
-/// Why a file was not repaired. It is as it was.
-#[derive(Debug, thiserror::Error)]
-pub enum RecoverError {
-    /// The system refuses.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// What the system says.
-        source: io::Error,
-    },
-    /// It is a folder, a pipe, a device or a link.
-    #[error("{}: not a file; name an episode itself, a file that ends in .mcap or .mcap.partial", .0.display())]
-    NotFile(PathBuf),
-    /// It is being written, or repaired, at this moment.
-    #[error("{}: another rapid is writing or repairing it; end that first", .0.display())]
-    Busy(PathBuf),
-    /// Whether it is being written cannot be known.
-    #[error("{}: its file system knows no locks, so it may still be written; copy it to another disk and repair it there", .0.display())]
-    NoLock(PathBuf),
-    /// A finished file that is no MCAP file.
-    #[error("{}: not an MCAP file", .0.display())]
-    NotMcap(PathBuf),
-    /// A finished file in which nothing can be read.
-    #[error("{}: no message in it can be read", .0.display())]
-    Nothing(PathBuf),
-    /// The user ended it.
-    #[error("{}: interrupted; it is as it was", .0.display())]
-    Interrupted(PathBuf),
-}
-
-impl From<OpenError> for RecoverError {
-    fn from(error: OpenError) -> Self {
-        match error {
-            OpenError::Io { path, source } => Self::Io { path, source },
-            OpenError::NotFile(path) => Self::NotFile(path),
-        }
-    }
-}
-
-impl RecoverError {
-    /// Was something named that cannot be meant?
-    #[must_use]
-    pub fn is_bad_argument(&self) -> bool {
-        match self {
-            Self::NotFile(_) | Self::NotMcap(_) => true,
-            Self::Io { source, .. } => source.kind() == io::ErrorKind::NotFound,
-            _ => false,
-        }
-    }
-}
 
 /// What became of a file.
 #[derive(Debug, Clone, PartialEq, Serialize)]
