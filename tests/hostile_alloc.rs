@@ -126,7 +126,7 @@ fn messages(topic: &str, chunks: usize, mut data: impl FnMut(u32) -> Vec<u8>) ->
     [beginning(1), chunk(&channel(1, topic, &map(&[]))), packed.repeat(chunks)].concat()
 }
 
-/// An event of this kind that says `json`.
+/// An event of this kind with `json`.
 fn event(kind: &str, json: &str) -> Vec<u8> {
     let field = |number: u8, bytes: &[u8]| {
         let (low, middle) = (0x80 | bytes.len() & 0x7f, 0x80 | bytes.len() >> 7 & 0x7f);

@@ -144,7 +144,7 @@ fn without_check_values(whole: &[u8]) -> Mutants {
 /// Files that other programs wrote.
 fn foreign(messages: u32) -> Vec<u8> {
     let mut file = std::io::Cursor::new(Vec::new());
-    let options = mcap::WriteOptions::new().library("recorder of somebody else");
+    let options = mcap::WriteOptions::new().library("another recorder");
     let mut writer = mcap::Writer::with_options(&mut file, options).expect("a writer");
     let channel = writer.add_channel(0, "/other", "json", &BTreeMap::new()).expect("a channel");
     for sequence in 0..messages {

@@ -1,7 +1,8 @@
 //! What the channels and schemas of a file are, wherever in it that stands.
 //!
 //! A chunk need not repeat what an earlier one defined, and that one may be damaged: what is defined at another place,
-//! the summary or the record at the head of a chunk of ours, is shown in its stead, before the first message that needs it.
+//! the summary or the record at the head of a chunk of ours, is shown in its stead, before the first message that needs
+//! it.
 //!
 //! Invariant: of definitions and metadata at most [`LARGEST`] bytes and [`MOST`] definitions are shown:
 //! whoever keeps them is bounded. The rest is counted.

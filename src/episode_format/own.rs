@@ -1,7 +1,7 @@
 //! The record that begins every chunk of an episode of ours: which episode the chunk belongs to, and what its channels
 //! are.
 //!
-//! A chunk need not repeat what an earlier one defines, and that one may be damaged; nor does MCAP say which file a chunk
+//! A chunk need not repeat what an earlier one defines, and that one may be damaged; nor does MCAP record which file a chunk
 //! belongs to, and one that is found behind damage may be the payload of a message. The chunk's check value covers this
 //! record, so both are known wherever the chunk is right.
 //!
@@ -23,7 +23,7 @@ use super::walk::Walk;
 use super::wire::Fields;
 use super::{ABOUT, BOOT_ID};
 
-/// Tells the record from another program's of the same opcode.
+/// Distinguishes the record from another program's of the same opcode.
 const MARK: [u8; 8] = *b"rapid/1\n";
 /// Bytes of definitions that are repeated in every chunk; no more, or a hostile file would grow without bound when it is
 /// repaired. An episode of 64 devices has about 30 KiB.
@@ -53,7 +53,7 @@ pub(super) enum Owner {
     Unknown,
     /// Whose file it is is being looked for: every chunk counts.
     Any,
-    /// No right chunk says: the file is another program's, or is older than this record.
+    /// No right chunk names one: the file is another program's, or is older than this record.
     Unnamed,
     Episode(EpisodeId),
 }
@@ -113,7 +113,7 @@ fn first(records: &[u8]) -> Option<(EpisodeId, Fields<'_>)> {
 }
 
 impl<R: ReadAt> Walk<R> {
-    /// The episode that the chunks shown so far belong to; `None` also if they do not say.
+    /// The episode that the chunks shown so far belong to; `None` also if they name none.
     pub(crate) fn episode(&self) -> Option<EpisodeId> {
         match self.names.owner {
             Owner::Episode(episode) => Some(episode),
@@ -121,7 +121,7 @@ impl<R: ReadAt> Walk<R> {
         }
     }
 
-    /// Is the file an episode of ours, as far as anything of it says?
+    /// Is the file an episode of ours, as far as anything in it shows?
     pub(super) fn is_episode(&mut self) -> io::Result<bool> {
         self.look_for_owner()?;
         Ok(matches!(self.names.owner, Owner::Episode(_) | Owner::Any))
@@ -179,7 +179,7 @@ impl<R: ReadAt> Walk<R> {
         self.names.named = if self.checked && !self.chunked { EpisodeId::of(&about) } else { None };
     }
 
-    /// Are these records, found behind damage, this file's? Where no chunk says, it is those that contradict nothing.
+    /// Are these records, found behind damage, this file's? Where no chunk names an episode, it is those that contradict nothing.
     pub(super) fn is_own(&mut self, records: &Records) -> io::Result<bool> {
         let owner = Owner::of(first(self.bytes(records)).map(|(episode, _)| episode));
         self.look_for_owner()?;

@@ -5,7 +5,7 @@
 //! 3. Otherwise the next place is searched at which a chunk may begin and whose check value is right. Nothing is searched
 //!    within what is known to be whole: in the records of a right chunk, in an attachment, in the records of a damaged
 //!    chunk as far as one follows the other. A chunk found within what is left, damaged, may be the payload of a
-//!    message: of an episode of ours only a chunk that says it belongs to it is taken (see `own`). In another
+//!    message: of an episode of ours only a chunk that names it is taken (see `own`). In another
 //!    file a chunk is taken unless it shows that it is another one's, by a channel or schema that contradicts one
 //!    of this file's, or by messages from before this episode began: a file is recorded before it is sent.
 //! 4. Metadata have no check value. They are taken where the index names them, or before the first chunk.
@@ -178,7 +178,7 @@ impl<R: ReadAt> Walk<R> {
     pub(super) fn hides(&mut self, at: u64, end: u64) -> io::Result<bool> {
         self.read_index()?;
         let from = match self.within(at)? {
-            // What says whose it is may be searched for anywhere.
+            // What names the episode may be searched for anywhere.
             Some(within) if within.is_whole && !self.is_episode()? => return Ok(false),
             Some(within) => within.sure,
             None => at,

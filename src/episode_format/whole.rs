@@ -79,7 +79,7 @@ impl<R: ReadAt> Walk<R> {
     pub(super) fn show(&mut self, head: ChunkHead, records: Records) -> io::Result<()> {
         self.sure = self.at;
         (self.chunked, self.with_checks) = (true, self.with_checks || head.crc != 0);
-        // Nothing is recorded twice; without a clock it cannot be told.
+        // Nothing is recorded twice; without a clock it is not known.
         let is_new = self.seen.insert((head.size, head.packed, head.crc)) || head.crc == 0 || head.times == (0, 0);
         if is_new {
             self.chunk = self.learn(&records)?.then_some(records);

@@ -21,7 +21,7 @@ const CHUNK_BYTES: u64 = 1 << 20;
 const SMALL_BYTES: u64 = 64 << 10;
 /// Gathers the small records between chunks (message indexes) into one write.
 const BUFFER_BYTES: usize = 64 << 10;
-/// Bytes that may be spent on saying whose a chunk is: of any file, and for each byte of its other records. A hostile file
+/// Bytes that may be spent on definitions repeated in chunks: of any file, and for each byte of its other records. A hostile file
 /// of many short chunks would otherwise become thousands of times as long when it is repaired.
 const REPEATED: (u64, u64) = (16 << 20, 8);
 /// Opcode and length of a record.
@@ -44,7 +44,7 @@ impl<S: Sink> Chunks<S> {
     pub(super) fn new(sink: S, episode: Option<EpisodeId>) -> io::Result<Self> {
         // JPEG does not compress and raw frames are rare: no codec, so that the thread's time goes
         // into the disk and every reader can read. Without seeking the writer keeps a chunk in
-        // memory until it is whole. Chunks are closed here, before the writer would: it does not say when it does.
+        // memory until it is whole. Chunks are closed here, before the writer would: it does not report when it does.
         let options = WriteOptions::new()
             .compression(None)
             .chunk_size(Some(CHUNK_BYTES + BUFFER_BYTES as u64))
@@ -190,7 +190,7 @@ fn number(record: &mut [u8], id: u16) {
     }
 }
 
-/// The system's own error where there is one: it says more than the writer's.
+/// The system's own error where there is one: it is more exact than the writer's.
 pub(super) fn io_error(error: McapError) -> io::Error {
     match error {
         McapError::Io(error) => error,

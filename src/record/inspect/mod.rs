@@ -113,7 +113,7 @@ pub struct Inspection {
     pub messages: u64,
     /// Samples lost on the way to the file, and those missing in it since; unknown in an unfinished file.
     pub dropped: Option<u64>,
-    /// Samples the recorder says the devices lost themselves; unknown in an unfinished file. Where samples are missing
+    /// Samples that the devices lost themselves, by the recorder's count; unknown in an unfinished file. Where samples are missing
     /// that it wrote, it is not known which were whose: all are `dropped`.
     pub lost: Option<u64>,
     /// Samples the drivers called damaged; unknown in an unfinished file.

@@ -1,6 +1,6 @@
 //! A folder of episodes: which of them were not finished, and their repair in the background.
 //!
-//! Invariant: nobody waits for a repair in the background, which works half of the time at most and
+//! Invariant: nothing waits for a repair in the background, which works half of the time at most and
 //! leaves so much room on the disk that an episode being recorded is neither closed nor warned of.
 
 use std::fs::{self, DirEntry, File};
@@ -79,7 +79,7 @@ pub struct Repairs {
 }
 
 impl Repairs {
-    /// Repairs what an earlier run left unfinished in `folder`, and says so on `board`; `reserve` is the
+    /// Repairs what an earlier run left unfinished in `folder`, and reports it on `board`; `reserve` is the
     /// registry's `disk_reserve`.
     ///
     /// # Errors

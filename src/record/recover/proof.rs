@@ -24,7 +24,7 @@ async fn a_whole_episode_whose_name_is_taken_gets_a_free_one_and_stays_as_it_is(
     let (_folder, bytes) = recorded().await;
     let (_folder, other) = recorded().await;
     let plant: [(&str, Plant<'_>); 4] = [
-        ("a file", &|at| fs::write(at, "of somebody else").unwrap()),
+        ("a file", &|at| fs::write(at, "of another program").unwrap()),
         ("another episode", &|at| fs::write(at, &other).unwrap()),
         ("a link that leads nowhere", &|at| std::os::unix::fs::symlink("nowhere", at).unwrap()),
         ("a folder", &|at| fs::create_dir(at).unwrap()),
@@ -45,7 +45,7 @@ async fn a_whole_episode_whose_name_is_taken_gets_a_free_one_and_stays_as_it_is(
         assert_eq!(names(folder.path()), ["a_001.mcap", "a_001.recovered-2.mcap", "a_001.recovered.mcap"], "{what}");
         let there = folder.path().join("a_001.mcap");
         match what {
-            "a file" => assert_eq!(fs::read(there).unwrap(), b"of somebody else"),
+            "a file" => assert_eq!(fs::read(there).unwrap(), b"of another program"),
             "another episode" => assert_eq!(fs::read(there).unwrap(), other),
             _ => assert!(fs::symlink_metadata(there).is_ok_and(|there| !there.is_file()), "{what}"),
         }
