@@ -1,9 +1,9 @@
 //! The record that begins every chunk of an episode of ours: which episode the chunk belongs to, and what its channels
 //! are.
 //!
-//! A chunk need not repeat what an earlier one defines, and that one may be damaged; nor does MCAP record which file a chunk
-//! belongs to, and one that is found behind damage may be the payload of a message. The chunk's check value covers this
-//! record, so both are known wherever the chunk is right.
+//! A chunk need not repeat what an earlier one defines, and that one may be damaged; nor does MCAP record which file a
+//! chunk belongs to, and one that is found behind damage may be the payload of a message. The chunk's check value covers
+//! this record, so both are known wherever the chunk is right.
 //!
 //! Layout: private opcode [`op::OWN`], which other readers pass over; its content is [`MARK`], 16 bytes of the episode,
 //! then schema and channel records with their heads, each schema before the channels that need it.
@@ -179,7 +179,8 @@ impl<R: ReadAt> Walk<R> {
         self.names.named = if self.checked && !self.chunked { EpisodeId::of(&about) } else { None };
     }
 
-    /// Are these records, found behind damage, this file's? Where no chunk names an episode, it is those that contradict nothing.
+    /// Are these records, found behind damage, this file's? Where no chunk names an episode, it is those that contradict
+    /// nothing.
     pub(super) fn is_own(&mut self, records: &Records) -> io::Result<bool> {
         let owner = Owner::of(first(self.bytes(records)).map(|(episode, _)| episode));
         self.look_for_owner()?;
