@@ -11,6 +11,7 @@
 mod asked;
 mod autopilot;
 mod conductor;
+mod error;
 mod screen;
 pub(crate) mod signals;
 mod watch;
@@ -28,28 +29,28 @@ use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
 use crate::action::Order;
-use crate::bus::{self, Bus, BusError, TopicId};
+use crate::bus::{self, Bus, TopicId};
 use crate::driver;
 use crate::fault;
+use crate::hotplug::HotplugStream;
 use crate::hotplug::lan::LanMonitor;
 use crate::hotplug::script::Script;
 use crate::hotplug::udev::UdevMonitor;
-use crate::hotplug::{HotplugError, HotplugStream};
-use crate::logging::{self, LoggingError, Stderr};
+use crate::logging::{self, Stderr};
 use crate::mask::MASK_PATH;
 use crate::panics;
 use crate::record::recover::Repairs;
-use crate::record::{EpisodeRequest, RecordError, Recorder, RecorderConfig};
+use crate::record::{EpisodeRequest, Recorder, RecorderConfig};
 use crate::registry::Registry;
 use crate::registry::scenario::Scenario;
-use crate::rig::presence::{Claim, Presence, PresenceError};
+use crate::rig::presence::{Claim, Presence};
 use crate::rig::{Rig, RigCommand, RigError};
 use crate::status::Board;
-use crate::tui::TuiError;
 use asked::Asked;
 use autopilot::Autopilot;
 pub use autopilot::PolicyOptions;
 use conductor::Conductor;
+pub use error::AppError;
 use signals::Signals;
 
 /// Where devices come from.
@@ -93,75 +94,6 @@ pub struct Options {
     pub duration: Option<Duration>,
     /// Keeps this rig apart from another on the machine.
     pub instance: Option<String>,
-}
-
-/// Why a run could not begin or go on.
-#[derive(Debug, thiserror::Error)]
-pub enum AppError {
-    /// The log.
-    #[error(transparent)]
-    Logging(#[from] LoggingError),
-    /// The mask.
-    #[error(transparent)]
-    Presence(#[from] PresenceError),
-    /// The bus.
-    #[error(transparent)]
-    Bus(#[from] BusError),
-    /// Plugging.
-    #[error(transparent)]
-    Hotplug(#[from] HotplugError),
-    /// The rig.
-    #[error(transparent)]
-    Rig(#[from] RigError),
-    /// The recorder.
-    #[error(transparent)]
-    Record(#[from] RecordError),
-    /// The monitor.
-    #[error(transparent)]
-    Tui(#[from] TuiError),
-    /// The output of a headless run.
-    #[error("output: {0}")]
-    Output(std::io::Error),
-    /// A thread or signal handler.
-    #[error("the system refuses: {0}")]
-    System(#[from] std::io::Error),
-    /// The policy.
-    #[error(transparent)]
-    Policy(#[from] autopilot::LoadError),
-    /// What the policy requires is not there.
-    #[error("the policy needs {0}: plug it in, or write --wait to start when it is there")]
-    Required(String),
-    /// The policy does not end.
-    #[error("the policy did not end within {} s", LAST_CHUNK.as_secs())]
-    Stuck,
-    /// An episode's file is not whole.
-    #[error("{}: {reason}", file.display())]
-    Episode {
-        /// What there is of it.
-        file: PathBuf,
-        /// Why.
-        reason: String,
-    },
-    /// A run without a screen recorded something that is not to be used.
-    #[error("{}", bad(*count, file))]
-    Bad {
-        /// Episodes that are BAD.
-        count: u64,
-        /// The last of them.
-        file: PathBuf,
-    },
-    /// A task or thread of ours panicked.
-    #[error("{0} panicked; please report this")]
-    Panicked(&'static str),
-    /// A second signal came while the run was ending.
-    #[error("interrupted twice")]
-    InterruptedTwice,
-}
-
-fn bad(count: u64, file: &Path) -> String {
-    let file = file.display();
-    let many = if count > 1 { format!(", and {} before it", count - 1) } else { String::new() };
-    format!("{file} is BAD{many}: its verdict above has the reasons; see `rapid inspect`")
 }
 
 /// Where the mask of an instance is published.

@@ -9,7 +9,7 @@
 
 use std::io;
 
-use super::source::ReadAt;
+use super::source::{ReadAt, Source};
 use super::walk::MAGIC;
 use super::wire::Fields;
 
@@ -18,7 +18,7 @@ const MARK: [u8; 16] = *b"\0rapid/failed/1\n";
 /// Bytes of length and check value.
 const HEAD: usize = 8;
 /// Bytes at the end in which it is looked for: the program that damaged the file may have written more since.
-const SEARCHED: usize = 1 << 20;
+const SEARCHED: u64 = 1 << 20;
 /// Longest reason in bytes.
 const LONGEST: usize = 4096;
 
@@ -41,18 +41,9 @@ impl Failed {
 
     /// Reads it from the end of a file of `size` bytes, if it stands there; of several the last.
     pub(crate) fn of(file: &(impl ReadAt + ?Sized), size: u64) -> io::Result<Option<Self>> {
-        let mut end = vec![0; usize::try_from(size).unwrap_or(usize::MAX).min(SEARCHED)];
-        let mut read = 0;
-        let from = size - end.len() as u64;
-        while let Some(room) = end.get_mut(read..).filter(|room| !room.is_empty()) {
-            match file.read_at(room, from + read as u64) {
-                Ok(0) => return Ok(None),
-                Ok(count) => read += count,
-                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-                Err(error) => return Err(error),
-            }
-        }
-        if end.ends_with(&MAGIC) {
+        let mut end = Vec::new();
+        let from = size.saturating_sub(SEARCHED);
+        if !Source::new(file, size).read(from, size - from, &mut end)? || end.ends_with(&MAGIC) {
             return Ok(None);
         }
         // A reason may contain the text of a mark, but nothing that is right as one.
@@ -79,7 +70,7 @@ mod tests {
     fn what_the_other_program_writes_behind_it_hides_it_only_where_that_ends_a_file() {
         let bytes = |behind: &[u8]| [&b"content"[..], &Failed::mark("another program cut it"), behind].concat();
         let found = |bytes: &[u8]| Failed::of(bytes, bytes.len() as u64).unwrap();
-        for behind in [&b"\n"[..], b"a line\n", &[0; 300], &vec![7; SEARCHED / 2]] {
+        for behind in [&b"\n"[..], b"a line\n", &[0; 300], &vec![7; 1 << 19]] {
             let found = found(&bytes(behind)).unwrap_or_else(|| panic!("{} bytes", behind.len()));
             assert_eq!((found.at, found.why.as_str()), (7, "another program cut it"), "{} bytes", behind.len());
         }

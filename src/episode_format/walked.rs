@@ -129,6 +129,12 @@ impl Walked {
         }
     }
 
+    /// Of the `size` bytes of the file those that were not understood. What stands before it and behind it is not its own.
+    pub(crate) fn unread(&self, size: u64) -> u64 {
+        let LeftOut { bytes_before, bytes_behind, .. } = self.left_out;
+        [self.bytes, bytes_before, bytes_behind].into_iter().fold(size, u64::saturating_sub)
+    }
+
     /// Is nothing left out but, perhaps, less than one record at a torn end?
     pub(crate) fn is_all(&self) -> bool {
         self.sound || self.end != FileEnd::Damaged && self.damaged_chunks == 0 && self.left_out.is_nothing()

@@ -182,6 +182,7 @@ async fn the_last_episode_whose_file_fails_is_an_error_of_the_run() {
     }
     let error = bench.conductor.finish_episode().await.unwrap_err().to_string();
     assert!(error.contains("_002.mcap.partial") && error.contains("lost"), "{error}");
+    assert!(error.contains("`rapid recover ") && error.matches("_002").count() == 2, "{error}");
 }
 
 fn ended(error: Option<&str>) -> What {

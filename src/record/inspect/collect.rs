@@ -273,7 +273,7 @@ impl Collected {
             verdict,
             // A verdict from before it failed is void.
             recorded_verdict: state::recorded_verdict(&self.summary).filter(|_| failed.is_none()),
-            unread_bytes: recorded.saturating_sub(walked.bytes),
+            unread_bytes: walked.unread(recorded),
             damaged_chunks: walked.damaged_chunks,
             left_out: walked.left_out,
             ordered_messages: walked.ordered_messages,

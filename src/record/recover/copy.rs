@@ -115,7 +115,7 @@ pub(super) fn copy(
     let walked = walk.walked();
     let damage = Damage {
         walked,
-        unread_bytes: recorded.saturating_sub(walked.bytes),
+        unread_bytes: walked.unread(recorded),
         refused_records: copy.refused,
         nameless: walk.nameless().clone(),
         // Or of the file from which that one was made.

@@ -9,7 +9,7 @@ use std::os::unix::ffi::OsStringExt;
 use super::super::chunks::{Channel, Chunks};
 use super::copy::recover_bytes;
 use super::tests::{go_on, names, put, recorded};
-use super::{Outcome, RecoverError, left_behind, recover};
+use super::{FileEnd, Outcome, RecoverError, left_behind, recover};
 use crate::episode_format::op;
 use crate::episode_format::own::EpisodeId;
 use crate::episode_format::testing::{self, Message, metadata, strictly};
@@ -393,8 +393,14 @@ async fn an_episode_behind_other_bytes_is_found_and_of_several_the_first() {
                 assert_eq!(strictly(&whole), all, "{} and {} bytes", prefix.len(), behind.len());
                 assert_eq!(metadata(&whole)["rapid"], metadata(&bytes)["rapid"]);
                 assert_eq!(repaired.left_out.bytes_before, prefix.len() as u64);
+                // Each byte is counted once.
+                let sentence = said.sentence().1;
+                let finished = repaired.end == FileEnd::Finished;
+                let is_all_known = finished && behind.iter().all(|byte| *byte == 0);
+                assert!(repaired.unread_bytes == 0 || !is_all_known, "{sentence}");
+                assert!(repaired.unread_bytes <= (state.len() + behind.len()) as u64, "{sentence}");
                 assert_eq!(fs::read(repaired.original.as_ref().unwrap()).unwrap(), archive);
-                assert!(said.sentence().1.contains("before the beginning of the file"), "{}", said.sentence().1);
+                assert!(sentence.contains("before the beginning of the file"), "{sentence}");
                 for name in names(folder.path()) {
                     fs::remove_file(folder.path().join(name)).unwrap();
                 }

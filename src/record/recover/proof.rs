@@ -283,6 +283,20 @@ async fn the_chunks_of_a_repaired_file_are_no_larger_than_those_recorded() {
     println!("{} chunks, largest {}", chunks(&whole).len(), largest_of(&whole));
 }
 
+/// What is there is right, and yet it is not all: the index and the check value of the whole are not of this.
+#[tokio::test]
+async fn a_file_from_which_a_chunk_was_cut_is_not_repaired_without_a_word() {
+    let (folder, mut bytes) = recorded().await;
+    let cut = chunks(&bytes)[1].content.clone();
+    bytes.drain(cut.start - 9..cut.end);
+    let said = recover(&put(&folder, "a_001.mcap", &bytes), &mut go_on).unwrap();
+    assert!(said.sentence().1.contains("parts of it may be missing"), "{said:?}");
+    // A file of which nothing is missing has no such word.
+    let Outcome::Repaired(made) = said.outcome else { panic!("{said:?}") };
+    let said = recover(&made.to, &mut go_on).unwrap();
+    assert!(!said.sentence().1.contains("missing"), "{said:?}");
+}
+
 /// Half of an episode and a whole one behind it: the second is no part of the first.
 #[tokio::test]
 async fn what_is_not_read_is_shown_with_its_size_and_the_original_is_kept() {

@@ -6,7 +6,7 @@ use serde_json::{Map, Value, json};
 
 use super::copy::{About, Damage};
 use super::summary::{LOSSLESS, SHA256, Summary};
-use super::{FileEnd, Outcome, Recovered, Repaired};
+use super::{FileEnd, LeftOut, Outcome, Recovered, Repaired};
 use crate::episode_format::FAILED;
 use crate::status::{Grade, Level};
 use crate::text;
@@ -107,6 +107,12 @@ impl Recovered {
 }
 
 impl Repaired {
+    /// Is nothing left out, although the original was not whole? Then something of it is gone, or a check value is wrong.
+    fn is_unexplained(&self) -> bool {
+        let counted = [self.unread_bytes, self.damaged_chunks, self.ordered_messages, self.refused_records];
+        self.failed.is_none() && counted.iter().all(|count| *count == 0) && self.left_out == LeftOut::default()
+    }
+
     fn sentence(&self) -> String {
         let mut said = format!("repaired, {:.1} s, {}", self.seconds, text::counted(self.messages, "message"));
         let mut but = |text: String| {
@@ -118,6 +124,9 @@ impl Repaired {
         }
         let unread = text::counted(self.unread_bytes, "byte");
         match self.end {
+            FileEnd::Finished if self.is_unexplained() => {
+                but("its end does not fit what is before it: parts of it may be missing".to_owned());
+            }
             FileEnd::Finished => {}
             FileEnd::Unfinished => but("the last second may be missing".to_owned()),
             FileEnd::Torn if self.unread_bytes == 0 => but("the last second may be missing".to_owned()),
@@ -152,7 +161,6 @@ impl Repaired {
 
 #[cfg(test)]
 mod tests {
-    use super::super::LeftOut;
     use super::*;
 
     #[test]

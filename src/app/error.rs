@@ -1,0 +1,93 @@
+//! Why a run could not begin or continue.
+
+use std::io;
+use std::path::{Path, PathBuf};
+
+use super::LAST_CHUNK;
+use super::autopilot::LoadError;
+use crate::bus::BusError;
+use crate::hotplug::HotplugError;
+use crate::logging::LoggingError;
+use crate::record::RecordError;
+use crate::rig::RigError;
+use crate::rig::presence::PresenceError;
+use crate::tui::TuiError;
+
+/// Why a run could not begin or continue.
+#[derive(Debug, thiserror::Error)]
+pub enum AppError {
+    /// The log.
+    #[error(transparent)]
+    Logging(#[from] LoggingError),
+    /// The mask.
+    #[error(transparent)]
+    Presence(#[from] PresenceError),
+    /// The bus.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    /// Plugging.
+    #[error(transparent)]
+    Hotplug(#[from] HotplugError),
+    /// The rig.
+    #[error(transparent)]
+    Rig(#[from] RigError),
+    /// The recorder.
+    #[error(transparent)]
+    Record(#[from] RecordError),
+    /// The monitor.
+    #[error(transparent)]
+    Tui(#[from] TuiError),
+    /// The output of a headless run.
+    #[error("output: {0}")]
+    Output(io::Error),
+    /// A thread or signal handler.
+    #[error("the system refuses: {0}")]
+    System(#[from] io::Error),
+    /// The policy.
+    #[error(transparent)]
+    Policy(#[from] LoadError),
+    /// What the policy requires is not there.
+    #[error("the policy needs {0}: plug it in, or write --wait to start when it is there")]
+    Required(String),
+    /// The policy does not end.
+    #[error("the policy did not end within {} s", LAST_CHUNK.as_secs())]
+    Stuck,
+    /// An episode's file is not whole.
+    #[error("{}: {reason}{}", file.display(), repair(file))]
+    Episode {
+        /// What there is of it.
+        file: PathBuf,
+        /// Why.
+        reason: String,
+    },
+    /// A run without a screen recorded something that is not to be used.
+    #[error("{}", bad(*count, file))]
+    Bad {
+        /// Episodes that are BAD.
+        count: u64,
+        /// The last of them.
+        file: PathBuf,
+    },
+    /// A task or thread of ours panicked.
+    #[error("{0} panicked; please report this")]
+    Panicked(&'static str),
+    /// A second signal came while the run was ending.
+    #[error("interrupted twice")]
+    InterruptedTwice,
+}
+
+fn bad(count: u64, file: &Path) -> String {
+    let file = file.display();
+    let many = if count > 1 { format!(", and {} before it", count - 1) } else { String::new() };
+    format!("{file} is BAD{many}: its verdict above has the reasons; see `rapid inspect`")
+}
+
+/// What to do about a file that did not get its finished name; where it did, nothing.
+fn repair(file: &Path) -> String {
+    let is_finished = file.extension().is_some_and(|extension| extension == "mcap");
+    if is_finished {
+        String::new()
+    } else {
+        format!("; `rapid recover {}` keeps what can be read of it", file.display())
+    }
+}
