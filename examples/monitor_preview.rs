@@ -48,7 +48,7 @@ async fn main() -> Result<(), tui::TuiError> {
                 () = async { end.await; std::future::pending().await } => Ok(()),
             }
         }
-        None => tui::run(board, sender, shutdown.clone()).await,
+        None => tui::run(board, sender, Arc::default(), shutdown.clone()).await,
     };
     shutdown.cancel();
     // It ends by the token.
@@ -113,7 +113,6 @@ async fn pretend(board: Arc<Board>, count: u8, mut commands: mpsc::Receiver<Comm
         tokio::select! {
             () = shutdown.cancelled() => return,
             Some(command) = commands.recv() => match command {
-                Command::Order(_) => say(&board, Level::Info, "there is no actuator".to_owned()),
                 Command::Quit => shutdown.cancel(),
                 Command::ToggleRecording => match episode.take() {
                     Some((_, file, _)) => {

@@ -65,14 +65,14 @@ impl OrderSlot {
     /// Leaves an order there.
     pub fn give(&self, order: Order) {
         match order {
-            Order::Disarm => self.0.store(Self::DISARM, Ordering::Release),
-            Order::Arm => drop(self.0.fetch_or(Self::ARM, Ordering::Release)),
+            Order::Disarm => self.0.store(Self::DISARM, Ordering::SeqCst),
+            Order::Arm => drop(self.0.fetch_or(Self::ARM, Ordering::SeqCst)),
         }
     }
 
     /// Takes what is there, in the order in which it is to be carried out.
     pub fn take(&self) -> impl Iterator<Item = Order> + use<> {
-        let given = self.0.swap(0, Ordering::Acquire);
+        let given = self.0.swap(0, Ordering::SeqCst);
         let orders = [(Self::DISARM, Order::Disarm), (Self::ARM, Order::Arm)].into_iter();
         orders.filter(move |(bit, _)| given & bit != 0).map(|(_, order)| order)
     }

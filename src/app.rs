@@ -28,7 +28,6 @@ use tokio::task::JoinHandle;
 use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
-use crate::action::Order;
 use crate::bus::{self, Bus, TopicId};
 use crate::driver;
 use crate::fault;
@@ -38,14 +37,17 @@ use crate::hotplug::script::Script;
 use crate::hotplug::udev::UdevMonitor;
 use crate::logging::{self, Stderr};
 use crate::mask::MASK_PATH;
+use crate::orders::receive::Orders;
 use crate::panics;
+use crate::permission::Permission;
 use crate::record::recover::Repairs;
 use crate::record::{EpisodeRequest, Recorder, RecorderConfig};
 use crate::registry::Registry;
 use crate::registry::scenario::Scenario;
 use crate::rig::presence::{Claim, Presence};
-use crate::rig::{Rig, RigCommand, RigError};
+use crate::rig::{Rig, RigError};
 use crate::status::Board;
+use crate::time::Stamp;
 use asked::Asked;
 use autopilot::Autopilot;
 pub use autopilot::PolicyOptions;
@@ -71,6 +73,16 @@ pub enum Screen {
     Lines,
     /// One JSON object a line.
     Json,
+}
+
+impl Screen {
+    const fn stderr(self) -> Stderr {
+        match self {
+            Self::Monitor => Stderr::Nothing,
+            Self::Lines => Stderr::Text,
+            Self::Json => Stderr::Json,
+        }
+    }
 }
 
 /// A run.
@@ -113,16 +125,14 @@ pub fn mask_path(instance: Option<&str>) -> PathBuf {
 pub async fn run(options: Options) -> Result<(), AppError> {
     let registry = Arc::new(options.registry);
     let board = Arc::new(Board::new(&registry));
-    let stderr = match options.screen {
-        Screen::Monitor => Stderr::Nothing,
-        Screen::Lines => Stderr::Text,
-        Screen::Json => Stderr::Json,
-    };
+    let stderr = options.screen.stderr();
     // Lines still on their way to standard error are waited for when this goes.
     let _log = logging::init(Arc::clone(&board), std::env::var("RAPID_LOG").ok().as_deref(), stderr)?;
     if options.screen != Screen::Monitor {
         panics::to_log();
     }
+    // Before anything that a full or damaged machine may refuse.
+    let (permission, _orders) = take_orders(options.instance.as_deref(), options.arm)?;
     let signals = Signals::listen()?;
 
     bus::check_memory()?;
@@ -151,13 +161,13 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     };
     let screen_stop = CancellationToken::new();
     let (commands, from_screen) = mpsc::channel(16);
-    let screen = screen::start(options.screen, &board, commands, screen_stop.clone(), options.duration);
+    let screen = screen::start(options.screen, &board, commands, &permission, screen_stop.clone(), options.duration);
 
     let rig_stop = CancellationToken::new();
     let (rig_commands, rig_asked) = mpsc::channel(16);
-    let asked = asked::sorted(from_screen, rig_commands.clone());
+    let asked = asked::sorted(from_screen, rig_commands);
     let mut rig =
-        Rig::new(&registry, &bus, presence, Arc::clone(&board)).following(recorder.episode()).arming(options.arm);
+        Rig::new(&registry, &bus, presence, Arc::clone(&board)).following(recorder.episode()).obeying(&permission);
     let rig_ended = CancellationToken::new();
     let (hurry, rig_ending) = (rig.hurry(), rig.ending());
     let rig = tokio::spawn({
@@ -193,8 +203,8 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     };
     let (kind, screen) = (options.screen, Some(screen));
     let mut running = Running {
+        permission,
         rig,
-        rig_commands,
         rig_ending,
         rig_ended,
         rig_stop,
@@ -219,6 +229,22 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     finish(running, conductor, outcome).await
 }
 
+/// Lets other programs, and signals, say whether motors may move, whatever else the run waits for.
+fn take_orders(instance: Option<&str>, arm: bool) -> Result<(Arc<Permission>, Orders), AppError> {
+    let permission = Arc::new(Permission::new(arm));
+    let orders = Orders::receive(instance, Arc::clone(&permission)).map_err(AppError::Orders)?;
+    tokio::spawn({
+        let (mut signals, permission) = (Signals::listen()?, Arc::clone(&permission));
+        async move {
+            loop {
+                signals.next().await;
+                permission.disarm(Stamp::now());
+            }
+        }
+    });
+    Ok((permission, orders))
+}
+
 /// Made by udev's daemon when it starts.
 const UDEV: &str = "/run/udev/control";
 /// The screen has limits of its own for a reader that does not read. This one is for a screen that is
@@ -232,8 +258,8 @@ const LAST_OUTPUT_IN_A_HURRY: Duration = Duration::from_secs(1);
 
 /// The tasks of a run, and what can be asked of it from outside.
 struct Running {
+    permission: Arc<Permission>,
     rig: JoinHandle<(Rig, Result<(), RigError>)>,
-    rig_commands: mpsc::Sender<RigCommand>,
     /// The rig ends by itself: it has begun to close its devices.
     rig_ending: CancellationToken,
     rig_ended: CancellationToken,
@@ -267,7 +293,7 @@ async fn finish(
     let judged = (conductor.record && running.kind != Screen::Monitor).then(|| Arc::clone(&conductor.board));
     // First of all nothing moves any more, whoever publishes actions. A chunk that is being computed is waited for
     // with the rest.
-    let _ = running.rig_commands.try_send(RigCommand::Order(Order::Disarm));
+    running.permission.disarm(Stamp::now());
     let policy_ended = async {
         match &mut running.autopilot {
             Some(autopilot) => timeout(LAST_CHUNK, autopilot.stop()).await.unwrap_or(Err(AppError::Stuck)),

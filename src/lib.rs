@@ -20,6 +20,7 @@
 //!                                                    policy      observations to actions, on the robot
 //!
 //!  L2   calibration                                how late a sensor is
+//!       orders                                     may motors move? what other programs say
 //!
 //!  L1   registry                                 devices.toml, checked
 //!       status                                   the board every stage reports on
@@ -28,8 +29,9 @@
 //!       control                                  from an action to what a motor is told, and whether
 //!       realtime                                 threads that keep a beat
 //!       panics                                   where their messages go
+//!       peer                                     who is at the other end of a socket
 //!       episode_format                           an episode's file, record by record
-//!  L0   modality   mask   sample   action   time   random   provenance   flash     nouns
+//!  L0   modality   mask   sample   action   permission   time   random   provenance   flash     nouns
 //! ```
 //!
 //! The arrows are the way of the data. Imports point down only; the stages of L3 do not know one
@@ -95,7 +97,7 @@
 //! * A screen sees [`status::Snapshot`]s and sends [`status::Command`]s; it holds no handle into a
 //!   stage.
 //! * Bytes from devices and files never make the program panic. `unsafe` stands in [`driver`],
-//!   [`bus`] and the loader of onnxruntime alone.
+//!   [`bus`], [`peer`] and the loader of onnxruntime alone.
 
 pub mod action;
 pub mod app;
@@ -118,8 +120,11 @@ pub mod lockstep;
 pub mod logging;
 pub mod mask;
 pub mod modality;
+pub mod orders;
 pub mod outlet;
 pub mod panics;
+pub mod peer;
+pub mod permission;
 pub mod policy;
 pub mod provenance;
 pub mod random;

@@ -20,7 +20,7 @@ use proc_macro2::{Delimiter, TokenStream, TokenTree};
 
 /// Modules by layer, lowest first. A module sees those of lower layers.
 const LAYERS: &[&[&str]] = &[
-    &["modality", "mask", "sample", "time", "action", "random", "provenance", "flash"],
+    &["modality", "mask", "sample", "time", "action", "permission", "random", "provenance", "flash"],
     &[
         "registry",
         "status",
@@ -31,10 +31,11 @@ const LAYERS: &[&[&str]] = &[
         "episode_format",
         "fault",
         "panics",
+        "peer",
         "realtime",
         "control",
     ],
-    &["hotplug", "driver", "bus", "sync", "calibration"],
+    &["hotplug", "driver", "bus", "orders", "sync", "calibration"],
     &["rig", "record", "policy"],
     &["app", "lockstep", "compare", "tui", "headless", "logging"],
     &["main", "dispatch", "cli", "commands"],
@@ -76,7 +77,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("iceoryx2_bb_elementary_traits", &["bus"]),
     ("iceoryx2_cal", &["bus"]),
     ("jpeg_encoder", &["driver/sim"]),
-    ("libc", &["registry", "bus", "hotplug", "driver", "rig", "app", "policy/library"]),
+    ("libc", &["registry", "bus", "hotplug", "driver", "rig", "app", "peer", "policy/library"]),
     ("lz4", &["episode_format"]),
     ("mcap", &["record"]),
     ("mdns_sd", &["hotplug/lan"]),
@@ -112,7 +113,7 @@ const ANYWHERE: &str = "*";
 const ABOVE_NOUNS: &str = "layers 1 and up";
 
 /// Where `unsafe` may stand: at the borders to the kernel and to shared memory.
-const UNSAFE_HOMES: &[&str] = &["driver", "bus", "policy/library/loader"];
+const UNSAFE_HOMES: &[&str] = &["driver", "bus", "peer", "policy/library/loader"];
 
 /// What makes one thread wait for another.
 const LOCKS: &[&str] = &["Mutex", "RwLock", "Condvar", "ReentrantMutex", "Semaphore", "Barrier"];

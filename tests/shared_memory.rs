@@ -37,9 +37,9 @@ fn after(place: &Place, first: &str, arguments: &[&str]) -> Command {
     command
 }
 
-/// The same with a `/dev/shm` of `size`.
-fn in_memory_of(place: &Place, size: &str, arguments: &[&str]) -> Command {
-    let shell = after(place, &format!("mount -t tmpfs -o size={size} tmpfs /dev/shm"), arguments);
+/// The same in a namespace of mounts of its own.
+fn apart(place: &Place, first: &str, arguments: &[&str]) -> Command {
+    let shell = after(place, first, arguments);
     let mut command = Command::new("unshare");
     command.args(["-m", "--propagation", "private"]).arg(shell.get_program()).args(shell.get_args());
     for (name, value) in shell.get_envs() {
@@ -50,6 +50,11 @@ fn in_memory_of(place: &Place, size: &str, arguments: &[&str]) -> Command {
     }
     command.current_dir(place.folder.path()).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
     command
+}
+
+/// The same with a `/dev/shm` of `size`.
+fn in_memory_of(place: &Place, size: &str, arguments: &[&str]) -> Command {
+    apart(place, &format!("mount -t tmpfs -o size={size} tmpfs /dev/shm"), arguments)
 }
 
 fn may_mount() -> bool {
@@ -121,9 +126,7 @@ fn too_little_memory_at_the_start_is_an_error_with_numbers_and_fix() {
         return;
     }
     let run = &["--sim", "--headless", "--duration", "1s"][..];
-    for (size, arguments) in
-        [("64k", run), ("1m", run), ("2m", run), ("8m", run), ("60m", run), ("8k", &["disarm"]), ("64k", &["arm"])]
-    {
+    for (size, arguments) in [("64k", run), ("1m", run), ("2m", run), ("8m", run), ("60m", run)] {
         let place = Place::new();
         let ended = in_memory_of(&place, size, arguments).output().expect("a shell");
         let error = said(&ended);
@@ -132,6 +135,46 @@ fn too_little_memory_at_the_start_is_an_error_with_numbers_and_fix() {
             assert!(error.contains(wanted), "{size} {arguments:?}: {error}");
         }
     }
+}
+
+/// Runs a program among the mounts of a run.
+fn enter(running: &Running, place: &Place, program: &Command) -> Output {
+    let mut command = Command::new("nsenter");
+    command.args(["-m", "-t", &running.pid().to_string()]).arg(program.get_program()).args(program.get_args());
+    command.env("RAPID_INSTANCE", &place.instance).output().expect("nsenter")
+}
+
+/// A run can be stopped whatever is full, damaged or gone.
+#[test]
+fn an_order_needs_no_memory_no_disk_and_no_bus() {
+    const FULL: &str = "mount -t tmpfs -o size=90m tmpfs /dev/shm && mount -t tmpfs -o size=4m tmpfs /tmp";
+    if !may_mount() {
+        return;
+    }
+    let place = Place::new();
+    let running = place.start_as(apart(&place, FULL, &["--sim", "--headless", "--json"]), "\"mask\":\"0x07\"");
+    let of = |path: &str| PathBuf::from(format!("/proc/{}/root{path}", running.pid()));
+    for folder in ["/dev/shm", "/tmp"] {
+        fill_up(&mut File::create(of(folder).join("fill")).expect("the run's memory"));
+    }
+    let order = |word: &str| enter(&running, &place, &place.command(&[word]));
+    let look = |what: &str| {
+        let (disarm, arm) = (order("disarm"), order("arm"));
+        assert_eq!(disarm.status.code(), Some(0), "{what}: {disarm:?}");
+        assert!(String::from_utf8_lossy(&disarm.stdout).contains("disarmed"), "{what}: {disarm:?}");
+        assert_eq!(arm.status.code(), Some(3), "{what}: {arm:?}");
+        assert!(said(&arm).contains("no actuator is plugged in"), "{what}: {arm:?}");
+    };
+    look("full");
+    for folder in ["/tmp/iceoryx2/services", "/tmp/iceoryx2/nodes"] {
+        std::fs::remove_dir_all(of(folder)).expect("the bus's folder");
+    }
+    look("the bus is damaged");
+    running.signal(Signal::INT);
+    running.end();
+    let none = place.command(&["disarm"]).output().expect("rapid");
+    assert_eq!(none.status.code(), Some(3), "{none:?}");
+    assert!(said(&none).contains("no rapid runs here as instance"), "{none:?}");
 }
 
 /// Fills the memory that a run sees, to the last byte.
@@ -156,15 +199,8 @@ fn memory_that_another_program_fills_ends_no_run() {
     let arguments: Vec<&str> = RECORD.iter().copied().chain(["--duration", "3s"]).collect();
     let running = place.start_as(in_memory_of(&place, "90m", &arguments), RECORDING);
     fill(&running);
-    // A subscriber that comes, and orders, find no room: they get an error.
-    let enter = |program: &mut Command| {
-        let mut command = Command::new("nsenter");
-        command.args(["-m", "-t", &running.pid().to_string()]).arg(program.get_program()).args(program.get_args());
-        command.env("RAPID_INSTANCE", &place.instance).output().expect("nsenter")
-    };
-    let disarm = enter(&mut place.command(&["disarm"]));
-    assert_eq!(disarm.status.code(), Some(1), "{disarm:?}");
-    assert!(said(&disarm).contains("/dev/shm: "), "{disarm:?}");
+    // A subscriber that comes finds no room: it gets an error.
+    let enter = |program: &mut Command| enter(&running, &place, program);
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/subscribe.py");
     enter(Command::new(python()).arg(script).args(["/rapid/camera/wrist", "5", "2"]));
     let (code, output, errors) = running.end();
@@ -279,11 +315,7 @@ fn files_that_are_removed_during_a_run_are_named_and_the_mask_is_made_anew() {
 
 /// `rapid ARGUMENTS` after `first` has changed mounts of its own.
 fn among_mounts(place: &Place, first: &str, arguments: &[&str]) -> Output {
-    let shell = after(place, first, arguments);
-    let mut command = Command::new("unshare");
-    command.args(["-m", "--propagation", "private"]).arg(shell.get_program()).args(shell.get_args());
-    command.envs(shell.get_envs().filter_map(|(name, value)| Some((name, value?))));
-    command.current_dir(place.folder.path()).output().expect("unshare")
+    apart(place, first, arguments).output().expect("unshare")
 }
 
 #[test]
@@ -298,13 +330,11 @@ fn what_is_not_mounted_is_named_with_the_fix() {
         ("mount -t tmpfs -o ro tmpfs /dev/shm", ["/dev/shm: it is mounted read-only; ", "sudo mount -o remount,rw"]),
         ("mount -t tmpfs tmpfs /proc", ["/proc: it is not mounted", "sudo mount -t proc"]),
     ] {
-        for arguments in [&RUN[..], &["disarm"]] {
-            let place = Place::new();
-            let ended = among_mounts(&place, first, arguments);
-            let error = said(&ended);
-            assert_eq!(ended.status.code(), Some(1), "{first}: {ended:?}");
-            assert!(wanted.iter().all(|wanted| error.contains(wanted)), "{first}: {ended:?}");
-        }
+        let place = Place::new();
+        let ended = among_mounts(&place, first, &RUN);
+        let error = said(&ended);
+        assert_eq!(ended.status.code(), Some(1), "{first}: {ended:?}");
+        assert!(wanted.iter().all(|wanted| error.contains(wanted)), "{first}: {ended:?}");
     }
 }
 

@@ -1,7 +1,7 @@
 //! What the screen asks for, on its way to whom it is for.
 //!
-//! Invariant: an order to the actuator waits for nothing that becomes of an episode: it does not pass
-//! through the conductor, which waits for files to be closed.
+//! Invariant: what is for the rig waits for nothing that becomes of an episode: it does not pass through the conductor,
+//! which waits for files to be closed. Orders to the actuator do not come this way at all.
 
 use std::path::PathBuf;
 
@@ -37,7 +37,6 @@ pub(super) fn sorted(
                 Command::DropEpisode(file) => conductor.send(Asked::DropEpisode(file)).is_ok(),
                 Command::Quit => conductor.send(Asked::Quit).is_ok(),
                 Command::Restart(id) => rig.send(RigCommand::Restart(id)).await.is_ok(),
-                Command::Order(order) => rig.send(RigCommand::Order(order)).await.is_ok(),
             };
         }
     });
@@ -47,19 +46,16 @@ pub(super) fn sorted(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::action::Order;
     use crate::modality::ModalityId;
 
     #[tokio::test]
-    async fn orders_reach_the_rig_while_the_conductor_is_busy() {
+    async fn the_rig_is_reached_while_the_conductor_is_busy() {
         let (screen, from_screen) = mpsc::channel(1);
         let (rig, mut at_rig) = mpsc::channel(1);
         let mut asked = sorted(from_screen, rig);
         for _ in 0..100 {
             screen.send(Command::ToggleRecording).await.unwrap();
         }
-        screen.send(Command::Order(Order::Disarm)).await.unwrap();
-        assert_eq!(at_rig.recv().await, Some(RigCommand::Order(Order::Disarm)));
         screen.send(Command::Restart(ModalityId::new(3).unwrap())).await.unwrap();
         assert_eq!(at_rig.recv().await, Some(RigCommand::Restart(ModalityId::new(3).unwrap())));
         screen.send(Command::Quit).await.unwrap();

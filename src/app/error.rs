@@ -60,6 +60,9 @@ pub enum AppError {
         /// Why.
         reason: String,
     },
+    /// Other programs could not stop it.
+    #[error("orders to the actuator cannot be received: {0}")]
+    Orders(#[source] io::Error),
     /// A run without a screen recorded something that is not to be used.
     #[error("{}", bad(*count, file))]
     Bad {

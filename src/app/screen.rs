@@ -11,6 +11,7 @@ use super::{AppError, Screen};
 use crate::fault;
 use crate::headless::style::ColourChoice;
 use crate::headless::{self, HeadlessOptions};
+use crate::permission::Permission;
 use crate::status::{Board, Command};
 use crate::tui::{self, TuiError};
 
@@ -21,14 +22,15 @@ pub(super) fn start(
     screen: Screen,
     board: &Arc<Board>,
     commands: mpsc::Sender<Command>,
+    permission: &Arc<Permission>,
     stop: CancellationToken,
     duration: Option<Duration>,
 ) -> ScreenTask {
-    let board = Arc::clone(board);
+    let (board, permission) = (Arc::clone(board), Arc::clone(permission));
     if screen == Screen::Monitor {
         return tokio::spawn(async move {
             tokio::select! {
-                outcome = tui::run(board, commands, stop) => match outcome {
+                outcome = tui::run(board, commands, permission, stop) => match outcome {
                     // As good as SIGHUP, which comes with it or a little later.
                     Err(error @ TuiError::Gone(_)) => {
                         tracing::warn!(%error, "the run ends");

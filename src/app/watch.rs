@@ -23,7 +23,7 @@ pub(super) async fn over(mut watchman: Watchman) -> ! {
             count => format!(", and {count} others of the bus"),
         };
         tracing::warn!(
-            "{}{others}: removed during the run, which continues; programs that start now, `rapid disarm` among them, may \
+            "{}{others}: removed during the run, which continues; programs that start now may \
              not reach it: end this run with Ctrl-C and start again",
             first.display()
         );

@@ -1,14 +1,11 @@
-//! What the actuator is told: the topic of actions and that of orders, for the one stream that reads the
-//! device.
+//! Where the actuator is to go: the topic of actions, for the one stream that reads the device.
 
-use iceoryx2::node::Node;
 use iceoryx2::port::subscriber::Subscriber;
 
 use super::error::topic_error;
 use super::guard::{Guarded, contained};
-use super::orders::Orders;
 use super::{BusError, Service, TopicFactory, TopicSpec, sigbus};
-use crate::action::{MAX_ACTION, Order};
+use crate::action::MAX_ACTION;
 use crate::sample::{Encoding, SampleHeader};
 use crate::time::Stamp;
 
@@ -17,7 +14,6 @@ pub struct Actions {
     topic: String,
     depth: usize,
     subscriber: Guarded<Subscriber<Service, [u8], SampleHeader>>,
-    orders: Orders,
 }
 
 impl std::fmt::Debug for Actions {
@@ -27,28 +23,16 @@ impl std::fmt::Debug for Actions {
 }
 
 impl Actions {
-    pub(super) fn open(node: &Node<Service>, spec: &TopicSpec, factory: &TopicFactory) -> Result<Self, BusError> {
+    pub(super) fn open(spec: &TopicSpec, factory: &TopicFactory) -> Result<Self, BusError> {
         let subscriber = factory.subscriber_builder().buffer_size(spec.depth).create();
         let subscriber = subscriber.map_err(|error| topic_error(&spec.name, &error))?;
         let subscriber = Guarded::new(subscriber);
-        Ok(Self { topic: spec.name.clone(), depth: spec.depth, subscriber, orders: Orders::open(node)? })
+        Ok(Self { topic: spec.name.clone(), depth: spec.depth, subscriber })
     }
 
-    /// Hands the orders of other programs to `take`, oldest first. One that it takes is answered, and counts as
-    /// given.
-    ///
-    /// # Errors
-    /// The first of `take`.
-    pub fn orders<E>(&self, take: &mut dyn FnMut(Order) -> Result<(), E>) -> Result<(), E> {
-        self.orders.hand_over(take)
-    }
-
-    /// Forgets orders and actions that were meant for a device before this one; says whether there was an
-    /// order.
-    #[must_use]
-    pub fn discard(&self) -> bool {
+    /// Forgets actions that were meant for a device before this one.
+    pub fn discard(&self) {
         let _ = self.newest(&mut [0.0; MAX_ACTION]);
-        self.orders.discard()
     }
 
     /// Writes the newest action that waits into `action` and forgets the older ones; gives it with the tick it

@@ -189,14 +189,10 @@ pub(super) fn addresses(need: u64) -> Result<(), BusError> {
 /// What iceoryx2 reports, with cause and fix where they are known.
 fn explained(reported: &str) -> String {
     /// Parts of the names of iceoryx2's errors.
-    const CAUSES: [(&[&str], &str); 5] = [
+    const CAUSES: [(&[&str], &str); 4] = [
         (
             &["Incompatible", "DoesNotSupportRequested", "VersionMismatch"],
             "a program of another version, or with another devices.toml, still uses it: end that program",
-        ),
-        (
-            &["ExceedsMaxSupportedServers"],
-            "another program receives these orders already: end it, or give this one a name of its own with --instance",
         ),
         (&["ExceedsMaxSupported", "ExceedsMaxNumberOf"], "too many programs use it: end one"),
         (
@@ -218,7 +214,6 @@ mod tests {
         for (reported, cause) in [
             ("PublishSubscribeOpenError(IncompatibleTypes)", "another version"),
             ("PublishSubscribeOpenError(DoesNotSupportRequestedMinBufferSize)", "another version"),
-            ("ExceedsMaxSupportedServers", "receives these orders already"),
             ("EventOpenError(ExceedsMaxNumberOfNodes)", "too many programs"),
             ("PublishSubscribeOpenError(ServiceInCorruptedState)", "missing or damaged"),
         ] {

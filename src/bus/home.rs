@@ -80,11 +80,6 @@ impl Home {
         if sigbus::happened() { sigbus::error() } else { or_damage(error, &self.files.files) }
     }
 
-    /// A file that iceoryx2 cannot read, if there is one.
-    pub(super) fn unreadable(&self) -> Option<BusError> {
-        self.files.files.unreadable()
-    }
-
     /// The files that this process needs for as long as it takes part.
     pub(super) fn needed(&self) -> Vec<PathBuf> {
         self.files.files.needed()

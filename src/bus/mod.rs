@@ -23,7 +23,6 @@ mod home;
 mod inbox;
 mod ingress;
 mod leftovers;
-mod orders;
 mod place;
 mod room;
 mod service;
@@ -51,7 +50,6 @@ pub use actions::Actions;
 pub use error::BusError;
 pub use inbox::{Foreign, Inbox};
 pub use ingress::{Given, Ingress, Watch};
-pub use orders::give as give_order;
 pub use place::memory as check_memory;
 pub use sigbus::lost;
 pub use topic::{TopicId, TopicSpec};
@@ -151,7 +149,7 @@ impl Bus {
             .map(|device| Ok((device.id, Arc::new(Ingress::open(node, device)?))))
             .collect::<Result<Vec<_>, BusError>>()?;
         let actions = topics.iter().find(|(spec, _)| spec.id == TopicId::Action);
-        let actions = actions.map(|(spec, factory)| Actions::open(node, spec, factory).map(Arc::new)).transpose()?;
+        let actions = actions.map(|(spec, factory)| Actions::open(spec, factory).map(Arc::new)).transpose()?;
         let instance = instance.map(str::to_owned);
         Ok(Self { writers, actions, topics, wake, ingresses, instance, home: Arc::clone(home) })
     }

@@ -3,17 +3,14 @@
 use std::io::{self, Write};
 
 use crate::action::Order;
-use crate::bus::{BusError, give_order};
+use crate::orders::give::{GiveError, give};
 
-/// Why an order did not arrive.
+/// Why an order was not carried out.
 #[derive(Debug, thiserror::Error)]
 pub enum OrderError {
-    /// The bus.
+    /// The run.
     #[error(transparent)]
-    Bus(#[from] BusError),
-    /// Nobody listens.
-    #[error("no rapid here has an actuator that is plugged in: start it, plug it in, or name it with --instance")]
-    Nobody,
+    Give(#[from] GiveError),
     /// The output.
     #[error(transparent)]
     Output(#[from] io::Error),
@@ -22,14 +19,12 @@ pub enum OrderError {
 /// Gives an order. What becomes of it, the run says.
 ///
 /// # Errors
-/// When no run with an actuator is there to take it.
+/// When no run is there to take it, or it is refused.
 pub fn order(instance: Option<&str>, order: Order, out: &mut dyn Write) -> Result<(), OrderError> {
-    if !give_order(instance, order)? {
-        return Err(OrderError::Nobody);
-    }
+    give(instance, order)?;
     let what = match order {
-        Order::Arm => "told to arm its actuator",
-        Order::Disarm => "told to disarm its actuator",
+        Order::Arm => "the actuator is being armed: what came of it is in the log of the run",
+        Order::Disarm => "the actuator is disarmed, and stays so until it is armed again",
     };
-    Ok(writeln!(out, "rapid was {what}; it says itself what came of it")?)
+    Ok(writeln!(out, "{what}")?)
 }

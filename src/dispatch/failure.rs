@@ -136,7 +136,7 @@ impl Failure {
             Self::Register(error) if error.is_bad_argument() => 2,
             Self::Recover(outcome) if outcome.is_bad_argument() => 2,
             Self::App(AppError::Bad { .. }) => 4,
-            Self::App(AppError::Required(_)) | Self::Order(commands::arm::OrderError::Nobody) => 3,
+            Self::App(AppError::Required(_)) | Self::Order(commands::arm::OrderError::Give(_)) => 3,
             _ => 1,
         }
     }

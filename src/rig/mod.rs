@@ -19,7 +19,6 @@ mod worker;
 
 pub use owner::Rig;
 
-use crate::action::Order;
 use crate::hotplug::HotplugError;
 use crate::modality::ModalityId;
 use presence::PresenceError;
@@ -40,6 +39,4 @@ pub enum RigError {
 pub enum RigCommand {
     /// Start a failed device again.
     Restart(ModalityId),
-    /// Let the actuator move, or stop it.
-    Order(Order),
 }

@@ -18,7 +18,7 @@ use super::slot::{Effects, End, Input, Slot};
 use super::stream::{Controls, Numbers, Reported, Stream};
 use super::worker::Seat;
 use super::{RigCommand, RigError};
-use crate::action::{Arming, OrderSlot};
+use crate::action::Arming;
 use crate::bus::{Bus, TopicId, Writer};
 use crate::hotplug::{HotplugEvent, HotplugStream, Witness};
 use crate::mask::PhysicalMask;
@@ -53,8 +53,6 @@ pub struct Rig {
     programs: Option<Programs>,
     /// The episode in progress.
     episode: EpisodeWatch,
-    /// To the actuator.
-    orders: Arc<OrderSlot>,
     /// Cancelled when devices begin to be closed.
     ending: CancellationToken,
 }
@@ -90,7 +88,6 @@ impl Rig {
     pub fn new(registry: &Registry, bus: &Bus, presence: Presence, board: Arc<Board>) -> Self {
         let programs = Programs::new(registry, bus, &board);
         let prefix = bus.membership().prefix();
-        let orders = Arc::<OrderSlot>::default();
         let modality = |spec: &DeviceSpec| {
             let writer = bus.writer(TopicId::Modality(spec.id))?;
             let spec = Arc::new(spec.clone());
@@ -109,7 +106,7 @@ impl Rig {
                     .action
                     .as_ref()
                     .filter(|_| seat.is_none())
-                    .and_then(|_| Some(Controls::new(bus.actions()?, Arc::clone(&orders)))),
+                    .and_then(|_| Some(Controls::new(bus.actions()?))),
                 arming: None,
                 was_told_gone: false,
                 seat,
@@ -131,7 +128,6 @@ impl Rig {
             reports: mpsc::channel(1).0,
             programs,
             episode: tokio::sync::watch::channel(None).1,
-            orders,
             ending: CancellationToken::new(),
         }
     }
@@ -169,8 +165,6 @@ impl Rig {
                 Some((id, epoch, report)) = reported.recv() => self.report(id, epoch, report),
                 Some(command) = commands.recv() => match command {
                     RigCommand::Restart(id) => self.apply(id, Input::Restart),
-                    // Without an actuator nobody listens.
-                    RigCommand::Order(order) => self.orders.give(order),
                 },
                 () = sleep(deadline.since(Stamp::now())) => self.deadlines_passed(),
                 _ = json.tick() => self.json_is_stale = true,

@@ -152,14 +152,12 @@ impl Stream {
         tokio::pin!(silent);
         let mut told = interval(ACTIONS_EVERY);
         told.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let mut controls = self.controls.clone();
-        if let Some(controls) = &mut controls {
-            if let Err(error) = controls.begin(source) {
-                return end(&error);
-            }
-            // An order that is carried out at once is told before its first sample.
-            self.pass_on_notices(source).await;
-        }
+        let mut controls = match self.controls.as_ref().map(|controls| controls.begin(source)).transpose() {
+            Ok(controls) => controls,
+            Err(error) => return end(&error),
+        };
+        // An order that is carried out at once is told before its first sample.
+        self.pass_on_notices(source).await;
         let mut episode = self.episode.clone();
         if episode.borrow_and_update().is_some() {
             episode.mark_changed();

@@ -18,7 +18,6 @@ use std::time::Duration;
 
 use serde::Serialize;
 
-use crate::action::Order;
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::sample::Epoch;
@@ -185,8 +184,6 @@ pub enum Command {
     DropEpisode(PathBuf),
     /// Start a failed device again.
     Restart(ModalityId),
-    /// Let the actuator move, or stop it.
-    Order(Order),
     /// End the program.
     Quit,
 }

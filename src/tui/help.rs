@@ -16,12 +16,12 @@ const KEYS: [(&str, &str); 11] = [
     ("x, y", "drop the last episode, if it is too short"),
     ("up, down", "select a device"),
     ("r", "restart the selected device, if it failed"),
-    ("a, a", "arm the actuator: motors follow actions"),
-    ("d", "disarm it: motors are disabled"),
+    ("a, ctrl-y", "arm the actuator: motors follow actions"),
+    ("d, esc", "disarm it, in every dialog: motors are off"),
     ("p", "pause the view; everything else continues"),
     ("pgup, pgdn", "scroll the log; esc goes to its end"),
     ("?", "this help"),
-    ("q, ctrl-c", "quit"),
+    ("q, ctrl-c", "quit; ctrl-c disarms first"),
     ("", ""),
 ];
 

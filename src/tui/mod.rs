@@ -1,7 +1,8 @@
 //! The monitor: a full-screen view of the rig while data is collected.
 //!
 //! A snapshot of the board fifteen times a second and the user's keys change the [`model`]; the
-//! `view` draws it; what the user wants goes out as [`Command`]s.
+//! `view` draws it; what the user wants goes out as [`Command`]s, but for orders to the actuator, which are given
+//! to its [`Permission`] at once.
 //!
 //! Invariant: the terminal is given back as it was found, however the screen ends.
 //! Invariant: a terminal that takes no output delays nothing: frames are written by a thread of
@@ -32,7 +33,10 @@ use tokio::sync::mpsc::error::TrySendError;
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 
+use crate::action::Order;
+use crate::permission::Permission;
 use crate::status::{Board, Command};
+use crate::time::Stamp;
 use model::{Effect, Model, Msg};
 use terminal::Screen;
 use theme::Theme;
@@ -67,19 +71,60 @@ pub fn columns() -> Option<usize> {
 pub async fn run(
     board: Arc<Board>,
     commands: mpsc::Sender<Command>,
+    permission: Arc<Permission>,
     shutdown: CancellationToken,
 ) -> Result<(), TuiError> {
     let theme = Theme::detect(|name| std::env::var(name).ok());
     let mut screen = Screen::open().map_err(TuiError::NoTerminal)?;
-    let outcome = drive(&board, &commands, &shutdown, EventStream::new(), |model| screen.draw(model, theme)).await;
+    let asked = Asked { commands, permission };
+    let outcome = drive(&board, &asked, &shutdown, EventStream::new(), |model| screen.draw(model, theme)).await;
     screen.close().await;
     outcome
+}
+
+/// Nobody takes commands any more.
+struct Ended;
+
+/// Who does what the user asks for.
+struct Asked {
+    commands: mpsc::Sender<Command>,
+    permission: Arc<Permission>,
+}
+
+impl Asked {
+    /// What the model is to know of it.
+    fn carry_out(&self, effect: Effect) -> Result<Option<Msg>, Ended> {
+        match effect {
+            Effect::None => Ok(None),
+            Effect::Order(Order::Disarm) => {
+                self.permission.disarm(Stamp::now());
+                Ok(None)
+            }
+            Effect::Order(Order::Arm) => {
+                let now = Stamp::now();
+                Ok(self.permission.arm(now, now).err().map(Msg::Void))
+            }
+            Effect::Leave => {
+                self.permission.disarm(Stamp::now());
+                self.send(Command::Quit)
+            }
+            Effect::Send(command) => self.send(command),
+        }
+    }
+
+    fn send(&self, command: Command) -> Result<Option<Msg>, Ended> {
+        match self.commands.try_send(command) {
+            Ok(()) => Ok(None),
+            Err(TrySendError::Full(_)) => Ok(Some(Msg::Refused)),
+            Err(TrySendError::Closed(_)) => Err(Ended),
+        }
+    }
 }
 
 /// The loop itself, with any source of terminal events and any way to draw.
 async fn drive(
     board: &Board,
-    commands: &mpsc::Sender<Command>,
+    asked: &Asked,
     shutdown: &CancellationToken,
     events: impl Stream<Item = io::Result<Event>>,
     mut draw: impl FnMut(&Model) -> io::Result<()>,
@@ -101,14 +146,10 @@ async fn drive(
             },
             _ = frames.tick() => model.update(Msg::Snapshot(Box::new(board.snapshot()))),
         };
-        if let Effect::Send(command) = effect {
-            match commands.try_send(command) {
-                Ok(()) => {}
-                Err(TrySendError::Full(_)) => {
-                    model.update(Msg::Refused);
-                }
-                Err(TrySendError::Closed(_)) => return Ok(()),
-            }
+        match asked.carry_out(effect) {
+            Ok(Some(answer)) => drop(model.update(answer)),
+            Ok(None) => {}
+            Err(Ended) => return Ok(()),
         }
         draw(&model).map_err(TuiError::Gone)?;
     }

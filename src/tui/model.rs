@@ -5,6 +5,7 @@
 //!
 //! Invariant: pure: no clock, no terminal, no channel; time is what the snapshots say.
 
+mod arming;
 mod dropping;
 
 use std::time::Duration;
@@ -15,6 +16,7 @@ use self::dropping::Asked;
 use super::theme::Edge;
 use crate::action::Order;
 use crate::modality::{MAX_MODALITIES, ModalityId};
+use crate::permission::Void;
 use crate::status::rates::Rates;
 use crate::status::{Command, DeviceStatus, SlotState, Snapshot};
 use crate::time::Stamp;
@@ -33,6 +35,8 @@ pub enum Msg {
     Key(KeyEvent),
     /// A command could not be handed over because the program is busy.
     Refused,
+    /// The actuator is not armed, and why.
+    Void(Void),
 }
 
 /// What is to be done about it.
@@ -42,6 +46,10 @@ pub enum Effect {
     None,
     /// Hand this over.
     Send(Command),
+    /// Order this of the actuator.
+    Order(Order),
+    /// Disarm the actuator, then end the program.
+    Leave,
 }
 
 /// Has the user asked to quit?
@@ -89,8 +97,8 @@ pub struct Model {
     scroll: usize,
     help: bool,
     quit: Quit,
-    /// The user has asked to arm the actuator: the next key counts.
-    arming: bool,
+    /// When the user asked to arm the actuator: the next key counts.
+    arming: Option<Stamp>,
     /// The user has asked to drop the last episode: the next key counts.
     dropping: Option<Asked>,
     notice: Option<(String, Stamp)>,
@@ -114,7 +122,7 @@ impl Model {
             scroll: 0,
             help: false,
             quit: Quit::No,
-            arming: false,
+            arming: None,
             dropping: None,
             notice: None,
         };
@@ -133,6 +141,10 @@ impl Model {
             Msg::Key(key) => self.key(key),
             Msg::Refused => {
                 self.say("busy: not taken, try again");
+                Effect::None
+            }
+            Msg::Void(why) => {
+                self.say(&format!("not armed: {why}"));
                 Effect::None
             }
         }
@@ -183,8 +195,17 @@ impl Model {
 
     fn key(&mut self, key: KeyEvent) -> Effect {
         let control = key.modifiers.contains(KeyModifiers::CONTROL);
+        // Only the key after the first asks for it.
+        let arming = self.arming.take();
         match key.code {
-            KeyCode::Char('c') if control => return self.ask_to_quit(),
+            KeyCode::Char('c') if control => {
+                // Nothing moves while the question is answered.
+                let effect = self.ask_to_quit();
+                return if effect == Effect::None { Effect::Order(Order::Disarm) } else { effect };
+            }
+            KeyCode::Char('y') if control && key.kind == KeyEventKind::Press => return self.arm(arming),
+            // What stops motion works everywhere, whatever else is held down.
+            KeyCode::Char('d' | 'D') | KeyCode::Esc => return self.disarm(key.code == KeyCode::Esc),
             KeyCode::Char(_) if control || key.modifiers.contains(KeyModifiers::ALT) => return Effect::None,
             KeyCode::Char('q') => return self.ask_to_quit(),
             _ => {}
@@ -193,15 +214,7 @@ impl Model {
         if self.quit == Quit::Asked {
             self.quit = Quit::No;
         }
-        // Only the key after the first asks for it.
-        let armed = std::mem::take(&mut self.arming);
         let dropping = self.dropping.take();
-        // What stops motion works everywhere.
-        if key.code == KeyCode::Char('d') {
-            self.help = false;
-            self.say("disarming the actuator");
-            return Effect::Send(Command::Order(Order::Disarm));
-        }
         if self.help {
             // A key that closes the help does nothing else.
             self.help = false;
@@ -211,7 +224,7 @@ impl Model {
             // A key held down must not start and stop episodes at the keyboard's repeat rate.
             KeyCode::Char(' ') if key.kind == KeyEventKind::Press => return self.toggle_recording(),
             KeyCode::Char('r') => return self.restart(),
-            KeyCode::Char('a') if key.kind == KeyEventKind::Press => return self.arm(armed),
+            KeyCode::Char('a') if key.kind == KeyEventKind::Press => self.ask_to_arm(),
             KeyCode::Char('x') if key.kind == KeyEventKind::Press => self.ask_to_drop(),
             KeyCode::Char('y') if key.kind == KeyEventKind::Press => return self.drop_episode(dropping),
             KeyCode::Char('p') => self.toggle_pause(),
@@ -222,7 +235,6 @@ impl Model {
             KeyCode::End => self.selected = usize::MAX,
             KeyCode::PageUp => self.scroll += SCROLL_STEP,
             KeyCode::PageDown => self.scroll = self.scroll.saturating_sub(SCROLL_STEP),
-            KeyCode::Esc => self.scroll = 0,
             _ => {}
         }
         self.keep_in_bounds();
@@ -235,18 +247,7 @@ impl Model {
             return Effect::None;
         }
         self.quit = Quit::Ending;
-        Effect::Send(Command::Quit)
-    }
-
-    /// Asks first: something is going to move.
-    fn arm(&mut self, asked: bool) -> Effect {
-        if asked {
-            self.say("arming the actuator");
-            return Effect::Send(Command::Order(Order::Arm));
-        }
-        self.arming = true;
-        self.say("a again to let the actuator move, any other key not to");
-        Effect::None
+        Effect::Leave
     }
 
     fn toggle_recording(&mut self) -> Effect {

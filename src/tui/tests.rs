@@ -320,6 +320,10 @@ fn typed(keys: &[KeyCode]) -> impl Stream<Item = io::Result<Event>> + use<> {
     futures::stream::iter(events).chain(futures::stream::pending())
 }
 
+fn desk(commands: &mpsc::Sender<Command>) -> Asked {
+    Asked { commands: commands.clone(), permission: Arc::default() }
+}
+
 #[tokio::test]
 async fn keys_become_commands_and_shutdown_ends_the_screen() {
     let board = board(&["cam"]);
@@ -327,7 +331,8 @@ async fn keys_become_commands_and_shutdown_ends_the_screen() {
     let shutdown = CancellationToken::new();
     let end = shutdown.clone();
     let keys = typed(&[KeyCode::Char(' '), KeyCode::Char('q')]);
-    let screen = drive(&board, &sender, &shutdown, keys, |_| Ok(()));
+    let desk = desk(&sender);
+    let screen = drive(&board, &desk, &shutdown, keys, |_| Ok(()));
     let app = async {
         assert_eq!(commands.recv().await, Some(Command::ToggleRecording));
         assert_eq!(commands.recv().await, Some(Command::Quit));
@@ -345,7 +350,7 @@ async fn a_busy_program_is_said_and_one_that_is_gone_ends_the_screen() {
     let shutdown = CancellationToken::new();
     let end = shutdown.clone();
     let mut notice = None;
-    drive(&board, &sender, &shutdown, typed(&[KeyCode::Char(' ')]), |model| {
+    drive(&board, &desk(&sender), &shutdown, typed(&[KeyCode::Char(' ')]), |model| {
         if let Some(said) = model.notice() {
             notice = Some(said.to_owned());
             end.cancel();
@@ -357,7 +362,7 @@ async fn a_busy_program_is_said_and_one_that_is_gone_ends_the_screen() {
     assert_eq!(notice.as_deref(), Some("busy: not taken, try again"));
 
     drop(commands);
-    drive(&board, &sender, &CancellationToken::new(), typed(&[KeyCode::Char('q')]), |_| Ok(())).await.unwrap();
+    drive(&board, &desk(&sender), &CancellationToken::new(), typed(&[KeyCode::Char('q')]), |_| Ok(())).await.unwrap();
 }
 
 #[tokio::test]
@@ -365,7 +370,7 @@ async fn a_terminal_that_goes_away_is_an_error() {
     let board = board(&["cam"]);
     let (sender, _commands) = mpsc::channel(1);
     let hung_up = futures::stream::iter([]);
-    let error = drive(&board, &sender, &CancellationToken::new(), hung_up, |_| Ok(())).await.unwrap_err();
+    let error = drive(&board, &desk(&sender), &CancellationToken::new(), hung_up, |_| Ok(())).await.unwrap_err();
     assert!(matches!(error, TuiError::Gone(_)), "{error}");
 }
 
@@ -383,7 +388,8 @@ async fn pasted_text_drops_nothing_whether_the_terminal_marks_it_or_not() {
     let events = events.chain(futures::stream::pending());
     let mut asked = false;
     let end = shutdown.clone();
-    let screen = drive(&board, &sender, &shutdown, events, |model| {
+    let desk = desk(&sender);
+    let screen = drive(&board, &desk, &shutdown, events, |model| {
         asked |= model.notice().is_some_and(|said| said.starts_with("y removes a_001.mcap"));
         Ok(())
     });

@@ -85,7 +85,7 @@ impl Bench {
         let running = Running {
             autopilot: None,
             rig: never(),
-            rig_commands: mpsc::channel(1).0,
+            permission: Arc::default(),
             rig_ending: CancellationToken::new(),
             rig_ended: CancellationToken::new(),
             rig_stop: CancellationToken::new(),

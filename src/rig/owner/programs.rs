@@ -1,9 +1,12 @@
 //! What the owner has to do with programs and with episodes.
 
+use std::sync::Arc;
+
 use tokio_util::sync::CancellationToken;
 
 use super::Rig;
 use crate::modality::ModalityId;
+use crate::permission::Permission;
 use crate::registry::Attachment;
 use crate::status::EpisodeWatch;
 
@@ -15,11 +18,11 @@ impl Rig {
         self
     }
 
-    /// Arms the actuator as soon as it is there: once, and not after another order.
+    /// Its actuator moves as `permission` says; without this nothing arms it.
     #[must_use]
-    pub fn arming(self, arm: bool) -> Self {
-        for controls in self.modalities.iter().filter_map(|modality| modality.controls.as_ref()) {
-            controls.arm_once(arm);
+    pub fn obeying(mut self, permission: &Arc<Permission>) -> Self {
+        for controls in self.modalities.iter_mut().filter_map(|modality| modality.controls.as_mut()) {
+            controls.obey(permission);
         }
         self
     }

@@ -12,6 +12,7 @@ use tokio::sync::{broadcast, watch};
 use super::*;
 use crate::action::Order;
 use crate::hotplug::HotplugError;
+use crate::permission::Permission;
 use crate::registry::scenario::{SimDevice, SimSource};
 use crate::registry::{
     DeviceNode, Framing, IdentitySpec, LanFind, LanProtocol, LanSpec, NodeSpec, Parse, RigSpec, SerialSpec,
@@ -77,7 +78,7 @@ enum Step {
     Silence(&'static str),
     Resume(&'static str),
     Restart(u8),
-    /// The operator gives an order, and the rig has it.
+    /// The operator gives an order.
     Give(Order),
     /// Takes events until this one.
     Until(&'static str),
@@ -95,6 +96,7 @@ use Step::{Adapter, Give, Link, Logged, Mask, Plug, Pull, Removed, Restart, Resu
 struct Bench {
     hotplug: UnboundedSender<Result<HotplugEvent, HotplugError>>,
     commands: mpsc::Sender<RigCommand>,
+    permission: Arc<Permission>,
     events: broadcast::Receiver<Event>,
     units: HashMap<&'static str, Arc<SimDevice>>,
     path: PathBuf,
@@ -129,12 +131,13 @@ impl Bench {
                 self.commands.send(RigCommand::Restart(id)).await.expect("rig");
             }
             Give(order) => {
-                self.commands.send(RigCommand::Order(*order)).await.expect("rig");
-                let begun = Instant::now();
-                while self.commands.capacity() < self.commands.max_capacity() {
-                    assert!(begun.elapsed() < PATIENCE, "nobody takes an order");
-                    tokio::time::sleep(Duration::from_millis(1)).await;
-                }
+                let _ = match order {
+                    Order::Arm => self.permission.arm(Stamp::now(), Stamp::now()),
+                    Order::Disarm => {
+                        self.permission.disarm(Stamp::now());
+                        Ok(())
+                    }
+                };
             }
             Until(wanted) => loop {
                 let event = timeout(PATIENCE, self.events.recv()).await;
@@ -208,8 +211,10 @@ async fn told_of(registry: &Registry, arm: bool, steps: &[Step]) -> Vec<String> 
     let (hotplug, plugged) = unbounded();
     let (commands, asked) = mpsc::channel(4);
     let stop = CancellationToken::new();
-    let mut rig = Rig::new(registry, &bus, presence, Arc::clone(&board)).arming(arm);
-    let mut bench = Bench { hotplug, commands, events: board.events(), units: HashMap::new(), path, told: Vec::new() };
+    let permission = Arc::new(Permission::new(arm));
+    let mut rig = Rig::new(registry, &bus, presence, Arc::clone(&board)).obeying(&permission);
+    let mut bench =
+        Bench { hotplug, commands, permission, events: board.events(), units: HashMap::new(), path, told: Vec::new() };
     let running = tokio::spawn({
         let stop = stop.clone();
         async move { rig.run(Box::pin(plugged), asked, stop).await }
@@ -347,7 +352,9 @@ async fn devices_are_told_of_the_episode_in_progress() {
     let (tell, episode) = watch::channel(None);
     let stop = CancellationToken::new();
     let mut rig = Rig::new(&registry, &bus, presence, Arc::clone(&board)).following(episode);
-    let mut bench = Bench { hotplug, commands, events: board.events(), units: HashMap::new(), path, told: Vec::new() };
+    let permission = Arc::default();
+    let events = board.events();
+    let mut bench = Bench { hotplug, commands, permission, events, units: HashMap::new(), path, told: Vec::new() };
     let running = tokio::spawn({
         let stop = stop.clone();
         async move { rig.run(Box::pin(plugged), asked, stop).await }

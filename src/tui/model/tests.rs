@@ -27,7 +27,7 @@ fn after(snapshot: &Snapshot, ms: u64) -> Msg {
 
 #[test]
 fn keys_become_commands() {
-    let quit = Effect::Send(Command::Quit);
+    let quit = Effect::Leave;
     let toggle = Effect::Send(Command::ToggleRecording);
     let restart = Effect::Send(Command::Restart(id(4)));
     let table: Vec<(&str, bool, Vec<Msg>, Effect)> = vec![
@@ -39,7 +39,6 @@ fn keys_become_commands() {
         ("ctrl-q is no q", false, vec![control('q')], Effect::None),
         ("quit while recording asks", true, vec![press(KeyCode::Char('q'))], Effect::None),
         ("quit twice", true, vec![press(KeyCode::Char('q')), press(KeyCode::Char('q'))], quit.clone()),
-        ("ctrl-c twice", true, vec![control('c'), control('c')], quit.clone()),
         (
             "quit, another key, quit asks again",
             true,
@@ -64,7 +63,7 @@ fn keys_become_commands() {
         (
             "space after the help",
             false,
-            vec![press(KeyCode::Char('?')), press(KeyCode::Esc), press(KeyCode::Char(' '))],
+            vec![press(KeyCode::Char('?')), press(KeyCode::Char('?')), press(KeyCode::Char(' '))],
             toggle,
         ),
     ];
@@ -76,6 +75,77 @@ fn keys_become_commands() {
         assert_eq!(effects.last(), Some(&expected), "{what}");
         let others = effects.iter().rev().skip(1);
         assert!(others.into_iter().all(|effect| *effect == Effect::None), "{what}");
+    }
+}
+
+#[test]
+fn what_stops_motion_does_so_at_any_moment() {
+    let questions: [(&str, Vec<Msg>); 6] = [
+        ("nothing", vec![]),
+        ("the help", vec![press(KeyCode::Char('?'))]),
+        ("leaving", vec![press(KeyCode::Char('q'))]),
+        ("dropping", vec![press(KeyCode::Char('x'))]),
+        ("arming", vec![press(KeyCode::Char('a'))]),
+        ("a paused view", vec![press(KeyCode::Char('p'))]),
+    ];
+    for (question, asked) in questions {
+        let shifted = Msg::Key(KeyEvent::new(KeyCode::Char('D'), KeyModifiers::SHIFT));
+        let keys = [
+            press(KeyCode::Char('d')),
+            press(KeyCode::Char('D')),
+            shifted,
+            control('d'),
+            press(KeyCode::Esc),
+            control('c'),
+        ];
+        for key in keys {
+            let mut snapshot = three_streaming();
+            snapshot.recording = Some(recording(0));
+            let mut model = Model::new(snapshot);
+            for msg in &asked {
+                let Msg::Key(key) = msg else { unreachable!() };
+                model.update(Msg::Key(*key));
+            }
+            let what = format!("{key:?} while {question} is asked");
+            let effect = model.update(key);
+            // Ctrl-C is the answer to the question whether to leave.
+            let leaves = question == "leaving" && what.contains("'c'");
+            assert_eq!(effect, if leaves { Effect::Leave } else { Effect::Order(Order::Disarm) }, "{what}");
+            assert!(!model.is_help_open() || what.contains("'c'"), "{what}");
+            // The question is not answered by what comes next.
+            assert_eq!(model.update(control('y')), Effect::None, "{what}");
+        }
+    }
+}
+
+/// Keys, and when each came, ms.
+type Keys = Vec<(u64, Msg)>;
+
+#[test]
+fn only_two_different_keys_within_two_seconds_arm() {
+    let a = || press(KeyCode::Char('a'));
+    let arm = Effect::Order(Order::Arm);
+    let repeated_y = Msg::Key(KeyEvent::new_with_kind(KeyCode::Char('y'), KeyModifiers::CONTROL, KeyEventKind::Repeat));
+    let table: Vec<(&str, Keys, &Effect)> = vec![
+        ("a, ctrl-y", vec![(0, a()), (300, control('y'))], &arm),
+        ("a, a, ctrl-y", vec![(0, a()), (100, a()), (300, control('y'))], &arm),
+        ("a twice", vec![(0, a()), (300, a())], &Effect::None),
+        ("a held down, as a terminal without repeats tells", (0..50).map(|at| (30 * at, a())).collect(), &Effect::None),
+        ("pasted text", "aay ay\nay".chars().map(|letter| (0, press(KeyCode::Char(letter)))).collect(), &Effect::None),
+        ("ctrl-y alone", vec![(0, control('y'))], &Effect::None),
+        ("ctrl-y held down", vec![(0, a()), (300, repeated_y)], &Effect::None),
+        ("too late", vec![(0, a()), (2_100, control('y'))], &Effect::None),
+        ("another key between", vec![(0, a()), (200, press(KeyCode::Down)), (300, control('y'))], &Effect::None),
+        ("a question between", vec![(0, a()), (200, press(KeyCode::Char('?'))), (300, control('y'))], &Effect::None),
+    ];
+    for (what, keys, expected) in table {
+        let mut model = Model::new(three_streaming());
+        let mut last = Effect::None;
+        for (at, key) in keys {
+            model.update(after(&three_streaming(), at));
+            last = model.update(key);
+        }
+        assert_eq!(last, *expected, "{what}");
     }
 }
 

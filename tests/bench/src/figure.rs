@@ -219,7 +219,7 @@ load
     #[test]
     fn only_what_the_machine_lacks_may_go_unmeasured() {
         let failed = |why: Failure| Figure::of_failure("a/all", &why);
-        assert!(failed("topic /rapid/arm: ExceedsMaxSupportedServers".into()).is_unmeasured());
+        assert!(failed("topic /rapid/mask: ExceedsMaxSupportedPublishers".into()).is_unmeasured());
         assert!(Figure::new("a/b", "ms", None).is_unmeasured());
         assert!(!Figure::new("a/b", "ms", Some(0.0)).is_unmeasured());
         let absent = failed(Absent("KVM".to_owned()).into());

@@ -3,6 +3,7 @@
 use super::*;
 use crate::registry::{
     ActionSpec, CanAdapter, CanProtocol, CanSpec, DamiaoSpec, MOTOR_CHANNELS, MotorKind, MotorMode, MotorSpec,
+    StopSpec, WatchSpec,
 };
 
 const NUMBERS: usize = MOTOR_CHANNELS;
@@ -19,6 +20,8 @@ fn arm() -> Registry {
         velocity: 1.0,
         torque: 1.0,
         slew: 1.0,
+        watch: WatchSpec::default(),
+        stop: StopSpec::default(),
         max_mos: 80.0,
         max_rotor: 80.0,
     };
@@ -26,7 +29,7 @@ fn arm() -> Registry {
         motors: vec![motor],
         hz: 200,
         deadman: None,
-        disable_after: Duration::from_secs(1),
+        disable_after: Some(Duration::from_secs(1)),
         timeout: Duration::from_millis(100),
         silent_after: Duration::from_millis(50),
     };

@@ -1,0 +1,129 @@
+//! Both sides over real sockets.
+
+use std::io::{Read, Write};
+use std::os::unix::net::{UnixListener, UnixStream};
+use std::sync::Arc;
+
+use super::give::{GiveError, give};
+use super::receive::Orders;
+use super::*;
+use crate::permission::{Attended, Permission};
+use Order::{Arm, Disarm};
+
+/// A run's side, under an instance of its own.
+struct Run {
+    instance: String,
+    permission: Arc<Permission>,
+    _orders: Orders,
+}
+
+fn run(test: &str) -> Run {
+    let instance = format!("orders-{test}-{}", std::process::id());
+    let permission = Arc::new(Permission::new(false));
+    let orders = Orders::receive(Some(&instance), Arc::clone(&permission)).unwrap();
+    Run { instance, permission, _orders: orders }
+}
+
+impl Run {
+    fn connect(&self) -> UnixStream {
+        let name = name(this_user(), Some(&self.instance), std::process::id());
+        UnixStream::connect_addr(&address(&name).unwrap()).unwrap()
+    }
+
+    fn give(&self, order: Order) -> Result<(), String> {
+        give(Some(&self.instance), order).map_err(|error| error.to_string())
+    }
+}
+
+fn taken(attended: &Attended) -> Vec<Order> {
+    attended.take().collect()
+}
+
+/// What is answered to these bytes.
+fn answered(stream: &mut UnixStream, bytes: &[u8]) -> String {
+    stream.write_all(bytes).unwrap();
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).unwrap();
+    answer
+}
+
+#[test]
+fn orders_are_carried_out_when_they_are_answered() {
+    let run = run("a");
+    // A disarm needs no actuator, an arm does.
+    assert_eq!(run.give(Disarm), Ok(()));
+    let refused = run.give(Arm).unwrap_err();
+    assert!(refused.contains("no actuator is plugged in"), "{refused}");
+    let attended = run.permission.attend();
+    assert_eq!(run.give(Arm), Ok(()));
+    assert_eq!(taken(&attended), [Arm]);
+    assert_eq!(run.give(Disarm), Ok(()));
+    assert_eq!(taken(&attended), [Disarm]);
+}
+
+#[test]
+fn without_a_run_there_is_an_error_at_once_and_after_its_end_too() {
+    let none = give(Some("orders-none"), Disarm).unwrap_err();
+    assert!(matches!(none, GiveError::NoRun(_)) && none.to_string().contains("orders-none"), "{none}");
+    let run = run("b");
+    let instance = run.instance.clone();
+    drop(run);
+    assert!(matches!(give(Some(&instance), Disarm), Err(GiveError::NoRun(_))));
+}
+
+#[test]
+fn an_arm_that_was_given_long_ago_or_is_to_come_does_nothing() {
+    let run = run("c");
+    let attended = run.permission.attend();
+    let old = Stamp::now().before(std::time::Duration::from_secs(2));
+    let answer = answered(&mut run.connect(), line(Arm, old).as_bytes());
+    assert!(answer.contains("the order is 2.0 s old"), "{answer}");
+    let early = answered(&mut run.connect(), line(Arm, Stamp(u64::MAX)).as_bytes());
+    assert!(early.contains("later time"), "{early}");
+    assert_eq!(taken(&attended), []);
+    // A disarm counts however old, and whoever waits for it.
+    run.connect().write_all(line(Disarm, Stamp(0)).as_bytes()).unwrap();
+    assert_eq!(answered(&mut run.connect(), b"disarm 1\n"), "done\n");
+    assert_eq!(taken(&attended), [Disarm]);
+}
+
+#[test]
+fn what_is_no_order_moves_nothing_and_holds_up_nobody() {
+    let run = run("d");
+    let attended = run.permission.attend();
+    // More connections than are held, which send nothing, or half a line.
+    let mut silent: Vec<_> = (0..40).map(|_| run.connect()).collect();
+    for stream in silent.iter_mut().step_by(2) {
+        // Those before the last few are closed by now.
+        let _ = stream.write_all(b"ar");
+    }
+    for bytes in [
+        &b"arm\n"[..],
+        b"arm x\n",
+        b"arm -1\n",
+        b"ARM 1\n",
+        b"arm 1 1\n",
+        b"\n",
+        b"\xff\xfe\n",
+        b"arm 99999999999999999999999\n",
+    ] {
+        let answer = answered(&mut run.connect(), bytes);
+        assert!(answer.contains("not an order"), "{bytes:?}: {answer}");
+    }
+    // It is closed at once: with bytes that nobody has read, which is an error here.
+    let mut endless = run.connect();
+    let _ = endless.write_all(&[b'x'; 4 * LONGEST]).and_then(|()| endless.read_to_string(&mut String::new()));
+    assert_eq!(run.give(Disarm), Ok(()));
+    assert_eq!(taken(&attended), [Disarm]);
+}
+
+#[test]
+fn a_socket_of_that_name_that_does_not_answer_is_named_with_its_process() {
+    let instance = format!("orders-e-{}", std::process::id());
+    let name = name(this_user(), Some(&instance), std::process::id());
+    let listener = UnixListener::bind_addr(&address(&name).unwrap()).unwrap();
+    let closes = std::thread::spawn(move || drop(listener.accept()));
+    let error = give(Some(&instance), Disarm).unwrap_err();
+    assert!(error.to_string().contains(&format!("process {} does not answer", std::process::id())), "{error}");
+    closes.join().unwrap();
+}

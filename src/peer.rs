@@ -1,0 +1,52 @@
+//! Who is at the other end of a local socket, as the kernel reports it: `SO_PEERCRED`, unix(7).
+
+use std::io;
+use std::mem::size_of;
+use std::os::fd::AsRawFd;
+use std::os::unix::net::UnixStream;
+
+/// See the module's comment.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Peer {
+    /// Its process; `None` for one of a namespace of processes that is not seen from here.
+    pub process: Option<u32>,
+    /// Its user.
+    pub user: u32,
+}
+
+impl Peer {
+    /// Whoever made the other end of `stream`, or listened there.
+    ///
+    /// # Errors
+    /// When the kernel does not say.
+    pub fn of(stream: &UnixStream) -> io::Result<Self> {
+        let mut found = libc::ucred { pid: 0, uid: 0, gid: 0 };
+        let mut length = libc::socklen_t::try_from(size_of::<libc::ucred>()).unwrap_or_default();
+        // SAFETY: both outlive the call, and `length` is the size of `found`, of which any bytes are a value.
+        let outcome = unsafe {
+            libc::getsockopt(
+                stream.as_raw_fd(),
+                libc::SOL_SOCKET,
+                libc::SO_PEERCRED,
+                (&raw mut found).cast(),
+                &raw mut length,
+            )
+        };
+        if outcome != 0 {
+            return Err(io::Error::last_os_error());
+        }
+        Ok(Self { process: u32::try_from(found.pid).ok().filter(|pid| *pid != 0), user: found.uid })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_other_end_of_a_pair_is_this_process() {
+        let (one, _other) = UnixStream::pair().unwrap();
+        let user = rustix::process::geteuid().as_raw();
+        assert_eq!(Peer::of(&one).unwrap(), Peer { process: Some(std::process::id()), user });
+    }
+}

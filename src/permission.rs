@@ -1,0 +1,135 @@
+//! Permission: may the actuator of this run move?
+//!
+//! Every order of a run is given here, whoever gives it: the operator at the screen, another program, the end of the run.
+//!
+//! Invariant: a disarm holds for the rest of the run, whether or not an actuator is plugged in, until a newer arm.
+//! Invariant: an arm that was given before the last disarm arrived does nothing, in whatever order the two arrive. Nor does
+//! one that is older than [`VOID_AFTER`], or comes while no actuator is plugged in. A disarm is never refused.
+//! Invariant: nothing here waits, locks or allocates.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::time::Duration;
+
+use crate::action::{Order, OrderSlot};
+use crate::time::Stamp;
+
+/// An arm that took longer on its way does nothing.
+pub const VOID_AFTER: Duration = Duration::from_secs(1);
+
+/// See the module's comment.
+#[derive(Debug, Default)]
+pub struct Permission {
+    /// When the last disarm arrived; 0 before the first.
+    disarmed: AtomicU64,
+    /// For the actuator.
+    slot: OrderSlot,
+    /// Actuators that are plugged in.
+    actuators: AtomicUsize,
+    /// The actuator is to be armed when it is first plugged in: no other order came since.
+    at_first_plug: AtomicBool,
+}
+
+/// Why an arm does nothing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum Void {
+    /// Nothing is there that could move.
+    #[error("no actuator is plugged in: plug it in, then arm it")]
+    NoActuator,
+    /// It was long on its way.
+    #[error("the order is {:.1} s old, and 1 s is allowed: give it again", .0.as_secs_f64())]
+    Old(Duration),
+    /// A disarm came between.
+    #[error("a disarm came after this order was given: give it again if the actuator is to move")]
+    Overtaken,
+    /// Its time has not come yet: it was given on another machine, or is made up.
+    #[error("the order is of a later time than now")]
+    Early,
+}
+
+impl Permission {
+    /// Of a run that begins; `at_first_plug`: its actuator is to be armed when it is first plugged in.
+    #[must_use]
+    pub fn new(at_first_plug: bool) -> Self {
+        Self { at_first_plug: AtomicBool::new(at_first_plug), ..Self::default() }
+    }
+
+    /// The actuator may not move, from `now` on. Says whether one is plugged in.
+    pub fn disarm(&self, now: Stamp) -> bool {
+        self.at_first_plug.store(false, Ordering::SeqCst);
+        // Before it is given: see `arm`.
+        self.disarmed.fetch_max(now.0.max(1), Ordering::SeqCst);
+        self.slot.give(Order::Disarm);
+        self.actuators.load(Ordering::SeqCst) > 0
+    }
+
+    /// The actuator may move; the order was given at `given` and has arrived `now`.
+    ///
+    /// # Errors
+    /// When it does nothing, and why.
+    pub fn arm(&self, given: Stamp, now: Stamp) -> Result<(), Void> {
+        self.at_first_plug.store(false, Ordering::SeqCst);
+        let age = now.since(given);
+        if given > now {
+            return Err(Void::Early);
+        } else if age > VOID_AFTER {
+            return Err(Void::Old(age));
+        } else if self.is_overtaken(given) {
+            return Err(Void::Overtaken);
+        } else if self.actuators.load(Ordering::SeqCst) == 0 {
+            return Err(Void::NoActuator);
+        }
+        self.slot.give(Order::Arm);
+        // A disarm that came meanwhile may have been given to the slot before this.
+        if self.is_overtaken(given) {
+            self.slot.give(Order::Disarm);
+            return Err(Void::Overtaken);
+        }
+        Ok(())
+    }
+
+    fn is_overtaken(&self, given: Stamp) -> bool {
+        given.0 <= self.disarmed.load(Ordering::SeqCst)
+    }
+
+    /// An actuator was plugged in: orders are for it until what is returned is dropped. What was given before is not.
+    #[must_use]
+    pub fn attend(self: &Arc<Self>) -> Attended {
+        self.slot.take().for_each(drop);
+        self.actuators.fetch_add(1, Ordering::SeqCst);
+        Attended(Arc::clone(self))
+    }
+}
+
+/// An actuator that is plugged in, and what it is ordered.
+#[derive(Debug)]
+pub struct Attended(Arc<Permission>);
+
+impl Attended {
+    /// Is it to be armed now, without an order? At most once a run.
+    #[must_use]
+    pub fn is_to_be_armed(&self) -> bool {
+        self.0.at_first_plug.swap(false, Ordering::SeqCst)
+    }
+
+    /// It could not be armed as [`Self::is_to_be_armed`] says: the next one is to be, unless an order came meanwhile.
+    pub fn was_not_armed(&self) {
+        if self.0.disarmed.load(Ordering::SeqCst) == 0 {
+            self.0.at_first_plug.store(true, Ordering::SeqCst);
+        }
+    }
+
+    /// Takes what it was ordered since the last call, in the order in which it is to be carried out.
+    pub fn take(&self) -> impl Iterator<Item = Order> + use<> {
+        self.0.slot.take()
+    }
+}
+
+impl Drop for Attended {
+    fn drop(&mut self) {
+        self.0.actuators.fetch_sub(1, Ordering::SeqCst);
+    }
+}
+
+#[cfg(test)]
+mod tests;
