@@ -14,7 +14,8 @@ use rapid::modality::ModalityKind;
 use rapid::registry::scenario::Scenario;
 use rapid::registry::{
     BUILTIN, CanAdapter, CanProtocol, DeviceSpec, Framing, Hook, LanFind, LanPicture, LanProtocol, Loaded, MotorKind,
-    MotorMode, NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream, Probe, Registry, VerdictSpec,
+    MotorMode, NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream, Probe, Registry, Stop, StopSpec, VerdictSpec,
+    WatchSpec,
 };
 
 fn files(folder: &str) -> Vec<PathBuf> {
@@ -28,10 +29,24 @@ fn valid(name: &str) -> Loaded {
 
 #[test]
 fn every_mistake_is_told_in_full() {
-    mistakes::check("registry/invalid", "toml", 174, |text| {
+    mistakes::check("registry/invalid", "toml", 176, |text| {
         let errors = Registry::parse(text, Some(Path::new("devices.toml"))).err()?;
         Some((errors.to_string(), errors.diagnostics))
     });
+}
+
+#[test]
+fn motors_that_go_on_for_long_after_a_kill_are_warned_of() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/registry/valid/can.toml");
+    let text = mistakes::read(&path);
+    for (timeout, is_warned) in [("200ms", false), ("500ms", false), ("501ms", true), ("10s", true)] {
+        let text = text.replace("timeout = \"200ms\"", &format!("timeout = \"{timeout}\""));
+        let warnings = Registry::parse(&text, None).unwrap().warnings;
+        let is_of_it = |warning: &rapid::registry::Diagnostic| {
+            warning.message.starts_with(&format!("timeout = {timeout}: ")) && warning.to_string().contains("500ms")
+        };
+        assert_eq!(warnings.iter().any(is_of_it), is_warned, "{timeout}: {warnings:?}");
+    }
 }
 
 #[test]
@@ -187,7 +202,7 @@ fn a_bus_and_its_motors_arrive() {
     let CanProtocol::Damiao(damiao) = &motors.protocol else { panic!("motors") };
     let ms = std::time::Duration::from_millis;
     assert_eq!((damiao.hz, damiao.deadman), (500, Some(ms(80))));
-    assert_eq!((damiao.disable_after, damiao.timeout, damiao.silent_after), (ms(2000), ms(200), ms(20)));
+    assert_eq!((damiao.disable_after, damiao.timeout, damiao.silent_after), (Some(ms(2000)), ms(200), ms(20)));
     let [gripper, roll, wheel, thumb] = damiao.motors.as_slice() else { panic!("four motors") };
     assert_eq!((gripper.slave, gripper.master, gripper.kind), (5, 0x15, MotorKind::Dmh3510));
     assert_eq!((gripper.mode, gripper.position), (MotorMode::Mit { kp: 0.8, kd: 0.05 }, [-1.5, 0.25]));
@@ -198,6 +213,10 @@ fn a_bus_and_its_motors_arrive() {
     assert_eq!((roll.velocity, roll.slew, thumb.torque), (10.0, 4.0, 3.0));
     assert_eq!((roll.max_mos, roll.max_rotor), (70.0, 90.0));
     assert_eq!((wheel.master, wheel.mode, wheel.slew), (0x7fe, MotorMode::Velocity, 20.0));
+    assert_eq!((gripper.watch, gripper.stop), (WatchSpec::default(), StopSpec::default()));
+    assert_eq!((roll.watch, roll.stop), (WatchSpec { lag: 0.5, ..WatchSpec::default() }, StopSpec::default()));
+    let kept = StopSpec { own_fault: Stop::Hold, other_fault: Stop::Limp, hold_for: Some(ms(5000)) };
+    assert_eq!((thumb.watch.margin, thumb.watch.blocked_after, thumb.stop), (0.05, None, kept));
     let axes = hand.action.as_ref().unwrap();
     assert_eq!(
         (axes.names.join(" "), axes.units.join(" ")),

@@ -1,11 +1,11 @@
 //! The deadman: no action, no motion.
 //!
 //! Without a fresh action for two periods of actions, or as long as is configured, motors hold; after
-//! holding for a while longer they are to be disabled. An action that comes while they hold moves them
+//! holding for a while longer, if that is configured, they are to be disabled. An action that comes while they hold moves them
 //! again. Two periods are never taken for less than two cycles of commands and the time that an action is
 //! on its way.
 //!
-//! Invariant: after being armed, and without an action, it says `Hold` and then `Disable`, never
+//! Invariant: after being armed, and without an action, it says `Hold` and then perhaps `Disable`, never
 //! `Follow`.
 
 use std::time::Duration;
@@ -25,7 +25,7 @@ pub struct Deadman {
     hold_after: Option<Duration>,
     /// Patience that nobody configured is no shorter.
     least: Duration,
-    disable_after: Duration,
+    disable_after: Option<Duration>,
     /// Of the newest action, if any came since arming.
     fresh: Option<Stamp>,
     armed: Stamp,
@@ -43,9 +43,9 @@ pub enum Verdict {
 }
 
 impl Deadman {
-    /// `hold_after` of `None` is two periods. `cycle` is the time between two commands.
+    /// `hold_after` of `None` is two periods, `disable_after` of `None` never. `cycle` is the time between two commands.
     #[must_use]
-    pub fn new(hold_after: Option<Duration>, disable_after: Duration, cycle: Duration) -> Self {
+    pub fn new(hold_after: Option<Duration>, disable_after: Option<Duration>, cycle: Duration) -> Self {
         let least = cycle.saturating_mul(CYCLES).saturating_add(WAY);
         Self { hold_after, least, disable_after, fresh: None, armed: Stamp(0) }
     }
@@ -73,7 +73,7 @@ impl Deadman {
         let holds_from = self.fresh.map_or(self.armed, |fresh| fresh.after(self.patience(period)));
         if self.fresh.is_some() && now < holds_from {
             Verdict::Follow
-        } else if now < holds_from.after(self.disable_after) {
+        } else if self.disable_after.is_none_or(|after| now < holds_from.after(after)) {
             Verdict::Hold
         } else {
             Verdict::Disable

@@ -1,10 +1,11 @@
 //! What an axis may be commanded: a range, and how fast the command may change.
 //!
 //! Invariant: what is no finite number is refused; what lies beyond the range is its end, and counted.
-//! Invariant: a command changes by at most the slew limit times the time that passed, except towards
-//! where the joint is, to keep to a torque.
+//! Invariant: a commanded position changes by at most the slew limit times the time that passed, whatever a motor reports.
 
 use std::time::Duration;
+
+use super::damiao::codec::KP_MAX;
 
 /// Limits of one axis, and what they did.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -93,6 +94,15 @@ pub fn within_torque(command: f64, measured: f64, torque: f64, kp: f64) -> f64 {
         return command;
     }
     command.clamp(measured - reach, measured + reach)
+}
+
+/// The stiffness, `kp` (Nm/rad) at most, with which a position error (rad) asks for no more than `torque` (Nm), in a frame
+/// too, which rounds it to 12 bits.
+#[must_use]
+pub fn stiffness(kp: f64, error: f64, torque: f64) -> f64 {
+    // No error asks for nothing: the quotient is infinite.
+    let most = torque / error.abs() - KP_MAX / 4095.0 / 2.0;
+    kp.min(most.max(0.0))
 }
 
 #[cfg(test)]

@@ -8,7 +8,7 @@
 //! | Following | go where actions say           | Holding, without a fresh action                  |
 //! | Holding   | stay                           | Following; Disabling, after a while              |
 //! | Disabling | told to turn off               | Disarmed, when all have said so                  |
-//! | Faulted   | told to turn off, until they do | Arming, when asked                              |
+//! | Faulted   | told to turn off, damped, or hold | Arming, when asked; Disabling, when asked     |
 //! | Stopped   | told to turn off, by the caller |                                                 |
 //!
 //! A cycle is: [`MotorBus::feed`] every frame that came, [`MotorBus::target`] the newest action,
@@ -18,14 +18,14 @@
 //! Every arm reads the parameters anew: a motor that lost its power has forgotten its mode and its time
 //! limit, by which it stops on its own when this program was killed.
 //!
-//! Invariant: no command before an arm was asked for, nor after a fault, a disarm or a stop until one is
-//! asked for again.
-//! Invariant: one motor that is silent, faulty or hot disables all: an arm must not go on without its
-//! elbow.
+//! Invariant: no command before an arm was asked for, nor after a disarm or a stop until one is asked for again; after a
+//! fault none but to damp a joint or to keep it where it is.
+//! Invariant: one motor that is silent, faulty or hot stops all, each in its way ([`Stop`](crate::registry::Stop)): an
+//! arm must not go on without its elbow, nor fall because of it. None of them follows an action before the next arm.
 //! Invariant: the first command is where the joint is. From there a commanded position changes by the
 //! slew limit at most, and goes nowhere beyond the limits; of a joint that is beyond them it stays or
-//! comes back. In MIT mode it is besides so near to the joint that the stiffness asks for no more than
-//! the torque limit; this alone may move it faster, or beyond, and only towards the joint.
+//! comes back. In MIT mode the stiffness asks for no more than the torque limit: the command comes towards the joint as
+//! fast as it may, and for the rest the stiffness is lowered.
 //! Invariant: an action is followed only if its tick is after the arm, after those of all before it, and
 //! no older than the deadman allows.
 //! Invariant: a sample holds an answer of every motor, each newer than those of the sample before.
@@ -35,12 +35,15 @@
 mod due;
 mod motor;
 mod notice;
+mod watch;
+mod words;
 
 use std::time::Duration;
 
 use motor::Motor;
 use notice::Notices;
-pub use notice::{BusState, Fault, Notice, Part, Reason, Refusal, Words};
+pub use notice::{BusState, Fault, Notice, Part, Reason, Refusal, Strange};
+pub use words::Words;
 
 use super::can::CanFrame;
 use super::damiao::codec::{self, Order};
@@ -80,6 +83,8 @@ pub struct MotorBus {
     stepped: Option<Stamp>,
     armed: Stamp,
     refusing: Option<Refusal>,
+    /// The motor that another program commanded last, and when.
+    other_master: Option<(usize, Stamp)>,
     /// The motor whose frames are sent first: where there is no room for all, each has its turn.
     first: usize,
     notices: Notices,
@@ -126,6 +131,7 @@ impl MotorBus {
             stepped: None,
             armed: now,
             refusing: None,
+            other_master: None,
             first: 0,
             notices: Notices::new(),
             counts: Counts::default(),
@@ -176,14 +182,16 @@ impl MotorBus {
         let reply = Reply::decode(frame);
         let Some(index) = self.motors.iter().position(|motor| motor.sent(frame, reply.as_ref())) else {
             self.counts.strangers += 1;
+            if let Some(motor) = self.motors.iter().position(|motor| motor.is_commanded_by(frame)) {
+                self.heard_master(motor, now);
+            }
             return;
         };
         let Some(motor) = self.motors.get_mut(index) else { return };
         let taken = if let Some(reply) = reply {
             motor.take_reply(&reply, &mut self.notices)
         } else {
-            motor.take_feedback(frame, now, &mut self.notices);
-            Ok(())
+            motor.take_feedback(frame, now, &mut self.notices)
         };
         // At once: what a motor says next must not cover it up.
         if self.state != BusState::Stopped
@@ -252,7 +260,7 @@ impl MotorBus {
 
     /// Disables all motors.
     pub fn disarm(&mut self, now: Stamp) {
-        if self.is_armed() || self.state == BusState::Arming {
+        if self.is_armed() || self.state == BusState::Arming || self.is_keeping() {
             self.disable(Reason::Asked, now);
         }
     }

@@ -33,5 +33,5 @@ pub use spec::{
     DeviceSpec, Framing, Hook, Hooks, IdentitySpec, LanFind, LanPicture, LanProtocol, LanSpec, MAX_BORROWED,
     MAX_MOTORS, MAX_SUBSCRIBERS, MOTOR_CHANNELS, ModuleError, ModuleSpec, MotorKind, MotorMode, MotorSpec, Mount,
     NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream, PixelFormat, Probe, ProcessSpec, Registry, RigSpec,
-    SLCAN_BITRATES, SerialSpec, UsbSpec, WhenStale, mounted, own_side,
+    SLCAN_BITRATES, SerialSpec, Stop, StopSpec, UsbSpec, WatchSpec, WhenStale, mounted, own_side,
 };

@@ -109,6 +109,7 @@ impl Registry {
         let mut devices: Vec<_> = drafts.into_iter().filter_map(|draft| draft.finish(&verdict)).collect();
         devices.sort_by_key(|device| device.id);
         warnings.extend(window::too_narrow(&devices, &entries, rig.sync_window, &problems));
+        warnings.extend(motors::slow_to_stop(&devices, &entries, &problems));
         for device in &mut devices {
             if let NodeSpec::Lan(lan) = &mut device.node {
                 lan.keep_free(rig.disk_reserve);

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use rapid::registry::{DamiaoSpec, MotorKind, MotorMode, MotorSpec};
+use rapid::registry::{DamiaoSpec, MotorKind, MotorMode, MotorSpec, Stop, StopSpec, WatchSpec};
 
 /// A motor in MIT mode that listens to `slave` and answers with 0x10 more.
 pub(crate) fn motor(slave: u16) -> MotorSpec {
@@ -16,6 +16,8 @@ pub(crate) fn motor(slave: u16) -> MotorSpec {
         velocity: 20.0,
         torque: 5.0,
         slew: 5.0,
+        watch: WatchSpec::default(),
+        stop: StopSpec { own_fault: Stop::Limp, other_fault: Stop::Limp, hold_for: None },
         max_mos: 80.0,
         max_rotor: 100.0,
     }
@@ -27,7 +29,7 @@ pub(crate) fn bus(motors: Vec<MotorSpec>) -> DamiaoSpec {
         motors,
         hz: 200,
         deadman: None,
-        disable_after: Duration::from_secs(1),
+        disable_after: Some(Duration::from_secs(1)),
         timeout: Duration::from_millis(400),
         silent_after: Duration::from_millis(50),
     }

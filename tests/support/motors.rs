@@ -146,7 +146,7 @@ pub(crate) fn spec(count: u16) -> DamiaoSpec {
     };
     DamiaoSpec {
         // A busy machine may not run a test, or the terminal between, for a second.
-        disable_after: Duration::from_secs(5),
+        disable_after: Some(Duration::from_secs(5)),
         timeout: Duration::from_secs(2),
         silent_after: Duration::from_secs(2),
         ..motor_spec::bus((1..=count).map(motor).collect())

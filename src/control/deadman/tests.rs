@@ -11,7 +11,7 @@ fn at(ms: u64) -> Stamp {
 fn actions_that_stop_are_held_and_then_disabled() {
     let period = Duration::from_millis(100);
     for (configured, hold_ms) in [(None, 200), (Some(Duration::from_millis(50)), 50)] {
-        let mut deadman = Deadman::new(configured, Duration::from_secs(1), CYCLE);
+        let mut deadman = Deadman::new(configured, Some(Duration::from_secs(1)), CYCLE);
         deadman.arm(at(0));
         deadman.feed(at(500));
         // One that is older than what is known changes nothing.
@@ -32,7 +32,7 @@ fn actions_that_stop_are_held_and_then_disabled() {
 
 #[test]
 fn an_armed_motor_without_an_action_holds_and_is_disabled() {
-    let mut deadman = Deadman::new(None, Duration::from_secs(1), CYCLE);
+    let mut deadman = Deadman::new(None, Some(Duration::from_secs(1)), CYCLE);
     deadman.feed(at(9));
     deadman.arm(at(10));
     for (ms, verdict) in [(10, Verdict::Hold), (1009, Verdict::Hold), (1010, Verdict::Disable)] {
@@ -42,7 +42,7 @@ fn an_armed_motor_without_an_action_holds_and_is_disabled() {
 
 #[test]
 fn actions_that_come_quicker_than_commands_are_waited_for_all_the_same() {
-    let mut deadman = Deadman::new(None, Duration::from_secs(1), CYCLE);
+    let mut deadman = Deadman::new(None, Some(Duration::from_secs(1)), CYCLE);
     let period = Duration::from_millis(1);
     assert_eq!(deadman.patience(period), Duration::from_millis(30), "two cycles, and 20 ms on its way");
     deadman.arm(at(0));
@@ -51,6 +51,16 @@ fn actions_that_come_quicker_than_commands_are_waited_for_all_the_same() {
         assert_eq!(deadman.look(at(ms), period), verdict);
     }
     // What is configured is as it is.
-    let deadman = Deadman::new(Some(Duration::from_millis(12)), Duration::from_secs(1), CYCLE);
+    let deadman = Deadman::new(Some(Duration::from_millis(12)), Some(Duration::from_secs(1)), CYCLE);
     assert_eq!(deadman.patience(period), Duration::from_millis(12));
+}
+
+#[test]
+fn an_arm_that_is_not_to_fall_is_held_for_ever() {
+    let mut deadman = Deadman::new(None, None, CYCLE);
+    deadman.arm(at(10));
+    deadman.feed(at(100));
+    for ms in [300, 2_000, 100_000_000] {
+        assert_eq!(deadman.look(at(ms), Duration::from_millis(100)), Verdict::Hold);
+    }
 }

@@ -5,8 +5,9 @@ use std::time::Duration;
 use super::MotorBus;
 use super::motor::{Motor, Phase};
 use super::notice::{BusState, Fault, Notice, Reason};
+use super::watch::Commanded;
 use crate::control::deadman::Verdict;
-use crate::registry::MotorMode;
+use crate::registry::{MotorMode, Stop};
 use crate::time::Stamp;
 
 /// An arm that took longer has failed...
@@ -15,6 +16,8 @@ const ARM_WITHIN: Duration = Duration::from_secs(1);
 const ARM_CYCLES: u32 = 40;
 /// Motors that have not told their parameters after this are told of.
 const PROBE_WITHIN: Duration = Duration::from_secs(1);
+/// For this long nobody else may have commanded a motor that is armed.
+const ONE_MASTER: Duration = Duration::from_secs(1);
 /// Motors that answer have to turn off within this.
 const DISABLE_WITHIN: Duration = Duration::from_millis(500);
 
@@ -37,6 +40,8 @@ impl MotorBus {
             (BusState::Disarmed | BusState::Following | BusState::Holding, _)
             | (BusState::Arming, Phase::Enabling | Phase::On) => status().or_else(|| motor.heat_fault()),
             (BusState::Arming, _) => motor.heat_fault(),
+            // It was stopped, and is on.
+            (BusState::Faulted(_), Phase::Kept(_)) => status().or_else(|| motor.heat_fault()),
             _ => None,
         }
     }
@@ -45,7 +50,7 @@ impl MotorBus {
         let waited = now.since(self.since);
         match self.state {
             BusState::Probing => self.probe(waited, now),
-            BusState::Arming => self.enable(waited, now),
+            BusState::Arming => self.enable(waited, now, passed),
             BusState::Following | BusState::Holding => match self.deadman.look(now, self.line.period()) {
                 Verdict::Disable => self.disable(Reason::Deadman, now),
                 Verdict::Hold if self.state == BusState::Following => {
@@ -64,8 +69,26 @@ impl MotorBus {
                 Some(_) => {}
             },
             // It says the same again.
-            BusState::Faulted(Fault::Unusable { .. }) | BusState::Stopped => {}
-            BusState::Disarmed | BusState::Faulted(_) => self.ask_late(now),
+            BusState::Faulted(Fault::Unusable { .. }) => self.keep(waited, now),
+            BusState::Stopped => {}
+            BusState::Faulted(_) => {
+                self.keep(waited, now);
+                self.ask_late(now);
+            }
+            BusState::Disarmed => self.ask_late(now),
+        }
+    }
+
+    /// Looks after motors that were stopped by a fault and are still on.
+    fn keep(&mut self, waited: Duration, now: Stamp) {
+        for motor in &mut self.motors {
+            let is_over = match motor.phase {
+                Phase::Kept(Stop::Hold) => motor.spec.stop.hold_for.is_some_and(|limit| waited >= limit),
+                _ => false,
+            };
+            if is_over || motor.is_kept() && motor.unanswered(now) >= self.silent_after {
+                motor.turn_off();
+            }
         }
     }
 
@@ -108,10 +131,31 @@ impl MotorBus {
         }
     }
 
-    fn enable(&mut self, waited: Duration, now: Stamp) {
+    /// Another program commands a motor: an arm does not go on with two masters.
+    pub(super) fn heard_master(&mut self, motor: usize, now: Stamp) {
+        let is_news = self.other_master.replace((motor, now)).is_none_or(|(_, last)| now.since(last) >= ONE_MASTER);
+        match self.state {
+            BusState::Arming | BusState::Following | BusState::Holding => self.fail(Fault::OtherMaster { motor }, now),
+            BusState::Probing | BusState::Disarmed | BusState::Disabling | BusState::Faulted(_) if is_news => {
+                self.notices.tell(Notice::OtherMaster { motor });
+            }
+            _ => {}
+        }
+    }
+
+    fn enable(&mut self, waited: Duration, now: Stamp, passed: Duration) {
+        if let Some((motor, last)) = self.other_master
+            && now.since(last) < ONE_MASTER
+        {
+            self.fail(Fault::OtherMaster { motor }, now);
+            return;
+        }
         if self.ask() {
-            for ((motor, command), limits) in self.motors.iter_mut().zip(&mut self.commands).zip(&mut self.limits) {
-                motor.enable(command, limits);
+            let axes = self.motors.iter_mut().zip(&mut self.commands).zip(&mut self.limits);
+            let mut enabled = axes.map(|((motor, command), limits)| motor.enable(command, limits, passed));
+            if let Some(fault) = enabled.find_map(Result::err) {
+                self.fail(fault, now);
+                return;
             }
         }
         if self.motors.iter().all(|motor| motor.phase == Phase::On) {
@@ -136,11 +180,21 @@ impl MotorBus {
         self.enter(BusState::Holding, now);
     }
 
-    /// The commands of this cycle.
+    /// The commands of this cycle, and whether each motor does what it was commanded.
     fn follow(&mut self, now: Stamp, passed: Duration) {
-        let axes = self.motors.iter().zip(&self.limits).zip(&mut self.commands);
+        let axes = self.motors.iter_mut().zip(&self.limits).zip(&mut self.commands);
+        let mut first = None;
         for (axis, ((motor, limits), command)) in axes.enumerate() {
-            *command = motor.bound(limits.slew(*command, self.line.at(axis, now), passed), limits);
+            let wanted = limits.slew(*command, self.line.at(axis, now), passed);
+            let bound = motor.bound(wanted, limits);
+            // What a motor reports moves the command no faster than an action does.
+            *command =
+                if motor.spec.mode == MotorMode::Velocity { bound } else { limits.slew(*command, bound, passed) };
+            let fault = motor.strange(Commanded { command: *command, wanted }, now, &mut self.notices);
+            first = first.or(fault);
+        }
+        if let Some(fault) = first {
+            self.fail(fault, now);
         }
     }
 
@@ -154,11 +208,32 @@ impl MotorBus {
         self.enter(BusState::Disabling, now);
     }
 
+    /// Stops all motors, each as it is to be stopped; of motors that are stopped already only that with the fault.
     pub(super) fn fail(&mut self, fault: Fault, now: Stamp) {
-        self.turn_off();
-        self.enter(BusState::Faulted(fault), now);
+        let own = fault.motor();
+        // What came first is what it is about.
+        let is_keeping = matches!(self.state, BusState::Faulted(_)) && self.is_keeping();
+        for (index, (motor, command)) in self.motors.iter_mut().zip(&mut self.commands).enumerate() {
+            motor.stop_at_fault(index == own, command);
+        }
+        if !is_keeping {
+            self.enter(BusState::Faulted(fault), now);
+        }
         self.counts.faults += 1;
         self.notices.tell(Notice::Fault(fault));
+        let kept = |stop| {
+            let kept = self.motors.iter().enumerate().filter(|(_, motor)| motor.phase == Phase::Kept(stop));
+            kept.fold(0, |bits, (index, _)| bits | 1_u16 << (index % 16))
+        };
+        let [damped, held] = [Stop::Damp, Stop::Hold].map(kept);
+        if damped | held != 0 {
+            self.notices.tell(Notice::Kept { damped, held });
+        }
+    }
+
+    /// Is a motor on that was stopped by a fault?
+    pub(super) fn is_keeping(&self) -> bool {
+        self.motors.iter().any(Motor::is_kept)
     }
 
     pub(super) const fn enter(&mut self, state: BusState, now: Stamp) {

@@ -7,25 +7,29 @@
 //! | Probed   | refresh                                | the bus is armed                        |
 //! | Clearing | clear error, refresh                   | it reports no fault                     |
 //! | Enabling | enable, then a command to stay         | it said that it is enabled              |
-//! | On       | a command                              | the bus is disarmed                     |
+//! | On       | a command                              | the bus is disarmed, or has a fault     |
+//! | Kept     | damping, or the last command           | the bus is disarmed, or it has a fault  |
 //!
-//! Invariant: a command is sent in `Enabling` and `On` alone.
+//! Invariant: a command is sent in `Enabling` and `On` alone, and in `Kept` the last one.
 //! Invariant: who is found enabled without having been armed is disabled.
+
+mod judged;
+mod parameters;
 
 use std::time::Duration;
 
 use super::notice::{Fault, Notice, Notices, Part};
+use super::watch::Watch;
 use crate::control::can::CanFrame;
 use crate::control::damiao::codec::{self, Feedback, Mit, MotorStatus, Order, Ranges};
-use crate::control::damiao::model;
-use crate::control::damiao::parameter::{self, ControlMode, Parameter, Reply, TIMEOUT_UNIT_US, Value};
-use crate::control::limits::{Limits, within_torque};
-use crate::registry::{MotorMode, MotorSpec};
+use crate::control::damiao::parameter::{self, Parameter, Reply, TIMEOUT_UNIT_US, Value};
+use crate::control::limits::{Limits, stiffness, within_torque};
+use crate::registry::{MotorMode, MotorSpec, Stop, StopSpec};
 use crate::time::Stamp;
+use parameters::PROBE;
 
-/// What is read, in this order.
-const PROBE: [Parameter; 5] =
-    [Parameter::ControlMode, Parameter::PMax, Parameter::VMax, Parameter::TMax, Parameter::Timeout];
+/// Ids of commands and orders, from a motor's own.
+const COMMANDS: [u32; 4] = [0, 0x100, 0x200, 0x300];
 /// A motor is warm this many °C below its limit...
 const WARM: f64 = 10.0;
 /// ...until it is this much cooler.
@@ -47,6 +51,8 @@ pub(super) enum Phase {
     Clearing,
     Enabling,
     On,
+    /// Stopped by a fault of the bus, and still enabled.
+    Kept(Stop),
 }
 
 /// The limits of a motor's axis.
@@ -88,6 +94,10 @@ pub(super) struct Motor {
     timeout: u32,
     read: [f64; 3],
     warm: [bool; 2],
+    watch: Watch,
+    /// When a parameter is read again, and which was.
+    look: Option<Stamp>,
+    looks: usize,
     differs: bool,
     /// That it does not answer was told.
     pub(super) missed: bool,
@@ -112,6 +122,9 @@ impl Motor {
             timeout: u32::try_from(units).unwrap_or(u32::MAX),
             read: [0.0; 3],
             warm: [false; 2],
+            watch: Watch::default(),
+            look: None,
+            looks: 0,
             differs: false,
             missed: false,
             may_be_on: false,
@@ -125,9 +138,38 @@ impl Motor {
         frame.id == u32::from(self.spec.master) && slave_fits
     }
 
+    /// Is this frame a command, an order or a question to it? It is not ours: what we send is not received.
+    pub(super) fn is_commanded_by(&self, frame: &CanFrame) -> bool {
+        let Some(offset) = frame.id.checked_sub(u32::from(self.spec.slave)) else { return false };
+        COMMANDS.contains(&offset)
+    }
+
     /// Turns it off, from the next frame on.
-    pub(super) const fn turn_off(&mut self) {
+    pub(super) fn turn_off(&mut self) {
+        self.watch.reset();
         self.phase = Phase::Off { told: false };
+    }
+
+    /// Stops it at a fault; `is_own`: its own. One that is not on is turned off, one that is kept already stays so.
+    pub(super) fn stop_at_fault(&mut self, is_own: bool, command: &mut f64) {
+        let StopSpec { own_fault, other_fault, .. } = self.spec.stop;
+        match (self.phase, if is_own { own_fault } else { other_fault }) {
+            (Phase::Kept(_), _) if !is_own => {}
+            // One that has turned itself off, or reports a fault, follows no command.
+            (Phase::On, stop @ (Stop::Damp | Stop::Hold)) if self.status == Some(MotorStatus::Enabled) => {
+                self.watch.reset();
+                self.phase = Phase::Kept(stop);
+                if self.spec.mode == MotorMode::Velocity {
+                    *command = 0.0;
+                }
+            }
+            _ => self.turn_off(),
+        }
+    }
+
+    /// It was stopped by a fault, and is still enabled.
+    pub(super) const fn is_kept(&self) -> bool {
+        matches!(self.phase, Phase::Kept(_))
     }
 
     /// It is being told to turn off for the last time.
@@ -143,19 +185,8 @@ impl Motor {
         match self.phase {
             Phase::Off { told } => told && self.status.is_some_and(|status| status != MotorStatus::Enabled),
             Phase::Asked { .. } | Phase::Probed => true,
-            Phase::Clearing | Phase::Enabling | Phase::On => false,
+            Phase::Clearing | Phase::Enabling | Phase::On | Phase::Kept(_) => false,
         }
-    }
-
-    /// Reads its parameters, from the first.
-    pub(super) const fn probe(&mut self) {
-        self.phase = Phase::Asked { at: 0, setting: None };
-    }
-
-    /// The parameter it is asked for.
-    pub(super) fn asked_for(&self) -> Option<Parameter> {
-        let Phase::Asked { at, .. } = self.phase else { return None };
-        PROBE.get(at).copied()
     }
 
     /// It has had a frame for this long without answering.
@@ -163,92 +194,20 @@ impl Motor {
         self.asked.map_or(Duration::ZERO, |asked| now.since(asked))
     }
 
-    /// Takes its answer about a parameter, if it is the one that was asked for.
-    pub(super) fn take_reply(&mut self, reply: &Reply, notices: &mut Notices) -> Result<(), Fault> {
-        self.asked = None;
-        let Phase::Asked { at, setting } = self.phase else { return Ok(()) };
-        // What comes late, to an earlier question or to one that was repeated, answers nothing.
-        if PROBE.get(at) != Some(&reply.parameter) || reply.written != setting.is_some() {
-            return Ok(());
-        }
-        let motor = self.index;
-        let unusable = Fault::Unusable { motor, parameter: reply.parameter, value: reply.value };
-        match self.wanted(reply.parameter) {
-            Some(wanted) if reply.value == wanted => {
-                if let Some(was) = setting {
-                    notices.tell(Notice::ParameterSet { motor, parameter: reply.parameter, was, is: wanted });
-                }
-            }
-            Some(_) if setting.is_none() => {
-                self.phase = Phase::Asked { at, setting: Some(reply.value) };
-                return Ok(());
-            }
-            Some(_) => return Err(unusable),
-            // A range: PROBE[1..=3].
-            None => {
-                let value = reply.value.number();
-                let [p, v, t] = &mut self.read;
-                let slot = match reply.parameter {
-                    Parameter::PMax => p,
-                    Parameter::VMax => v,
-                    _ => t,
-                };
-                *slot = value;
-                Ranges::new(value, value, value).ok_or(unusable)?;
-                let [low, high] = within(self.spec.position, value);
-                if reply.parameter == Parameter::PMax && low > high {
-                    return Err(unusable);
-                }
-            }
-        }
-        self.phase = if at + 1 < PROBE.len() { Phase::Asked { at: at + 1, setting: None } } else { Phase::Probed };
-        if self.phase == Phase::Probed {
-            self.take_ranges(notices);
-        }
-        Ok(())
-    }
-
-    fn take_ranges(&mut self, notices: &mut Notices) {
-        let [p, v, t] = self.read;
-        let ranges = Ranges::new(p, v, t);
-        if self.ranges != ranges {
-            // Counted in other ranges, it says something else.
-            self.feedback = None;
-            self.is_new = false;
-        }
-        self.ranges = ranges;
-        let Some(read) = ranges else { return };
-        let differs = !model::is_shipped(self.spec.kind, &read);
-        if differs && !self.differs {
-            notices.tell(Notice::RangesDiffer { motor: self.index, read, shipped: model::shipped(self.spec.kind) });
-        }
-        self.differs = differs;
-    }
-
-    /// What a parameter is to be, if that is for us to say.
-    fn wanted(&self, parameter: Parameter) -> Option<Value> {
-        match parameter {
-            Parameter::ControlMode => Some(Value::Whole(match self.spec.mode {
-                MotorMode::Mit { .. } => ControlMode::Mit,
-                MotorMode::PositionVelocity => ControlMode::PositionVelocity,
-                MotorMode::Velocity => ControlMode::Velocity,
-            } as u32)),
-            Parameter::Timeout => Some(Value::Whole(self.timeout)),
-            _ => None,
-        }
-    }
-
     /// Takes its feedback.
-    pub(super) fn take_feedback(&mut self, frame: &CanFrame, now: Stamp, notices: &mut Notices) {
+    pub(super) fn take_feedback(&mut self, frame: &CanFrame, now: Stamp, notices: &mut Notices) -> Result<(), Fault> {
         // Before its ranges are known, what it says of itself counts alone.
         let Some(feedback) = self.ranges.or(Ranges::new(1.0, 1.0, 1.0)).and_then(|r| Feedback::decode(frame, &r))
         else {
-            return;
+            return Ok(());
         };
         self.asked = None;
         self.status = Some(feedback.status);
         self.may_be_on = feedback.status == MotorStatus::Enabled || self.may_be_on && !self.is_off();
-        if self.ranges.is_some() {
+        if let Some(ranges) = self.ranges {
+            if !self.is_possible(&feedback, &ranges, now, notices)? {
+                return Ok(());
+            }
             self.feedback = Some(feedback);
             self.seen = now;
             self.is_new = true;
@@ -262,6 +221,7 @@ impl Motor {
                 *warm = false;
             }
         }
+        Ok(())
     }
 
     fn temperatures(&self, feedback: &Feedback) -> [(Part, f64, f64); 2] {
@@ -275,7 +235,7 @@ impl Motor {
     pub(super) fn status_fault(&self) -> Option<Fault> {
         let motor = self.index;
         match self.status? {
-            MotorStatus::Disabled if self.phase == Phase::On => Some(Fault::Dropped { motor }),
+            MotorStatus::Disabled if self.phase == Phase::On || self.is_kept() => Some(Fault::Dropped { motor }),
             MotorStatus::Enabled | MotorStatus::Disabled => None,
             status => Some(Fault::Latched { motor, status }),
         }
@@ -290,9 +250,17 @@ impl Motor {
 
     /// Goes on to be enabled, once its parameters are read: faults are cleared before. Until it is, its
     /// command is where it is.
-    pub(super) fn enable(&mut self, command: &mut f64, limits: &mut Limits) {
-        let (Some(ranges), Some(feedback), Some(status)) = (self.ranges, self.feedback, self.status) else { return };
+    ///
+    /// # Errors
+    /// It stands where it may not be armed.
+    pub(super) fn enable(&mut self, command: &mut f64, limits: &mut Limits, passed: Duration) -> Result<(), Fault> {
+        let (Some(ranges), Some(feedback), Some(status)) = (self.ranges, self.feedback, self.status) else {
+            return Ok(());
+        };
         if self.phase == Phase::Probed {
+            if let Some(fault) = self.outside() {
+                return Err(fault);
+            }
             self.phase = Phase::Clearing;
             if self.spec.mode != MotorMode::Velocity {
                 let [low, high] = within(self.spec.position, ranges.position());
@@ -309,8 +277,9 @@ impl Motor {
             }
         } else if self.phase == Phase::On {
             // It waits for the others, and somebody may lean on it.
-            *command = self.bound(*command, limits);
+            *command = limits.slew(*command, self.bound(*command, limits), passed);
         }
+        Ok(())
     }
 
     /// The command next to `command` that where the joint is allows.
@@ -329,7 +298,7 @@ impl Motor {
         match (self.phase, self.status) {
             // Who is probed waits for the others, which come to their own.
             (Phase::On | Phase::Probed, _) => None,
-            (Phase::Off { .. }, Some(MotorStatus::Enabled)) => Some(Fault::NotDisabled { motor }),
+            (Phase::Off { .. }, Some(MotorStatus::Enabled)) | (Phase::Kept(_), _) => Some(Fault::NotDisabled { motor }),
             (Phase::Off { .. }, _) => Some(Fault::Silent { motor }),
             (Phase::Asked { .. }, _) => Some(Fault::Unread { motor, parameter: self.asked_for()? }),
             (Phase::Clearing, Some(status)) if status != MotorStatus::Disabled => {
@@ -373,16 +342,35 @@ impl Motor {
                 self.may_be_on = true;
                 self.command(command, send);
             }
-            Phase::On => self.command(command, send),
+            Phase::On => {
+                self.command(command, send);
+                self.look_again(now, send);
+            }
+            Phase::Kept(stop) => self.keep(stop, command, send),
         }
         self.asked.get_or_insert(now);
+    }
+
+    /// Keeps it from falling, or from falling fast.
+    fn keep(&self, stop: Stop, command: f64, send: &mut impl FnMut(CanFrame)) {
+        let (MotorMode::Mit { kd, .. }, Stop::Damp) = (self.spec.mode, stop) else {
+            return self.command(command, send);
+        };
+        let (Some(ranges), Some(Feedback { q, .. })) = (&self.ranges, self.feedback) else { return };
+        if let Ok(frame) = codec::mit(self.spec.slave, &Mit { kp: 0.0, kd, q, dq: 0.0, tau: 0.0 }, ranges) {
+            send(frame);
+        }
     }
 
     fn command(&self, command: f64, send: &mut impl FnMut(CanFrame)) {
         let slave = self.spec.slave;
         let Some(ranges) = &self.ranges else { return };
         let frame = match self.spec.mode {
-            MotorMode::Mit { kp, kd } => codec::mit(slave, &Mit { kp, kd, q: command, dq: 0.0, tau: 0.0 }, ranges),
+            MotorMode::Mit { kp, kd } => {
+                let error = self.feedback.map_or(0.0, |feedback| command - feedback.q);
+                let kp = stiffness(kp, error, self.spec.torque);
+                codec::mit(slave, &Mit { kp, kd, q: command, dq: 0.0, tau: 0.0 }, ranges)
+            }
             MotorMode::PositionVelocity => codec::position_velocity(slave, command, self.spec.velocity),
             MotorMode::Velocity => codec::velocity(slave, command),
         };

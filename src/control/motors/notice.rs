@@ -1,8 +1,8 @@
-//! What a bus of motors tells, for the log and for events.
+//! What a bus of motors tells, for the log and for events; in words: `words`.
 
 use std::collections::VecDeque;
-use std::fmt;
 
+use super::words::Words;
 use crate::control::damiao::codec::{MotorStatus, Ranges};
 use crate::control::damiao::parameter::{Parameter, Value};
 
@@ -36,6 +36,57 @@ pub enum Part {
     Rotor,
 }
 
+/// Something that a motor does and should not. Numbers are rad, rad/s and Nm.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Strange {
+    /// It reports a position to which it cannot have come since its last frame: the frame is damaged, or another
+    /// program set its zero.
+    Jump {
+        /// Where it was.
+        from: f64,
+        /// Where it says that it is.
+        to: f64,
+    },
+    /// It is outside its limits.
+    Beyond {
+        /// Where it is.
+        position: f64,
+        /// The limits.
+        range: [f64; 2],
+    },
+    /// It is faster than it may be.
+    Fast {
+        /// How fast it is.
+        velocity: f64,
+        /// How fast it may be.
+        limit: f64,
+    },
+    /// It reports more torque than it may have.
+    Strong {
+        /// How much.
+        torque: f64,
+        /// The limit.
+        limit: f64,
+    },
+    /// It moves away from its command, though pushed with all the torque that it may have.
+    Driven {
+        /// The limit.
+        torque: f64,
+    },
+    /// It stands still, though pushed with all the torque that it may have.
+    Blocked {
+        /// The limit.
+        torque: f64,
+    },
+    /// Its own loop does not bring it to its command.
+    Lagging {
+        /// The command.
+        command: f64,
+        /// What it reports.
+        is: f64,
+    },
+}
+
 /// Why all motors of a bus were disabled. Motors are given by their position in the entry.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Fault {
@@ -61,6 +112,27 @@ pub enum Fault {
         celsius: f64,
         /// °C.
         limit: f64,
+    },
+    /// A motor did so for too long.
+    Strange {
+        /// Which.
+        motor: usize,
+        /// What.
+        what: Strange,
+    },
+    /// A motor that is on was set otherwise by another program.
+    Changed {
+        /// Which.
+        motor: usize,
+        /// What was set.
+        parameter: Parameter,
+        /// What it is.
+        value: Value,
+    },
+    /// Another program commands a motor.
+    OtherMaster {
+        /// Which.
+        motor: usize,
     },
     /// A motor was enabled and no longer is: it lost its power, or another program disabled it.
     Dropped {
@@ -158,6 +230,18 @@ pub enum Notice {
         /// °C.
         limit: f64,
     },
+    /// Another program commands a motor, while none of ours is on.
+    OtherMaster {
+        /// Which.
+        motor: usize,
+    },
+    /// A motor does something that it should not.
+    Strange {
+        /// Which.
+        motor: usize,
+        /// What.
+        what: Strange,
+    },
     /// An arm was asked for.
     Arming,
     /// All motors are enabled. They hold until an action comes.
@@ -168,8 +252,15 @@ pub enum Notice {
     Holding,
     /// All motors are disabled.
     Disabled(Reason),
-    /// All motors are being disabled.
+    /// All motors are being stopped.
     Fault(Fault),
+    /// Of motors stopped by a fault, those that are still on, a bit each: damped, or holding.
+    Kept {
+        /// Bits of motors that are damped.
+        damped: u16,
+        /// Bits of motors that hold.
+        held: u16,
+    },
     /// A target is beyond the limits of its axis; the limit is used.
     Clamped {
         /// Which motor.
@@ -233,6 +324,9 @@ impl Notice {
             | Self::Holding
             | Self::Disabled(Reason::Deadman)
             | Self::Fault(_)
+            | Self::Strange { .. }
+            | Self::OtherMaster { .. }
+            | Self::Kept { .. }
             | Self::Clamped { .. }
             | Self::Refused(_) => true,
         }
@@ -246,100 +340,27 @@ impl Notice {
 }
 
 impl Fault {
+    /// The motor that it is of, by its position in the entry.
+    #[must_use]
+    pub const fn motor(&self) -> usize {
+        match *self {
+            Self::Silent { motor }
+            | Self::Latched { motor, .. }
+            | Self::Hot { motor, .. }
+            | Self::Strange { motor, .. }
+            | Self::Changed { motor, .. }
+            | Self::OtherMaster { motor }
+            | Self::Dropped { motor }
+            | Self::NotEnabled { motor }
+            | Self::NotDisabled { motor }
+            | Self::Unread { motor, .. }
+            | Self::Unusable { motor, .. } => motor,
+        }
+    }
+
     /// In words; `names` are those of the motors.
     #[must_use]
     pub const fn words<'a>(&'a self, names: &'a [String]) -> Words<'a, Self> {
         Words { what: self, names }
-    }
-}
-
-/// Something to be shown, with the names of the motors it speaks of.
-#[derive(Debug)]
-pub struct Words<'a, T> {
-    what: &'a T,
-    names: &'a [String],
-}
-
-impl<T> Words<'_, T> {
-    fn name(&self, motor: usize) -> &str {
-        self.names.get(motor).map_or("?", String::as_str)
-    }
-}
-
-impl fmt::Display for Part {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Mos => "transistors",
-            Self::Rotor => "winding",
-        })
-    }
-}
-
-impl fmt::Display for Words<'_, Fault> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match *self.what {
-            Fault::Silent { motor } => write!(f, "motor {} does not answer", self.name(motor)),
-            Fault::Latched { motor, status } => write!(f, "motor {} reports {status}", self.name(motor)),
-            Fault::Hot { motor, part, celsius, limit } => {
-                write!(f, "the {part} of motor {} have {celsius} °C, more than {limit} °C", self.name(motor))
-            }
-            Fault::Dropped { motor } => write!(f, "motor {} is no longer enabled", self.name(motor)),
-            Fault::NotEnabled { motor } => write!(f, "motor {} does not become enabled", self.name(motor)),
-            Fault::NotDisabled { motor } => write!(f, "motor {} does not become disabled", self.name(motor)),
-            Fault::Unread { motor, parameter } => write!(f, "motor {} does not tell its {parameter}", self.name(motor)),
-            Fault::Unusable { motor, parameter: Parameter::PMax, value }
-                if value.number().is_finite() && value.number() > 0.0 =>
-            {
-                write!(f, "motor {} counts to {value} rad, and its `position` lies beyond that", self.name(motor))
-            }
-            Fault::Unusable { motor, parameter, value } => {
-                write!(f, "{parameter} of motor {} is {value}, and cannot be used or changed", self.name(motor))
-            }
-        }
-    }
-}
-
-impl fmt::Display for Refusal {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Length => "it has not one number for each motor",
-            Self::NotFinite => "a number of it is not finite",
-            Self::Old => "it is too old",
-            Self::Early => "its time is in the future",
-        })
-    }
-}
-
-impl fmt::Display for Words<'_, Notice> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self.what {
-            Notice::Ready => f.write_str("all motors have answered; they are disarmed"),
-            Notice::Unanswered { motor } => write!(f, "motor {} has not answered yet", self.name(*motor)),
-            Notice::RangesDiffer { motor, read, shipped: [p, v, t] } => write!(
-                f,
-                "motor {} counts in PMAX {} VMAX {} TMAX {}, its type is shipped with {p} {v} {t}; the motor's own are used",
-                self.name(*motor),
-                read.position(),
-                read.velocity(),
-                read.torque(),
-            ),
-            Notice::ParameterSet { motor, parameter, was, is } => {
-                write!(f, "{parameter} of motor {} was {was} and is {is} now", self.name(*motor))
-            }
-            Notice::Warm { motor, part, celsius, limit } => {
-                write!(f, "the {part} of motor {} have {celsius} °C, of at most {limit} °C", self.name(*motor))
-            }
-            Notice::Arming => f.write_str("motors are being armed"),
-            Notice::Armed => f.write_str("motors are armed, and hold until an action comes"),
-            Notice::Following => f.write_str("motors follow actions"),
-            Notice::Holding => f.write_str("no action came in time: motors hold"),
-            Notice::Disabled(Reason::Asked) => f.write_str("motors are disabled"),
-            Notice::Disabled(Reason::Deadman) => f.write_str("no action came for too long: motors are disabled"),
-            Notice::Fault(fault) => write!(f, "{}: all motors are disabled", fault.words(self.names)),
-            Notice::Clamped { motor, target, used } => {
-                write!(f, "target {target} of motor {} is beyond its limits; {used} is used", self.name(*motor))
-            }
-            Notice::Refused(refusal) => write!(f, "an action moves nothing: {refusal}"),
-        }
     }
 }

@@ -4,6 +4,8 @@
 mod always;
 mod arming;
 mod following;
+mod stopping;
+mod watched;
 mod world;
 
 use std::time::Duration;
@@ -231,7 +233,7 @@ fn a_notice_names_its_motor() {
     let fault = Fault::Hot { motor: 1, part: Part::Mos, celsius: 81.0, limit: 80.0 };
     assert_eq!(fault.words(&names).to_string(), "the transistors of motor elbow have 81 °C, more than 80 °C");
     let notice = Notice::Fault(Fault::Latched { motor: 0, status: MotorStatus::OverCurrent });
-    assert_eq!(notice.words(&names).to_string(), "motor shoulder reports over-current: all motors are disabled");
+    assert_eq!(notice.words(&names).to_string(), "motor shoulder reports over-current: all motors are stopped");
     assert!(notice.is_problem() && !Notice::Armed.is_problem());
     assert_eq!(Fault::Silent { motor: 9 }.words(&names).to_string(), "motor ? does not answer");
 }

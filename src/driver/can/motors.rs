@@ -14,7 +14,8 @@ use std::thread::JoinHandle;
 
 use tokio::sync::mpsc;
 
-use super::link::Link;
+use super::claim::Claim;
+use super::link::{Link, LinkError};
 use crate::action::{ActuatorNotice, Order};
 use crate::control::motors::SAMPLE_VALUES;
 use crate::driver::{DriverError, Reading, unblock};
@@ -54,8 +55,15 @@ impl Motors {
     /// When the adapter cannot be opened, or the system gives no thread.
     pub async fn open(spec: &CanSpec, motors: &DamiaoSpec, node: &DeviceNode) -> Result<Self, DriverError> {
         let (can, node, motors) = (spec.clone(), node.clone(), motors.clone());
-        unblock(move || Self::start(Link::open(&can, &node).map_err(super::link::LinkError::into_driver)?, &motors))
-            .await
+        unblock(move || {
+            let claim = match &node {
+                // Before the interface is brought up, and the first frame.
+                DeviceNode::Net(name) => Some(Claim::take(name).map_err(LinkError::into_driver)?),
+                _ => None,
+            };
+            Self::begin(Link::open(&can, &node).map_err(LinkError::into_driver)?, &motors, claim)
+        })
+        .await
     }
 
     /// Starts the thread over an open adapter.
@@ -63,12 +71,16 @@ impl Motors {
     /// # Errors
     /// When the system gives no thread.
     pub fn start(link: Link, spec: &DamiaoSpec) -> Result<Self, DriverError> {
+        Self::begin(link, spec, None)
+    }
+
+    fn begin(link: Link, spec: &DamiaoSpec, claim: Option<Claim>) -> Result<Self, DriverError> {
         let description = format!("{}, {} motors at {} Hz", link.description(), spec.motors.len(), spec.hz);
         let (told, samples) = mpsc::channel(SAMPLES);
         let (tell, notices) = mpsc::channel(NOTICES);
         let (targets, asked) = sync_channel(TARGETS);
         let shared = Arc::<Shared>::default();
-        let beat = Beat::new(link, spec, asked, told, tell, Arc::clone(&shared));
+        let beat = Beat::new((link, claim), spec, asked, told, tell, Arc::clone(&shared));
         let thread = std::thread::Builder::new().name(CONTROL_THREAD.to_owned()).spawn(move || beat.run());
         let thread = thread.map_err(|error| DriverError::Retry(format!("no thread for the motors: {error}")))?;
         Ok(Self {

@@ -2,11 +2,16 @@
 
 use std::time::Duration;
 
-use crate::registry::diagnostic::did_you_mean;
+use super::window::Entry;
+use crate::registry::diagnostic::{Diagnostic, did_you_mean};
 use crate::registry::section::{Problems, Section};
-use crate::registry::spec::{ActionSpec, DamiaoSpec, MotorKind, MotorMode, MotorSpec};
+use crate::registry::spec::{
+    ActionSpec, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, MotorKind, MotorMode, MotorSpec, NodeSpec, Stop,
+    StopSpec, WatchSpec,
+};
+use crate::registry::units::show_duration;
 
-const KEYS: [&str; 13] = [
+const KEYS: [&str; 19] = [
     "name",
     "slave",
     "master",
@@ -18,6 +23,12 @@ const KEYS: [&str; 13] = [
     "velocity",
     "torque",
     "slew",
+    "margin",
+    "lag",
+    "blocked_after",
+    "own_fault",
+    "other_fault",
+    "hold_for",
     "max_mos",
     "max_rotor",
 ];
@@ -27,6 +38,8 @@ const MOST: usize = 10;
 const DEADMAN_PERIODS: u32 = 2;
 /// A motor that stops by itself when it is told nothing must not do so between two commands.
 const TIMEOUT_PERIODS: u32 = 4;
+/// A motor that goes on for longer than this when this program is killed has gone far.
+const LONG_TIMEOUT: Duration = Duration::from_millis(500);
 /// What a motor does that nobody has set limits for: slow enough to step aside.
 const SPEED: f64 = 2.0;
 /// Of the highest torque of its type, likewise.
@@ -37,6 +50,8 @@ const TEMPERATURE: f64 = 80.0;
 const MASTER_OFFSET: u16 = 0x10;
 /// Ids of commands, from a motor's own: MIT, position and velocity, velocity, position and force.
 const COMMANDS: [u16; 4] = [0, 0x100, 0x200, 0x300];
+/// The least damping above 0 in a MIT frame, Nm s/rad: 12 bits from 0 to 5.
+const KD_STEP: f64 = 5.0 / 4095.0;
 /// The id by which parameters of all motors are read and written.
 const PARAMETERS: u16 = 0x7ff;
 
@@ -52,7 +67,7 @@ pub(super) fn damiao(table: &Section<'_>, problems: &mut Problems<'_>) -> Option
         let fix = format!("write deadman = \"{least}ms\" or more, or remove it for twice the time between actions");
         table.report(problems, "deadman", message, fix);
     }
-    let disable_after = table.duration(problems, "disable_after", ms(10)..=Duration::from_hours(1));
+    let disable_after = or_never(table, problems, "disable_after", ms(10), None);
     let silent_after = table.duration(problems, "silent_after", ms(1)..=second(10));
     let least = second(1) * TIMEOUT_PERIODS / hz;
     let timeout = table.duration(problems, "timeout", ms(1)..=second(10));
@@ -65,10 +80,27 @@ pub(super) fn damiao(table: &Section<'_>, problems: &mut Problems<'_>) -> Option
         motors: motors?,
         hz,
         deadman,
-        disable_after: disable_after.unwrap_or(second(1)),
+        disable_after,
         timeout: timeout.unwrap_or(ms(100).max(least)),
         silent_after: silent_after.unwrap_or(ms(50)),
     })
+}
+
+/// Warns of motors that go on for long once this program was killed.
+pub(super) fn slow_to_stop(devices: &[DeviceSpec], entries: &[Entry], problems: &Problems<'_>) -> Vec<Diagnostic> {
+    let warn = |device: &DeviceSpec| {
+        let NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(motors), .. }) = &device.node else { return None };
+        let place = entries.iter().find(|entry| entry.name == device.name)?;
+        if motors.timeout <= LONG_TIMEOUT {
+            return None;
+        }
+        let timeout = show_duration(motors.timeout);
+        let message =
+            format!("timeout = {timeout}: for so long the motors follow their last command when rapid is killed");
+        let fix = format!("write timeout = \"500ms\" or less in [{}.can]", place.table);
+        Some(problems.diagnostic(place.at, &place.table, message, fix))
+    };
+    devices.iter().filter_map(warn).collect()
 }
 
 fn motors(table: &Section<'_>, problems: &mut Problems<'_>) -> Option<Vec<MotorSpec>> {
@@ -112,7 +144,6 @@ fn motor(entry: &Section<'_>, problems: &mut Problems<'_>) -> Option<MotorSpec> 
             entry.missing(problems, key, fix);
         }
     }
-    let position = position(entry, problems);
     let (most_speed, most_torque) = kind.map_or((1000.0, 1000.0), |kind| {
         let [_, velocity, torque] = kind.shipped();
         (velocity, torque)
@@ -120,7 +151,11 @@ fn motor(entry: &Section<'_>, problems: &mut Problems<'_>) -> Option<MotorSpec> 
     let velocity = above_zero(entry, "velocity", most_speed, problems).unwrap_or(SPEED.min(most_speed));
     let torque = above_zero(entry, "torque", most_torque, problems).unwrap_or(TORQUE_SHARE * most_torque);
     let mode = mode(entry, problems);
-    let slew = above_zero(entry, "slew", 100_000.0, problems);
+    let position = position(entry, mode, problems);
+    // A position can change no faster than the motor turns; a speed within a hundredth of a second.
+    let most_slew = if mode == Some(MotorMode::Velocity) { 100.0 * most_speed } else { most_speed };
+    let slew = above_zero(entry, "slew", most_slew, problems);
+    let (watch, stop) = (watch(entry, problems), stop(entry, problems));
     let mut temperature = |key| entry.number(problems, key, 20.0..=150.0).unwrap_or(TEMPERATURE);
     let (max_mos, max_rotor) = (temperature("max_mos"), temperature("max_rotor"));
     let slave = slave?;
@@ -136,6 +171,8 @@ fn motor(entry: &Section<'_>, problems: &mut Problems<'_>) -> Option<MotorSpec> 
         torque,
         // To its highest speed within a tenth of a second.
         slew: slew.unwrap_or(if mode == MotorMode::Velocity { 10.0 * velocity } else { velocity }),
+        watch,
+        stop,
         max_mos,
         max_rotor,
     })
@@ -180,22 +217,62 @@ fn kind(entry: &Section<'_>, problems: &mut Problems<'_>) -> Option<MotorKind> {
     kind
 }
 
-fn position(entry: &Section<'_>, problems: &mut Problems<'_>) -> Option<[f64; 2]> {
-    /// More turns than any joint has.
-    const FARTHEST: f64 = 1000.0;
+fn position(entry: &Section<'_>, mode: Option<MotorMode>, problems: &mut Problems<'_>) -> Option<[f64; 2]> {
+    // Eight times what motors count to as they are shipped; a wheel turns on.
+    let farthest = if mode == Some(MotorMode::Velocity) { 1000.0 } else { 100.0 };
     if !entry.has("position") {
         return None;
     }
     let limits = entry.numbers(problems, "position")?;
     match limits.as_slice() {
-        [low, high] if low.abs() <= FARTHEST && high.abs() <= FARTHEST && low < high => Some([*low, *high]),
+        [low, high] if low.abs() <= farthest && high.abs() <= farthest && low < high => Some([*low, *high]),
         _ => {
             let message = format!("position = {limits:?} is no range");
-            let fix = format!("write [lowest, highest] in rad, the highest above the lowest, within {FARTHEST}");
+            let fix = format!("write [lowest, highest] in rad, the highest above the lowest, within {farthest}");
             entry.report(problems, "position", message, fix);
             None
         }
     }
+}
+
+/// When what the motor does is a fault.
+fn watch(entry: &Section<'_>, problems: &mut Problems<'_>) -> WatchSpec {
+    let default = WatchSpec::default();
+    let half_a_second = Duration::from_millis(500);
+    WatchSpec {
+        margin: entry.number(problems, "margin", 0.0..=1.0).unwrap_or(default.margin),
+        lag: above_zero(entry, "lag", 10.0, problems).unwrap_or(default.lag),
+        blocked_after: or_never(entry, problems, "blocked_after", half_a_second, default.blocked_after),
+    }
+}
+
+/// How the motor stops at a fault.
+fn stop(entry: &Section<'_>, problems: &mut Problems<'_>) -> StopSpec {
+    let default = StopSpec::default();
+    let words = [("limp", Stop::Limp), ("damp", Stop::Damp), ("hold", Stop::Hold)];
+    let mut choice = |key| entry.has(key).then(|| entry.choice(problems, key, &words)).flatten();
+    let (own_fault, other_fault) = (choice("own_fault"), choice("other_fault"));
+    StopSpec {
+        own_fault: own_fault.unwrap_or(default.own_fault),
+        other_fault: other_fault.unwrap_or(default.other_fault),
+        hold_for: or_never(entry, problems, "hold_for", Duration::from_millis(10), default.hold_for),
+    }
+}
+
+/// A time of `least` to an hour, or the word "never".
+fn or_never(
+    table: &Section<'_>,
+    problems: &mut Problems<'_>,
+    key: &str,
+    least: Duration,
+    default: Option<Duration>,
+) -> Option<Duration> {
+    if !table.has(key) {
+        return default;
+    }
+    let mut fields = table.fields().into_iter();
+    let is_never = fields.any(|(_, name, value)| name == key && value.get_ref().as_str() == Some("never"));
+    if is_never { None } else { table.duration(problems, key, least..=Duration::from_hours(1)) }
 }
 
 /// A number above zero.
@@ -225,10 +302,14 @@ fn mode(entry: &Section<'_>, problems: &mut Problems<'_>) -> Option<MotorMode> {
         entry.number(problems, key, 0.0..=most)
     });
     let (kp, kd) = (kp?, kd?);
-    // Position held without damping rings: the maker's manual forbids it.
-    if kp > 0.0 && kd == 0.0 {
-        let message = "kp without kd: the motor would swing".to_owned();
-        entry.report(problems, "kd", message, "write a kd above 0, for example kd = 0.05");
+    // Position held without damping rings: the maker's manual forbids it. A frame has 12 bits for it.
+    if kp > 0.0 && kd < KD_STEP {
+        let message = if kd == 0.0 {
+            "kp without kd: the motor would swing".to_owned()
+        } else {
+            format!("kd = {kd} is less than a frame can express, {KD_STEP:.5}: the motor would swing")
+        };
+        entry.report(problems, "kd", message, "write a higher kd, for example kd = 0.05");
         return None;
     }
     Some(MotorMode::Mit { kp, kd })

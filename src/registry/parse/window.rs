@@ -10,9 +10,9 @@ use crate::registry::units::show_duration;
 
 /// Where the entry of a device stands in the file.
 pub(super) struct Entry {
-    name: String,
-    at: usize,
-    table: String,
+    pub(super) name: String,
+    pub(super) at: usize,
+    pub(super) table: String,
 }
 
 /// Where the entries stand.

@@ -18,8 +18,8 @@ pub struct DamiaoSpec {
     /// Without an action for this long the motors hold, two commands at least; `None` is twice the time
     /// between actions.
     pub deadman: Option<Duration>,
-    /// Holding for this long they are disabled.
-    pub disable_after: Duration,
+    /// Holding for this long they are disabled; `None` is never.
+    pub disable_after: Option<Duration>,
     /// The motors' own limit: without a frame for this long they stop by themselves. Above 0.
     pub timeout: Duration,
     /// A motor that leaves frames unanswered for this long is silent, default 50 ms.
@@ -49,10 +49,63 @@ pub struct MotorSpec {
     /// Highest change of the command: rad/s of a commanded position, rad/s² of a commanded velocity;
     /// above 0.
     pub slew: f64,
+    /// When what it does is a fault.
+    pub watch: WatchSpec,
+    /// How it stops at a fault.
+    pub stop: StopSpec,
     /// Highest temperature of its transistors, °C.
     pub max_mos: f64,
     /// Highest temperature of its winding, °C.
     pub max_rotor: f64,
+}
+
+/// How a joint stops at a fault. A disarm, and the end of the program, disable it whatever this is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Stop {
+    /// Disabled: a joint under load falls.
+    Limp,
+    /// Without stiffness, with its damping alone: a joint under load sinks slowly. Motors in the modes
+    /// [`MotorMode::PositionVelocity`] and [`MotorMode::Velocity`] have no frame for it and stop as with [`Stop::Hold`].
+    Damp,
+    /// Where it was commanded last, within its torque.
+    Hold,
+}
+
+/// How a motor stops at which fault.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct StopSpec {
+    /// At a fault of its own.
+    pub own_fault: Stop,
+    /// At another motor's.
+    pub other_fault: Stop,
+    /// How long it holds before it is disabled; `None` is until a disarm.
+    pub hold_for: Option<Duration>,
+}
+
+impl Default for StopSpec {
+    /// What is wrong with a joint is not driven on; the others sink slowly with it.
+    fn default() -> Self {
+        Self { own_fault: Stop::Limp, other_fault: Stop::Damp, hold_for: None }
+    }
+}
+
+/// When what a motor does is a fault.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct WatchSpec {
+    /// How far outside its limits it may be, rad; an arm farther out is refused. At least 0.
+    pub margin: f64,
+    /// How far it may be from what its own loop is commanded, rad, in [`MotorMode::PositionVelocity`]. Above 0.
+    pub lag: f64,
+    /// How long it may stand still while pushed with its highest torque; `None` for ever, as a gripper that holds
+    /// something does.
+    pub blocked_after: Option<Duration>,
+}
+
+impl Default for WatchSpec {
+    /// What fits a joint of an arm.
+    fn default() -> Self {
+        Self { margin: 0.1, lag: 0.3, blocked_after: Some(Duration::from_secs(2)) }
+    }
 }
 
 /// How a motor is driven, and what its axis of an action means.
@@ -185,6 +238,8 @@ mod tests {
             velocity: 1.0,
             torque: 1.0,
             slew: 1.0,
+            watch: WatchSpec::default(),
+            stop: StopSpec::default(),
             max_mos: 80.0,
             max_rotor: 80.0,
         };
@@ -193,7 +248,7 @@ mod tests {
             motors: ids.iter().copied().map(motor).collect(),
             hz: 200,
             deadman: None,
-            disable_after: second,
+            disable_after: Some(second),
             timeout: second,
             silent_after: second,
         }

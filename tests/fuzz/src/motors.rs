@@ -110,15 +110,15 @@ struct Axis {
     /// The ends of position, velocity and torque that it told: the smallest and the largest of each. Which of
     /// them counts is for the bus to say, so what is judged by them is judged by the largest.
     told: [[f64; 2]; 3],
-    /// The newest position it told, rad.
-    measured: Option<f64>,
+    /// The newest positions it told, rad, the newest last. Two that are impossible may be passed over, not a third.
+    measured: Vec<f64>,
     /// What a position may be commanded: within the limits, or where the joint was since the arm.
     span: [f64; 2],
 }
 
 impl Axis {
     fn new(spec: &MotorSpec) -> Self {
-        Self { spec: spec.clone(), told: [[f64::INFINITY, 0.0]; 3], measured: None, span: spec.position }
+        Self { spec: spec.clone(), told: [[f64::INFINITY, 0.0]; 3], measured: Vec::new(), span: spec.position }
     }
 
     fn hear(&mut self, frame: &CanFrame) {
@@ -143,7 +143,10 @@ impl Axis {
         let ranges = Ranges::new(self.told[0][1], 1.0, 1.0);
         let Some(feedback) = ranges.and_then(|ranges| Feedback::decode(frame, &ranges)) else { return };
         if u16::from(feedback.id) == self.spec.slave {
-            self.measured = Some(feedback.q);
+            if self.measured.len() > 2 {
+                self.measured.remove(0);
+            }
+            self.measured.push(feedback.q);
             self.span = [self.span[0].min(feedback.q), self.span[1].max(feedback.q)];
         }
     }
@@ -151,7 +154,8 @@ impl Axis {
     /// What was before is of the past, but for where the joint is.
     fn arm(&mut self) {
         let [low, high] = self.spec.position;
-        self.span = [self.measured.map_or(low, |q| q.min(low)), self.measured.map_or(high, |q| q.max(high))];
+        let measured = self.measured.iter().copied();
+        self.span = [measured.clone().fold(low, f64::min), measured.fold(high, f64::max)];
     }
 
     /// What a position is counted in, rad, if it has told one range alone.
@@ -164,27 +168,34 @@ impl Axis {
     fn judge(&self, command: f64) {
         let [low, high] = self.spec.position;
         let slack = self.quantum().unwrap_or(2.0 * self.told[0][1] / 65_535.0);
-        let measured = self.measured.expect("a command before any answer");
+        assert!(!self.measured.is_empty(), "a command before any answer");
         match self.spec.mode {
             MotorMode::Velocity => {
                 assert!(command.abs() <= self.spec.velocity, "{command} rad/s");
-                let back = (measured <= high + slack || command <= 0.0) && (measured >= low - slack || command >= 0.0);
-                assert!(back || self.quantum().is_none(), "{command} rad/s at {measured}");
+                let back = |measured: &f64| {
+                    (*measured <= high + slack || command <= 0.0) && (*measured >= low - slack || command >= 0.0)
+                };
+                let is_back = self.measured.iter().any(back);
+                assert!(is_back || self.quantum().is_none(), "{command} rad/s at {:?}", self.measured);
             }
             _ => {
                 let [low, high] = self.span;
                 assert!((low - slack..=high + slack).contains(&command), "{command} is beyond {low}..{high}");
             }
         }
-        if let (MotorMode::Mit { kp, .. }, Some(quantum)) = (self.spec.mode, self.quantum()) {
-            let reach = self.spec.torque / kp + quantum;
-            assert!((command - measured).abs() <= reach, "{command} is too far from {measured}");
-        }
+    }
+
+    /// The stiffness in a frame asks for no more than the torque limit.
+    fn judge_torque(&self, command: f64, [high, low]: [u8; 2], quantum: f64) {
+        let kp = f64::from(u16::from_be_bytes([high & 0xf, low])) / 4095.0 * 500.0;
+        let least = self.measured.iter().map(|measured| (command - measured).abs()).fold(f64::INFINITY, f64::min);
+        let most = self.spec.torque + 2.0 * quantum * kp;
+        assert!(kp * least <= most, "{kp} Nm/rad to {command} at {:?}", self.measured);
     }
 
     /// A frame: what it commands of this motor is judged as it is written there.
     fn judge_frame(&self, frame: &CanFrame) {
-        let [a, b, c, d, ..] = frame.data;
+        let [a, b, c, d, e, ..] = frame.data;
         match self.spec.mode {
             MotorMode::Velocity if frame.id == u32::from(self.spec.slave) + 0x200 => {
                 self.judge(f64::from(f32::from_le_bytes([a, b, c, d])));
@@ -192,7 +203,9 @@ impl Axis {
             // Seven such bytes begin an order.
             MotorMode::Mit { .. } if frame.id == u32::from(self.spec.slave) && !frame.data.starts_with(&[0xff; 7]) => {
                 let Some(quantum) = self.quantum() else { return };
-                self.judge(f64::from(u16::from_be_bytes([a, b])) * quantum - self.told[0][1]);
+                let command = f64::from(u16::from_be_bytes([a, b])) * quantum - self.told[0][1];
+                self.judge(command);
+                self.judge_torque(command, [d, e], quantum);
             }
             _ => {}
         }

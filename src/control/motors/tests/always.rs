@@ -4,6 +4,7 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::control::damiao::codec::Order;
+use crate::registry::Stop;
 
 /// What happens next.
 #[derive(Debug, Clone)]
@@ -93,19 +94,22 @@ proptest! {
     #[test]
     fn motors_move_only_as_they_may(
         happenings in prop::collection::vec(happening(), 1..60), torque in prop_oneof![Just(1000.0), 0.5..5.0],
+        stop in prop::sample::select(vec![Stop::Limp, Stop::Damp, Stop::Hold]),
         modes in prop::sample::select(vec![
             [MIT, MIT], [MIT, MotorMode::PositionVelocity], [MotorMode::Velocity, MIT],
         ]),
     ) {
         let mut spec = spec(vec![motor(1, 0x11, modes[0]), motor(2, 0x12, modes[1])]);
         spec.motors.iter_mut().for_each(|motor| motor.torque = torque);
+        spec.motors[0].stop.other_fault = stop;
+        spec.motors[1].stop.own_fault = stop;
         let mut world = World::new(spec);
         for happening in happenings {
             happening.happen(&mut world);
         }
-        // What was broken is mended: from anywhere, an arm works.
+        // What was broken is repaired: from anywhere within the limits, an arm works.
         for sim in &mut world.sims {
-            *sim = Sim { mode: sim.mode, q: sim.q, status: sim.status, ..Sim::new(sim.slave, sim.master) };
+            *sim = Sim { mode: sim.mode, q: sim.q.clamp(-2.0, 2.0), status: sim.status, ..Sim::new(sim.slave, sim.master) };
             if matches!(sim.status, MotorStatus::Other(_)) {
                 sim.status = MotorStatus::Disabled;
             }
@@ -115,6 +119,9 @@ proptest! {
         world.disarm();
         world.run(300);
         prop_assert!(!world.sims.iter().any(Sim::is_on), "{:?}", world.bus.state());
+        // It may have been commanded to stay where it was pushed.
+        world.sims.iter_mut().for_each(|sim| sim.q = sim.q.clamp(-2.0, 2.0));
+        world.run(2);
         world.arm();
         world.run(60);
         prop_assert!(world.bus.is_armed(), "{:?} {:?}", world.bus.state(), world.sims);

@@ -185,11 +185,14 @@ fn who_waits_for_the_others_yields_when_leant_on() {
         world.cycle();
     }
     world.run(5);
-    world.sims[0].q = 1.0;
-    world.run(3);
+    for _ in 0..30 {
+        world.sims[0].q += 0.025;
+        world.cycle();
+    }
+    world.run(10);
     assert_eq!(world.bus.state(), BusState::Arming);
     let command = world.sims[0].command.unwrap().1;
-    assert!((command - 0.8).abs() < 1e-3, "{command}: 2 Nm at 10 Nm/rad are 0.2 rad");
+    assert!((command - 0.8).abs() < 1e-3, "{command}: 2 Nm at 10 Nm/rad are 0.2 rad, and it is at 1.0");
 }
 
 #[test]

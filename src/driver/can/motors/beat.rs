@@ -25,6 +25,7 @@ use crate::action::{ActuatorNotice, Arming, Order, OrderSlot};
 use crate::control::can::CanFrame;
 use crate::control::motors::{BusState, MotorBus, SAMPLE_VALUES};
 use crate::driver::DriverError;
+use crate::driver::can::claim::Claim;
 use crate::driver::can::link::{Link, LinkError};
 use crate::fault;
 use crate::realtime::{CONTROL_PRIORITY, use_fifo};
@@ -106,6 +107,8 @@ impl Shared {
 struct Powered {
     link: Link,
     bus: MotorBus,
+    /// Until the last frame was sent.
+    _claim: Option<Claim>,
 }
 
 impl Drop for Powered {
@@ -186,7 +189,7 @@ pub(super) struct Beat {
 
 impl Beat {
     pub(super) fn new(
-        link: Link,
+        (link, claim): (Link, Option<Claim>),
         spec: &DamiaoSpec,
         targets: Receiver<Target>,
         samples: mpsc::Sender<Sample>,
@@ -194,7 +197,7 @@ impl Beat {
         shared: Arc<Shared>,
     ) -> Self {
         Self {
-            powered: Powered { link, bus: MotorBus::new(spec, Stamp::now()) },
+            powered: Powered { link, bus: MotorBus::new(spec, Stamp::now()), _claim: claim },
             cycle: Duration::from_secs(1) / spec.hz.max(1),
             targets,
             samples,
@@ -305,7 +308,7 @@ impl Beat {
     }
 
     fn step(&mut self, now: Stamp) -> Result<(), LinkError> {
-        let Powered { link, bus } = &mut self.powered;
+        let Powered { link, bus, .. } = &mut self.powered;
         let mut end = None;
         let (mut sent, mut full) = (false, 0);
         bus.step(now, |frame| match link.send(&frame) {

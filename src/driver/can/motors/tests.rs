@@ -15,7 +15,7 @@ use crate::control::damiao::codec::{self, Feedback, MotorStatus, Ranges};
 use crate::control::damiao::parameter::{Parameter, Reply, Value};
 use crate::driver::can::link::tests::damiao_link;
 use crate::driver::can::socket::tests::{bus, bytes};
-use crate::registry::{MotorKind, MotorMode, MotorSpec};
+use crate::registry::{MotorKind, MotorMode, MotorSpec, Stop, StopSpec, WatchSpec};
 
 /// The longest that a condition is waited for.
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -31,6 +31,8 @@ fn spec(count: u16, hz: u32) -> DamiaoSpec {
         velocity: 5.0,
         torque: 5.0,
         slew: 5.0,
+        watch: WatchSpec::default(),
+        stop: StopSpec { own_fault: Stop::Limp, other_fault: Stop::Limp, hold_for: None },
         max_mos: 80.0,
         max_rotor: 80.0,
     };
@@ -38,7 +40,7 @@ fn spec(count: u16, hz: u32) -> DamiaoSpec {
         motors: (1..=count).map(motor).collect(),
         hz,
         deadman: None,
-        disable_after: Duration::from_mins(1),
+        disable_after: Some(Duration::from_mins(1)),
         timeout: Duration::from_millis(400),
         // A busy machine is slower than a bus.
         silent_after: Duration::from_secs(2),

@@ -1,0 +1,51 @@
+//! What a motor reports, judged by its [`Watch`](crate::control::motors::watch::Watch).
+
+use super::{Motor, Phase};
+use crate::control::damiao::codec::{Feedback, Ranges};
+use crate::control::motors::notice::{Fault, Notice, Notices, Strange};
+use crate::control::motors::watch::Commanded;
+use crate::time::Stamp;
+
+impl Motor {
+    /// Can it be where it says? One that is off may be turned by hand, and its zero set.
+    pub(super) fn is_possible(
+        &mut self,
+        feedback: &Feedback,
+        ranges: &Ranges,
+        now: Stamp,
+        notices: &mut Notices,
+    ) -> Result<bool, Fault> {
+        let motor = self.index;
+        let before = self.feedback.as_ref().filter(|_| matches!(self.phase, Phase::Enabling | Phase::On));
+        let heard = self
+            .watch
+            .hear(before, feedback, (&self.spec, ranges), now)
+            .map_err(|what| Fault::Strange { motor, what })?;
+        if let Some(what) = heard
+            && self.watch.is_first_jump()
+        {
+            notices.tell(Notice::Strange { motor, what });
+        }
+        Ok(heard.is_none())
+    }
+
+    /// What is wrong with what it does, once it is a fault.
+    pub(in crate::control::motors) fn strange(
+        &mut self,
+        commanded: Commanded,
+        now: Stamp,
+        notices: &mut Notices,
+    ) -> Option<Fault> {
+        let (motor, feedback) = (self.index, self.feedback.as_ref()?);
+        let what = self.watch.look((motor, &self.spec), feedback, commanded, now, notices)?;
+        Some(Fault::Strange { motor, what })
+    }
+
+    /// Is it too far outside its limits to be armed?
+    pub(super) fn outside(&self) -> Option<Fault> {
+        let (position, [low, high]) = (self.feedback.as_ref()?.q, self.spec.position);
+        let is_outside = position < low - self.spec.watch.margin || position > high + self.spec.watch.margin;
+        let what = Strange::Beyond { position, range: self.spec.position };
+        is_outside.then_some(Fault::Strange { motor: self.index, what })
+    }
+}

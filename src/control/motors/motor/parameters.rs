@@ -1,0 +1,127 @@
+//! What a motor is asked for before it is enabled, what is set, and what is read again while it is on.
+
+use std::time::Duration;
+
+use super::{Motor, Phase, within};
+use crate::control::can::CanFrame;
+use crate::control::damiao::codec::Ranges;
+use crate::control::damiao::model;
+use crate::control::damiao::parameter::{self, ControlMode, Parameter, Reply, Value};
+use crate::control::motors::notice::{Fault, Notice, Notices};
+use crate::registry::MotorMode;
+use crate::time::Stamp;
+
+/// What is read, in this order.
+pub(super) const PROBE: [Parameter; 5] =
+    [Parameter::ControlMode, Parameter::PMax, Parameter::VMax, Parameter::TMax, Parameter::Timeout];
+/// What is read again while a motor is on: without its time limit nothing stops it once this program is dead.
+const KEPT: [Parameter; 2] = [Parameter::Timeout, Parameter::ControlMode];
+/// ...one of them each time that this has passed.
+const LOOK_AGAIN: Duration = Duration::from_millis(400);
+
+impl Motor {
+    /// Reads its parameters, from the first.
+    pub(in crate::control::motors) const fn probe(&mut self) {
+        self.phase = Phase::Asked { at: 0, setting: None };
+    }
+
+    /// The parameter it is asked for.
+    pub(in crate::control::motors) fn asked_for(&self) -> Option<Parameter> {
+        let Phase::Asked { at, .. } = self.phase else { return None };
+        PROBE.get(at).copied()
+    }
+
+    /// Takes its answer about a parameter, if it is the one that was asked for.
+    pub(in crate::control::motors) fn take_reply(&mut self, reply: &Reply, notices: &mut Notices) -> Result<(), Fault> {
+        self.asked = None;
+        let motor = self.index;
+        if self.phase == Phase::On {
+            let changed = Fault::Changed { motor, parameter: reply.parameter, value: reply.value };
+            return self
+                .wanted(reply.parameter)
+                .filter(|wanted| *wanted != reply.value)
+                .map_or(Ok(()), |_| Err(changed));
+        }
+        let Phase::Asked { at, setting } = self.phase else { return Ok(()) };
+        // What comes late, to an earlier question or to one that was repeated, answers nothing.
+        if PROBE.get(at) != Some(&reply.parameter) || reply.written != setting.is_some() {
+            return Ok(());
+        }
+        let unusable = Fault::Unusable { motor, parameter: reply.parameter, value: reply.value };
+        match self.wanted(reply.parameter) {
+            Some(wanted) if reply.value == wanted => {
+                if let Some(was) = setting {
+                    notices.tell(Notice::ParameterSet { motor, parameter: reply.parameter, was, is: wanted });
+                }
+            }
+            Some(_) if setting.is_none() => {
+                self.phase = Phase::Asked { at, setting: Some(reply.value) };
+                return Ok(());
+            }
+            Some(_) => return Err(unusable),
+            // A range: PROBE[1..=3].
+            None => {
+                let value = reply.value.number();
+                let [p, v, t] = &mut self.read;
+                let slot = match reply.parameter {
+                    Parameter::PMax => p,
+                    Parameter::VMax => v,
+                    _ => t,
+                };
+                *slot = value;
+                Ranges::new(value, value, value).ok_or(unusable)?;
+                let [low, high] = within(self.spec.position, value);
+                if reply.parameter == Parameter::PMax && low > high {
+                    return Err(unusable);
+                }
+            }
+        }
+        self.phase = if at + 1 < PROBE.len() { Phase::Asked { at: at + 1, setting: None } } else { Phase::Probed };
+        if self.phase == Phase::Probed {
+            self.take_ranges(notices);
+        }
+        Ok(())
+    }
+
+    fn take_ranges(&mut self, notices: &mut Notices) {
+        let [p, v, t] = self.read;
+        let ranges = Ranges::new(p, v, t);
+        if self.ranges != ranges {
+            // Counted in other ranges, it says something else.
+            self.feedback = None;
+            self.is_new = false;
+        }
+        self.ranges = ranges;
+        let Some(read) = ranges else { return };
+        let differs = !model::is_shipped(self.spec.kind, &read);
+        if differs && !self.differs {
+            notices.tell(Notice::RangesDiffer { motor: self.index, read, shipped: model::shipped(self.spec.kind) });
+        }
+        self.differs = differs;
+    }
+
+    /// What a parameter is to be, if that is for us to say.
+    pub(super) fn wanted(&self, parameter: Parameter) -> Option<Value> {
+        match parameter {
+            Parameter::ControlMode => Some(Value::Whole(match self.spec.mode {
+                MotorMode::Mit { .. } => ControlMode::Mit,
+                MotorMode::PositionVelocity => ControlMode::PositionVelocity,
+                MotorMode::Velocity => ControlMode::Velocity,
+            } as u32)),
+            Parameter::Timeout => Some(Value::Whole(self.timeout)),
+            _ => None,
+        }
+    }
+
+    /// Asks now and then for what another program may have changed.
+    pub(super) fn look_again(&mut self, now: Stamp, send: &mut impl FnMut(CanFrame)) {
+        // Not all motors of a bus at once.
+        let turn = LOOK_AGAIN / 16 * u32::try_from(self.index % 16).unwrap_or(0);
+        if now < *self.look.get_or_insert_with(|| now.after(turn)) {
+            return;
+        }
+        self.look = Some(now.after(LOOK_AGAIN));
+        self.looks = (self.looks + 1) % KEPT.len();
+        send(parameter::read(self.spec.slave, KEPT.get(self.looks).copied().unwrap_or(Parameter::Timeout)));
+    }
+}

@@ -1,0 +1,120 @@
+//! How joints stop at a fault: each in its way, and none until the next arm in another.
+
+use super::*;
+use crate::registry::{Stop, StopSpec};
+
+/// Two motors that are armed, the second of which stops in this way.
+fn armed(mode: MotorMode, stop: StopSpec) -> World {
+    let mut spec = spec(vec![motor(1, 0x11, MIT), motor(2, 0x12, mode)]);
+    spec.motors[1].stop = stop;
+    let mut world = World::new(spec);
+    world.run_until(BusState::Disarmed);
+    world.arm();
+    world.run_until(BusState::Holding);
+    world.target(&[0.5, 0.5]);
+    world.run(15);
+    world
+}
+
+/// The last command to the second motor.
+fn second(world: &World) -> Option<CanFrame> {
+    world.sent.iter().copied().find(|frame| [0x2, 0x102, 0x202].contains(&frame.id))
+}
+
+const fn others(other_fault: Stop) -> StopSpec {
+    StopSpec { own_fault: Stop::Limp, other_fault, hold_for: None }
+}
+
+#[test]
+fn by_default_a_faulty_joint_is_limp_and_the_others_are_damped() {
+    assert_eq!(StopSpec::default(), others(Stop::Damp));
+    for trouble in [
+        |sim: &mut Sim| sim.silent = true,
+        |sim: &mut Sim| sim.status = MotorStatus::OverCurrent,
+        |sim: &mut Sim| sim.mos = 99,
+    ] {
+        let mut world = armed(MIT, StopSpec::default());
+        trouble(&mut world.sims[0]);
+        let fault = world.run_to_fault();
+        assert_eq!(fault.motor(), 0);
+        assert_eq!(world.told(Notice::Kept { damped: 2, held: 0 }), 1, "{:?}", world.notices);
+        // No action moves it, however long it is kept so.
+        for _ in 0..20 {
+            assert!(!world.target(&[1.0, 1.0]));
+            world.run(50);
+            let frame = second(&world).expect("it is damped");
+            let kp = u16::from_be_bytes([frame.data[3] & 0xf, frame.data[4]]);
+            let kd = u16::from_be_bytes([frame.data[5], frame.data[6]]) >> 4;
+            assert_eq!((kp, kd), (0, 819), "{frame:x?}: 1 Nm s/rad of 5, in 12 bits");
+            assert!(world.sims[1].is_on() && world.bus.state() == BusState::Faulted(fault));
+        }
+        world.disarm();
+        world.run(5);
+        assert!(!world.sims[1].is_on() && second(&world).is_none_or(|frame| frame == Order::Disable.frame(2)));
+    }
+}
+
+#[test]
+fn a_joint_that_holds_stays_where_it_was_commanded_for_as_long_as_it_is_to() {
+    for (hold_for, is_on) in
+        [(None, true), (Some(Duration::from_millis(900)), true), (Some(Duration::from_millis(500)), false)]
+    {
+        for mode in [MIT, MotorMode::PositionVelocity] {
+            let mut world = armed(mode, StopSpec { hold_for, ..others(Stop::Hold) });
+            world.sims[0].status = MotorStatus::OverCurrent;
+            world.run_to_fault();
+            world.run(2);
+            let held = world.sims[1].q;
+            world.run(140);
+            assert_eq!(world.sims[1].is_on(), is_on, "{hold_for:?}");
+            assert!((world.sims[1].q - held).abs() < 1e-3, "{} and not {held}", world.sims[1].q);
+        }
+    }
+}
+
+#[test]
+fn motors_that_run_their_own_loop_hold_where_others_are_damped() {
+    for (mode, id) in [(MotorMode::PositionVelocity, 0x102), (MotorMode::Velocity, 0x202)] {
+        let mut world = armed(mode, others(Stop::Damp));
+        world.sims[0].status = MotorStatus::OverCurrent;
+        world.run_to_fault();
+        world.run(20);
+        let frame = second(&world).expect("a command");
+        assert_eq!(frame.id, id);
+        assert!(mode != MotorMode::Velocity || frame.data == [0; 8], "{frame:x?}");
+        let before = world.sims[1].q;
+        world.run(50);
+        assert!((world.sims[1].q - before).abs() < 1e-3);
+    }
+}
+
+#[test]
+fn a_joint_that_is_kept_and_has_a_fault_of_its_own_is_disabled() {
+    for trouble in [
+        |sim: &mut Sim| sim.silent = true,
+        |sim: &mut Sim| sim.status = MotorStatus::OverCurrent,
+        |sim: &mut Sim| sim.rotor = 120,
+    ] {
+        let mut world = armed(MIT, others(Stop::Hold));
+        world.sims[0].status = MotorStatus::OverCurrent;
+        let first = world.run_to_fault();
+        world.run(10);
+        trouble(&mut world.sims[1]);
+        world.run(40);
+        assert!(second(&world).is_none_or(|frame| frame == Order::Disable.frame(2)), "{:x?}", second(&world));
+        assert_eq!(world.bus.state(), BusState::Faulted(first), "what came first is what it is about");
+    }
+}
+
+#[test]
+fn an_arm_takes_joints_that_are_kept_again() {
+    let mut world = armed(MIT, StopSpec::default());
+    world.sims[0].status = MotorStatus::OverCurrent;
+    world.run_to_fault();
+    world.run(100);
+    world.arm();
+    world.run_until(BusState::Holding);
+    assert!(world.target(&[0.6, 0.6]));
+    world.run(30);
+    assert!((world.sims[1].q - 0.6).abs() < 1e-3);
+}

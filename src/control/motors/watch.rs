@@ -1,0 +1,196 @@
+//! Is what a motor reports possible, and does it do what it is commanded?
+//!
+//! What is wrong is first a notice and, if it lasts, a fault: a frame may be damaged, a joint may be pushed for a moment.
+//!
+//! Invariant: a position that a motor cannot have come to is used for nothing.
+
+use std::time::Duration;
+
+use super::notice::{Notice, Notices, Strange};
+use crate::control::damiao::codec::{Feedback, Ranges};
+use crate::registry::{MotorMode, MotorSpec};
+use crate::time::Stamp;
+
+/// Frames with an impossible position, one after the other, that make a fault: one may be damaged.
+const JUMPS: u32 = 3;
+/// Steps of the 16 bits of a position by which it may differ besides.
+const STEPS: f64 = 2.0;
+/// The time between two frames may be so much longer than that between their arrivals: adapters hand over several at once.
+const JITTER: Duration = Duration::from_millis(20);
+/// A limit of speed or torque may be exceeded by this share: what is measured is noisy, and a command is reached with a
+/// swing.
+const SHARE: f64 = 0.25;
+/// Speed is a few steps of 12 bits exact, rad/s.
+const SLOW: f64 = 0.5;
+/// A joint that moves no faster stands still, rad/s.
+const STILL: f64 = 0.05;
+/// How long a joint may be outside its limits, three frames at least at 200 Hz...
+const BEYOND_AFTER: Duration = Duration::from_millis(20);
+/// ...or exceed its speed or torque...
+const EXCEED_AFTER: Duration = Duration::from_millis(100);
+/// ...or be driven away from its command against all the torque that it may have...
+const DRIVEN_AFTER: Duration = Duration::from_millis(200);
+/// ...or lag behind what its own loop is commanded...
+const LAG_AFTER: Duration = Duration::from_millis(500);
+/// ...or not move though pushed with all the torque that it may have, before there is a word of it.
+const BLOCKED_WORD: Duration = Duration::from_millis(500);
+
+/// How long something has been the case.
+#[derive(Debug, Clone, Copy, Default)]
+struct Spell {
+    since: Option<Stamp>,
+    told: bool,
+}
+
+impl Spell {
+    /// It is the case at `now`, or not. Tells it once it has lasted for `word`; says whether it has lasted for `limit`.
+    fn look(
+        &mut self,
+        strange: Option<Strange>,
+        now: Stamp,
+        [word, limit]: [Duration; 2],
+        tell: &mut dyn FnMut(Strange),
+    ) -> Option<Strange> {
+        let Some(strange) = strange else {
+            *self = Self::default();
+            return None;
+        };
+        let lasted = now.since(*self.since.get_or_insert(now));
+        if lasted >= word && !std::mem::replace(&mut self.told, true) {
+            tell(strange);
+        }
+        (lasted >= limit).then_some(strange)
+    }
+}
+
+/// See the module's comment.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Watch {
+    /// When its newest frame came.
+    heard: Option<Stamp>,
+    jumps: u32,
+    spells: [Spell; 6],
+}
+
+/// What a joint is commanded in this cycle, rad or rad/s.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Commanded {
+    /// The command.
+    pub(super) command: f64,
+    /// What it would be without the bound of the torque.
+    pub(super) wanted: f64,
+}
+
+impl Watch {
+    /// It was turned off: what it did is of the past.
+    pub(super) fn reset(&mut self) {
+        *self = Self { heard: self.heard, ..Self::default() };
+    }
+
+    /// A frame came at `now` of a motor that is on, after one with the feedback `before`. Is its position one that
+    /// the motor can have come to?
+    ///
+    /// # Errors
+    /// When it is the last of several that are not.
+    pub(super) fn hear(
+        &mut self,
+        before: Option<&Feedback>,
+        feedback: &Feedback,
+        (spec, ranges): (&MotorSpec, &Ranges),
+        now: Stamp,
+    ) -> Result<Option<Strange>, Strange> {
+        let last = self.heard.replace(now);
+        let (Some(before), Some(last)) = (before, last) else { return Ok(None) };
+        let step = 2.0 * ranges.position() / f64::from(u16::MAX);
+        // As fast as it was, and somewhat faster than it may be, which is a fault of its own.
+        let fastest = (before.dq.abs() + too_fast(spec)).min(ranges.velocity());
+        let reach = fastest * (now.since(last) + JITTER).as_secs_f64() + STEPS * step;
+        if (feedback.q - before.q).abs() <= reach {
+            self.jumps = 0;
+            return Ok(None);
+        }
+        let jump = Strange::Jump { from: before.q, to: feedback.q };
+        self.jumps += 1;
+        if self.jumps < JUMPS { Ok(Some(jump)) } else { Err(jump) }
+    }
+
+    /// The first of the impossible positions?
+    pub(super) const fn is_first_jump(&self) -> bool {
+        self.jumps == 1
+    }
+
+    /// What is wrong with a motor that is on, for so long that it is a fault.
+    pub(super) fn look(
+        &mut self,
+        (index, spec): (usize, &MotorSpec),
+        feedback: &Feedback,
+        commanded: Commanded,
+        now: Stamp,
+        notices: &mut Notices,
+    ) -> Option<Strange> {
+        let mut tell = |what| notices.tell(Notice::Strange { motor: index, what });
+        let at_once = Duration::ZERO;
+        let never = Duration::MAX;
+        let table = [
+            (beyond(spec, feedback), [at_once, BEYOND_AFTER]),
+            (fast(spec, feedback), [at_once, EXCEED_AFTER]),
+            (strong(spec, feedback), [at_once, EXCEED_AFTER]),
+            (driven(spec, feedback, commanded), [at_once, DRIVEN_AFTER]),
+            (blocked(spec, feedback, commanded), [BLOCKED_WORD, spec.watch.blocked_after.unwrap_or(never)]),
+            (lagging(spec, feedback, commanded), [at_once, LAG_AFTER]),
+        ];
+        let looks = self.spells.iter_mut().zip(table);
+        let lasting = looks.map(|(spell, (strange, limits))| spell.look(strange, now, limits, &mut tell));
+        // Each is looked at, also behind one that lasts.
+        lasting.fold(None, Option::or)
+    }
+}
+
+fn beyond(spec: &MotorSpec, feedback: &Feedback) -> Option<Strange> {
+    let [low, high] = spec.position;
+    let outside = (low - feedback.q).max(feedback.q - high);
+    (outside > spec.watch.margin).then_some(Strange::Beyond { position: feedback.q, range: spec.position })
+}
+
+/// A speed that is none of noise, rad/s.
+fn too_fast(spec: &MotorSpec) -> f64 {
+    spec.velocity * (1.0 + SHARE) + SLOW
+}
+
+fn fast(spec: &MotorSpec, feedback: &Feedback) -> Option<Strange> {
+    let is_fast = feedback.dq.abs() > too_fast(spec);
+    is_fast.then_some(Strange::Fast { velocity: feedback.dq, limit: spec.velocity })
+}
+
+/// The frames of the motor's own loops have no torque: it is for the motor to bound.
+fn strong(spec: &MotorSpec, feedback: &Feedback) -> Option<Strange> {
+    let MotorMode::Mit { .. } = spec.mode else { return None };
+    let limit = spec.torque;
+    (feedback.tau.abs() > limit * (1.0 + SHARE)).then_some(Strange::Strong { torque: feedback.tau, limit })
+}
+
+/// Of a joint whose torque is bounded: how fast it moves towards its command, rad/s.
+fn approach(spec: &MotorSpec, feedback: &Feedback, commanded: Commanded) -> Option<f64> {
+    let MotorMode::Mit { kp, .. } = spec.mode else { return None };
+    let error = commanded.wanted - feedback.q;
+    (error.abs() * kp > spec.torque).then_some(feedback.dq * error.signum())
+}
+
+fn driven(spec: &MotorSpec, feedback: &Feedback, commanded: Commanded) -> Option<Strange> {
+    let speed = approach(spec, feedback, commanded)?;
+    (speed < -STILL).then_some(Strange::Driven { torque: spec.torque })
+}
+
+fn blocked(spec: &MotorSpec, feedback: &Feedback, commanded: Commanded) -> Option<Strange> {
+    let speed = approach(spec, feedback, commanded)?;
+    (speed.abs() <= STILL).then_some(Strange::Blocked { torque: spec.torque })
+}
+
+fn lagging(spec: &MotorSpec, feedback: &Feedback, commanded: Commanded) -> Option<Strange> {
+    let (is, limit) = match spec.mode {
+        MotorMode::Mit { .. } => return None,
+        MotorMode::PositionVelocity => (feedback.q, spec.watch.lag),
+        MotorMode::Velocity => (feedback.dq, SHARE * spec.velocity + SLOW),
+    };
+    ((commanded.command - is).abs() > limit).then_some(Strange::Lagging { command: commanded.command, is })
+}

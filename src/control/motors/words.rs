@@ -1,0 +1,139 @@
+//! What happened on a bus of motors, in words.
+
+use std::fmt;
+
+use super::notice::{Fault, Notice, Part, Reason, Refusal, Strange};
+use crate::control::damiao::parameter::Parameter;
+
+/// Something to be shown, with the names of the motors it speaks of.
+#[derive(Debug)]
+pub struct Words<'a, T> {
+    pub(super) what: &'a T,
+    pub(super) names: &'a [String],
+}
+
+impl<T> Words<'_, T> {
+    fn name(&self, motor: usize) -> &str {
+        self.names.get(motor).map_or("?", String::as_str)
+    }
+}
+
+impl fmt::Display for Part {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Mos => "transistors",
+            Self::Rotor => "winding",
+        })
+    }
+}
+
+impl fmt::Display for Strange {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Jump { from, to } => write!(
+                f,
+                "reports {to:.3} rad after {from:.3} rad, where it cannot have come: a damaged frame, or another program \
+                 set its zero"
+            ),
+            Self::Beyond { position, range: [low, high] } => {
+                write!(f, "is at {position:.3} rad, outside its limits of {low} to {high} rad")
+            }
+            Self::Fast { velocity, limit } => write!(f, "moves at {velocity:.2} rad/s, and {limit} rad/s is its limit"),
+            Self::Strong { torque, limit } => write!(f, "reports {torque:.2} Nm, and {limit} Nm is its limit"),
+            Self::Driven { torque } => write!(f, "moves away from its command against {torque} Nm, its limit"),
+            Self::Blocked { torque } => write!(f, "does not move with {torque} Nm, its limit"),
+            Self::Lagging { command, is } => write!(f, "does not follow: {command:.3} is commanded, {is:.3} reported"),
+        }
+    }
+}
+
+impl fmt::Display for Words<'_, Fault> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match *self.what {
+            Fault::Silent { motor } => write!(f, "motor {} does not answer", self.name(motor)),
+            Fault::Latched { motor, status } => write!(f, "motor {} reports {status}", self.name(motor)),
+            Fault::Hot { motor, part, celsius, limit } => {
+                write!(f, "the {part} of motor {} have {celsius} °C, more than {limit} °C", self.name(motor))
+            }
+            Fault::Strange { motor, what } => write!(f, "motor {} {what}", self.name(motor)),
+            Fault::Changed { motor, parameter, value } => {
+                write!(f, "{parameter} of motor {} is {value} now: another program set it", self.name(motor))
+            }
+            Fault::OtherMaster { motor } => {
+                write!(f, "another program on the bus commands motor {}: end it", self.name(motor))
+            }
+            Fault::Dropped { motor } => write!(f, "motor {} is no longer enabled", self.name(motor)),
+            Fault::NotEnabled { motor } => write!(f, "motor {} does not become enabled", self.name(motor)),
+            Fault::NotDisabled { motor } => write!(f, "motor {} does not become disabled", self.name(motor)),
+            Fault::Unread { motor, parameter } => write!(f, "motor {} does not tell its {parameter}", self.name(motor)),
+            Fault::Unusable { motor, parameter: Parameter::PMax, value }
+                if value.number().is_finite() && value.number() > 0.0 =>
+            {
+                write!(f, "motor {} counts to {value} rad, and its `position` lies beyond that", self.name(motor))
+            }
+            Fault::Unusable { motor, parameter, value } => {
+                write!(f, "{parameter} of motor {} is {value}, and cannot be used or changed", self.name(motor))
+            }
+        }
+    }
+}
+
+impl fmt::Display for Refusal {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Length => "it has not one number for each motor",
+            Self::NotFinite => "a number of it is not finite",
+            Self::Old => "it is too old",
+            Self::Early => "its time is in the future",
+        })
+    }
+}
+
+impl fmt::Display for Words<'_, Notice> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.what {
+            Notice::Ready => f.write_str("all motors have answered; they are disarmed"),
+            Notice::Unanswered { motor } => write!(f, "motor {} has not answered yet", self.name(*motor)),
+            Notice::RangesDiffer { motor, read, shipped: [p, v, t] } => write!(
+                f,
+                "motor {} counts in PMAX {} VMAX {} TMAX {}, its type is shipped with {p} {v} {t}; the motor's own are used",
+                self.name(*motor),
+                read.position(),
+                read.velocity(),
+                read.torque(),
+            ),
+            Notice::ParameterSet { motor, parameter, was, is } => {
+                write!(f, "{parameter} of motor {} was {was} and is {is} now", self.name(*motor))
+            }
+            Notice::Warm { motor, part, celsius, limit } => {
+                write!(f, "the {part} of motor {} have {celsius} °C, of at most {limit} °C", self.name(*motor))
+            }
+            Notice::Strange { motor, what } => write!(f, "motor {} {what}", self.name(*motor)),
+            Notice::OtherMaster { motor } => {
+                write!(f, "another program on the bus commands motor {}: end it before an arm", self.name(*motor))
+            }
+            Notice::Arming => f.write_str("motors are being armed"),
+            Notice::Armed => f.write_str("motors are armed, and hold until an action comes"),
+            Notice::Following => f.write_str("motors follow actions"),
+            Notice::Holding => f.write_str("no action came in time: motors hold"),
+            Notice::Disabled(Reason::Asked) => f.write_str("motors are disabled"),
+            Notice::Disabled(Reason::Deadman) => f.write_str("no action came for too long: motors are disabled"),
+            Notice::Fault(fault) => write!(f, "{}: all motors are stopped", fault.words(self.names)),
+            Notice::Kept { damped, held } => {
+                let parts = [("damped", damped), ("holding", held)].into_iter().filter(|(_, bits)| **bits != 0);
+                for (word, bits) in parts {
+                    write!(f, "{word} until a disarm: ")?;
+                    let named = self.names.iter().enumerate().filter(|(index, _)| bits >> (index % 16) & 1 == 1);
+                    for (_, name) in named {
+                        write!(f, "{name} ")?;
+                    }
+                }
+                f.write_str("(the others are disabled)")
+            }
+            Notice::Clamped { motor, target, used } => {
+                write!(f, "target {target} of motor {} is beyond its limits; {used} is used", self.name(*motor))
+            }
+            Notice::Refused(refusal) => write!(f, "an action moves nothing: {refusal}"),
+        }
+    }
+}
