@@ -213,6 +213,10 @@ pub enum Command {
     )]
     Arm,
     /// Stops the actuator of a running rapid: its motors are disabled
+    #[command(
+        after_help = "It holds for the rest of the run, with or without an actuator, until the next arm, and needs neither \
+        disk nor shared memory.\n\nExamples:\n  rapid disarm\n  rapid disarm --instance left"
+    )]
     Disarm,
     /// Tells what an episode holds: verdict, rates, gaps, lateness, presence over time
     #[command(after_help = "Of one file a report; of a folder or of several files one line each, GOOD, SUSPECT or \
