@@ -162,11 +162,13 @@ fn fast(spec: &MotorSpec, feedback: &Feedback) -> Option<Strange> {
     is_fast.then_some(Strange::Fast { velocity: feedback.dq, limit: spec.velocity })
 }
 
-/// The frames of the motor's own loops have no torque: it is for the motor to bound.
+/// The limit bounds what the stiffness asks for; damping comes on top, as much as the highest speed makes it. The frames of
+/// the motor's own loops have no torque: it is for the motor to bound.
 fn strong(spec: &MotorSpec, feedback: &Feedback) -> Option<Strange> {
-    let MotorMode::Mit { .. } = spec.mode else { return None };
+    let MotorMode::Mit { kd, .. } = spec.mode else { return None };
     let limit = spec.torque;
-    (feedback.tau.abs() > limit * (1.0 + SHARE)).then_some(Strange::Strong { torque: feedback.tau, limit })
+    let is_strong = feedback.tau.abs() > limit * (1.0 + SHARE) + kd * too_fast(spec);
+    is_strong.then_some(Strange::Strong { torque: feedback.tau, limit })
 }
 
 /// Of a joint whose torque is bounded: how fast it moves towards its command, rad/s.

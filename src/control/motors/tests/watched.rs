@@ -96,7 +96,7 @@ fn what_lasts_is_a_fault_with_its_name_and_is_told_before() {
             "outside its limits",
         ),
         ("it is too fast", |world| (world.sims[0].stuck, world.sims[0].drift) = (true, 3.9), 20..=23, "moves at 3."),
-        ("it is too strong", |world| world.sims[0].tau = 2.0, 20..=24, "reports 2.0"),
+        ("it is too strong", |world| world.sims[0].tau = 6.0, 20..=24, "reports 6.0"),
     ];
     for (what, trouble, cycles, name) in TROUBLES {
         let mut world = armed(|joint| {
