@@ -152,7 +152,8 @@ impl MotorBus {
         }
         if self.ask() {
             let axes = self.motors.iter_mut().zip(&mut self.commands).zip(&mut self.limits);
-            let mut enabled = axes.map(|((motor, command), limits)| motor.enable(command, limits, passed));
+            let mut enabled =
+                axes.map(|((motor, command), limits)| motor.enable(command, limits, passed, &mut self.notices));
             if let Some(fault) = enabled.find_map(Result::err) {
                 self.fail(fault, now);
                 return;

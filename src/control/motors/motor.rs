@@ -253,7 +253,13 @@ impl Motor {
     ///
     /// # Errors
     /// It stands where it may not be armed.
-    pub(super) fn enable(&mut self, command: &mut f64, limits: &mut Limits, passed: Duration) -> Result<(), Fault> {
+    pub(super) fn enable(
+        &mut self,
+        command: &mut f64,
+        limits: &mut Limits,
+        passed: Duration,
+        notices: &mut Notices,
+    ) -> Result<(), Fault> {
         let (Some(ranges), Some(feedback), Some(status)) = (self.ranges, self.feedback, self.status) else {
             return Ok(());
         };
@@ -262,6 +268,9 @@ impl Motor {
                 return Err(fault);
             }
             self.phase = Phase::Clearing;
+            if status.is_fault() {
+                notices.tell(Notice::Cleared { motor: self.index, status });
+            }
             if self.spec.mode != MotorMode::Velocity {
                 let [low, high] = within(self.spec.position, ranges.position());
                 limits.set_range(low, high);

@@ -242,6 +242,13 @@ pub enum Notice {
         /// What.
         what: Strange,
     },
+    /// A fault that a motor has latched is cleared, because an arm was asked for.
+    Cleared {
+        /// Which motor.
+        motor: usize,
+        /// The fault.
+        status: MotorStatus,
+    },
     /// An arm was asked for.
     Arming,
     /// All motors are enabled. They hold until an action comes.
@@ -327,6 +334,7 @@ impl Notice {
             | Self::Strange { .. }
             | Self::OtherMaster { .. }
             | Self::Kept { .. }
+            | Self::Cleared { .. }
             | Self::Clamped { .. }
             | Self::Refused(_) => true,
         }

@@ -112,6 +112,9 @@ impl fmt::Display for Words<'_, Notice> {
             Notice::OtherMaster { motor } => {
                 write!(f, "another program on the bus commands motor {}: end it before an arm", self.name(*motor))
             }
+            Notice::Cleared { motor, status } => {
+                write!(f, "motor {} reported {status}: cleared for this arm", self.name(*motor))
+            }
             Notice::Arming => f.write_str("motors are being armed"),
             Notice::Armed => f.write_str("motors are armed, and hold until an action comes"),
             Notice::Following => f.write_str("motors follow actions"),

@@ -36,6 +36,8 @@ fn an_arm_clears_a_fault_and_fails_while_it_lasts() {
     assert_eq!(world.bus.state(), BusState::Faulted(fault), "nothing brings it back but an arm");
     world.arm();
     world.run_until(BusState::Holding);
+    let cleared = Notice::Cleared { motor: 1, status: MotorStatus::CommunicationLost };
+    assert_eq!(world.told(cleared), 1, "{:?}", world.notices);
     world.disarm();
     world.run_until(BusState::Disarmed);
 
