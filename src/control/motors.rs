@@ -21,7 +21,7 @@
 //! Invariant: no command before an arm was asked for, nor after a disarm or a stop until one is asked for again; after a
 //! fault none but to damp a joint or to keep it where it is.
 //! Invariant: one motor that is silent, faulty or hot stops all, each in its way ([`Stop`](crate::registry::Stop)): an
-//! arm must not go on without its elbow, nor fall because of it. None of them follows an action before the next arm.
+//! arm must not continue without its elbow, nor fall because of it. None of them follows an action before the next arm.
 //! Invariant: the first command is where the joint is. From there a commanded position changes by the
 //! slew limit at most, and goes nowhere beyond the limits; of a joint that is beyond them it stays or
 //! comes back. In MIT mode the stiffness asks for no more than the torque limit: the command comes towards the joint as

@@ -1,6 +1,6 @@
 //! The run's side: thread `orders`, which takes what comes over the socket.
 //!
-//! Invariant: it writes to no file and no terminal, and waits for nobody: a connection that sends nothing, or does not
+//! Invariant: it writes to no file and no terminal, and waits for no one: a connection that sends nothing, or does not
 //! read its answer, holds up no other.
 
 use std::io::{self, ErrorKind, Read, Write};
@@ -140,7 +140,7 @@ impl Waiting {
                 permission.arm(given, Stamp::now()).map_or_else(|void| void.to_string(), |()| DONE.to_owned())
             }
         };
-        // Room for a line is there, or nobody reads.
+        // Room for a line is there, or there is no reader.
         let _ = self.stream.write_all(format!("{answer}\n").as_bytes());
         false
     }

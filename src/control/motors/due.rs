@@ -16,7 +16,7 @@ const ARM_WITHIN: Duration = Duration::from_secs(1);
 const ARM_CYCLES: u32 = 40;
 /// Motors that have not told their parameters after this are told of.
 const PROBE_WITHIN: Duration = Duration::from_secs(1);
-/// For this long nobody else may have commanded a motor that is armed.
+/// For this long no other program may have commanded a motor that is armed.
 const ONE_MASTER: Duration = Duration::from_secs(1);
 /// Motors that answer have to turn off within this.
 const DISABLE_WITHIN: Duration = Duration::from_millis(500);
@@ -131,7 +131,7 @@ impl MotorBus {
         }
     }
 
-    /// Another program commands a motor: an arm does not go on with two masters.
+    /// Another program commands a motor: an arm with two masters is a fault.
     pub(super) fn heard_master(&mut self, motor: usize, now: Stamp) {
         let is_news = self.other_master.replace((motor, now)).is_none_or(|(_, last)| now.since(last) >= ONE_MASTER);
         match self.state {

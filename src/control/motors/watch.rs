@@ -39,11 +39,11 @@ const BLOCKED_WORD: Duration = Duration::from_millis(500);
 #[derive(Debug, Clone, Copy, Default)]
 struct Spell {
     since: Option<Stamp>,
-    told: bool,
+    is_reported: bool,
 }
 
 impl Spell {
-    /// It is the case at `now`, or not. Tells it once it has lasted for `word`; says whether it has lasted for `limit`.
+    /// It is the case at `now`, or not. Reports it once it has lasted for `word`; returns it when it has lasted for `limit`.
     fn look(
         &mut self,
         strange: Option<Strange>,
@@ -56,7 +56,7 @@ impl Spell {
             return None;
         };
         let lasted = now.since(*self.since.get_or_insert(now));
-        if lasted >= word && !std::mem::replace(&mut self.told, true) {
+        if lasted >= word && !std::mem::replace(&mut self.is_reported, true) {
             tell(strange);
         }
         (lasted >= limit).then_some(strange)

@@ -38,7 +38,7 @@ const MOST: usize = 10;
 const DEADMAN_PERIODS: u32 = 2;
 /// A motor that stops by itself when it is told nothing must not do so between two commands.
 const TIMEOUT_PERIODS: u32 = 4;
-/// A motor that goes on for longer than this when this program is killed has gone far.
+/// A motor that continues for longer than this when this program is killed has gone far.
 const LONG_TIMEOUT: Duration = Duration::from_millis(500);
 /// What a motor does that nobody has set limits for: slow enough to step aside.
 const SPEED: f64 = 2.0;
@@ -86,7 +86,7 @@ pub(super) fn damiao(table: &Section<'_>, problems: &mut Problems<'_>) -> Option
     })
 }
 
-/// Warns of motors that go on for long once this program was killed.
+/// Warns of motors that continue for long once this program was killed.
 pub(super) fn slow_to_stop(devices: &[DeviceSpec], entries: &[Entry], problems: &Problems<'_>) -> Vec<Diagnostic> {
     let warn = |device: &DeviceSpec| {
         let NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(motors), .. }) = &device.node else { return None };

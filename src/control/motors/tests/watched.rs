@@ -159,7 +159,7 @@ fn another_master_is_named_and_nothing_is_armed_beside_it() {
         world.bus.feed(&order, world.now);
         let (fault, cycle) = fault_within(&mut world, 0.25, 20).expect("a fault");
         assert_eq!((fault, cycle), (Fault::OtherMaster { motor: 0 }, 1));
-        // It goes on talking: no arm.
+        // It continues to command: no arm.
         for _ in 0..5 {
             world.bus.feed(&order, world.now);
             world.arm();
