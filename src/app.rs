@@ -15,6 +15,7 @@ mod error;
 mod screen;
 pub(crate) mod signals;
 mod watch;
+mod watchdog;
 
 use std::panic::AssertUnwindSafe;
 use std::path::{Path, PathBuf};
@@ -54,6 +55,7 @@ pub use autopilot::PolicyOptions;
 use conductor::Conductor;
 pub use error::AppError;
 use signals::Signals;
+use watchdog::Watchdog;
 
 /// Where devices come from.
 #[derive(Debug)]
@@ -134,6 +136,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     // Before anything that a full or damaged machine may refuse.
     let (permission, _orders) = take_orders(options.instance.as_deref(), options.arm)?;
     let signals = Signals::listen()?;
+    let _fed = Watchdog::feed();
 
     bus::check_memory()?;
     // First of all: are we the only one? A registry has at most 64 devices.

@@ -1,8 +1,14 @@
-//! Entry point: parses the command line, runs the command, prints an error, sets the exit code.
+//! Entry point: becomes the guard of a bus of motors if it was started as one; otherwise parses the command line, runs the command, prints an error, sets the exit code.
 
 use std::process::ExitCode;
 
+use rapid::driver::can::guard;
+
 fn main() -> ExitCode {
+    let mut args = std::env::args_os();
+    if args.next().is_some_and(|name| name == guard::NAME) {
+        return guard::run(args);
+    }
     match rapid::cli::Cli::read(std::env::args_os()) {
         Ok(cli) => rapid::dispatch::dispatch(cli),
         Err(error) => {

@@ -1,5 +1,7 @@
 //! Threads that keep a beat.
 
+use rustix::mm::{MlockAllFlags, mlockall};
+use rustix::process::{Resource, getrlimit};
 use thread_priority::unix::{
     RealtimeThreadSchedulePolicy, ThreadSchedulePolicy, set_thread_priority_and_policy, thread_native_id,
 };
@@ -20,4 +22,17 @@ pub fn use_fifo(priority: u8) -> Result<(), String> {
     let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
     set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Crossplatform(priority), policy)
         .map_err(|error| format!("{error:?}"))
+}
+
+/// Keeps every page of this process in memory from the first use of it on: a thread that keeps a beat is not to wait for a
+/// disk because another program needs memory.
+///
+/// # Errors
+/// Without an unlimited `RLIMIT_MEMLOCK`, as less of it would make later allocations fail: why, for people.
+pub fn lock_memory() -> Result<(), String> {
+    if let Some(limit) = getrlimit(Resource::Memlock).current {
+        return Err(format!("it may lock {} KiB of memory alone (`ulimit -l`)", limit >> 10));
+    }
+    // Not before the first use: stacks and buffers are mostly room that is never used.
+    mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE | MlockAllFlags::ONFAULT).map_err(|error| error.to_string())
 }

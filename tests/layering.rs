@@ -88,6 +88,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("rand_pcg", &["random"]),
     ("ratatui", &["tui"]),
     ("rustix", &["time", ABOVE_NOUNS]),
+    ("sd_notify", &["app/watchdog"]),
     ("serde", &[ANYWHERE]),
     ("serde_json", &[ABOVE_NOUNS]),
     ("sha2", &["policy/bundle", "record/recover"]),

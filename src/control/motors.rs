@@ -26,6 +26,8 @@
 //! slew limit at most, and goes nowhere beyond the limits; of a joint that is beyond them it stays or
 //! comes back. In MIT mode the stiffness asks for no more than the torque limit: the command comes towards the joint as
 //! fast as it may, and for the rest the stiffness is lowered.
+//! Invariant: cycles that stood still for longer than [`stalled_after`] end an arm: what happened to the motors meanwhile
+//! is not known.
 //! Invariant: an action is followed only if its tick is after the arm, after those of all before it, and
 //! no older than the deadman allows.
 //! Invariant: a sample holds an answer of every motor, each newer than those of the sample before.
@@ -33,6 +35,7 @@
 //! were read, unless they cannot be used.
 
 mod due;
+mod last_will;
 mod motor;
 mod notice;
 mod watch;
@@ -40,6 +43,7 @@ mod words;
 
 use std::time::Duration;
 
+pub use last_will::stalled_after;
 use motor::Motor;
 use notice::Notices;
 pub use notice::{BusState, Fault, Notice, Part, Reason, Refusal, Strange};
@@ -80,6 +84,7 @@ pub struct MotorBus {
     reason: Reason,
     cycle: Duration,
     silent_after: Duration,
+    stalled_after: Duration,
     stepped: Option<Stamp>,
     armed: Stamp,
     refusing: Option<Refusal>,
@@ -128,6 +133,7 @@ impl MotorBus {
             reason: Reason::Asked,
             cycle,
             silent_after: spec.silent_after.max(cycle * SILENT_CYCLES),
+            stalled_after: stalled_after(spec),
             stepped: None,
             armed: now,
             refusing: None,
@@ -309,6 +315,7 @@ impl MotorBus {
         if self.state == BusState::Stopped {
             return;
         }
+        self.look_for_stall(now);
         let passed = self.stepped.map_or(self.cycle, |last| now.since(last)).min(self.cycle * LATE_CYCLES);
         self.stepped = Some(now);
         self.listen(now);

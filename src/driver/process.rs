@@ -133,10 +133,16 @@ fn prepare(parent: Pid) -> io::Result<()> {
     if getppid() != Some(parent) {
         return Err(io::Error::from_raw_os_error(libc::ESRCH));
     }
+    leak_nothing();
+    Ok(())
+}
+
+/// What is open here is not to be open in the program that this process becomes, but for the standard descriptors. Between
+/// fork and exec it makes a system call and nothing else.
+pub(super) fn leak_nothing() {
     // Libraries open descriptors without O_CLOEXEC. Linux 5.11; before that they are inherited.
     // SAFETY: closes nothing now and takes no pointers.
     unsafe { libc::syscall(libc::SYS_close_range, 3, libc::c_uint::MAX, libc::CLOSE_RANGE_CLOEXEC) };
-    Ok(())
 }
 
 /// A running child. Dropped before it was reaped, it is killed.

@@ -27,6 +27,12 @@ impl CanAdapter {
     /// Every kind of adapter and its name.
     pub const WORDS: [(&str, Self); 3] =
         [("socketcan", Self::SocketCan), ("slcan", Self::Slcan), ("damiao", Self::Damiao)];
+
+    /// The word for it.
+    #[must_use]
+    pub fn word(self) -> &'static str {
+        word(&Self::WORDS, &self)
+    }
 }
 
 impl Opens {

@@ -1,5 +1,7 @@
-//! Motors on a serial line: the simulated motors of the virtual bench behind Damiao's adapter, on a
-//! pseudo-terminal.
+//! Motors on a serial line: the simulated motors of the virtual bench behind an adapter of Damiao's or one that speaks
+//! slcan, on a pseudo-terminal.
+
+#![allow(dead_code, reason = "each who uses it needs a part of it")]
 
 #[path = "motor_spec.rs"]
 mod motor_spec;
@@ -13,11 +15,12 @@ use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use rapid::registry::{DamiaoSpec, MotorMode, MotorSpec};
+use rapid::registry::{CanAdapter, DamiaoSpec, MotorMode, MotorSpec};
 use rapid::time::Stamp;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use vbench::emu::can::bus::{self, Bus};
 use vbench::emu::can::damiao::{self, Damiao};
+use vbench::emu::can::slcan::{Heard, Slcan};
 use vbench::emu::order::Order;
 use vbench::emu::told::Told;
 
@@ -35,12 +38,49 @@ pub(crate) struct Adapter {
 
 struct Shared {
     bus: Bus,
-    told: Vec<Told>,
+    /// What motors told, and when.
+    told: Vec<(Stamp, Told)>,
+}
+
+/// How the adapter speaks on its line.
+enum Speech {
+    Damiao(Damiao),
+    Slcan(Slcan),
+}
+
+impl Speech {
+    /// What the bus answers to bytes of the host is written to `answers`.
+    fn hear(&mut self, bytes: &[u8], bus: &mut Bus, answers: &mut Vec<u8>) {
+        let mut frames = Vec::new();
+        match self {
+            Self::Damiao(damiao) => damiao.hear(bytes, answers, |frame| frames.push(frame)),
+            Self::Slcan(slcan) => slcan.hear(bytes, answers, |heard| {
+                if let Heard::Frame(frame) = heard {
+                    frames.push(frame);
+                }
+            }),
+        }
+        for frame in frames {
+            bus.send(&frame, Stamp::now().0, |answer| match self {
+                Self::Damiao(_) => damiao::tell(&answer, answers),
+                Self::Slcan(slcan) => slcan.tell(&answer, answers),
+            });
+        }
+    }
 }
 
 impl Adapter {
-    /// With `count` motors, which listen to 1, 2, ... and answer with 0x11, 0x12, ...
+    /// Damiao's, with `count` motors, which listen to 1, 2, ... and answer with 0x11, 0x12, ...
     pub(crate) fn plug(count: u16) -> Self {
+        Self::plug_as(CanAdapter::Damiao, count)
+    }
+
+    /// One that speaks slcan, or Damiao's.
+    pub(crate) fn plug_as(adapter: CanAdapter, count: u16) -> Self {
+        let speech = match adapter {
+            CanAdapter::Slcan => Speech::Slcan(Slcan::default()),
+            _ => Speech::Damiao(Damiao::default()),
+        };
         let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).expect("terminal");
         grantpt(&master).expect("terminal");
         unlockpt(&master).expect("terminal");
@@ -52,7 +92,7 @@ impl Adapter {
         let pulled = Arc::new(AtomicBool::new(false));
         let thread = std::thread::spawn({
             let (shared, pulled) = (Arc::clone(&shared), Arc::clone(&pulled));
-            move || serve(master, &shared, &pulled)
+            move || serve(master, speech, &shared, &pulled)
         });
         Self { path, shared, pulled, thread: Some(thread) }
     }
@@ -64,12 +104,19 @@ impl Adapter {
 
     /// What the motors have told so far, oldest first.
     pub(crate) fn told(&self) -> Vec<&'static str> {
-        self.shared.lock().expect("whole").told.iter().map(|told| told.action).collect()
+        self.shared.lock().expect("whole").told.iter().map(|(_, told)| told.action).collect()
     }
 
     /// How often the motors told this.
     pub(crate) fn count(&self, action: &str) -> usize {
         self.told().iter().filter(|told| **told == action).count()
+    }
+
+    /// When a motor told this first, after `since`.
+    pub(crate) fn told_at(&self, motor: u16, action: &str, since: Stamp) -> Option<Stamp> {
+        let shared = self.shared.lock().expect("whole");
+        let mut of = shared.told.iter().filter(|(_, told)| told.action == action && told.fields["motor"] == motor);
+        of.find(|(at, _)| *at >= since).map(|(at, _)| *at)
     }
 
     /// Waits until each of these motors was turned off after the last time that it was enabled. One motor
@@ -85,7 +132,7 @@ impl Adapter {
     /// It was enabled, and turned off after that.
     fn is_off(&self, motor: u16) -> bool {
         let told = &self.shared.lock().expect("whole").told;
-        let last = |action| told.iter().rposition(|told| told.action == action && told.fields["motor"] == motor);
+        let last = |action| told.iter().rposition(|(_, told)| told.action == action && told.fields["motor"] == motor);
         last("motor_enabled").is_some_and(|enabled| last("motor_disabled").is_some_and(|off| off > enabled))
     }
 }
@@ -99,10 +146,10 @@ impl Drop for Adapter {
     }
 }
 
-fn serve(master: OwnedFd, shared: &Mutex<Shared>, pulled: &AtomicBool) {
+fn serve(master: OwnedFd, mut speech: Speech, shared: &Mutex<Shared>, pulled: &AtomicBool) {
     use rustix::event::{PollFd, PollFlags, Timespec, poll};
     let mut line = File::from(master);
-    let (mut damiao, mut piece) = (Damiao::default(), [0; 4096]);
+    let mut piece = [0; 4096];
     while !pulled.load(Ordering::Acquire) {
         let waits = Timespec { tv_sec: 0, tv_nsec: 1_000_000 };
         let ready = {
@@ -115,17 +162,14 @@ fn serve(master: OwnedFd, shared: &Mutex<Shared>, pulled: &AtomicBool) {
             let mut shared = shared.lock().expect("whole");
             if ready.contains(PollFlags::IN) {
                 let count = line.read(&mut piece).unwrap_or(0);
-                let mut frames = Vec::new();
-                damiao.hear(&piece[..count], &mut answers, |frame| frames.push(frame));
-                for frame in frames {
-                    shared.bus.send(&frame, Stamp::now().0, |answer| damiao::tell(&answer, &mut answers));
-                }
+                speech.hear(&piece[..count], &mut shared.bus, &mut answers);
             } else if ready.contains(PollFlags::HUP) {
                 // Nobody has it open: it may be opened again.
                 std::thread::sleep(Duration::from_millis(1));
             }
             shared.bus.tend(Stamp::now().0);
-            let told: Vec<_> = shared.bus.told().collect();
+            let now = Stamp::now();
+            let told: Vec<_> = shared.bus.told().map(|told| (now, told)).collect();
             shared.told.extend(told);
         }
         // A reader that does not read is its own loss.

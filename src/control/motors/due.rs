@@ -215,7 +215,7 @@ impl MotorBus {
         // What came first is what it is about.
         let is_keeping = matches!(self.state, BusState::Faulted(_)) && self.is_keeping();
         for (index, (motor, command)) in self.motors.iter_mut().zip(&mut self.commands).enumerate() {
-            motor.stop_at_fault(index == own, command);
+            motor.stop_at_fault(own == Some(index), command);
         }
         if !is_keeping {
             self.enter(BusState::Faulted(fault), now);

@@ -14,6 +14,7 @@
 //! Invariant: who is found enabled without having been armed is disabled.
 
 mod judged;
+mod last_will;
 mod parameters;
 
 use std::time::Duration;

@@ -1,6 +1,7 @@
 //! What a bus of motors tells, for the log and for events; in words: `words`.
 
 use std::collections::VecDeque;
+use std::time::Duration;
 
 use super::words::Words;
 use crate::control::damiao::codec::{MotorStatus, Ranges};
@@ -133,6 +134,11 @@ pub enum Fault {
     OtherMaster {
         /// Which.
         motor: usize,
+    },
+    /// This program was held up: no motor was commanded for so long.
+    Stalled {
+        /// How long.
+        after: Duration,
     },
     /// A motor was enabled and no longer is: it lost its power, or another program disabled it.
     Dropped {
@@ -348,10 +354,11 @@ impl Notice {
 }
 
 impl Fault {
-    /// The motor that it is of, by its position in the entry.
+    /// The motor that it is of, by its position in the entry, if it is of one.
     #[must_use]
-    pub const fn motor(&self) -> usize {
+    pub const fn motor(&self) -> Option<usize> {
         match *self {
+            Self::Stalled { .. } => None,
             Self::Silent { motor }
             | Self::Latched { motor, .. }
             | Self::Hot { motor, .. }
@@ -362,7 +369,7 @@ impl Fault {
             | Self::NotEnabled { motor }
             | Self::NotDisabled { motor }
             | Self::Unread { motor, .. }
-            | Self::Unusable { motor, .. } => motor,
+            | Self::Unusable { motor, .. } => Some(motor),
         }
     }
 

@@ -62,6 +62,9 @@ impl fmt::Display for Words<'_, Fault> {
             Fault::OtherMaster { motor } => {
                 write!(f, "another program on the bus commands motor {}: end it", self.name(motor))
             }
+            Fault::Stalled { after } => {
+                write!(f, "rapid was held up: no motor was commanded for {} ms", after.as_millis())
+            }
             Fault::Dropped { motor } => write!(f, "motor {} is no longer enabled", self.name(motor)),
             Fault::NotEnabled { motor } => write!(f, "motor {} does not become enabled", self.name(motor)),
             Fault::NotDisabled { motor } => write!(f, "motor {} does not become disabled", self.name(motor)),

@@ -137,6 +137,14 @@ impl Link {
         Line::damiao(path).map(Self::Damiao)
     }
 
+    /// Another descriptor of the adapter.
+    ///
+    /// # Errors
+    /// When the system gives none.
+    pub(super) fn duplicate(&self) -> io::Result<OwnedFd> {
+        self.as_fd().try_clone_to_owned()
+    }
+
     /// Hands a frame to the kernel. Does not wait, and does not say that the frame was on the bus.
     ///
     /// # Errors

@@ -7,6 +7,7 @@
 
 mod claim;
 pub mod damiao_serial;
+pub mod guard;
 mod line;
 pub mod link;
 pub mod motors;

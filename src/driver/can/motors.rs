@@ -6,6 +6,7 @@
 //! Invariant: whatever ends the driver, the motors are told to turn off: see `beat`.
 
 mod beat;
+mod powered;
 mod tally;
 
 use std::sync::Arc;
@@ -15,6 +16,7 @@ use std::thread::JoinHandle;
 use tokio::sync::mpsc;
 
 use super::claim::Claim;
+use super::guard::Guard;
 use super::link::{Link, LinkError};
 use crate::action::{ActuatorNotice, Order};
 use crate::control::motors::SAMPLE_VALUES;
@@ -25,6 +27,7 @@ use crate::registry::{CanSpec, DamiaoSpec, DeviceNode, MAX_MOTORS};
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
 use crate::time::Stamp;
 use beat::{Beat, Sample, Shared, Target};
+use powered::Powered;
 pub use tally::Punctuality;
 
 /// Samples that may wait to be read, a second of them at 200 Hz.
@@ -61,26 +64,33 @@ impl Motors {
                 DeviceNode::Net(name) => Some(Claim::take(name).map_err(LinkError::into_driver)?),
                 _ => None,
             };
-            Self::begin(Link::open(&can, &node).map_err(LinkError::into_driver)?, &motors, claim)
+            let link = Link::open(&can, &node).map_err(LinkError::into_driver)?;
+            let guard = Guard::start(&link, &can, &motors, &node).map_err(|error| {
+                tracing::warn!(
+                    %error,
+                    "the motors have no guard: if rapid is killed, they stop by their own time limit alone"
+                );
+            });
+            Self::begin(Powered::new(link, &motors, guard.ok(), claim), &motors)
         })
         .await
     }
 
-    /// Starts the thread over an open adapter.
+    /// Starts the thread over an open adapter, without a guard.
     ///
     /// # Errors
     /// When the system gives no thread.
     pub fn start(link: Link, spec: &DamiaoSpec) -> Result<Self, DriverError> {
-        Self::begin(link, spec, None)
+        Self::begin(Powered::new(link, spec, None, None), spec)
     }
 
-    fn begin(link: Link, spec: &DamiaoSpec, claim: Option<Claim>) -> Result<Self, DriverError> {
-        let description = format!("{}, {} motors at {} Hz", link.description(), spec.motors.len(), spec.hz);
+    fn begin(powered: Powered, spec: &DamiaoSpec) -> Result<Self, DriverError> {
+        let description = format!("{}, {} motors at {} Hz", powered.description(), spec.motors.len(), spec.hz);
         let (told, samples) = mpsc::channel(SAMPLES);
         let (tell, notices) = mpsc::channel(NOTICES);
         let (targets, asked) = sync_channel(TARGETS);
         let shared = Arc::<Shared>::default();
-        let beat = Beat::new((link, claim), spec, asked, told, tell, Arc::clone(&shared));
+        let beat = Beat::new(powered, spec, asked, told, tell, Arc::clone(&shared));
         let thread = std::thread::Builder::new().name(CONTROL_THREAD.to_owned()).spawn(move || beat.run());
         let thread = thread.map_err(|error| DriverError::Retry(format!("no thread for the motors: {error}")))?;
         Ok(Self {

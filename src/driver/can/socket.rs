@@ -123,6 +123,14 @@ impl AsFd for Socket {
     }
 }
 
+/// Hands a frame to a socket that is not ours alone; how many bytes it took.
+pub(super) fn put(socket: BorrowedFd<'_>, frame: &CanFrame) -> rustix::io::Result<usize> {
+    let raw = to_raw(frame);
+    // SAFETY: `raw` is a whole can_frame of integers, without gaps, that outlives the slice.
+    let bytes = unsafe { std::slice::from_raw_parts((&raw const raw).cast::<u8>(), size_of::<libc::can_frame>()) };
+    rustix::io::write(socket, bytes)
+}
+
 /// Opens a socket and closes it: the first one of a kind makes the kernel load its modules.
 pub(super) fn load() {
     // SAFETY: plain numbers.

@@ -17,7 +17,7 @@
 use std::collections::BTreeSet;
 
 use super::HEADER;
-use crate::registry::spec::{CanAdapter, NodeSpec, Opens, Registry};
+use crate::registry::spec::{CanAdapter, CanProtocol, NodeSpec, Opens, Registry};
 
 /// Where the unit expects the registry.
 pub const SYSTEM_REGISTRY: &str = "/etc/rapid/devices.toml";
@@ -31,12 +31,15 @@ struct Needs {
     usb: bool,
     /// Programs of others run: nodes and hooks.
     programs: bool,
+    /// Motors have a guard, which outlives the program.
+    guard: bool,
 }
 
 impl Needs {
     fn of(registry: &Registry) -> Self {
         let mut needs = Self::default();
         for device in &registry.devices {
+            needs.guard |= matches!(&device.node, NodeSpec::Can(can) if matches!(can.protocol, CanProtocol::Damiao(_)));
             match &device.node {
                 NodeSpec::Can(can) if can.adapter == CanAdapter::SocketCan => {
                     needs.sockets.insert("AF_CAN");
@@ -62,6 +65,11 @@ impl Needs {
         all.collect::<Vec<_>>().join(" ")
     }
 
+    /// `KillMode=` and what has to do with it.
+    const fn kill_mode(&self) -> &'static str {
+        if self.guard { GUARDED } else { "KillMode=mixed\n" }
+    }
+
     /// Settings that only some registries permit, a line each.
     fn only_without(&self) -> String {
         let network = if self.sockets.iter().any(|family| family.starts_with("AF_INET")) { "" } else { NO_NETWORK };
@@ -72,6 +80,14 @@ impl Needs {
 
 /// Of a unit without sockets for the network.
 const NO_NETWORK: &str = "IPAddressDeny=any\n";
+
+/// Of a unit with motors.
+const GUARDED: &str = "\
+# Motors have a guard: a process of its own that stops them if rapid is killed. It ends by itself.
+KillMode=process
+# What keeps the beat of the motors is not to wait for a disk because memory is short.
+LimitMEMLOCK=infinity
+";
 
 /// What whoever has programs of their own should know.
 const PROGRAMS: &str = "\
@@ -86,7 +102,7 @@ const PROGRAMS: &str = "\
 pub(super) fn unit(registry: &Registry) -> String {
     let rig = &registry.rig.name;
     let needs = Needs::of(registry);
-    let (families, only_without) = (needs.families(), needs.only_without());
+    let (families, only_without, kill_mode) = (needs.families(), needs.only_without(), needs.kill_mode());
     // The group is that of the rules.
     let (make_group, group, allow) = if needs.usb {
         ("#   groupadd --system --force plugdev\n", " plugdev", "DeviceAllow=char-usb_device rw\n")
@@ -119,12 +135,13 @@ StateDirectoryMode=0750
 UMask=0027
 # SIGINT ends the episode in progress and closes its file; that takes one fsync.
 KillSignal=SIGINT
-KillMode=mixed
-TimeoutStopSec=30
+{kill_mode}TimeoutStopSec=30
 # An episode that is BAD is no failure of the service.
 SuccessExitStatus=4
 Restart=on-failure
 RestartSec=2
+# A rapid that hangs is killed, and started again.
+WatchdogSec=20
 # The thread `mask` asks for real-time scheduling.
 LimitRTPRIO=80
 

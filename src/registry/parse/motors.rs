@@ -86,7 +86,7 @@ pub(super) fn damiao(table: &Section<'_>, problems: &mut Problems<'_>) -> Option
     })
 }
 
-/// Warns of motors that continue for long once this program was killed.
+/// Warns of motors that continue for long once nothing commands them.
 pub(super) fn slow_to_stop(devices: &[DeviceSpec], entries: &[Entry], problems: &Problems<'_>) -> Vec<Diagnostic> {
     let warn = |device: &DeviceSpec| {
         let NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(motors), .. }) = &device.node else { return None };
@@ -95,8 +95,9 @@ pub(super) fn slow_to_stop(devices: &[DeviceSpec], entries: &[Entry], problems: 
             return None;
         }
         let timeout = show_duration(motors.timeout);
-        let message =
-            format!("timeout = {timeout}: for so long the motors follow their last command when rapid is killed");
+        let message = format!(
+            "timeout = {timeout}: for so long the motors follow their last command when rapid and its guard are gone"
+        );
         let fix = format!("write timeout = \"500ms\" or less in [{}.can]", place.table);
         Some(problems.diagnostic(place.at, &place.table, message, fix))
     };

@@ -8,8 +8,8 @@
 //! what happened, and a sample is handed over by tokio's channel, which allocates room for some dozens where
 //! none is free, and whose reader is woken under a lock of the runtime.
 //! Invariant: however the thread ends, a panic included, [`Powered`] tells every motor to turn off. Without a
-//! panic it also waits until each that was on has said that it is off, [`OFF_WITHIN`] at most. A process that
-//! is killed sends nothing: then the motors' own time limit does it.
+//! panic it also waits until each that was on has said that it is off, for a tenth of a second at most. A process that
+//! is killed sends nothing: then its guard does it.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -20,24 +20,18 @@ use std::time::Duration;
 
 use tokio::sync::mpsc;
 
+use super::powered::Powered;
 use super::tally::{Punctuality, Tally};
 use crate::action::{ActuatorNotice, Arming, Order, OrderSlot};
 use crate::control::can::CanFrame;
-use crate::control::motors::{BusState, MotorBus, SAMPLE_VALUES};
+use crate::control::motors::{BusState, SAMPLE_VALUES};
 use crate::driver::DriverError;
-use crate::driver::can::claim::Claim;
-use crate::driver::can::link::{Link, LinkError};
+use crate::driver::can::link::LinkError;
 use crate::fault;
-use crate::realtime::{CONTROL_PRIORITY, use_fifo};
+use crate::realtime::{CONTROL_PRIORITY, lock_memory, use_fifo};
 use crate::registry::{DamiaoSpec, MAX_MOTORS};
 use crate::time::Stamp;
 
-/// Motors are told to turn off so often at least, at [`AGAIN`] from one another: a frame may be lost.
-const TURN_OFF: usize = 3;
-/// ...and for this long at most, while one that was on has not said that it is off.
-const OFF_WITHIN: Duration = Duration::from_millis(100);
-/// See [`TURN_OFF`].
-const AGAIN: Duration = Duration::from_millis(5);
 /// Frames taken after the deadline of a cycle: a flooded bus must not keep the motors from their commands.
 const LATE_FRAMES: usize = 64;
 /// Trouble with the bus is told anew when there was none for so long.
@@ -102,57 +96,6 @@ impl Shared {
     }
 }
 
-/// An adapter with motors behind it that may be powered.
-#[derive(Debug)]
-struct Powered {
-    link: Link,
-    bus: MotorBus,
-    /// Until the last frame was sent.
-    _claim: Option<Claim>,
-}
-
-impl Drop for Powered {
-    fn drop(&mut self) {
-        // After a panic the bus may be half of what it was: it is asked for its frames, and fed no more.
-        let panics = std::thread::panicking();
-        let end = Stamp::now().after(OFF_WITHIN);
-        let mut frame = CanFrame::default();
-        let (mut rounds, mut gone, mut all_off) = (0, false, panics);
-        while rounds < TURN_OFF || !(all_off || gone || Stamp::now() >= end) {
-            rounds += 1;
-            for off in self.bus.stop_frames() {
-                // A bus that is gone has no motors to stop.
-                let _ = self.link.send(&off);
-            }
-            // Waiting also lets out what the adapter had no room for.
-            let until = Stamp::now().after(AGAIN);
-            loop {
-                match self.link.recv_until(until, &mut frame) {
-                    Ok(Some(arrival)) if !panics => self.bus.feed(&frame, arrival.at),
-                    Ok(Some(_)) | Err(LinkError::BusOff | LinkError::Full) => {}
-                    Ok(None) => break,
-                    Err(_) => {
-                        gone = true;
-                        break;
-                    }
-                }
-                if Stamp::now() >= until {
-                    break;
-                }
-            }
-            all_off = panics || self.bus.still_on().next().is_none();
-        }
-        if !all_off {
-            let motors = self.bus.still_on().collect::<Vec<_>>().join(", ");
-            tracing::warn!(
-                motors,
-                "motors were told to turn off and did not say that they are; without commands they stop by their own \
-                 time limit"
-            );
-        }
-    }
-}
-
 /// Something that goes on for a while, and is told when it begins.
 #[derive(Debug, Default)]
 struct Spell(Option<Stamp>);
@@ -189,7 +132,7 @@ pub(super) struct Beat {
 
 impl Beat {
     pub(super) fn new(
-        (link, claim): (Link, Option<Claim>),
+        powered: Powered,
         spec: &DamiaoSpec,
         targets: Receiver<Target>,
         samples: mpsc::Sender<Sample>,
@@ -197,7 +140,7 @@ impl Beat {
         shared: Arc<Shared>,
     ) -> Self {
         Self {
-            powered: Powered { link, bus: MotorBus::new(spec, Stamp::now()), _claim: claim },
+            powered,
             cycle: Duration::from_secs(1) / spec.hz.max(1),
             targets,
             samples,
@@ -220,6 +163,13 @@ impl Beat {
                 reason,
                 "the motors' thread has no real-time priority, so that a busy machine may delay it: run rapid as \
                  rapid.service does, or give the user `rtprio {CONTROL_PRIORITY}` in /etc/security/limits.conf"
+            );
+        }
+        if let Err(reason) = lock_memory() {
+            tracing::info!(
+                reason,
+                "the motors' thread may have to wait for memory that is on the disk: run rapid as rapid.service does, or \
+                 give the user `memlock unlimited` in /etc/security/limits.conf"
             );
         }
         let end = self.beat();
@@ -270,6 +220,7 @@ impl Beat {
                 Ok(Some(arrival)) => {
                     self.is_bus_off = false;
                     self.from_kernel &= arrival.from_kernel;
+                    self.powered.bus.look_for_stall(Stamp::now());
                     self.powered.bus.feed(&frame, arrival.at);
                     self.sample();
                 }
@@ -308,7 +259,7 @@ impl Beat {
     }
 
     fn step(&mut self, now: Stamp) -> Result<(), LinkError> {
-        let Powered { link, bus, .. } = &mut self.powered;
+        let Powered { link, bus, guard, .. } = &mut self.powered;
         let mut end = None;
         let (mut sent, mut full) = (false, 0);
         bus.step(now, |frame| match link.send(&frame) {
@@ -317,12 +268,18 @@ impl Beat {
             Err(LinkError::Full | LinkError::BusOff) => full += 1,
             Err(error) => end = Some(error),
         });
+        let trouble = guard.as_mut().and_then(|guard| guard.beat(bus));
         if sent && let Some(tick) = self.unsent.take() {
             self.tally.on_the_wire(Stamp::now().0.saturating_sub(tick.0));
         }
         self.tally.full += full;
         if full > 0 && self.full.goes_on(now) {
             self.complain(LinkError::Full.to_string());
+        }
+        if let Some(trouble) = trouble {
+            self.complain(format!(
+                "the guard of the motors {trouble}: if rapid is killed, they stop by their own time limit alone"
+            ));
         }
         end.map_or(Ok(()), Err)
     }

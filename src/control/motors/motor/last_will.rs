@@ -1,0 +1,33 @@
+//! What a motor is sent when this program can send nothing any more.
+
+use super::{Motor, Phase};
+use crate::control::can::CanFrame;
+use crate::control::damiao::codec::{self, Feedback, Mit, Order};
+use crate::registry::{MotorMode, Stop};
+
+impl Motor {
+    /// The frame that keeps the motor from falling, or from falling fast, while no program reads what it reports; one that
+    /// disables it where it is to be limp.
+    ///
+    /// A joint in MIT mode that is to hold is damped: with nobody to lower the stiffness, a joint that is pushed away would
+    /// push back with more than its torque limit.
+    pub(in crate::control::motors) fn last_will(&self, command: f64) -> CanFrame {
+        let slave = self.spec.slave;
+        let stop = match self.phase {
+            Phase::On => self.spec.stop.other_fault,
+            Phase::Kept(stop) => stop,
+            _ => Stop::Limp,
+        };
+        let frame = match (stop, self.spec.mode, self.ranges, self.feedback) {
+            (Stop::Damp | Stop::Hold, MotorMode::Mit { kd, .. }, Some(ranges), Some(Feedback { q, .. })) => {
+                codec::mit(slave, &Mit { kp: 0.0, kd, q, dq: 0.0, tau: 0.0 }, &ranges).ok()
+            }
+            (Stop::Damp | Stop::Hold, MotorMode::PositionVelocity, ..) => {
+                codec::position_velocity(slave, command, self.spec.velocity).ok()
+            }
+            (Stop::Damp | Stop::Hold, MotorMode::Velocity, ..) => codec::velocity(slave, 0.0).ok(),
+            _ => None,
+        };
+        frame.unwrap_or_else(|| Order::Disable.frame(slave))
+    }
+}

@@ -1,0 +1,174 @@
+//! The guard of a bus of motors: a process that stops them when this one cannot.
+//!
+//! Motors that are enabled follow their last command until their own time limit, and then fall. A process that is killed,
+//! crashes or is stopped sends nothing more; the guard holds the bus too and, within milliseconds of its death or once it
+//! has been silent for [`stalled_after`], sends each motor its last will: the frame that stops it as it is to stop at the
+//! fault of another, again and again for [`KEEP_FOR`], and then the order to disable. The motors' own time limit stays
+//! behind it as the second line.
+//!
+//! The guard is this program started once more, under the name [`NAME`], when an adapter with motors is opened. It has one
+//! end of a pair of sockets as its standard input, the adapter as its standard output, and nothing else that is open here.
+//! A message is a byte, [`OFF`], [`ON`] or [`DISMISSED`], and after [`ON`] a frame of [`FRAME`] bytes for each motor.
+//!
+//! Invariant: the guard sends nothing while the cycles come, nor while no motor is on.
+//! Invariant: what the motors answer is left to the guarded process as long as that runs.
+//! Invariant: a beat costs one system call, and neither allocates nor waits.
+//! Invariant: the guard has ended, or was killed, before the adapter is closed here: a serial line that it held open would
+//! come back under another name.
+
+mod process;
+
+use std::io;
+use std::os::fd::OwnedFd;
+use std::os::unix::process::CommandExt as _;
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::io::Errno;
+use rustix::net::{AddressFamily, SendFlags, SocketFlags, SocketType, send, socketpair};
+use rustix::process::{Pid, PidfdFlags, pidfd_open, setsid};
+
+use super::link::Link;
+use crate::control::can::CanFrame;
+use crate::control::motors::{MotorBus, stalled_after};
+use crate::driver::process::leak_nothing;
+use crate::registry::{CanSpec, DamiaoSpec, DeviceNode, MAX_MOTORS};
+
+pub use process::run;
+
+/// The name that the guard is started under, as its argument 0. It has no "rapid" in it: `pkill rapid` is not meant for it.
+pub const NAME: &str = "motor-guard";
+/// How long motors that are not to be limp are damped, or hold, before they are disabled: a joint that sinks damped has
+/// come to rest by then, and for longer nothing is kept on that no one watches.
+pub const KEEP_FOR: Duration = Duration::from_secs(5);
+
+/// No motor is on.
+const OFF: u8 = 0;
+/// Motors are on; their last will follows.
+const ON: u8 = 1;
+/// It is no longer needed.
+const DISMISSED: u8 = 2;
+/// Bytes of a frame: identifier (u32, little endian), length, three zeros, data.
+const FRAME: usize = 16;
+/// Longest message.
+const LONGEST: usize = 1 + MAX_MOTORS * FRAME;
+/// It ends within this when it is dismissed, or is killed.
+const ENDS_WITHIN: Duration = Duration::from_millis(200);
+
+/// The guard, as seen from the process that it guards.
+#[derive(Debug)]
+pub(super) struct Guard {
+    socket: OwnedFd,
+    process: Child,
+    /// What it heard last.
+    heard: u8,
+    /// It was reported that it does not listen.
+    is_reported: bool,
+}
+
+impl Guard {
+    /// Starts the guard of the motors of an entry, whose adapter is open.
+    ///
+    /// # Errors
+    /// When the system gives no socket or no process.
+    pub(super) fn start(link: &Link, can: &CanSpec, motors: &DamiaoSpec, node: &DeviceNode) -> io::Result<Self> {
+        let (ours, theirs) = socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None)?;
+        let interface = match node {
+            DeviceNode::Net(name) => name.as_str(),
+            _ => "-",
+        };
+        let mut command = Command::new("/proc/self/exe");
+        command
+            .arg0(NAME)
+            .arg(can.adapter.word())
+            .arg(stalled_after(motors).as_millis().to_string())
+            .arg(interface)
+            .args(motors.motors.iter().map(|motor| motor.slave.to_string()))
+            .current_dir("/")
+            .stdin(theirs)
+            .stdout(Stdio::from(link.duplicate()?));
+        // SAFETY: between fork and exec only system calls are made: no allocation, no lock. Errors are plain numbers.
+        unsafe { command.pre_exec(prepare) };
+        Ok(Self { socket: ours, process: command.spawn()?, heard: OFF, is_reported: false })
+    }
+
+    /// A cycle is over. Returns why the guard is of no use any more, the first time that it is.
+    pub(super) fn beat(&mut self, bus: &MotorBus) -> Option<&'static str> {
+        let mut message = [0; LONGEST];
+        let mut length = 1;
+        if let Some(frames) = bus.last_will() {
+            message[0] = ON;
+            for frame in frames {
+                if let Some(place) = message.get_mut(length..length + FRAME) {
+                    place.copy_from_slice(&encode(&frame));
+                    length += FRAME;
+                }
+            }
+        }
+        if message[0] == OFF && self.heard == OFF {
+            return None;
+        }
+        let sent = send(&self.socket, message.get(..length)?, SendFlags::DONTWAIT | SendFlags::NOSIGNAL);
+        let problem = match sent {
+            Ok(_) => {
+                self.heard = message[0];
+                return None;
+            }
+            Err(Errno::INTR | Errno::NOMEM | Errno::NOBUFS) => return None,
+            Err(Errno::AGAIN) => "does not run",
+            Err(_) => "has ended",
+        };
+        (!std::mem::replace(&mut self.is_reported, true)).then_some(problem)
+    }
+
+    /// The motors are off, or were ordered to be: it is to end. Returns when it has.
+    pub(super) fn dismiss(mut self) {
+        self.end();
+    }
+
+    fn end(&mut self) {
+        let _ = send(&self.socket, &[DISMISSED], SendFlags::DONTWAIT | SendFlags::NOSIGNAL);
+        let process = Pid::from_raw(self.process.id().cast_signed());
+        if let Some(Ok(process)) = process.map(|process| pidfd_open(process, PidfdFlags::empty())) {
+            let limit = Timespec { tv_sec: 0, tv_nsec: ENDS_WITHIN.subsec_nanos().into() };
+            let _ = poll(&mut [PollFd::new(&process, PollFlags::IN)], Some(&limit));
+        }
+        // One that has ended takes no harm.
+        let _ = self.process.kill();
+        let _ = self.process.wait();
+    }
+}
+
+impl Drop for Guard {
+    fn drop(&mut self) {
+        if matches!(self.process.try_wait(), Ok(None)) {
+            self.end();
+        }
+    }
+}
+
+/// Runs in the guard before its program does.
+fn prepare() -> io::Result<()> {
+    setsid()?;
+    // What ends the guarded process in order ends the guard by its message.
+    for signal in [libc::SIGINT, libc::SIGTERM, libc::SIGHUP, libc::SIGQUIT] {
+        // SAFETY: no handler of ours is involved.
+        unsafe { libc::signal(signal, libc::SIG_IGN) };
+    }
+    leak_nothing();
+    Ok(())
+}
+
+fn encode(frame: &CanFrame) -> [u8; FRAME] {
+    let mut bytes = [0; FRAME];
+    bytes[..4].copy_from_slice(&frame.id.to_le_bytes());
+    bytes[4] = frame.len;
+    bytes[8..].copy_from_slice(&frame.data);
+    bytes
+}
+
+fn decode(bytes: &[u8; FRAME]) -> CanFrame {
+    let [a, b, c, d, len, _, _, _, data @ ..] = *bytes;
+    CanFrame { id: u32::from_le_bytes([a, b, c, d]), len: len.min(8), data, ..CanFrame::default() }
+}

@@ -1,0 +1,330 @@
+//! The guard's own process: what it does when, and the loop around that.
+
+use std::ffi::OsString;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::fd::{AsFd, BorrowedFd};
+use rustix::io::Errno;
+use rustix::net::{RecvFlags, recv};
+
+use super::{DISMISSED, FRAME, KEEP_FOR, LONGEST, NAME, ON, decode};
+use crate::control::can::CanFrame;
+use crate::control::damiao::codec::Order;
+use crate::driver::can::claim::Claim;
+use crate::driver::can::{damiao_serial, slcan, socket};
+use crate::realtime::{CONTROL_PRIORITY, lock_memory, use_fifo};
+use crate::registry::{CanAdapter, MAX_MOTORS};
+use crate::time::Stamp;
+
+/// From one round of frames to the next.
+const ROUND: Duration = Duration::from_millis(5);
+/// For so long motors are disabled: a frame may be lost.
+const DISABLE_FOR: Duration = Duration::from_millis(100);
+
+/// What the guard was started with.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Post {
+    adapter: CanAdapter,
+    stalled_after: Duration,
+    /// The network interface, if the adapter is one.
+    interface: Option<String>,
+    off: Vec<CanFrame>,
+}
+
+impl Post {
+    fn read(args: impl Iterator<Item = OsString>) -> Option<Self> {
+        let mut args = args.map(OsString::into_string).map_while(Result::ok);
+        let adapter = args.next()?;
+        let (_, adapter) = CanAdapter::WORDS.into_iter().find(|(word, _)| *word == adapter)?;
+        let stalled_after = Duration::from_millis(args.next()?.parse().ok()?);
+        let interface = args.next().filter(|name| name != "-");
+        let off = args.map(|slave| Some(Order::Disable.frame(slave.parse().ok()?))).collect::<Option<Vec<_>>>()?;
+        (1..=MAX_MOTORS).contains(&off.len()).then_some(Self { adapter, stalled_after, interface, off })
+    }
+}
+
+/// What the guard is doing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum State {
+    /// No motor is on.
+    Idle,
+    /// Motors are on, and a cycle was over at this time.
+    Watching(Stamp),
+    /// It stops the motors since this time.
+    Stopping(Stamp),
+    /// It stopped them, and the guarded process does not run.
+    Stopped,
+    /// Nothing is left to do.
+    Done,
+}
+
+/// What the guard does when, without I/O.
+#[derive(Debug)]
+struct Ward {
+    post: Post,
+    state: State,
+    will: Vec<CanFrame>,
+    /// The guarded process has ended.
+    is_orphan: bool,
+}
+
+impl Ward {
+    fn new(post: Post) -> Self {
+        Self { post, state: State::Idle, will: Vec::with_capacity(MAX_MOTORS), is_orphan: false }
+    }
+
+    /// A message came.
+    fn hear(&mut self, message: &[u8], now: Stamp) {
+        match message {
+            [ON, frames @ ..] => {
+                self.will.clear();
+                self.will.extend(frames.as_chunks::<FRAME>().0.iter().map(decode));
+                self.state = State::Watching(now);
+            }
+            [DISMISSED, ..] => self.state = State::Done,
+            _ => self.state = State::Idle,
+        }
+    }
+
+    /// The guarded process has ended.
+    fn lose(&mut self, now: Stamp) {
+        self.is_orphan = true;
+        self.state = match self.state {
+            State::Watching(_) => State::Stopping(now),
+            State::Stopping(since) => State::Stopping(since),
+            State::Idle | State::Stopped | State::Done => State::Done,
+        };
+    }
+
+    /// How long motors are kept on: not at all where each is to be limp.
+    fn keep_for(&self) -> Duration {
+        if self.will.iter().all(|frame| self.post.off.contains(frame)) { Duration::ZERO } else { KEEP_FOR }
+    }
+
+    /// The frames of now, if any are to be sent.
+    fn due(&mut self, now: Stamp) -> &[CanFrame] {
+        if let State::Watching(heard) = self.state
+            && now.since(heard) >= self.post.stalled_after
+        {
+            self.state = State::Stopping(now);
+        }
+        let State::Stopping(since) = self.state else { return &[] };
+        let (passed, keep_for) = (now.since(since), self.keep_for());
+        if passed >= keep_for + DISABLE_FOR {
+            self.state = if self.is_orphan { State::Done } else { State::Stopped };
+        }
+        if passed < keep_for { &self.will } else { &self.post.off }
+    }
+
+    /// When [`Self::due`] is to be asked again, if no message comes; `None` is never.
+    fn next(&self, now: Stamp) -> Option<Duration> {
+        match self.state {
+            State::Watching(heard) => Some(heard.after(self.post.stalled_after).since(now)),
+            State::Stopping(_) => Some(ROUND),
+            State::Done => Some(Duration::ZERO),
+            State::Idle | State::Stopped => None,
+        }
+    }
+}
+
+/// Guards what is behind standard output until standard input closes; the arguments are those behind argument 0.
+#[must_use]
+pub fn run(args: impl Iterator<Item = OsString>) -> ExitCode {
+    let Some(post) = Post::read(args) else { return ExitCode::from(2) };
+    // The text of /proc/PID/comm, which would be that of the file that was started.
+    let _ = std::fs::write("/proc/self/comm", NAME);
+    // Neither is needed on an idle machine, and who may not have them was informed by thread `control`.
+    let _ = use_fifo(CONTROL_PRIORITY);
+    let _ = lock_memory();
+    let (input, output, error) = (std::io::stdin(), std::io::stdout(), std::io::stderr());
+    let mut ward = Ward::new(post);
+    if !guard(&mut ward, input.as_fd(), output.as_fd()) {
+        return ExitCode::SUCCESS;
+    }
+    // The motors are off: this may wait for its reader.
+    let kept = if ward.keep_for().is_zero() { "disabled" } else { "stopped as `other_fault` says, then disabled" };
+    let text = format!("rapid ended while its motors were on: its guard {kept} them\n");
+    let _ = rustix::io::write(error.as_fd(), text.as_bytes());
+    ExitCode::SUCCESS
+}
+
+/// Returns when there is nothing left to guard: did it stop the motors of a process that has ended?
+fn guard(ward: &mut Ward, input: BorrowedFd<'_>, output: BorrowedFd<'_>) -> bool {
+    let mut claim = None;
+    let mut has_sent = false;
+    loop {
+        listen(ward, input);
+        let now = Stamp::now();
+        let adapter = ward.post.adapter;
+        let frames = ward.due(now);
+        if !frames.is_empty() {
+            if !std::mem::replace(&mut has_sent, true) && adapter == CanAdapter::Slcan {
+                // Half a line may be what was sent last.
+                let _ = rustix::io::write(output, b"\r");
+            }
+            for frame in frames {
+                transmit(adapter, frame, output);
+            }
+            discard(adapter, output);
+        }
+        if ward.is_orphan && claim.is_none() {
+            // Until the motors are off no other program is to command them.
+            claim = ward.post.interface.as_deref().and_then(|name| Claim::take(name).ok());
+        }
+        if ward.state == State::Done {
+            if ward.is_orphan && adapter == CanAdapter::Slcan {
+                let _ = rustix::io::write(output, slcan::Command::Close.encode().bytes());
+            }
+            return has_sent && ward.is_orphan;
+        }
+        wait(ward.next(now), input, ward.is_orphan);
+    }
+}
+
+/// Takes all messages that wait.
+fn listen(ward: &mut Ward, input: BorrowedFd<'_>) {
+    let mut message = [0; LONGEST];
+    while !ward.is_orphan {
+        match recv(input, &mut message[..], RecvFlags::DONTWAIT) {
+            Ok((0, _)) | Err(Errno::CONNRESET) => ward.lose(Stamp::now()),
+            Ok((count, _)) => ward.hear(message.get(..count).unwrap_or_default(), Stamp::now()),
+            Err(Errno::INTR) => {}
+            Err(_) => return,
+        }
+    }
+}
+
+/// Waits for a message, or for so long.
+fn wait(limit: Option<Duration>, input: BorrowedFd<'_>, is_orphan: bool) {
+    let limit = limit.map(|limit| Timespec {
+        tv_sec: limit.as_secs().try_into().unwrap_or(i64::MAX),
+        tv_nsec: limit.subsec_nanos().into(),
+    });
+    let mut fds = [PollFd::from_borrowed_fd(input, PollFlags::IN)];
+    // The end of the input stays readable.
+    let count = usize::from(!is_orphan);
+    let _ = poll(fds.get_mut(..count).unwrap_or_default(), limit.as_ref());
+}
+
+/// Sends a frame, if there is room for it: it is sent again in the next round.
+fn transmit(adapter: CanAdapter, frame: &CanFrame, output: BorrowedFd<'_>) {
+    let _ = match adapter {
+        CanAdapter::SocketCan => socket::put(output, frame),
+        CanAdapter::Slcan => rustix::io::write(output, slcan::encode(frame).bytes()),
+        CanAdapter::Damiao => damiao_serial::encode(frame).map_or(Ok(0), |bytes| rustix::io::write(output, &bytes)),
+    };
+}
+
+/// Takes what the motors answer: an adapter on a serial line that cannot get rid of it may take no more frames.
+fn discard(adapter: CanAdapter, output: BorrowedFd<'_>) {
+    // A socket's queue drops what finds no room.
+    let is_line = adapter != CanAdapter::SocketCan;
+    let mut bytes = [0; 4096];
+    while is_line && rustix::io::read(output, &mut bytes).is_ok_and(|count| count == bytes.len()) {}
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::driver::can::guard::{OFF, encode};
+
+    fn ward() -> Ward {
+        let args = ["socketcan", "75", "can0", "5", "6"].map(OsString::from);
+        Ward::new(Post::read(args.into_iter()).unwrap())
+    }
+
+    fn will(frames: &[CanFrame]) -> Vec<u8> {
+        std::iter::once(ON).chain(frames.iter().flat_map(encode)).collect()
+    }
+
+    fn damping(slave: u16) -> CanFrame {
+        CanFrame::standard(slave, [1, 2, 3, 4, 0, 5, 6, 7])
+    }
+
+    const START: Stamp = Stamp(1_000_000_000);
+
+    fn at(ms: u64) -> Stamp {
+        START.after(Duration::from_millis(ms))
+    }
+
+    #[test]
+    fn what_it_is_started_with_is_read_back() {
+        let post = ward().post;
+        assert_eq!((post.adapter, post.stalled_after), (CanAdapter::SocketCan, Duration::from_millis(75)));
+        assert_eq!((post.interface.as_deref(), post.off.len()), (Some("can0"), 2));
+        for bad in [&["socketcan", "75", "can0"][..], &["usb", "75", "-", "5"], &["slcan", "x", "-", "5"], &["slcan"]] {
+            assert_eq!(Post::read(bad.iter().map(OsString::from)), None, "{bad:?}");
+        }
+    }
+
+    #[test]
+    fn frames_survive_the_way_to_it() {
+        let frame = damping(0x123);
+        assert_eq!(decode(&encode(&frame)), frame);
+    }
+
+    #[test]
+    fn it_sends_nothing_while_cycles_come_and_nothing_while_no_motor_is_on() {
+        let mut ward = ward();
+        for ms in 0..200 {
+            ward.hear(&will(&[damping(5), damping(6)]), at(ms * 74));
+            assert_eq!(ward.due(at(ms * 74 + 74)), &[], "{ms}");
+        }
+        ward.hear(&[OFF], at(20_000));
+        assert_eq!(ward.due(at(30_000)), &[]);
+        assert_eq!(ward.next(at(30_000)), None);
+        ward.lose(at(30_000));
+        assert_eq!(ward.due(at(30_000)), &[]);
+        assert_eq!(ward.state, State::Done);
+    }
+
+    #[test]
+    fn a_death_stops_the_motors_at_once_as_they_are_to_stop_and_later_disables_them() {
+        let mut ward = ward();
+        let frames = [damping(5), damping(6)];
+        ward.hear(&will(&frames), at(0));
+        ward.lose(at(3));
+        for ms in [3, 8, 5_002] {
+            assert_eq!(ward.due(at(ms)), frames, "{ms}");
+            assert_eq!(ward.next(at(ms)), Some(ROUND));
+        }
+        let off = ward.post.off.clone();
+        assert_eq!(ward.due(at(5_003)), off);
+        assert_eq!(ward.due(at(5_103)), off);
+        assert_eq!(ward.state, State::Done);
+    }
+
+    #[test]
+    fn motors_that_are_to_be_limp_are_disabled_at_once() {
+        let mut ward = ward();
+        let off = ward.post.off.clone();
+        ward.hear(&will(&off), at(0));
+        ward.lose(at(1));
+        assert_eq!(ward.due(at(1)), off);
+        ward.due(at(101));
+        assert_eq!(ward.state, State::Done);
+    }
+
+    #[test]
+    fn a_process_that_stands_still_is_stopped_for_and_watched_again_when_it_runs() {
+        let mut ward = ward();
+        let frames = [damping(5), damping(6)];
+        ward.hear(&will(&frames), at(0));
+        assert_eq!(ward.next(at(0)), Some(Duration::from_millis(75)));
+        assert_eq!(ward.due(at(75)), frames);
+        ward.hear(&will(&frames), at(300));
+        assert_eq!(ward.due(at(301)), &[]);
+        // It stands still for good.
+        assert_eq!(ward.due(at(375)), frames);
+        let off = ward.post.off.clone();
+        assert_eq!(ward.due(at(5_375)), off);
+        ward.due(at(5_475));
+        assert_eq!((ward.state, ward.next(at(5_475))), (State::Stopped, None));
+        ward.hear(&will(&frames), at(9_000));
+        assert_eq!(ward.state, State::Watching(at(9_000)));
+        ward.hear(&[DISMISSED], at(9_001));
+        assert_eq!(ward.state, State::Done);
+    }
+}

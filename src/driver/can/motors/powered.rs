@@ -1,0 +1,84 @@
+//! An adapter with motors behind it: however it is dropped, they are ordered to turn off.
+
+use std::time::Duration;
+
+use crate::control::can::CanFrame;
+use crate::control::motors::MotorBus;
+use crate::driver::can::claim::Claim;
+use crate::driver::can::guard::Guard;
+use crate::driver::can::link::{Link, LinkError};
+use crate::registry::DamiaoSpec;
+use crate::time::Stamp;
+
+/// Motors are told to turn off so often at least, at [`AGAIN`] from one another: a frame may be lost.
+const TURN_OFF: usize = 3;
+/// ...and for this long at most, while one that was on has not said that it is off.
+const OFF_WITHIN: Duration = Duration::from_millis(100);
+/// See [`TURN_OFF`].
+const AGAIN: Duration = Duration::from_millis(5);
+
+/// An adapter with motors behind it that may be powered.
+#[derive(Debug)]
+pub(super) struct Powered {
+    pub(super) link: Link,
+    pub(super) bus: MotorBus,
+    pub(super) guard: Option<Guard>,
+    /// Until the last frame was sent.
+    _claim: Option<Claim>,
+}
+
+impl Powered {
+    pub(super) fn new(link: Link, spec: &DamiaoSpec, guard: Option<Guard>, claim: Option<Claim>) -> Self {
+        Self { link, bus: MotorBus::new(spec, Stamp::now()), guard, _claim: claim }
+    }
+
+    /// The adapter, for people.
+    pub(super) fn description(&self) -> &str {
+        self.link.description()
+    }
+}
+
+impl Drop for Powered {
+    fn drop(&mut self) {
+        // After a panic the bus may be half of what it was: it is asked for its frames, and fed no more.
+        let panics = std::thread::panicking();
+        let end = Stamp::now().after(OFF_WITHIN);
+        let mut frame = CanFrame::default();
+        let (mut rounds, mut gone, mut all_off) = (0, false, panics);
+        while rounds < TURN_OFF || !(all_off || gone || Stamp::now() >= end) {
+            rounds += 1;
+            for off in self.bus.stop_frames() {
+                // A bus that is gone has no motors to stop.
+                let _ = self.link.send(&off);
+            }
+            // Waiting also lets out what the adapter had no room for.
+            let until = Stamp::now().after(AGAIN);
+            loop {
+                match self.link.recv_until(until, &mut frame) {
+                    Ok(Some(arrival)) if !panics => self.bus.feed(&frame, arrival.at),
+                    Ok(Some(_)) | Err(LinkError::BusOff | LinkError::Full) => {}
+                    Ok(None) => break,
+                    Err(_) => {
+                        gone = true;
+                        break;
+                    }
+                }
+                if Stamp::now() >= until {
+                    break;
+                }
+            }
+            all_off = panics || self.bus.still_on().next().is_none();
+        }
+        if let Some(guard) = self.guard.take() {
+            guard.dismiss();
+        }
+        if !all_off {
+            let motors = self.bus.still_on().collect::<Vec<_>>().join(", ");
+            tracing::warn!(
+                motors,
+                "motors were told to turn off and did not say that they are; without commands they stop by their own \
+                 time limit"
+            );
+        }
+    }
+}
