@@ -29,7 +29,7 @@ fn valid(name: &str) -> Loaded {
 
 #[test]
 fn every_mistake_is_told_in_full() {
-    mistakes::check("registry/invalid", "toml", 176, |text| {
+    mistakes::check("registry/invalid", "toml", 178, |text| {
         let errors = Registry::parse(text, Some(Path::new("devices.toml"))).err()?;
         Some((errors.to_string(), errors.diagnostics))
     });
@@ -217,6 +217,8 @@ fn a_bus_and_its_motors_arrive() {
     assert_eq!((roll.watch, roll.stop), (WatchSpec { lag: 0.5, ..WatchSpec::default() }, StopSpec::default()));
     let kept = StopSpec { own_fault: Stop::Hold, other_fault: Stop::Limp, hold_for: Some(ms(5000)) };
     assert_eq!((thumb.watch.margin, thumb.watch.blocked_after, thumb.stop), (0.05, None, kept));
+    let started = MotionSpec { acceleration: 8.0, soft_start: ms(250), first_target: 0.2 };
+    assert_eq!((roll.motion, thumb.motion), (MotionSpec::of_slew(4.0), started));
     let axes = hand.action.as_ref().unwrap();
     assert_eq!(
         (axes.names.join(" "), axes.units.join(" ")),

@@ -13,3 +13,4 @@ pub mod deadman;
 pub mod interpolate;
 pub mod limits;
 pub mod motors;
+pub mod ramp;

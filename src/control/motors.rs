@@ -23,11 +23,12 @@
 //! Invariant: one motor that is silent, faulty or hot stops all, each in its way ([`Stop`](crate::registry::Stop)): an
 //! arm must not continue without its elbow, nor fall because of it. None of them follows an action before the next arm.
 //! Invariant: the first command is where the joint is. From there a commanded position changes by the
-//! slew limit at most, and goes nowhere beyond the limits; of a joint that is beyond them it stays or
+//! slew limit at most, as softly as [`Ramp`] says, and goes nowhere beyond the limits; of a joint that is beyond them it stays or
 //! comes back. In MIT mode the stiffness asks for no more than the torque limit: the command comes towards the joint as
 //! fast as it may, and for the rest the stiffness is lowered.
 //! Invariant: cycles that stood still for longer than [`stalled_after`] end an arm: what happened to the motors meanwhile
 //! is not known.
+//! Invariant: the first action after an arm is near to where every joint is, or the arm is refused, or the action.
 //! Invariant: an action is followed only if its tick is after the arm, after those of all before it, and
 //! no older than the deadman allows.
 //! Invariant: a sample holds an answer of every motor, each newer than those of the sample before.
@@ -38,6 +39,7 @@ mod due;
 mod last_will;
 mod motor;
 mod notice;
+mod notices;
 mod watch;
 mod words;
 
@@ -45,8 +47,8 @@ use std::time::Duration;
 
 pub use last_will::stalled_after;
 use motor::Motor;
-use notice::Notices;
 pub use notice::{BusState, Fault, Notice, Part, Reason, Refusal, Strange};
+use notices::Notices;
 pub use words::Words;
 
 use super::can::CanFrame;
@@ -55,6 +57,7 @@ use super::damiao::parameter::Reply;
 use super::deadman::Deadman;
 use super::interpolate::Interpolator;
 use super::limits::Limits;
+use super::ramp::Ramp;
 use crate::registry::DamiaoSpec;
 use crate::time::Stamp;
 
@@ -76,6 +79,9 @@ pub struct MotorBus {
     limits: Vec<Limits>,
     commands: Vec<f64>,
     targets: Vec<f64>,
+    ramps: Vec<Ramp>,
+    /// The newest action, followed or not, and its tick.
+    asked: (Vec<f64>, Stamp),
     line: Interpolator,
     deadman: Deadman,
     state: BusState,
@@ -126,6 +132,8 @@ impl MotorBus {
             limits: spec.motors.iter().map(motor::limits).collect(),
             commands: vec![0.0; axes],
             targets: vec![0.0; axes],
+            ramps: spec.motors.iter().map(motor::ramp).collect(),
+            asked: (vec![0.0; axes], Stamp(0)),
             line: Interpolator::new(axes),
             deadman: Deadman::new(spec.deadman, spec.disable_after, cycle),
             state: BusState::Probing,
@@ -217,6 +225,10 @@ impl MotorBus {
             }
         }
         self.refusing = refusal;
+        if refusal.is_none() && tick >= self.asked.1 {
+            self.asked.0.copy_from_slice(target);
+            self.asked.1 = tick;
+        }
         let is_newer = self.line.tick().is_none_or(|last| tick > last);
         if refusal.is_some() || !self.is_armed() || tick < self.armed || !is_newer {
             return false;
@@ -249,9 +261,18 @@ impl MotorBus {
             Some(Refusal::Early)
         } else if now.since(tick) >= self.deadman.patience(self.line.period()) {
             Some(Refusal::Old)
+        } else if self.is_armed() && tick >= self.armed && self.line.tick().is_none() {
+            // The first one since the arm.
+            self.far(target).map(|motor| Refusal::Far { motor })
         } else {
             None
         }
+    }
+
+    /// The first motor that is too far from an action for it to be the first after an arm.
+    fn far(&self, target: &[f64]) -> Option<usize> {
+        let mut axes = self.motors.iter().zip(&self.limits).zip(target);
+        axes.position(|((motor, limits), target)| motor.is_far(*target, limits))
     }
 
     /// Enables all motors, after reading their parameters and clearing their faults. A notice says

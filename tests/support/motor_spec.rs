@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use rapid::registry::{DamiaoSpec, MotorKind, MotorMode, MotorSpec, Stop, StopSpec, WatchSpec};
+use rapid::registry::{DamiaoSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Stop, StopSpec, WatchSpec};
 
 /// A motor in MIT mode that listens to `slave` and answers with 0x10 more.
 pub(crate) fn motor(slave: u16) -> MotorSpec {
@@ -16,6 +16,8 @@ pub(crate) fn motor(slave: u16) -> MotorSpec {
         velocity: 20.0,
         torque: 5.0,
         slew: 5.0,
+        // How a joint starts has tests of its own.
+        motion: MotionSpec { acceleration: f64::INFINITY, soft_start: Duration::ZERO, first_target: 100.0 },
         watch: WatchSpec::default(),
         stop: StopSpec { own_fault: Stop::Limp, other_fault: Stop::Limp, hold_for: None },
         max_mos: 80.0,

@@ -7,6 +7,7 @@ use super::motor::{Motor, Phase};
 use super::notice::{BusState, Fault, Notice, Reason};
 use super::watch::Commanded;
 use crate::control::deadman::Verdict;
+use crate::control::ramp::Ramp;
 use crate::registry::{MotorMode, Stop};
 use crate::time::Stamp;
 
@@ -150,6 +151,10 @@ impl MotorBus {
             self.fail(Fault::OtherMaster { motor }, now);
             return;
         }
+        if let Some(fault) = self.far_from_actions(now) {
+            self.fail(fault, now);
+            return;
+        }
         if self.ask() {
             let axes = self.motors.iter_mut().zip(&mut self.commands).zip(&mut self.limits);
             let mut enabled =
@@ -163,6 +168,7 @@ impl MotorBus {
             self.armed = now;
             self.deadman.arm(now);
             self.line.restart(&self.commands);
+            self.ramps.iter_mut().for_each(Ramp::restart);
             self.hold(now);
             self.notices.tell(Notice::Armed);
         } else if waited >= ARM_WITHIN.max(self.cycle * ARM_CYCLES)
@@ -172,10 +178,27 @@ impl MotorBus {
         }
     }
 
-    /// Stays where the last command was.
+    /// What the actions that come ask for, if that is far from where a motor is that has not been enabled yet.
+    fn far_from_actions(&self, now: Stamp) -> Option<Fault> {
+        let (target, tick) = &self.asked;
+        if now.since(*tick) >= self.deadman.patience(self.line.period()) {
+            return None;
+        }
+        let motor = self.far(target)?;
+        let position = self.motors.get(motor)?.feedback?.q;
+        Some(Fault::Far { motor, position, target: *target.get(motor)? })
+    }
+
+    /// Stays where the last command was, or where it can stop.
     fn hold(&mut self, now: Stamp) {
-        for ((target, command), motor) in self.targets.iter_mut().zip(&self.commands).zip(&self.motors) {
-            *target = if motor.spec.mode == MotorMode::Velocity { 0.0 } else { *command };
+        let axes = self.targets.iter_mut().zip(&self.commands).zip(&self.motors).zip(&self.ramps).zip(&self.limits);
+        for ((((target, command), motor), ramp), limits) in axes {
+            let [low, high] = limits.range();
+            *target = match motor.spec.mode {
+                MotorMode::Velocity => 0.0,
+                // One that is beyond its limits stays there.
+                _ => ramp.stops_at(*command).clamp(low.min(*command), high.max(*command)),
+            };
         }
         self.line.hold(&self.targets);
         self.enter(BusState::Holding, now);
@@ -183,14 +206,18 @@ impl MotorBus {
 
     /// The commands of this cycle, and whether each motor does what it was commanded.
     fn follow(&mut self, now: Stamp, passed: Duration) {
-        let axes = self.motors.iter_mut().zip(&self.limits).zip(&mut self.commands);
+        let axes = self.motors.iter_mut().zip(&self.limits).zip(&mut self.commands).zip(&mut self.ramps);
         let mut first = None;
-        for (axis, ((motor, limits), command)) in axes.enumerate() {
-            let wanted = limits.slew(*command, self.line.at(axis, now), passed);
+        for (axis, (((motor, limits), command), ramp)) in axes.enumerate() {
+            let (before, target) = (*command, self.line.at(axis, now));
+            let wanted = match motor.spec.mode {
+                MotorMode::Velocity => limits.slew(before, target, passed),
+                _ => ramp.next(limits, before, target, passed),
+            };
             let bound = motor.bound(wanted, limits);
             // What a motor reports moves the command no faster than an action does.
-            *command =
-                if motor.spec.mode == MotorMode::Velocity { bound } else { limits.slew(*command, bound, passed) };
+            *command = if motor.spec.mode == MotorMode::Velocity { bound } else { limits.slew(before, bound, passed) };
+            ramp.took(*command - before, passed);
             let fault = motor.strange(Commanded { command: *command, wanted }, now, &mut self.notices);
             first = first.or(fault);
         }
@@ -222,6 +249,7 @@ impl MotorBus {
         }
         self.counts.faults += 1;
         self.notices.tell(Notice::Fault(fault));
+        self.name_latched(fault);
         let kept = |stop| {
             let kept = self.motors.iter().enumerate().filter(|(_, motor)| motor.phase == Phase::Kept(stop));
             kept.fold(0, |bits, (index, _)| bits | 1_u16 << (index % 16))
@@ -229,6 +257,16 @@ impl MotorBus {
         let [damped, held] = [Stop::Damp, Stop::Hold].map(kept);
         if damped | held != 0 {
             self.notices.tell(Notice::Kept { damped, held });
+        }
+    }
+
+    /// Reports every fault that motors have latched, once: it is for the next arm to clear them.
+    fn name_latched(&mut self, reported: Fault) {
+        for (motor, latching) in self.motors.iter_mut().enumerate() {
+            let Some(status) = latching.status.filter(|status| status.is_fault()) else { continue };
+            if latching.named.replace(status) != Some(status) && reported != (Fault::Latched { motor, status }) {
+                self.notices.tell(Notice::Latched { motor, status });
+            }
         }
     }
 

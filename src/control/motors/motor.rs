@@ -19,12 +19,14 @@ mod parameters;
 
 use std::time::Duration;
 
-use super::notice::{Fault, Notice, Notices, Part};
+use super::notice::{Fault, Notice, Part};
+use super::notices::Notices;
 use super::watch::Watch;
 use crate::control::can::CanFrame;
 use crate::control::damiao::codec::{self, Feedback, Mit, MotorStatus, Order, Ranges};
 use crate::control::damiao::parameter::{self, Parameter, Reply, TIMEOUT_UNIT_US, Value};
 use crate::control::limits::{Limits, stiffness, within_torque};
+use crate::control::ramp::Ramp;
 use crate::registry::{MotorMode, MotorSpec, Stop, StopSpec};
 use crate::time::Stamp;
 use parameters::PROBE;
@@ -67,6 +69,11 @@ pub(super) fn limits(spec: &MotorSpec) -> Limits {
     }
 }
 
+/// How the command of a motor's axis starts and changes.
+pub(super) const fn ramp(spec: &MotorSpec) -> Ramp {
+    Ramp::new(spec.motion.acceleration, spec.motion.soft_start)
+}
+
 /// Positions within what a motor counts in, from `-range` to `range`: those beyond can be neither sent nor
 /// seen. The lower end is above the higher one if there are none.
 fn within([low, high]: [f64; 2], range: f64) -> [f64; 2] {
@@ -100,6 +107,8 @@ pub(super) struct Motor {
     look: Option<Stamp>,
     looks: usize,
     differs: bool,
+    /// The fault that it has latched and that was reported: an arm after that clears it.
+    pub(super) named: Option<MotorStatus>,
     /// That it does not answer was told.
     pub(super) missed: bool,
     /// It was told to turn on, or said that it is on, and has not said since it was told to turn off that
@@ -127,6 +136,7 @@ impl Motor {
             look: None,
             looks: 0,
             differs: false,
+            named: None,
             missed: false,
             may_be_on: false,
         }
@@ -204,6 +214,7 @@ impl Motor {
         };
         self.asked = None;
         self.status = Some(feedback.status);
+        self.named = self.named.filter(|named| *named == feedback.status);
         self.may_be_on = feedback.status == MotorStatus::Enabled || self.may_be_on && !self.is_off();
         if let Some(ranges) = self.ranges {
             if !self.is_possible(&feedback, &ranges, now, notices)? {
@@ -253,7 +264,7 @@ impl Motor {
     /// command is where it is.
     ///
     /// # Errors
-    /// It stands where it may not be armed.
+    /// It stands where it may not be armed, or has latched a fault that was not reported yet.
     pub(super) fn enable(
         &mut self,
         command: &mut f64,
@@ -267,6 +278,9 @@ impl Motor {
         if self.phase == Phase::Probed {
             if let Some(fault) = self.outside() {
                 return Err(fault);
+            }
+            if status.is_fault() && self.named != Some(status) {
+                return Err(Fault::Latched { motor: self.index, status });
             }
             self.phase = Phase::Clearing;
             if status.is_fault() {
@@ -299,22 +313,6 @@ impl Motor {
             MotorMode::Mit { kp, .. } => within_torque(command, q, self.spec.torque, kp),
             MotorMode::PositionVelocity => command,
             MotorMode::Velocity => limits.brake(command, q, within(self.spec.position, ranges.position())),
-        }
-    }
-
-    /// Why it is not enabled by now, if it is not.
-    pub(super) fn arm_fault(&self) -> Option<Fault> {
-        let motor = self.index;
-        match (self.phase, self.status) {
-            // Who is probed waits for the others, which come to their own.
-            (Phase::On | Phase::Probed, _) => None,
-            (Phase::Off { .. }, Some(MotorStatus::Enabled)) | (Phase::Kept(_), _) => Some(Fault::NotDisabled { motor }),
-            (Phase::Off { .. }, _) => Some(Fault::Silent { motor }),
-            (Phase::Asked { .. }, _) => Some(Fault::Unread { motor, parameter: self.asked_for()? }),
-            (Phase::Clearing, Some(status)) if status != MotorStatus::Disabled => {
-                Some(Fault::Latched { motor, status })
-            }
-            (Phase::Clearing | Phase::Enabling, _) => Some(Fault::NotEnabled { motor }),
         }
     }
 

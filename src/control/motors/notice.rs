@@ -1,6 +1,5 @@
 //! What a bus of motors tells, for the log and for events; in words: `words`.
 
-use std::collections::VecDeque;
 use std::time::Duration;
 
 use super::words::Words;
@@ -135,6 +134,15 @@ pub enum Fault {
         /// Which.
         motor: usize,
     },
+    /// Actions ask for a position that is far from where the joint is.
+    Far {
+        /// Which motor.
+        motor: usize,
+        /// Where it is, rad.
+        position: f64,
+        /// What the actions ask for, rad.
+        target: f64,
+    },
     /// This program was held up: no motor was commanded for so long.
     Stalled {
         /// How long.
@@ -193,6 +201,11 @@ pub enum Refusal {
     Old,
     /// Its tick is in the future.
     Early,
+    /// It is the first after an arm, and far from where a joint is.
+    Far {
+        /// Which motor.
+        motor: usize,
+    },
 }
 
 /// What happened on a bus of motors. Each is told once when it begins, not again while it lasts.
@@ -248,6 +261,13 @@ pub enum Notice {
         /// What.
         what: Strange,
     },
+    /// A motor has latched a fault, beside the one that everything was stopped for.
+    Latched {
+        /// Which motor.
+        motor: usize,
+        /// The fault.
+        status: MotorStatus,
+    },
     /// A fault that a motor has latched is cleared, because an arm was asked for.
     Cleared {
         /// Which motor.
@@ -287,39 +307,6 @@ pub enum Notice {
     Refused(Refusal),
 }
 
-/// Notices that wait to be taken. The oldest are lost where there is no room, for nothing here
-/// allocates.
-#[derive(Debug)]
-pub(super) struct Notices {
-    waiting: VecDeque<Notice>,
-    lost: u64,
-}
-
-impl Notices {
-    /// Notices that may wait.
-    const ROOM: usize = 64;
-
-    pub(super) fn new() -> Self {
-        Self { waiting: VecDeque::with_capacity(Self::ROOM), lost: 0 }
-    }
-
-    pub(super) fn tell(&mut self, notice: Notice) {
-        if self.waiting.len() >= Self::ROOM {
-            self.waiting.pop_front();
-            self.lost += 1;
-        }
-        self.waiting.push_back(notice);
-    }
-
-    pub(super) fn take(&mut self) -> Option<Notice> {
-        self.waiting.pop_front()
-    }
-
-    pub(super) const fn lost(&self) -> u64 {
-        self.lost
-    }
-}
-
 impl Notice {
     /// Is it about something that an operator should look after?
     #[must_use]
@@ -341,6 +328,7 @@ impl Notice {
             | Self::OtherMaster { .. }
             | Self::Kept { .. }
             | Self::Cleared { .. }
+            | Self::Latched { .. }
             | Self::Clamped { .. }
             | Self::Refused(_) => true,
         }
@@ -366,6 +354,7 @@ impl Fault {
             | Self::Changed { motor, .. }
             | Self::OtherMaster { motor }
             | Self::Dropped { motor }
+            | Self::Far { motor, .. }
             | Self::NotEnabled { motor }
             | Self::NotDisabled { motor }
             | Self::Unread { motor, .. }

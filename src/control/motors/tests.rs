@@ -4,6 +4,7 @@
 mod always;
 mod arming;
 mod following;
+mod starting;
 mod stopping;
 mod watched;
 mod world;

@@ -62,6 +62,12 @@ impl fmt::Display for Words<'_, Fault> {
             Fault::OtherMaster { motor } => {
                 write!(f, "another program on the bus commands motor {}: end it", self.name(motor))
             }
+            Fault::Far { motor, position, target } => write!(
+                f,
+                "motor {} is at {position:.2} rad, and actions ask for {target:.2} rad: bring them together, or raise \
+                 `first_target`",
+                self.name(motor)
+            ),
             Fault::Stalled { after } => {
                 write!(f, "rapid was held up: no motor was commanded for {} ms", after.as_millis())
             }
@@ -81,14 +87,19 @@ impl fmt::Display for Words<'_, Fault> {
     }
 }
 
-impl fmt::Display for Refusal {
+impl fmt::Display for Words<'_, Refusal> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Length => "it has not one number for each motor",
-            Self::NotFinite => "a number of it is not finite",
-            Self::Old => "it is too old",
-            Self::Early => "its time is in the future",
-        })
+        match self.what {
+            Refusal::Length => f.write_str("it has not one number for each motor"),
+            Refusal::NotFinite => f.write_str("a number of it is not finite"),
+            Refusal::Old => f.write_str("it is too old"),
+            Refusal::Early => f.write_str("its time is in the future"),
+            Refusal::Far { motor } => write!(
+                f,
+                "it is the first after the arm, and motor {} is farther from it than `first_target`",
+                self.name(*motor)
+            ),
+        }
     }
 }
 
@@ -115,6 +126,9 @@ impl fmt::Display for Words<'_, Notice> {
             Notice::OtherMaster { motor } => {
                 write!(f, "another program on the bus commands motor {}: end it before an arm", self.name(*motor))
             }
+            Notice::Latched { motor, status } => {
+                write!(f, "motor {} reports {status}: the next arm clears it", self.name(*motor))
+            }
             Notice::Cleared { motor, status } => {
                 write!(f, "motor {} reported {status}: cleared for this arm", self.name(*motor))
             }
@@ -139,7 +153,9 @@ impl fmt::Display for Words<'_, Notice> {
             Notice::Clamped { motor, target, used } => {
                 write!(f, "target {target} of motor {} is beyond its limits; {used} is used", self.name(*motor))
             }
-            Notice::Refused(refusal) => write!(f, "an action moves nothing: {refusal}"),
+            Notice::Refused(refusal) => {
+                write!(f, "an action moves nothing: {}", Words { what: refusal, names: self.names })
+            }
         }
     }
 }

@@ -6,12 +6,12 @@ use super::window::Entry;
 use crate::registry::diagnostic::{Diagnostic, did_you_mean};
 use crate::registry::section::{Problems, Section};
 use crate::registry::spec::{
-    ActionSpec, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, MotorKind, MotorMode, MotorSpec, NodeSpec, Stop,
-    StopSpec, WatchSpec,
+    ActionSpec, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, NodeSpec,
+    Stop, StopSpec, WatchSpec,
 };
 use crate::registry::units::show_duration;
 
-const KEYS: [&str; 19] = [
+const KEYS: [&str; 22] = [
     "name",
     "slave",
     "master",
@@ -23,6 +23,9 @@ const KEYS: [&str; 19] = [
     "velocity",
     "torque",
     "slew",
+    "acceleration",
+    "soft_start",
+    "first_target",
     "margin",
     "lag",
     "blocked_after",
@@ -155,7 +158,10 @@ fn motor(entry: &Section<'_>, problems: &mut Problems<'_>) -> Option<MotorSpec> 
     let position = position(entry, mode, problems);
     // A position can change no faster than the motor turns; a speed within a hundredth of a second.
     let most_slew = if mode == Some(MotorMode::Velocity) { 100.0 * most_speed } else { most_speed };
-    let slew = above_zero(entry, "slew", most_slew, problems);
+    // To its highest speed within a tenth of a second.
+    let default_slew = if mode == Some(MotorMode::Velocity) { 10.0 * velocity } else { velocity };
+    let slew = above_zero(entry, "slew", most_slew, problems).unwrap_or(default_slew);
+    let motion = motion(entry, slew, mode, problems);
     let (watch, stop) = (watch(entry, problems), stop(entry, problems));
     let mut temperature = |key| entry.number(problems, key, 20.0..=150.0).unwrap_or(TEMPERATURE);
     let (max_mos, max_rotor) = (temperature("max_mos"), temperature("max_rotor"));
@@ -170,8 +176,8 @@ fn motor(entry: &Section<'_>, problems: &mut Problems<'_>) -> Option<MotorSpec> 
         position: position?,
         velocity,
         torque,
-        // To its highest speed within a tenth of a second.
-        slew: slew.unwrap_or(if mode == MotorMode::Velocity { 10.0 * velocity } else { velocity }),
+        slew,
+        motion,
         watch,
         stop,
         max_mos,
@@ -233,6 +239,24 @@ fn position(entry: &Section<'_>, mode: Option<MotorMode>, problems: &mut Problem
             entry.report(problems, "position", message, fix);
             None
         }
+    }
+}
+
+/// How the command of a position starts and changes.
+fn motion(entry: &Section<'_>, slew: f64, mode: Option<MotorMode>, problems: &mut Problems<'_>) -> MotionSpec {
+    let default = MotionSpec::of_slew(slew);
+    if mode == Some(MotorMode::Velocity) {
+        for key in ["acceleration", "soft_start", "first_target"].into_iter().filter(|key| entry.has(key)) {
+            let message = format!("a commanded velocity has no {key}");
+            entry.report(problems, key, message, format!("remove {key}; slew limits its acceleration"));
+        }
+        return default;
+    }
+    let soft_start = entry.duration(problems, "soft_start", Duration::ZERO..=Duration::from_secs(10));
+    MotionSpec {
+        acceleration: above_zero(entry, "acceleration", 100_000.0, problems).unwrap_or(default.acceleration),
+        soft_start: soft_start.unwrap_or(default.soft_start),
+        first_target: above_zero(entry, "first_target", 200.0, problems).unwrap_or(default.first_target),
     }
 }
 

@@ -49,6 +49,8 @@ pub struct MotorSpec {
     /// Highest change of the command: rad/s of a commanded position, rad/s² of a commanded velocity;
     /// above 0.
     pub slew: f64,
+    /// How it starts.
+    pub motion: MotionSpec,
     /// When what it does is a fault.
     pub watch: WatchSpec,
     /// How it stops at a fault.
@@ -86,6 +88,29 @@ impl Default for StopSpec {
     /// What is wrong with a joint is not driven on; the others sink slowly with it.
     fn default() -> Self {
         Self { own_fault: Stop::Limp, other_fault: Stop::Damp, hold_for: None }
+    }
+}
+
+/// How the command of a position starts and changes. Means nothing in [`MotorMode::Velocity`], whose slew limit is one of
+/// acceleration.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MotionSpec {
+    /// Highest acceleration of the command, rad/s²; above 0, infinite is none.
+    pub acceleration: f64,
+    /// After an arm the command reaches its highest speed in this time.
+    pub soft_start: Duration,
+    /// How far from the joint the first action after an arm may be, rad. Above 0.
+    pub first_target: f64,
+}
+
+impl MotionSpec {
+    /// To its highest speed within so many seconds.
+    const SPEEDS_UP_IN: f64 = 0.05;
+
+    /// For a command that changes by `slew` (rad/s) at most.
+    #[must_use]
+    pub fn of_slew(slew: f64) -> Self {
+        Self { acceleration: slew / Self::SPEEDS_UP_IN, soft_start: Duration::from_secs(1), first_target: 0.5 }
     }
 }
 
@@ -238,6 +263,7 @@ mod tests {
             velocity: 1.0,
             torque: 1.0,
             slew: 1.0,
+            motion: MotionSpec::of_slew(1.0),
             watch: WatchSpec::default(),
             stop: StopSpec::default(),
             max_mos: 80.0,

@@ -18,8 +18,8 @@ disable_after = "30s"
 timeout = "600ms"
 silent_after = "400ms"
 motors = [
-    { name = "shoulder", slave = 0x05, master = 0x15, type = "DMH3510", mode = "position", position = [-1.0, 1.0], slew = 2.0, other_fault = "limp" },
-    { name = "gripper", slave = 0x06, master = 0x16, type = "DM4310", mode = "position", position = [-1.0, 1.0], slew = 2.0, other_fault = "limp" },
+    { name = "shoulder", slave = 0x05, master = 0x15, type = "DMH3510", mode = "position", position = [-1.0, 1.0], slew = 2.0, first_target = 2, other_fault = "limp" },
+    { name = "gripper", slave = 0x06, master = 0x16, type = "DM4310", mode = "position", position = [-1.0, 1.0], slew = 2.0, first_target = 2, other_fault = "limp" },
 ]"#;
 
 const SCRIPT: &str = r#"

@@ -1,9 +1,12 @@
 //! What a motor reports, judged by its [`Watch`](crate::control::motors::watch::Watch).
 
 use super::{Motor, Phase};
-use crate::control::damiao::codec::{Feedback, Ranges};
-use crate::control::motors::notice::{Fault, Notice, Notices, Strange};
+use crate::control::damiao::codec::{Feedback, MotorStatus, Ranges};
+use crate::control::limits::Limits;
+use crate::control::motors::notice::{Fault, Notice, Strange};
+use crate::control::motors::notices::Notices;
 use crate::control::motors::watch::Commanded;
+use crate::registry::MotorMode;
 use crate::time::Stamp;
 
 impl Motor {
@@ -47,5 +50,30 @@ impl Motor {
         let is_outside = position < low - self.spec.watch.margin || position > high + self.spec.watch.margin;
         let what = Strange::Beyond { position, range: self.spec.position };
         is_outside.then_some(Fault::Strange { motor: self.index, what })
+    }
+
+    /// Is it too far from an action for that to be the first after an arm?
+    pub(in crate::control::motors) fn is_far(&self, target: f64, limits: &Limits) -> bool {
+        let Some(feedback) = self.feedback else { return false };
+        let [low, high] = limits.range();
+        // A target beyond the limits is none: the limit is used.
+        let far = (target.clamp(low, high) - feedback.q).abs() > self.spec.motion.first_target;
+        far && self.spec.mode != MotorMode::Velocity
+    }
+
+    /// Why it is not enabled by now, if it is not.
+    pub(in crate::control::motors) fn arm_fault(&self) -> Option<Fault> {
+        let motor = self.index;
+        match (self.phase, self.status) {
+            // Who is probed waits for the others, which come to their own.
+            (Phase::On | Phase::Probed, _) => None,
+            (Phase::Off { .. }, Some(MotorStatus::Enabled)) | (Phase::Kept(_), _) => Some(Fault::NotDisabled { motor }),
+            (Phase::Off { .. }, _) => Some(Fault::Silent { motor }),
+            (Phase::Asked { .. }, _) => Some(Fault::Unread { motor, parameter: self.asked_for()? }),
+            (Phase::Clearing, Some(status)) if status != MotorStatus::Disabled => {
+                Some(Fault::Latched { motor, status })
+            }
+            (Phase::Clearing | Phase::Enabling, _) => Some(Fault::NotEnabled { motor }),
+        }
     }
 }

@@ -7,7 +7,8 @@ use crate::control::can::CanFrame;
 use crate::control::damiao::codec::Ranges;
 use crate::control::damiao::model;
 use crate::control::damiao::parameter::{self, ControlMode, Parameter, Reply, Value};
-use crate::control::motors::notice::{Fault, Notice, Notices};
+use crate::control::motors::notice::{Fault, Notice};
+use crate::control::motors::notices::Notices;
 use crate::registry::MotorMode;
 use crate::time::Stamp;
 

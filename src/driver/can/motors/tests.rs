@@ -15,7 +15,7 @@ use crate::control::damiao::codec::{self, Feedback, MotorStatus, Ranges};
 use crate::control::damiao::parameter::{Parameter, Reply, Value};
 use crate::driver::can::link::tests::damiao_link;
 use crate::driver::can::socket::tests::{bus, bytes};
-use crate::registry::{MotorKind, MotorMode, MotorSpec, Stop, StopSpec, WatchSpec};
+use crate::registry::{MotionSpec, MotorKind, MotorMode, MotorSpec, Stop, StopSpec, WatchSpec};
 
 /// The longest that a condition is waited for.
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -31,6 +31,7 @@ fn spec(count: u16, hz: u32) -> DamiaoSpec {
         velocity: 5.0,
         torque: 5.0,
         slew: 5.0,
+        motion: MotionSpec { first_target: 10.0, ..MotionSpec::of_slew(5.0) },
         watch: WatchSpec::default(),
         stop: StopSpec { own_fault: Stop::Limp, other_fault: Stop::Limp, hold_for: None },
         max_mos: 80.0,

@@ -2,8 +2,8 @@
 
 use super::*;
 use crate::registry::{
-    ActionSpec, CanAdapter, CanProtocol, CanSpec, DamiaoSpec, MOTOR_CHANNELS, MotorKind, MotorMode, MotorSpec,
-    StopSpec, WatchSpec,
+    ActionSpec, CanAdapter, CanProtocol, CanSpec, DamiaoSpec, MOTOR_CHANNELS, MotionSpec, MotorKind, MotorMode,
+    MotorSpec, StopSpec, WatchSpec,
 };
 
 const NUMBERS: usize = MOTOR_CHANNELS;
@@ -20,6 +20,7 @@ fn arm() -> Registry {
         velocity: 1.0,
         torque: 1.0,
         slew: 1.0,
+        motion: MotionSpec::of_slew(1.0),
         watch: WatchSpec::default(),
         stop: StopSpec::default(),
         max_mos: 80.0,
