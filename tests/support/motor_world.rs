@@ -53,8 +53,8 @@ pub(crate) struct World {
     /// When it was told, and its words.
     pub(crate) notices: Vec<(Stamp, Notice, String)>,
     pub(crate) judge: Judge,
-    /// The newest target that was followed, and since when it is the same.
-    pub(crate) followed: Option<(Vec<f64>, Stamp)>,
+    /// The target that is followed.
+    pub(crate) followed: Option<Vec<f64>>,
     /// What reaches the program with its next cycle.
     arriving: Vec<CanFrame>,
     target: Option<Vec<f64>>,
@@ -89,10 +89,14 @@ pub(crate) struct Axis {
     pub(crate) command: Option<(f64, Stamp)>,
     /// What the newest MIT frame asks for at its newest position, Nm.
     pub(crate) torque: f64,
+    /// Commands that are where the joint is, because it is being enabled.
+    enabling: u8,
     /// The newest frame is one that damps.
     is_damped: bool,
     /// It neither hears nor answers.
     pub(crate) is_deaf: bool,
+    /// Another program commands it after the end of ours.
+    is_foreign: bool,
     /// Since when nothing has allowed it to be on.
     forbidden: Option<Stamp>,
     /// How it is to be stopped, by when.
@@ -176,6 +180,7 @@ impl World {
             ["disarm"] => {
                 self.bus.disarm(self.now);
                 self.judge.forbid();
+                self.judge.was_armed = false;
             }
             ["stop"] => {
                 let frames: Vec<CanFrame> = self.bus.stop_frames().collect();
@@ -216,6 +221,8 @@ impl World {
                 match order {
                     Order::Mute(is_deaf) => axis.is_deaf = is_deaf,
                     Order::Power(is_powered) => axis.is_deaf = !is_powered,
+                    // It turns itself off.
+                    Order::Fault(_) | Order::Hot(_) => {}
                     _ => continue,
                 }
                 (axis.kind, axis.forbidden) = (None, None);
@@ -230,6 +237,7 @@ impl World {
             if let Some(answer) = motor.hear(&frame, self.now.0) {
                 // Who turned it on, or off, is another.
                 (axis.forbidden, axis.kind) = (None, None);
+                axis.is_foreign = self.judge.stopped;
                 self.arriving.push(CanFrame::standard(answer.id as u16, answer.padded()));
             }
         }
@@ -257,7 +265,7 @@ impl World {
             return;
         }
         if self.away_until.take().is_some() {
-            self.judge.axes.iter_mut().for_each(|axis| axis.forbidden = None);
+            self.judge.axes.iter_mut().for_each(|axis| (axis.forbidden, axis.kind) = (None, None));
         }
         for mut frame in std::mem::take(&mut self.arriving) {
             self.arrive(&mut frame);
@@ -266,8 +274,8 @@ impl World {
             && let Some(target) = &self.target
         {
             self.action_due = now.after(ACTIONS);
-            if self.bus.target(target, now, now) && self.followed.as_ref().is_none_or(|(last, _)| last != target) {
-                self.followed = Some((target.clone(), now));
+            if self.bus.target(target, now, now) {
+                self.followed = Some(target.clone());
             }
         }
         let mut sent = Vec::new();
@@ -367,6 +375,8 @@ impl Judge {
         let mut wrong = Vec::new();
         if place == 0 && frame.data.starts_with(&[0xff; 7]) {
             (axis.command, axis.is_damped, axis.torque) = (None, false, 0.0);
+            // That with the order, and the first one after the motor says that it is enabled.
+            axis.enabling = if frame.data[7] == 0xfc { 2 } else { 0 };
             if frame.data[7] == 0xfc && !self.may_move {
                 wrong.push("it is enabled without an arm".to_owned());
             }
@@ -457,7 +467,7 @@ impl Judge {
                     wrong.push(format!("{name} stops {is:?} and not {expected:?}"));
                 }
             }
-            if self.may_move || self.may_keep || axis.is_deaf || !motor.is_on() {
+            if self.may_move || self.may_keep || axis.is_deaf || axis.is_foreign || !motor.is_on() {
                 axis.forbidden = None;
             } else if now.since(*axis.forbidden.get_or_insert(now)) > OFF_WITHIN {
                 axis.forbidden = Some(now);
@@ -487,7 +497,10 @@ impl Axis {
             return Some(format!("is pushed with {:.3} Nm", kp * error));
         }
         let [low, high] = motor.position;
-        let Some((before, at)) = self.command else {
+        let is_enabling = self.enabling > 0;
+        self.enabling = self.enabling.saturating_sub(1);
+        let before = self.command.filter(|_| !is_enabling);
+        let Some((before, at)) = before else {
             let jumps = error > ROUNDING + motor.slew * 2.0 * CYCLE.as_secs_f64();
             return jumps.then(|| format!("is first commanded {value:.4}, {error:.4} from where it is"));
         };

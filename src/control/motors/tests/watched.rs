@@ -136,12 +136,13 @@ fn a_blocked_joint_is_a_fault_though_actions_come_in_the_moment_of_a_step() {
 
 #[test]
 fn what_comes_again_within_a_second_is_not_told_again() {
-    let mut world = armed(|joint| joint.watch.blocked_after = None);
+    let mut world = armed(|joint| (joint.watch.blocked_after, joint.velocity) = (None, 5.0));
     for (cycles, stuck) in [(40, true), (40, false), (40, true), (200, false), (60, true)] {
         world.sims[0].stuck = stuck;
         assert_eq!(fault_within(&mut world, if stuck { 1.5 } else { 0.25 }, cycles), None);
     }
-    assert_eq!(words(&world).len(), 2, "{:?}", words(&world));
+    let blocked = words(&world).iter().filter(|word| word.contains("does not move")).count();
+    assert_eq!(blocked, 2, "{:?}", words(&world));
 }
 
 #[test]
@@ -167,6 +168,7 @@ fn a_speed_without_a_movement_is_a_frozen_encoder() {
                 let after = world.now.since(begun).as_millis();
                 assert!(matches!(fault, Fault::Strange { what: Strange::Frozen { .. }, .. }), "{fault:?}");
                 assert!((90..=120).contains(&after), "{after} ms");
+                break;
             }
         }
         assert!(matches!(world.bus.state(), BusState::Faulted(_)), "{mode:?}");
