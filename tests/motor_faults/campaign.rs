@@ -84,6 +84,8 @@ struct Campaign {
     /// Positions and speeds that did not change, since when.
     still: Vec<(f64, Stamp)>,
     paused: Stamp,
+    /// When the motors were not armed last.
+    armed: Stamp,
     story: String,
     wrong: Vec<String>,
 }
@@ -101,6 +103,7 @@ fn play(seed: u64) -> (Vec<String>, String) {
         seen: vec![Seen::default(); count],
         still: vec![(f64::NAN, now); count],
         paused: now,
+        armed: now,
         story: String::new(),
         wrong: Vec::new(),
     };
@@ -310,6 +313,9 @@ impl Campaign {
 
     fn look(&mut self) {
         let now = self.world.now;
+        if !self.world.bus.is_armed() {
+            self.armed = now;
+        }
         if !self.world.bus.is_armed() || now < self.paused {
             // Something else stopped them, or the program does not run.
             self.dues.clear();
