@@ -369,9 +369,10 @@ impl Campaign {
             since[at] = since[at].or(Some(now)).filter(|_| is_armed && now.since(newest[at]) < CYCLE * 3);
             let Some(since) = since[at].filter(|_| is_seen) else { continue };
             // The frame that shows it, and the cycle that says it.
-            if now.since(since.max(self.paused)) > NAMED_WITHIN + CYCLE * 2
-                && !self.is_named(motor, "", since.before(AGAIN))
-            {
+            let is_late = now.since(since.max(self.paused)) > NAMED_WITHIN + CYCLE * 2;
+            // A notice of a joint that is blocked comes once for as long as that lasts, which may have begun before.
+            let is_old = what == "blocked" && self.is_named(motor, "does not move", self.armed);
+            if is_late && !is_old && !self.is_named(motor, "", since.before(AGAIN)) {
                 self.seen[motor].since[at] = None;
                 self.note(&format!("joint_{} is {what} and not named", motor + 1));
             }
