@@ -73,7 +73,14 @@ pub enum Strange {
         /// The limit.
         torque: f64,
     },
-    /// It stands still, though pushed with all the torque that it may have.
+    /// It reports a speed and always the same position: its encoder stands still.
+    Frozen {
+        /// The position.
+        position: f64,
+        /// The speed.
+        velocity: f64,
+    },
+    /// It stands still, though pushed with all the torque that it may have: it is blocked, or its encoder stands still.
     Blocked {
         /// The limit.
         torque: f64,

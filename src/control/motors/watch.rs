@@ -33,14 +33,27 @@ const EXCEED_AFTER: Duration = Duration::from_millis(100);
 const DRIVEN_AFTER: Duration = Duration::from_millis(200);
 /// ...or lag behind what its own loop is commanded...
 const LAG_AFTER: Duration = Duration::from_millis(500);
-/// ...or not move though pushed with all the torque that it may have, before there is a word of it.
-const BLOCKED_WORD: Duration = Duration::from_millis(500);
+/// ...or report a speed and stand still, before there is a notice: a position may be read twice...
+const FROZEN_WORD: Duration = Duration::from_millis(30);
+/// ...and for how long after it.
+const FROZEN_AFTER: Duration = Duration::from_millis(70);
+/// How long a joint may stand still though pushed with all the torque that it may have, before there is a notice: what
+/// begins to move, or turns back, is slow for a moment.
+const BLOCKED_WORD: Duration = Duration::from_millis(40);
+/// Cycles in a row in which it is not the case end a spell: in the one in which an action comes, and by a step of what is
+/// measured, a joint at its highest torque may seem to have less.
+const ABSENT: u8 = 2;
+/// A notice is not repeated within this, though what it is about ceased and came again.
+const AGAIN: Duration = Duration::from_secs(1);
 
 /// How long something has been the case.
 #[derive(Debug, Clone, Copy, Default)]
 struct Spell {
     since: Option<Stamp>,
-    is_reported: bool,
+    /// Cycles in a row in which it was not the case.
+    absent: u8,
+    /// When there was a notice of it last.
+    reported: Option<Stamp>,
 }
 
 impl Spell {
@@ -53,11 +66,19 @@ impl Spell {
         tell: &mut dyn FnMut(Strange),
     ) -> Option<Strange> {
         let Some(strange) = strange else {
-            *self = Self::default();
+            self.absent = self.absent.saturating_add(1);
+            if self.absent >= ABSENT {
+                self.since = None;
+            }
             return None;
         };
-        let lasted = now.since(*self.since.get_or_insert(now));
-        if lasted >= word && !std::mem::replace(&mut self.is_reported, true) {
+        self.absent = 0;
+        let since = *self.since.get_or_insert(now);
+        let lasted = now.since(since);
+        // Once for all the time that it lasts, too.
+        let is_news = self.reported.is_none_or(|last| last < since && now.since(last) >= AGAIN);
+        if lasted >= word && is_news {
+            self.reported = Some(now);
             tell(strange);
         }
         (lasted >= limit).then_some(strange)
@@ -70,7 +91,17 @@ pub(super) struct Watch {
     /// When its newest frame came.
     heard: Option<Stamp>,
     jumps: u32,
-    spells: [Spell; 6],
+    still: Option<Still>,
+    spells: [Spell; 7],
+}
+
+/// Frames that all report a speed in one direction, and one position.
+#[derive(Debug, Clone, Copy)]
+struct Still {
+    since: Stamp,
+    newest: Stamp,
+    position: f64,
+    speed: f64,
 }
 
 /// What a joint is commanded in this cycle, rad or rad/s.
@@ -101,8 +132,9 @@ impl Watch {
         now: Stamp,
     ) -> Result<Option<Strange>, Strange> {
         let last = self.heard.replace(now);
-        let (Some(before), Some(last)) = (before, last) else { return Ok(None) };
         let step = 2.0 * ranges.position() / f64::from(u16::MAX);
+        self.compare_speed(feedback, step, now);
+        let (Some(before), Some(last)) = (before, last) else { return Ok(None) };
         // As fast as it was, and somewhat faster than it may be, which is a fault of its own.
         let fastest = (before.dq.abs() + too_fast(spec)).min(ranges.velocity());
         let reach = fastest * (now.since(last) + JITTER).as_secs_f64() + STEPS * step;
@@ -113,6 +145,25 @@ impl Watch {
         let jump = Strange::Jump { from: before.q, to: feedback.q };
         self.jumps += 1;
         if self.jumps < JUMPS { Ok(Some(jump)) } else { Err(jump) }
+    }
+
+    /// Does the position change as the speed says?
+    fn compare_speed(&mut self, feedback: &Feedback, step: f64, now: Stamp) {
+        let Feedback { q, dq, .. } = *feedback;
+        let is_still = |still: &Still| (q - still.position).abs() <= STEPS * step && still.speed * dq > 0.0;
+        self.still = if dq.abs() <= SLOW {
+            None
+        } else {
+            let begun = Still { since: now, newest: now, position: q, speed: dq };
+            Some(self.still.filter(is_still).map_or(begun, |still| Still { newest: now, ..still }))
+        };
+    }
+
+    /// Its encoder stands still, by frames of this long.
+    fn frozen(&self) -> Option<(Strange, Duration)> {
+        let still = self.still?;
+        let what = Strange::Frozen { position: still.position, velocity: still.speed };
+        Some((what, still.newest.since(still.since)))
     }
 
     /// The first of the impossible positions?
@@ -132,7 +183,10 @@ impl Watch {
         let mut tell = |what| notices.tell(Notice::Strange { motor: index, what });
         let at_once = Duration::ZERO;
         let never = Duration::MAX;
+        // Time passes in which no frame comes.
+        let frozen = self.frozen().filter(|(_, lasted)| *lasted >= FROZEN_WORD).map(|(what, _)| what);
         let table = [
+            (frozen, [at_once, FROZEN_AFTER]),
             (beyond(spec, feedback), [at_once, BEYOND_AFTER]),
             (fast(spec, feedback), [at_once, EXCEED_AFTER]),
             (strong(spec, feedback), [at_once, EXCEED_AFTER]),

@@ -41,7 +41,12 @@ impl fmt::Display for Strange {
             Self::Fast { velocity, limit } => write!(f, "moves at {velocity:.2} rad/s, and {limit} rad/s is its limit"),
             Self::Strong { torque, limit } => write!(f, "reports {torque:.2} Nm, and {limit} Nm is its limit"),
             Self::Driven { torque } => write!(f, "moves away from its command against {torque} Nm, its limit"),
-            Self::Blocked { torque } => write!(f, "does not move with {torque} Nm, its limit"),
+            Self::Frozen { position, velocity } => {
+                write!(f, "reports {velocity:.2} rad/s and stays at {position:.3} rad: its encoder stands still")
+            }
+            Self::Blocked { torque } => {
+                write!(f, "does not move with {torque} Nm, its limit: it is blocked, or its encoder stands still")
+            }
             Self::Lagging { command, is } => write!(f, "does not follow: {command:.3} is commanded, {is:.3} reported"),
         }
     }

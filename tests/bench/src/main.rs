@@ -26,6 +26,7 @@ mod picture;
 mod policy;
 mod process;
 mod replug;
+mod safety;
 mod start;
 mod stats;
 mod sync;
@@ -105,6 +106,7 @@ enum Section {
     Infer,
     Control,
     Motors,
+    Safety,
     Can,
     Eval,
     Unplug,
@@ -115,7 +117,7 @@ enum Section {
 
 impl Section {
     /// In this order: what must not be disturbed comes before what leaves dirty pages behind.
-    const ALL: [Self; 19] = [
+    const ALL: [Self; 20] = [
         Self::Start,
         Self::Infer,
         Self::Sync,
@@ -123,6 +125,7 @@ impl Section {
         Self::Policy,
         Self::Control,
         Self::Motors,
+        Self::Safety,
         Self::Can,
         Self::Eval,
         Self::Frame,
@@ -152,6 +155,7 @@ impl Section {
             Self::Infer => "infer",
             Self::Control => "control",
             Self::Motors => "motors",
+            Self::Safety => "safety",
             Self::Can => "can",
             Self::Eval => "eval",
             Self::Unplug => "unplug",
@@ -181,6 +185,7 @@ impl Section {
             Self::Infer => infer::measure(bench),
             Self::Control => control::measure(bench),
             Self::Motors => motors::measure(bench),
+            Self::Safety => safety::measure(bench),
             Self::Can => can::measure(bench),
             Self::Eval => eval::measure(bench),
             Self::Unplug => others::unplug(bench),

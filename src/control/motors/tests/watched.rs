@@ -116,6 +116,66 @@ fn what_lasts_is_a_fault_with_its_name_and_is_told_before() {
 }
 
 #[test]
+fn a_blocked_joint_is_a_fault_though_actions_come_in_the_moment_of_a_step() {
+    let mut world = armed(|_| {});
+    world.sims[0].stuck = true;
+    let begun = world.now;
+    let fault = (0..500).find_map(|cycle| {
+        if cycle % 20 == 0 {
+            // As the thread that drives the bus does it: with the time of the step.
+            let now = world.now.after(CYCLE);
+            world.bus.target(&[1.5], now, now);
+        }
+        world.cycle();
+        matches!(world.bus.state(), BusState::Faulted(_)).then_some(world.now)
+    });
+    let lasted = fault.expect("a fault").since(begun);
+    assert!((2000..2200).contains(&lasted.as_millis()), "{lasted:?}");
+    assert_eq!(words(&world).len(), 1, "{:?}", words(&world));
+}
+
+#[test]
+fn what_comes_again_within_a_second_is_not_told_again() {
+    let mut world = armed(|joint| (joint.watch.blocked_after, joint.velocity) = (None, 5.0));
+    for (cycles, stuck) in [(40, true), (40, false), (40, true), (200, false), (60, true)] {
+        world.sims[0].stuck = stuck;
+        assert_eq!(fault_within(&mut world, if stuck { 1.5 } else { 0.25 }, cycles), None);
+    }
+    let blocked = words(&world).iter().filter(|word| word.contains("does not move")).count();
+    assert_eq!(blocked, 2, "{:?}", words(&world));
+}
+
+#[test]
+fn a_speed_without_a_movement_is_a_frozen_encoder() {
+    for mode in [MIT, MotorMode::PositionVelocity, MotorMode::Velocity] {
+        let mut world = armed(|joint| joint.mode = mode);
+        assert_eq!(fault_within(&mut world, 0.25, 20), None);
+        let mut sim = world.sims[0].clone();
+        (sim.dq, sim.status) = (1.2, MotorStatus::Enabled);
+        let frozen = sim.feedback().unwrap();
+        world.sims[0].silent = true;
+        let begun = world.now;
+        for cycle in 1..=40 {
+            world.now = world.now.after(CYCLE);
+            world.bus.feed(&frozen, world.now);
+            world.bus.step(world.now, |_| {});
+            while let Some(notice) = world.bus.take_notice() {
+                world.notices.push(notice);
+            }
+            let said = words(&world).iter().filter(|word| word.contains("encoder stands still")).count();
+            assert_eq!(said, usize::from(cycle >= 7), "{mode:?}: {cycle} cycles, {:?}", words(&world));
+            if let BusState::Faulted(fault) = world.bus.state() {
+                let after = world.now.since(begun).as_millis();
+                assert!(matches!(fault, Fault::Strange { what: Strange::Frozen { .. }, .. }), "{fault:?}");
+                assert!((90..=120).contains(&after), "{after} ms");
+                break;
+            }
+        }
+        assert!(matches!(world.bus.state(), BusState::Faulted(_)), "{mode:?}");
+    }
+}
+
+#[test]
 fn a_gripper_may_hold_something_for_ever() {
     let mut world = armed(|joint| joint.watch.blocked_after = None);
     world.sims[0].stuck = true;

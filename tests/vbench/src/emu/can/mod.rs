@@ -11,7 +11,9 @@ pub mod damiao;
 pub mod gsusb;
 pub mod motion;
 pub mod motor;
+pub mod plant;
 pub mod registers;
+pub mod run;
 pub mod slcan;
 
 /// A classic CAN frame.

@@ -2,23 +2,24 @@
 //!
 //! Frames as in the vendor's `DM_CAN.py` and LeRobot's `motors/damiao`: MIT at its slave id, position with velocity at 0x100 more,
 //! velocity at 0x200 more, parameters at 0x7FF; the answer is one feedback or parameter frame at its master id. It moves towards
-//! what it is told with a lag of the first order, never faster than VMAX, and carries no load.
+//! what it is told with a lag of the first order, never faster than VMAX, and carries no load; once an order gives it a body
+//! (`plant`), it moves as that does under the torque of its loops, TMAX at the most, and without any while it is disabled.
 //!
 //! Invariant: every frame for a motor that can hear gets one answer, but for a register it does not have and a save while enabled.
-//! Invariant: it moves only while it is enabled; a fault and the time-out of its own disable it until somebody enables it again.
+//! Invariant: it moves by itself only while it is enabled; a fault and the time-out of its own disable it until somebody enables it again.
 
 use serde_json::{Value, json};
 
 use super::Frame;
 use super::motion::{Mit, reach, to_unsigned, turn};
+use super::plant::{Body, Drive, MOST_STEPS, Movement, STEP_NS, Trouble};
 use super::registers::{self, Registers, Type};
+use super::run::Run;
 use crate::emu::order::Order;
 use crate::emu::told::Told;
 
 /// Identifier that parameters of every motor are spoken to by.
 const PARAMETERS: u32 = 0x7ff;
-/// Commands further apart than this are two runs of commands.
-const RUN_ENDS_NS: u64 = 100_000_000;
 /// From this temperature on it protects itself, degrees Celsius.
 const TOO_HOT: u8 = 120;
 const COIL_TOO_HOT: u8 = 0xc;
@@ -34,34 +35,15 @@ pub struct Motor {
     muted: bool,
     fault: u8,
     degrees: u8,
-    goal: Goal,
-    position: f64,
-    velocity: f64,
-    torque: f64,
+    drive: Drive,
+    /// By its own count.
+    movement: Movement,
+    body: Option<Body>,
+    trouble: Trouble,
     moved_ns: u64,
     heard_ns: u64,
     run: Option<Run>,
     told: Vec<Told>,
-}
-
-/// Where it is going.
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum Goal {
-    Rest,
-    Reach { position: f64, fastest: f64 },
-    Turn(f64),
-}
-
-/// Commands that followed each other without a pause.
-#[derive(Clone, Copy, Debug)]
-struct Run {
-    count: u64,
-    last_ns: u64,
-    longest_gap_ns: u64,
-    /// Between the positions of two commands, rad.
-    largest_step: f64,
-    position: Option<f64>,
-    enabled: bool,
 }
 
 impl Motor {
@@ -76,10 +58,10 @@ impl Motor {
             muted: false,
             fault: 0,
             degrees: 30,
-            goal: Goal::Rest,
-            position: 0.0,
-            velocity: 0.0,
-            torque: 0.0,
+            drive: Drive::Off,
+            movement: Movement { position: 0.0, velocity: 0.0, torque: 0.0 },
+            body: None,
+            trouble: Trouble::default(),
             moved_ns: 0,
             heard_ns: 0,
             run: None,
@@ -90,6 +72,16 @@ impl Motor {
     /// Identifier it is spoken to by.
     pub fn slave(&self) -> u32 {
         self.registers.slave
+    }
+
+    /// The joint's true angle, rad, which a wrong zero and a frozen encoder do not change.
+    pub fn angle(&self) -> f64 {
+        self.movement.position - self.trouble.offset
+    }
+
+    /// Is it enabled?
+    pub fn is_on(&self) -> bool {
+        self.enabled && self.powered
     }
 
     /// What it has to tell since the last call.
@@ -141,7 +133,7 @@ impl Motor {
             }
         }
         if let Some(run) = self.run {
-            let ends_ns = run.last_ns + RUN_ENDS_NS;
+            let ends_ns = run.ends_ns();
             if now_ns >= ends_ns {
                 self.run = None;
                 self.tell("commands_end", run.summary());
@@ -171,9 +163,27 @@ impl Motor {
                 self.fault = 0;
                 self.stop();
             }
+            Order::Load { torque, is_lever } => {
+                let body = self.body.get_or_insert_default();
+                (body.load, body.is_lever) = (torque, is_lever);
+            }
+            Order::Friction([coulomb, viscous]) => {
+                let body = self.body.get_or_insert_default();
+                (body.coulomb, body.viscous) = (coulomb, viscous);
+            }
+            Order::Inertia(inertia) => self.body.get_or_insert_default().inertia = inertia,
+            Order::Ends(ends) => self.body.get_or_insert_default().ends = Some(ends),
+            Order::Zero(by) => self.shift(by),
+            Order::Freeze(frozen) => {
+                let Movement { position, velocity, .. } = self.movement;
+                self.trouble.frozen = frozen.then_some([position, velocity]);
+            }
+            Order::Block(blocked) => self.trouble.is_blocked = blocked,
             Order::Ask => {
+                let Movement { position, velocity, .. } = self.movement;
                 let state = json!({
-                    "enabled": self.enabled, "err": self.err(), "position": self.position, "velocity": self.velocity,
+                    "enabled": self.enabled, "err": self.err(), "position": position, "velocity": velocity,
+                    "angle": self.angle(),
                     "degrees": self.degrees, "mode": self.registers.mode, "timeout": self.registers.timeout,
                 });
                 self.tell("motor_state", state);
@@ -200,8 +210,8 @@ impl Motor {
                 self.tell("motor_disabled", json!({}));
             }
             0xfe => {
-                self.position = 0.0;
-                self.goal = Goal::Rest;
+                self.shift(-self.movement.position);
+                self.drive = Drive::Off;
                 self.tell("motor_zeroed", json!({}));
             }
             _ => {}
@@ -215,49 +225,39 @@ impl Motor {
             let value = f32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]);
             if value.is_finite() { f64::from(value) } else { 0.0 }
         };
-        let (goal, torque) = match self.registers.mode {
-            registers::MIT => {
-                let mit = Mit::decode(bytes, limits);
-                let torque =
-                    mit.kp * (mit.position - self.position) + mit.kd * (mit.velocity - self.velocity) + mit.torque;
-                let goal = if mit.kp > 0.0 {
-                    Goal::Reach { position: mit.position, fastest: vmax }
-                } else if mit.kd > 0.0 {
-                    Goal::Turn(mit.velocity)
-                } else {
-                    Goal::Rest
-                };
-                (goal, torque)
-            }
+        let drive = match self.registers.mode {
+            registers::MIT => Drive::Mit(Mit::decode(bytes, limits)),
             registers::POS_VEL => {
-                let fastest = real(4).abs().min(vmax);
-                (Goal::Reach { position: real(0).clamp(-pmax, pmax), fastest }, 0.0)
+                Drive::Position { position: real(0).clamp(-pmax, pmax), fastest: real(4).abs().min(vmax) }
             }
-            registers::VEL => (Goal::Turn(real(0).clamp(-vmax, vmax)), 0.0),
-            _ => (Goal::Rest, 0.0),
+            registers::VEL => Drive::Velocity(real(0).clamp(-vmax, vmax)),
+            _ => Drive::Off,
         };
         if self.enabled {
-            self.goal = goal;
-            self.torque = torque.clamp(-tmax, tmax);
+            self.drive = drive;
+            if self.body.is_none() {
+                let Movement { position, velocity, .. } = self.movement;
+                self.movement.torque = match drive {
+                    Drive::Mit(mit) => {
+                        mit.kp * (mit.position - position) + mit.kd * (mit.velocity - velocity) + mit.torque
+                    }
+                    _ => 0.0,
+                }
+                .clamp(-tmax, tmax);
+            }
         }
-        let position = match goal {
-            Goal::Reach { position, .. } => Some(position),
-            Goal::Rest | Goal::Turn(_) => None,
+        let position = match drive {
+            Drive::Mit(mit) => (mit.kp > 0.0).then_some(mit.position),
+            Drive::Position { position, .. } => Some(position),
+            Drive::Off | Drive::Velocity(_) => None,
         };
         let enabled = self.enabled;
-        let Some(run) = &mut self.run else {
-            self.run = Some(Run { count: 1, last_ns: now_ns, longest_gap_ns: 0, largest_step: 0.0, position, enabled });
+        if let Some(run) = &mut self.run {
+            run.take(position, enabled, now_ns);
+        } else {
+            self.run = Some(Run::begin(position, enabled, now_ns));
             self.tell("commands_begin", json!({"enabled": enabled, "position": position}));
-            return;
-        };
-        run.count += 1;
-        run.longest_gap_ns = run.longest_gap_ns.max(now_ns - run.last_ns);
-        if let (Some(last), Some(position)) = (run.position, position) {
-            run.largest_step = run.largest_step.max((position - last).abs());
         }
-        run.position = position.or(run.position);
-        run.enabled |= enabled;
-        run.last_ns = now_ns;
     }
 
     fn parameter(&mut self, bytes: [u8; 8]) -> Option<Frame> {
@@ -289,9 +289,11 @@ impl Motor {
     /// What it says of itself.
     fn feedback(&self) -> Frame {
         let [pmax, vmax, tmax] = [self.registers.pmax, self.registers.vmax, self.registers.tmax].map(f64::from);
-        let [p_high, p_low] = (to_unsigned(self.position, pmax, 16) as u16).to_be_bytes();
-        let [v_high, v_low] = (to_unsigned(self.velocity, vmax, 12) as u16).to_be_bytes();
-        let [t_high, t_low] = (to_unsigned(self.torque, tmax, 12) as u16).to_be_bytes();
+        let Movement { position, velocity, torque } = self.movement;
+        let [position, velocity] = self.trouble.frozen.unwrap_or([position, velocity]);
+        let [p_high, p_low] = (to_unsigned(position, pmax, 16) as u16).to_be_bytes();
+        let [v_high, v_low] = (to_unsigned(velocity, vmax, 12) as u16).to_be_bytes();
+        let [t_high, t_low] = (to_unsigned(torque, tmax, 12) as u16).to_be_bytes();
         let [id, ..] = self.registers.slave.to_le_bytes();
         Frame::data(
             self.master(),
@@ -324,39 +326,57 @@ impl Motor {
 
     fn stop(&mut self) {
         self.enabled = false;
-        self.goal = Goal::Rest;
-        self.velocity = 0.0;
-        self.torque = 0.0;
+        self.drive = Drive::Off;
+        self.movement.torque = 0.0;
+        if self.body.is_none() {
+            self.movement.velocity = 0.0;
+        }
+    }
+
+    /// Counts from another zero.
+    fn shift(&mut self, by: f64) {
+        self.movement.position += by;
+        self.trouble.offset += by;
     }
 
     fn advance(&mut self, now_ns: u64) {
-        let seconds = now_ns.saturating_sub(self.moved_ns) as f64 / 1e9;
+        let passed_ns = now_ns.saturating_sub(self.moved_ns);
+        if let Some(body) = self.body {
+            let steps = passed_ns / STEP_NS;
+            // What is left of a step is for the next call.
+            self.moved_ns += steps * STEP_NS;
+            let tmax = self.registers.tmax.into();
+            body.pass(steps.min(MOST_STEPS), &mut self.movement, self.drive, &self.trouble, tmax);
+            return;
+        }
         self.moved_ns = self.moved_ns.max(now_ns);
-        match self.goal {
-            Goal::Rest => self.velocity = 0.0,
-            Goal::Reach { position, fastest } => {
-                (self.position, self.velocity) = reach(self.position, position, fastest, seconds);
-            }
-            Goal::Turn(velocity) => {
-                let (moved, reached) = turn(self.velocity, velocity, seconds);
-                self.position += moved;
-                self.velocity = reached;
-            }
+        if self.trouble.is_blocked {
+            self.movement.velocity = 0.0;
+            return;
+        }
+        let Movement { position, velocity, torque } = self.movement;
+        let (position, velocity) = self.glide([position, velocity], passed_ns as f64 / 1e9);
+        self.movement = Movement { position, velocity, torque };
+    }
+
+    /// Position and velocity of a motor without a body, after a while.
+    fn glide(&self, [position, velocity]: [f64; 2], seconds: f64) -> (f64, f64) {
+        let turned = |wanted| {
+            let (moved, reached) = turn(velocity, wanted, seconds);
+            (position + moved, reached)
+        };
+        match self.drive {
+            Drive::Mit(mit) if mit.kp > 0.0 => reach(position, mit.position, self.registers.vmax.into(), seconds),
+            Drive::Mit(mit) if mit.kd > 0.0 => turned(mit.velocity),
+            Drive::Position { position: goal, fastest } => reach(position, goal, fastest, seconds),
+            Drive::Velocity(wanted) => turned(wanted),
+            Drive::Off | Drive::Mit(_) => (position, 0.0),
         }
     }
 
     fn tell(&mut self, action: &'static str, mut fields: Value) {
         fields["motor"] = json!(self.registers.slave);
         self.told.push(Told::new(action, fields));
-    }
-}
-
-impl Run {
-    fn summary(&self) -> Value {
-        json!({
-            "count": self.count, "last_mono_ns": self.last_ns, "longest_gap_ns": self.longest_gap_ns,
-            "largest_step": self.largest_step, "position": self.position, "enabled": self.enabled,
-        })
     }
 }
 

@@ -7,6 +7,7 @@ const MS: u64 = 1_000_000;
 const ENABLE: [u8; 8] = [0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xfc];
 const DISABLE: [u8; 8] = [0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xfd];
 const CLEAR: [u8; 8] = [0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xfb];
+const SET_ZERO: [u8; 8] = [0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xfe];
 const LIMITS: [f64; 3] = [12.5, 280.0, 1.0];
 /// MIT: to 1 rad at -10 rad/s with 0.5 Nm, without gains.
 const NO_GAINS: [u8; 8] = [0x8a, 0x3c, 0x7b, 0x60, 0x00, 0x00, 0x0b, 0xff];
@@ -183,6 +184,65 @@ fn a_run_of_commands_is_summed_up() {
     assert!((end.fields["largest_step"].as_f64().unwrap() - 0.3).abs() < 0.001);
 }
 
+/// Befalls it what a line of the script says.
+fn befall(motor: &mut Motor, line: &str, ms: u64) {
+    let mut words = line.split_whitespace();
+    let (_, order) = crate::emu::order::parse(words.next().unwrap(), &mut words).expect("an order");
+    motor.befall(order, ms * MS);
+}
+
+/// Commands it every 5 ms; the last answer.
+fn drive(motor: &mut Motor, bytes: [u8; 8], ms: std::ops::Range<u64>) -> [u8; 8] {
+    ms.step_by(5).map(|ms| ask(motor, 0x05, bytes, ms)).last().expect("an answer")
+}
+
+#[test]
+fn with_a_load_it_sags_while_on_and_falls_while_off() {
+    let mut motor = Motor::new(Type::named("DM4310").unwrap(), 0x05, 0x15);
+    for line in ["load 0 1.5", "ends 0 -1 1"] {
+        befall(&mut motor, line, 0);
+    }
+    ask(&mut motor, 0x05, ENABLE, 0);
+    // A stiffness of 20 Nm/rad, and 1 Nm s/rad of damping.
+    let mut hold = mit(0.0, 20.0);
+    hold[5] = 0x33;
+    let sagged = position(drive(&mut motor, hold, 0..2_000));
+    assert!((sagged + 0.075).abs() < 0.003, "{sagged}");
+    ask(&mut motor, 0x05, DISABLE, 2_000);
+    ask(&mut motor, 0x05, DISABLE, 2_500);
+    assert_eq!((motor.angle(), motor.is_on()), (-1.0, false));
+}
+
+#[test]
+fn a_wrong_zero_and_a_frozen_encoder_lie_about_where_it_is() {
+    let mut motor = motor();
+    befall(&mut motor, "inertia 0 0.02", 0);
+    befall(&mut motor, "zero 0 0.25", 0);
+    let reported = position(ask(&mut motor, 0x05, [0; 8], 5));
+    assert!((reported - 0.25).abs() < 0.001 && motor.angle().abs() < 1e-9, "{reported}");
+    befall(&mut motor, "freeze 0 1", 5);
+    befall(&mut motor, "load 0 0.5", 5);
+    let frozen = position(ask(&mut motor, 0x05, [0; 8], 200));
+    assert!((frozen - 0.25).abs() < 0.001 && motor.angle() < -0.1, "{frozen} at {}", motor.angle());
+    befall(&mut motor, "freeze 0 0", 200);
+    let angle = motor.angle();
+    ask(&mut motor, 0x05, SET_ZERO, 200);
+    assert!(position(ask(&mut motor, 0x05, [0; 8], 200)).abs() < 0.001);
+    assert!((motor.angle() - angle).abs() < 1e-9, "another zero moves nothing");
+}
+
+#[test]
+fn a_blocked_joint_stays_with_a_body_and_without() {
+    for body in [None, Some("load 0 0.1")] {
+        let mut motor = motor();
+        body.into_iter().chain(["block 0 1"]).for_each(|line| befall(&mut motor, line, 0));
+        ask(&mut motor, 0x05, ENABLE, 0);
+        assert!(position(drive(&mut motor, mit(1.0, 10.0), 0..500)).abs() < 0.001, "{body:?}");
+        befall(&mut motor, "block 0 0", 500);
+        assert!(position(drive(&mut motor, mit(1.0, 10.0), 500..700)) > 0.5, "{body:?}");
+    }
+}
+
 proptest! {
     #[test]
     fn it_never_moves_faster_than_it_can(
@@ -205,7 +265,7 @@ proptest! {
         for (frame, ms) in frames {
             now_ns += ms * MS;
             motor.hear(&frame, now_ns);
-            prop_assert!(motor.position.is_finite());
+            prop_assert!(motor.movement.position.is_finite());
         }
     }
 
@@ -220,7 +280,7 @@ proptest! {
                 bytes[..2].copy_from_slice(&[0x05, 0]);
             }
             motor.hear(&Frame::data(id, bytes), place as u64 * MS);
-            prop_assert!(motor.position.is_finite() && motor.velocity.is_finite());
+            prop_assert!(motor.movement.position.is_finite() && motor.movement.velocity.is_finite());
         }
     }
 }
