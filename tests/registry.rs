@@ -13,9 +13,9 @@ use proptest::prelude::*;
 use rapid::modality::ModalityKind;
 use rapid::registry::scenario::Scenario;
 use rapid::registry::{
-    BUILTIN, CanAdapter, CanProtocol, DeviceSpec, Framing, Hook, LanFind, LanPicture, LanProtocol, Loaded, MotorKind,
-    MotorMode, NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream, Probe, Registry, Stop, StopSpec, VerdictSpec,
-    WatchSpec,
+    BUILTIN, CanAdapter, CanProtocol, DeviceSpec, Framing, Hook, LanFind, LanPicture, LanProtocol, Loaded, MotionSpec,
+    MotorKind, MotorMode, NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream, Probe, Registry, Stop, StopSpec,
+    VerdictSpec, WatchSpec,
 };
 
 fn files(folder: &str) -> Vec<PathBuf> {

@@ -293,6 +293,7 @@ impl World {
         if self.instead.is_some() {
             return self.cycle_instead();
         }
+        self.bus.look_for_stall(now);
         for frame in std::mem::take(&mut self.arriving) {
             self.bus.feed(&frame, now);
         }
@@ -468,16 +469,16 @@ impl Judge {
         for (place, fault) in faults.into_iter().enumerate() {
             self.may_move = false;
             let own = fault.motor();
-            if !fault.words(bus.names()).to_string().contains(&spec.motors[own].name) {
+            if !own.is_none_or(|own| fault.words(bus.names()).to_string().contains(&spec.motors[own].name)) {
                 self.note(now, &format!("{fault:?} does not name its motor"));
             }
             for (at, (axis, motor)) in self.axes.iter_mut().zip(motors).enumerate() {
                 let stop = spec.motors[at].stop;
-                let kind = if at == own { stop.own_fault } else { stop.other_fault };
+                let kind = if Some(at) == own { stop.own_fault } else { stop.other_fault };
                 // Who was stopped before stays so; who is off, or does not hear, cannot be kept.
                 if place == 0 && self.was_armed && motor.is_on() && !axis.is_deaf && self.may_keep {
                     axis.kind = Some((kind, now.after(KIND_WITHIN)));
-                } else if at == own {
+                } else if Some(at) == own {
                     axis.kind = None;
                 }
             }
