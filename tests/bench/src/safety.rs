@@ -51,7 +51,7 @@ const fn event(name: &'static str, lines: &'static [&'static str]) -> Event {
     Event { name, lines, torque: [3.0, LOAD], stops: true, other: Stop::Damp }
 }
 
-const EVENTS: [Event; 20] = [
+const EVENTS: [Event; 21] = [
     Event { stops: false, ..event("a damaged frame", &["damage 1 1 6.283"]) },
     event("damaged frames", &["damage 1 20 0.3"]),
     event("its zero is set by another", &["foreign 001 fffffffffffffffe"]),
@@ -62,6 +62,7 @@ const EVENTS: [Event; 20] = [
     event("encoder frozen", &["freeze 0.1 1", "target 0.9 0.3"]),
     event("TIMEOUT rewritten", &["foreign 7ff 0100550900000000"]),
     event("TIMEOUT rewritten unseen", &["rewrite 1 9 0"]),
+    event("PMAX rewritten", &["foreign 7ff 010055150000c841"]),
     event("mode rewritten unseen", &["rewrite 1 10 3"]),
     event("another master", &["foreign 001 7fff7ff0000007ff"]),
     event("mute", &["mute 0.1 1"]),
