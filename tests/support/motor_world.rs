@@ -365,6 +365,8 @@ impl World {
             return "limp";
         }
         match self.bus.state() {
+            // It goes on as it was told last.
+            _ if self.judge.axes[motor].is_deaf => "on",
             BusState::Following => "follow",
             BusState::Faulted(_) if self.judge.axes[motor].is_damped => "damp",
             BusState::Holding | BusState::Faulted(_) => "hold",

@@ -51,7 +51,7 @@ const fn event(name: &'static str, lines: &'static [&'static str]) -> Event {
     Event { name, lines, torque: [3.0, LOAD], stops: true, other: Stop::Damp }
 }
 
-const EVENTS: [Event; 20] = [
+const EVENTS: [Event; 21] = [
     Event { stops: false, ..event("a damaged frame", &["damage 1 1 6.283"]) },
     event("damaged frames", &["damage 1 20 0.3"]),
     event("its zero is set by another", &["foreign 001 fffffffffffffffe"]),
@@ -62,6 +62,7 @@ const EVENTS: [Event; 20] = [
     event("encoder frozen", &["freeze 0.1 1", "target 0.9 0.3"]),
     event("TIMEOUT rewritten", &["foreign 7ff 0100550900000000"]),
     event("TIMEOUT rewritten unseen", &["rewrite 1 9 0"]),
+    event("PMAX rewritten", &["foreign 7ff 010055150000c841"]),
     event("mode rewritten unseen", &["rewrite 1 10 3"]),
     event("another master", &["foreign 001 7fff7ff0000007ff"]),
     event("mute", &["mute 0.1 1"]),
@@ -84,7 +85,7 @@ pub(crate) fn measure(_bench: &Bench) -> Result<Vec<Figure>, Failure> {
         let note = format!("{words}Then {} and {}{has_none}", ours.joints[0], ours.joints[1]);
         let ms = |outcome: &Outcome| outcome.stopped.map(|after| after.as_secs_f64() * 1e3);
         if event.stops {
-            figures.push(Figure::new(name("stopped"), "ms", ms(&ours)).baseline(ms(&plain)).note(note));
+            figures.push(Figure::new(name("both stopped"), "ms", ms(&ours)).baseline(ms(&plain)).note(note));
         }
         for (joint, what) in ["this joint, first second", "the other joint"].into_iter().enumerate() {
             figures.push(Figure::new(name(what), "rad", Some(ours.moved[joint])).baseline(Some(plain.moved[joint])));
@@ -103,7 +104,7 @@ pub(crate) fn measure(_bench: &Bench) -> Result<Vec<Figure>, Failure> {
 }
 
 struct Outcome {
-    /// From the event until the joint is off, damped or held.
+    /// From the event until both joints are off, damped or held.
     stopped: Option<Duration>,
     /// How far each joint went from where it was.
     moved: [f64; 2],
@@ -139,17 +140,20 @@ fn play(event: &Event, is_plain: bool) -> Outcome {
     let begun = world.now;
     let from = [0, 1].map(|joint: usize| world.motors[joint].angle());
     let mut outcome = Outcome { stopped: None, moved: [0.0; 2], joints: ["", ""], words: None };
-    for line in event.lines {
-        match line.strip_prefix("wait ").and_then(|ms| ms.parse().ok()) {
-            Some(ms) => world.run(ms),
-            None => world.play(line),
-        }
-    }
+    let (mut lines, mut due) = (event.lines.iter(), begun);
     while world.now.since(begun) < WINDOW {
+        while world.now >= due
+            && let Some(line) = lines.next()
+        {
+            match line.strip_prefix("wait ").and_then(|ms| ms.parse().ok()) {
+                Some(ms) => due = world.now.after(Duration::from_millis(ms)),
+                None => world.play(line),
+            }
+        }
         world.cycle();
         let after = world.now.since(begun);
-        let is_kept = if is_plain { holds.get() } else { matches!(world.kind(0), "damp" | "hold") };
-        if !world.motors[0].is_on() || is_kept {
+        let is_kept = |joint| if is_plain { holds.get() } else { matches!(world.kind(joint), "damp" | "hold") };
+        if (0..2).all(|joint: usize| !world.motors[joint].is_on() || is_kept(joint)) {
             outcome.stopped.get_or_insert(after);
         }
         for joint in (0..2).filter(|_| after <= FIRST) {

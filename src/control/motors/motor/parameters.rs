@@ -38,10 +38,9 @@ impl Motor {
         let motor = self.index;
         if self.phase == Phase::On {
             let changed = Fault::Changed { motor, parameter: reply.parameter, value: reply.value };
-            return self
-                .wanted(reply.parameter)
-                .filter(|wanted| *wanted != reply.value)
-                .map_or(Ok(()), |_| Err(changed));
+            let is_changed = self.wanted(reply.parameter).is_some_and(|wanted| wanted != reply.value)
+                || self.range(reply.parameter).is_some_and(|range| range.to_bits() != reply.value.number().to_bits());
+            return if is_changed { Err(changed) } else { Ok(()) };
         }
         let Phase::Asked { at, setting } = self.phase else { return Ok(()) };
         // What comes late, to an earlier question or to one that was repeated, answers nothing.
@@ -110,6 +109,17 @@ impl Motor {
                 MotorMode::Velocity => ControlMode::Velocity,
             } as u32)),
             Parameter::Timeout => Some(Value::Whole(self.timeout)),
+            _ => None,
+        }
+    }
+
+    /// What it said that it counts in, if that is a range: by another one every position means something else.
+    fn range(&self, parameter: Parameter) -> Option<f64> {
+        let [p, v, t] = self.read;
+        match parameter {
+            Parameter::PMax => Some(p),
+            Parameter::VMax => Some(v),
+            Parameter::TMax => Some(t),
             _ => None,
         }
     }

@@ -4,6 +4,7 @@ use std::f64::consts::TAU;
 
 use super::world::CYCLE;
 use super::*;
+use crate::control::damiao::parameter::{Parameter, Value};
 use crate::registry::MotorSpec;
 
 /// One motor that is armed, changed by `change` before.
@@ -206,6 +207,21 @@ fn what_another_program_sets_is_noticed_within_a_second() {
         // The next arm sets it right.
         world.arm();
         world.run_until(BusState::Holding);
+    }
+}
+
+#[test]
+fn another_range_is_noticed_in_the_answer_to_who_sets_it() {
+    for (parameter, value) in [(Parameter::PMax, 25.0), (Parameter::VMax, 10.0), (Parameter::TMax, 28.0)] {
+        let mut world = armed(|_| {});
+        assert_eq!(fault_within(&mut world, 0.25, 20), None);
+        let same = Reply { slave: 1, written: true, parameter: Parameter::PMax, value: Value::Float(12.5) };
+        world.bus.feed(&same.encode(0x11), world.now);
+        assert_eq!(fault_within(&mut world, 0.25, 1), None, "the same as before");
+        let reply = Reply { value: Value::Float(value), parameter, ..same };
+        world.bus.feed(&reply.encode(0x11), world.now);
+        let (fault, _) = fault_within(&mut world, 0.25, 1).expect("a fault");
+        assert!(matches!(fault, Fault::Changed { motor: 0, .. }), "{fault:?}");
     }
 }
 
