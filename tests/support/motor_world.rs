@@ -470,8 +470,8 @@ impl Judge {
         }
         for (place, fault) in faults.into_iter().enumerate() {
             self.may_move = false;
-            let own = fault.motor();
-            if !own.is_none_or(|own| fault.words(bus.names()).to_string().contains(&spec.motors[own].name)) {
+            let own = fault.own();
+            if !fault.motor().is_none_or(|own| fault.words(bus.names()).to_string().contains(&spec.motors[own].name)) {
                 self.note(now, &format!("{fault:?} does not name its motor"));
             }
             for (at, (axis, motor)) in self.axes.iter_mut().zip(motors).enumerate() {

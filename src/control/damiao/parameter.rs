@@ -168,6 +168,17 @@ pub const fn refresh(slave: u16) -> CanFrame {
     request(slave, REFRESH, 0, [0; 4])
 }
 
+/// The motor whose parameters this frame sets or saves, if it is a request to.
+#[must_use]
+pub const fn is_write(frame: &CanFrame) -> Option<u16> {
+    match frame.data {
+        [low, high, WRITE | SAVE, ..] if frame.id == BROADCAST as u32 && !frame.extended => {
+            Some(u16::from_le_bytes([low, high]))
+        }
+        _ => None,
+    }
+}
+
 const fn request(slave: u16, verb: u8, rid: u8, value: [u8; 4]) -> CanFrame {
     let [low, high] = slave.to_le_bytes();
     let [a, b, c, d] = value;

@@ -238,7 +238,7 @@ impl MotorBus {
 
     /// Stops all motors, each as it is to be stopped; of motors that are stopped already only that with the fault.
     pub(super) fn fail(&mut self, fault: Fault, now: Stamp) {
-        let own = fault.motor();
+        let own = fault.own();
         // What came first is what it is about.
         let is_keeping = matches!(self.state, BusState::Faulted(_)) && self.is_keeping();
         for (index, (motor, command)) in self.motors.iter_mut().zip(&mut self.commands).enumerate() {

@@ -149,10 +149,11 @@ impl Motor {
         frame.id == u32::from(self.spec.master) && slave_fits
     }
 
-    /// Is this frame a command, an order or a question to it? It is not ours: what we send is not received.
+    /// Is this frame a command or an order to it, or does it set a parameter of it? It is not ours: what we send is not received.
     pub(super) fn is_commanded_by(&self, frame: &CanFrame) -> bool {
-        let Some(offset) = frame.id.checked_sub(u32::from(self.spec.slave)) else { return false };
-        COMMANDS.contains(&offset)
+        let slave = u32::from(self.spec.slave);
+        let writes = parameter::is_write(frame) == Some(self.spec.slave);
+        writes || frame.id.checked_sub(slave).is_some_and(|offset| COMMANDS.contains(&offset))
     }
 
     /// Turns it off, from the next frame on.
@@ -276,7 +277,7 @@ impl Motor {
             return Ok(());
         };
         if self.phase == Phase::Probed {
-            if let Some(fault) = self.outside() {
+            if let Some(fault) = self.unfit() {
                 return Err(fault);
             }
             if status.is_fault() && self.named != Some(status) {

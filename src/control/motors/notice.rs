@@ -369,6 +369,18 @@ impl Fault {
         }
     }
 
+    /// The motor whose own joint is at fault, by its position in the entry. A joint that is sound, and overloaded or
+    /// commanded by another program, needs not fall for it.
+    #[must_use]
+    pub const fn own(&self) -> Option<usize> {
+        match *self {
+            Self::OtherMaster { .. }
+            | Self::Changed { parameter: Parameter::Timeout, .. }
+            | Self::Strange { what: Strange::Driven { .. } | Strange::Beyond { .. }, .. } => None,
+            _ => self.motor(),
+        }
+    }
+
     /// In words; `names` are those of the motors.
     #[must_use]
     pub const fn words<'a>(&'a self, names: &'a [String]) -> Words<'a, Self> {

@@ -201,7 +201,7 @@ impl Watch {
     }
 }
 
-fn beyond(spec: &MotorSpec, feedback: &Feedback) -> Option<Strange> {
+pub(super) fn beyond(spec: &MotorSpec, feedback: &Feedback) -> Option<Strange> {
     let [low, high] = spec.position;
     let outside = (low - feedback.q).max(feedback.q - high);
     (outside > spec.watch.margin).then_some(Strange::Beyond { position: feedback.q, range: spec.position })
@@ -212,7 +212,7 @@ fn too_fast(spec: &MotorSpec) -> f64 {
     spec.velocity * (1.0 + SHARE) + SLOW
 }
 
-fn fast(spec: &MotorSpec, feedback: &Feedback) -> Option<Strange> {
+pub(super) fn fast(spec: &MotorSpec, feedback: &Feedback) -> Option<Strange> {
     let is_fast = feedback.dq.abs() > too_fast(spec);
     is_fast.then_some(Strange::Fast { velocity: feedback.dq, limit: spec.velocity })
 }

@@ -3,9 +3,9 @@
 use super::{Motor, Phase};
 use crate::control::damiao::codec::{Feedback, MotorStatus, Ranges};
 use crate::control::limits::Limits;
-use crate::control::motors::notice::{Fault, Notice, Strange};
+use crate::control::motors::notice::{Fault, Notice};
 use crate::control::motors::notices::Notices;
-use crate::control::motors::watch::Commanded;
+use crate::control::motors::watch::{Commanded, beyond, fast};
 use crate::registry::MotorMode;
 use crate::time::Stamp;
 
@@ -44,12 +44,11 @@ impl Motor {
         Some(Fault::Strange { motor, what })
     }
 
-    /// Is it too far outside its limits to be armed?
-    pub(super) fn outside(&self) -> Option<Fault> {
-        let (position, [low, high]) = (self.feedback.as_ref()?.q, self.spec.position);
-        let is_outside = position < low - self.spec.watch.margin || position > high + self.spec.watch.margin;
-        let what = Strange::Beyond { position, range: self.spec.position };
-        is_outside.then_some(Fault::Strange { motor: self.index, what })
+    /// Is it too far outside its limits, or too fast, to be armed?
+    pub(super) fn unfit(&self) -> Option<Fault> {
+        let feedback = self.feedback.as_ref()?;
+        let what = beyond(&self.spec, feedback).or_else(|| fast(&self.spec, feedback))?;
+        Some(Fault::Strange { motor: self.index, what })
     }
 
     /// Is it too far from an action for that to be the first after an arm?

@@ -15,10 +15,9 @@ use crate::time::Stamp;
 /// What is read, in this order.
 pub(super) const PROBE: [Parameter; 5] =
     [Parameter::ControlMode, Parameter::PMax, Parameter::VMax, Parameter::TMax, Parameter::Timeout];
-/// What is read again while a motor is on: without its time limit nothing stops it once this program is dead.
-const KEPT: [Parameter; 2] = [Parameter::Timeout, Parameter::ControlMode];
-/// ...one of them each time that this has passed.
-const LOOK_AGAIN: Duration = Duration::from_millis(400);
+/// One of them is read again each time that this has passed while a motor is on, so that each is within a second: without
+/// its time limit nothing stops a motor once this program is dead, and in other ranges it goes elsewhere.
+const LOOK_AGAIN: Duration = Duration::from_millis(150);
 
 impl Motor {
     /// Reads its parameters, from the first.
@@ -36,7 +35,7 @@ impl Motor {
     pub(in crate::control::motors) fn take_reply(&mut self, reply: &Reply, notices: &mut Notices) -> Result<(), Fault> {
         self.asked = None;
         let motor = self.index;
-        if self.phase == Phase::On {
+        if matches!(self.phase, Phase::On | Phase::Kept(_)) {
             let changed = Fault::Changed { motor, parameter: reply.parameter, value: reply.value };
             let is_changed = self.wanted(reply.parameter).is_some_and(|wanted| wanted != reply.value)
                 || self.range(reply.parameter).is_some_and(|range| range.to_bits() != reply.value.number().to_bits());
@@ -132,7 +131,7 @@ impl Motor {
             return;
         }
         self.look = Some(now.after(LOOK_AGAIN));
-        self.looks = (self.looks + 1) % KEPT.len();
-        send(parameter::read(self.spec.slave, KEPT.get(self.looks).copied().unwrap_or(Parameter::Timeout)));
+        self.looks = (self.looks + 1) % PROBE.len();
+        send(parameter::read(self.spec.slave, PROBE.get(self.looks).copied().unwrap_or(Parameter::Timeout)));
     }
 }
