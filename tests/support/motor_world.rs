@@ -6,7 +6,8 @@
 //! arm   disarm   stop               what an operator orders, or the end of the program
 //! target Q..                        from now on an action with this target comes ten times a second
 //! silence                           no action comes any more
-//! away MS   die                     the program does not run for so long, or never again
+//! away MS   die                     the program does not run for so long, or never again, and its guard neither
+//! killed                            the program does not run again, and its guard stops the motors
 //! foreign ID HEX                    another program sends this frame: everybody on the bus receives it
 //! rewrite MOTOR RID VALUE           a register is written in a frame that the program does not receive
 //! damage MOTOR COUNT RAD            so many of its next frames have a position that is off by this
@@ -24,8 +25,10 @@ pub(crate) mod motor_spec;
 use std::time::Duration;
 
 use rapid::control::can::CanFrame;
+use rapid::control::damiao::codec;
 use rapid::control::damiao::parameter::Reply;
 use rapid::control::motors::{BusState, Fault, MotorBus, Notice, Reason};
+use rapid::driver::can::guard::KEEP_FOR;
 use rapid::registry::{DamiaoSpec, MotorMode, Stop};
 use rapid::time::Stamp;
 use vbench::emu::can::Frame;
@@ -77,6 +80,7 @@ pub(crate) struct World {
     target: Option<Vec<f64>>,
     action_due: Stamp,
     away_until: Option<Stamp>,
+    killed: Option<Stamp>,
     damage: Vec<(usize, usize, f64)>,
 }
 
@@ -147,6 +151,7 @@ impl World {
             target: None,
             action_due: now,
             away_until: None,
+            killed: None,
             damage: Vec::new(),
         };
         world.play("inertia 0 0.02");
@@ -211,6 +216,7 @@ impl World {
             ["target", ..] => self.target = Some((1..words.len()).map(number).collect()),
             ["silence"] => self.target = None,
             ["away", _] => self.away_until = Some(self.now.after(Duration::from_millis(whole(1) as u64))),
+            ["killed"] => (self.killed, self.away_until) = (Some(self.now), Some(Stamp(u64::MAX))),
             ["die"] => self.away_until = Some(Stamp(u64::MAX)),
             ["foreign", id, bytes] => {
                 let id = u16::from_str_radix(id, 16).expect(line);
@@ -280,6 +286,7 @@ impl World {
             motor.told().for_each(drop);
         }
         if self.away_until.is_some_and(|until| now < until) {
+            self.guard();
             return;
         }
         if self.away_until.take().is_some() {
@@ -320,6 +327,20 @@ impl World {
             self.followed = None;
         }
         self.judge.end_of_cycle(&self.bus, &self.motors, &self.spec, &self.notices[first..], now);
+    }
+
+    /// What the guard of a killed program sends. A program that is no machine of ours has none.
+    fn guard(&mut self) {
+        let Some(killed) = self.killed.filter(|_| self.instead.is_none()) else { return };
+        let mut will: Vec<CanFrame> = self.bus.last_will().into_iter().flatten().collect();
+        if self.now.since(killed) >= KEEP_FOR {
+            will = self.spec.motors.iter().map(|motor| codec::Order::Disable.frame(motor.slave)).collect();
+        }
+        for frame in will {
+            self.deliver(&frame);
+        }
+        // The program reads no answer.
+        self.arriving.clear();
     }
 
     /// A frame reaches the program.
@@ -363,6 +384,12 @@ impl World {
     pub(crate) fn kind(&self, motor: usize) -> &'static str {
         if !self.motors[motor].is_on() {
             return "limp";
+        }
+        if self.killed.is_some() {
+            // Its guard sends this alone.
+            let frame = self.bus.last_will().and_then(|mut will| will.nth(motor)).expect("it is on");
+            let damps = frame.id == self.motors[motor].slave() && Mit::decode(frame.data, RANGES).kp == 0.0;
+            return if damps { "damp" } else { "hold" };
         }
         match self.bus.state() {
             // It goes on as it was told last.

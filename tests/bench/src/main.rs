@@ -10,6 +10,7 @@ mod beat;
 mod can;
 mod child;
 mod control;
+mod disarm;
 mod eager;
 mod eval;
 mod feed;
@@ -39,6 +40,7 @@ use std::time::{Duration, Instant};
 
 use clap::{Parser, ValueEnum};
 use figure::Figure;
+use rapid::driver::can::guard;
 
 /// What goes wrong in a section ends it, with its text as the reason.
 type Failure = Box<dyn std::error::Error>;
@@ -107,6 +109,7 @@ enum Section {
     Control,
     Motors,
     Safety,
+    Disarm,
     Can,
     Eval,
     Unplug,
@@ -117,7 +120,7 @@ enum Section {
 
 impl Section {
     /// In this order: what must not be disturbed comes before what leaves dirty pages behind.
-    const ALL: [Self; 20] = [
+    const ALL: [Self; 21] = [
         Self::Start,
         Self::Infer,
         Self::Sync,
@@ -126,6 +129,7 @@ impl Section {
         Self::Control,
         Self::Motors,
         Self::Safety,
+        Self::Disarm,
         Self::Can,
         Self::Eval,
         Self::Frame,
@@ -156,6 +160,7 @@ impl Section {
             Self::Control => "control",
             Self::Motors => "motors",
             Self::Safety => "safety",
+            Self::Disarm => "disarm",
             Self::Can => "can",
             Self::Eval => "eval",
             Self::Unplug => "unplug",
@@ -186,6 +191,7 @@ impl Section {
             Self::Control => control::measure(bench),
             Self::Motors => motors::measure(bench),
             Self::Safety => safety::measure(bench),
+            Self::Disarm => disarm::measure(bench),
             Self::Can => can::measure(bench),
             Self::Eval => eval::measure(bench),
             Self::Unplug => others::unplug(bench),
@@ -268,6 +274,11 @@ fn by_length<T>(cli: &Cli, full: T, quick: T, smoke: T) -> T {
 }
 
 fn main() -> ExitCode {
+    let mut args = std::env::args_os();
+    if args.next().is_some_and(|name| name == guard::NAME) {
+        // Motors that are driven here have their guard from here.
+        return guard::run(args);
+    }
     let cli = Cli::parse();
     let done = match &cli.child {
         Some(child) => child.run().map(|()| Vec::new()),

@@ -3,8 +3,7 @@
 //! The motors are those of the virtual bench, behind Damiao's adapter on a pseudo-terminal.
 
 #[path = "../../support/motors.rs"]
-#[expect(dead_code, reason = "the tests use the rest")]
-mod adapter;
+pub(crate) mod adapter;
 
 use std::hint::black_box;
 use std::time::{Duration, Instant};

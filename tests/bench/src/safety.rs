@@ -72,7 +72,7 @@ const EVENTS: [Event; 21] = [
     event("power lost for 0.02 s", &["power 0.1 0", "wait 20", "power 0.1 1"]),
     event("publisher killed", &["silence"]),
     event("disarm", &["disarm"]),
-    event("program killed", &["die"]),
+    event("program killed", &["killed"]),
 ];
 
 pub(crate) fn measure(_bench: &Bench) -> Result<Vec<Figure>, Failure> {
@@ -245,7 +245,11 @@ mod tests {
         for event in &EVENTS {
             let outcome = play(event, false);
             assert_eq!(outcome.stopped.is_some(), event.stops, "{}", event.name);
-            assert!(outcome.words.is_some() || event.lines == ["die"] || event.lines == ["disarm"], "{}", event.name);
+            assert!(
+                outcome.words.is_some() || event.lines == ["killed"] || event.lines == ["disarm"],
+                "{}",
+                event.name
+            );
         }
     }
 }
