@@ -4,8 +4,8 @@
 //!
 //! Invariant: on the topic of a modality and of the mask, only samples of their one writer are handed over. What
 //! another program publishes there is counted and dropped.
-//! Invariant: actions of another program are handed over, as the actuator carries them out; they are counted once
-//! this process, which runs a policy, has published one.
+//! Invariant: actions of another program are handed over, so that an episode has them; they are counted once this
+//! process, which runs a policy, has published one, and the actuator follows them no more ([`super::Actions`]).
 
 use std::cell::Cell;
 use std::time::Duration;

@@ -46,7 +46,7 @@ use guard::{Guarded, contained};
 use home::Home;
 use service::Service;
 
-pub use actions::Actions;
+pub use actions::{Actions, NoAction};
 pub use error::BusError;
 pub use inbox::{Foreign, Inbox};
 pub use ingress::{Given, Ingress, Watch};
@@ -148,8 +148,9 @@ impl Bus {
             .filter(|device| matches!(device.node, NodeSpec::Process(_)))
             .map(|device| Ok((device.id, Arc::new(Ingress::open(node, device)?))))
             .collect::<Result<Vec<_>, BusError>>()?;
-        let actions = topics.iter().find(|(spec, _)| spec.id == TopicId::Action);
-        let actions = actions.map(|(spec, factory)| Actions::open(spec, factory).map(Arc::new)).transpose()?;
+        let actions = topics.iter().zip(&writers).find(|((spec, _), _)| spec.id == TopicId::Action);
+        let actions = actions.map(|((spec, factory), (_, writer))| Actions::open(spec, factory, writer).map(Arc::new));
+        let actions = actions.transpose()?;
         let instance = instance.map(str::to_owned);
         Ok(Self { writers, actions, topics, wake, ingresses, instance, home: Arc::clone(home) })
     }

@@ -1,4 +1,5 @@
 use super::*;
+use crate::action::MAX_ACTION;
 use crate::modality::ModalityId;
 use crate::registry::{DeviceSpec, IdentitySpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbSpec, WhenStale};
 use std::time::Duration;
@@ -285,14 +286,19 @@ fn actions_of_another_program_are_its_right_until_a_policy_of_ours_gives_some() 
     let bus = Bus::open(&registry, Some(&format!("busk{}", std::process::id()))).expect("bus");
     let inbox = bus.inbox().expect("inbox");
     let other = stranger(&bus, TopicId::Action);
+    let (actions, mut numbers) = (bus.actions().expect("an actuator"), [0.0; MAX_ACTION]);
     give(&other, 1);
+    assert!(matches!(actions.newest(&mut numbers), Ok(Some(([0.0], _)))));
     let taken = |inbox: &Inbox| sequences(inbox).into_iter().map(|(_, seq, _)| seq).collect::<Vec<_>>();
     assert_eq!((taken(&inbox), foreign(&inbox)), (vec![1], vec![]));
     let ours = bus.writer(TopicId::Action).expect("writer");
     ours.publish(SampleHeader { seq: 2, ..SampleHeader::default() }, &[0; 8]).expect("publish");
     assert_eq!((taken(&inbox), foreign(&inbox)), (vec![2], vec![]));
-    // The actuator carries it out: it is handed over all the same.
+    // It is recorded, and moves nothing.
+    assert!(matches!(actions.newest(&mut numbers), Ok(Some(_))));
     give(&other, 3);
+    assert_eq!(actions.newest(&mut numbers), Err(NoAction::Foreign));
+    assert_eq!(actions.newest(&mut numbers), Ok(None));
     let seen = foreign_after(&inbox, &[3]);
     assert_eq!(seen, [("/action".to_owned(), std::process::id(), 1)]);
 }

@@ -14,7 +14,6 @@ pub struct Limits {
     high: f64,
     slew: f64,
     clamped: u64,
-    clamping: bool,
 }
 
 /// A target within the limits.
@@ -22,8 +21,8 @@ pub struct Limits {
 pub struct Clamped {
     /// It, or the end of the range that is nearest to it.
     pub value: f64,
-    /// It was beyond the range, and the one before was not.
-    pub is_news: bool,
+    /// It was beyond the range.
+    pub is_beyond: bool,
 }
 
 impl Limits {
@@ -31,7 +30,7 @@ impl Limits {
     /// numbers, leave nothing but 0; a slew that is no number or negative leaves no change.
     #[must_use]
     pub fn new(low: f64, high: f64, slew: f64) -> Self {
-        let mut limits = Self { low: 0.0, high: 0.0, slew: slew.max(0.0), clamped: 0, clamping: false };
+        let mut limits = Self { low: 0.0, high: 0.0, slew: slew.max(0.0), clamped: 0 };
         limits.set_range(low, high);
         limits
     }
@@ -56,11 +55,9 @@ impl Limits {
     /// A target, within the range; `None` if it is infinite or no number.
     pub fn clamp(&mut self, target: f64) -> Option<Clamped> {
         let value = target.is_finite().then(|| target.clamp(self.low, self.high))?;
-        let beyond = !(self.low..=self.high).contains(&target);
-        let is_news = beyond && !self.clamping;
-        self.clamping = beyond;
-        self.clamped += u64::from(beyond);
-        Some(Clamped { value, is_news })
+        let is_beyond = !(self.low..=self.high).contains(&target);
+        self.clamped += u64::from(is_beyond);
+        Some(Clamped { value, is_beyond })
     }
 
     /// From the command before towards `wanted`, as far as the time that passed allows. Beyond the range

@@ -48,7 +48,7 @@ use std::time::Duration;
 pub use last_will::stalled_after;
 use motor::Motor;
 pub use notice::{BusState, Fault, Notice, Part, Reason, Refusal, Strange};
-use notices::Notices;
+use notices::{Notices, Seldom};
 pub use words::Words;
 
 use super::can::CanFrame;
@@ -94,6 +94,9 @@ pub struct MotorBus {
     stepped: Option<Stamp>,
     armed: Stamp,
     refusing: Option<Refusal>,
+    /// Refused actions, and targets beyond the limits of each axis: reported once a second at most.
+    refused: Seldom,
+    clamped: Vec<Seldom>,
     /// The motor that another program commanded last, and when.
     other_master: Option<(usize, Stamp)>,
     /// The motor whose frames are sent first: where there is no room for all, each has its turn.
@@ -145,6 +148,8 @@ impl MotorBus {
             stepped: None,
             armed: now,
             refusing: None,
+            refused: Seldom::default(),
+            clamped: vec![Seldom::default(); axes],
             other_master: None,
             first: 0,
             notices: Notices::new(),
@@ -218,13 +223,17 @@ impl MotorBus {
     /// An action: a number for each motor, and its tick. Says whether it is followed.
     pub fn target(&mut self, target: &[f64], tick: Stamp, now: Stamp) -> bool {
         let refusal = self.refuse(target, tick, now);
+        let is_same = self.refusing == refusal;
+        self.refusing = refusal;
         if let Some(refusal) = refusal {
             self.counts.refused += 1;
-            if self.refusing != Some(refusal) {
+            // Another reason is another beginning.
+            if self.refused.look(is_same, now) || self.refused.look(true, now) {
                 self.notices.tell(Notice::Refused(refusal));
             }
+        } else {
+            self.refused.look(false, now);
         }
-        self.refusing = refusal;
         if refusal.is_none() && tick >= self.asked.1 {
             self.asked.0.copy_from_slice(target);
             self.asked.1 = tick;
@@ -235,7 +244,8 @@ impl MotorBus {
         }
         for (motor, target) in target.iter().enumerate() {
             let Some(clamped) = self.limits.get_mut(motor).and_then(|limits| limits.clamp(*target)) else { continue };
-            if clamped.is_news {
+            let is_beyond = clamped.is_beyond;
+            if self.clamped.get_mut(motor).is_some_and(|seldom| seldom.look(is_beyond, now)) {
                 self.notices.tell(Notice::Clamped { motor, target: *target, used: clamped.value });
             }
             if let Some(slot) = self.targets.get_mut(motor) {

@@ -1,8 +1,32 @@
 //! The notices of a bus of motors on their way to whoever shows them.
 
 use std::collections::VecDeque;
+use std::time::Duration;
 
 use super::notice::Notice;
+use crate::time::Stamp;
+
+/// A notice that may come often comes this seldom at most.
+const SELDOM: Duration = Duration::from_secs(1);
+
+/// Something of which there is a notice when it begins, but not more often than [`SELDOM`].
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Seldom {
+    last: Option<Stamp>,
+    is_reported: bool,
+}
+
+impl Seldom {
+    /// It is the case at `now`, or not. Is there to be a notice of it?
+    pub(super) fn look(&mut self, is: bool, now: Stamp) -> bool {
+        self.is_reported &= is;
+        let is_due = is && !self.is_reported && self.last.is_none_or(|last| now.since(last) >= SELDOM);
+        if is_due {
+            *self = Self { last: Some(now), is_reported: true };
+        }
+        is_due
+    }
+}
 
 /// Notices that wait to be taken. The oldest are lost where there is no room, for nothing here
 /// allocates.

@@ -237,6 +237,10 @@ impl Line {
                         self.lost += 1;
                         Decoded::Nothing
                     }
+                    // As the kernel says it of a controller that left the bus: linux/can/error.h.
+                    Some((Kind::BusError, _)) => {
+                        Decoded::Frame(CanFrame { id: 0x40, error: true, ..CanFrame::default() })
+                    }
                     _ => Decoded::Nothing,
                 };
                 (taken, decoded)

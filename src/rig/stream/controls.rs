@@ -65,11 +65,12 @@ impl Controlled {
     /// Hands the device the newest action that came since the last call, if any did.
     ///
     /// # Errors
-    /// When it does not take it.
+    /// When it does not take it, or what came is not to be followed.
     pub(super) fn pass_on_action(&mut self, source: &mut Source) -> Result<(), DriverError> {
         match self.actions.newest(&mut self.action) {
-            Some((target, tick)) => source.command(target, tick),
-            None => Ok(()),
+            Ok(Some((target, tick))) => source.command(target, tick),
+            Ok(None) => Ok(()),
+            Err(refused) => Err(DriverError::Retry(refused.to_string())),
         }
     }
 }

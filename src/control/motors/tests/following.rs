@@ -318,3 +318,32 @@ fn a_velocity_comes_to_rest_where_the_motor_counts_no_further() {
     }
     assert!((world.sims[0].q - 1.0).abs() < 0.01, "{}", world.sims[0].q);
 }
+
+#[test]
+fn what_comes_and_goes_is_reported_once_a_second() {
+    let mut world = World::armed();
+    for round in 0..400 {
+        // Beyond its limits and not, and refused for one reason and another.
+        let target = [[7.0, 0.25], [f64::NAN, 0.25], [0.5, 0.25]][round % 3];
+        world.target(&target);
+        world.bus.target(&[1.0], world.now, world.now);
+        world.cycle();
+    }
+    let reported = |is: &dyn Fn(&Notice) -> bool| world.notices.iter().filter(|notice| is(notice)).count();
+    let clamped = reported(&|notice| matches!(notice, Notice::Clamped { .. }));
+    let refused = reported(&|notice| matches!(notice, Notice::Refused(_)));
+    assert!((2..=3).contains(&clamped) && (2..=3).contains(&refused), "{clamped} and {refused} in two seconds");
+}
+
+#[test]
+fn what_begins_within_a_second_of_the_last_report_is_reported_if_it_lasts() {
+    let mut world = World::armed();
+    world.target(&[7.0, 0.25]);
+    world.run(20);
+    world.target(&[1.0, 0.25]);
+    for _ in 0..20 {
+        world.run(20);
+        world.target(&[8.0, 0.25]);
+    }
+    assert_eq!(world.told(Notice::Clamped { motor: 0, target: 8.0, used: 2.0 }), 1, "{:?}", world.notices);
+}
