@@ -21,6 +21,7 @@
 //!
 //!  L2   calibration                                how late a sensor is
 //!       orders                                     may motors move? what other programs say
+//!       interlocks                                 and what emergency stops and enabling switches say
 //!
 //!  L1   registry                                 devices.toml, checked
 //!       status                                   the board every stage reports on
@@ -31,7 +32,7 @@
 //!       panics                                   where their messages go
 //!       peer                                     who is at the other end of a socket
 //!       episode_format                           an episode's file, record by record
-//!  L0   modality   mask   sample   action   permission   time   random   provenance   flash     nouns
+//!  L0   modality   mask   sample   action   interlock   permission   time   random   provenance   flash   nouns
 //! ```
 //!
 //! The arrows are the way of the data. Imports point down only; the stages of L3 do not know one
@@ -116,6 +117,8 @@ pub mod flash;
 pub mod folder;
 pub mod headless;
 pub mod hotplug;
+pub mod interlock;
+pub mod interlocks;
 pub mod lockstep;
 pub mod logging;
 pub mod mask;

@@ -215,7 +215,8 @@ fn a_bus_and_its_motors_arrive() {
     assert_eq!((wheel.master, wheel.mode, wheel.slew), (0x7fe, MotorMode::Velocity, 20.0));
     assert_eq!((gripper.watch, gripper.stop), (WatchSpec::default(), StopSpec::default()));
     assert_eq!((roll.watch, roll.stop), (WatchSpec { lag: 0.5, ..WatchSpec::default() }, StopSpec::default()));
-    let kept = StopSpec { own_fault: Stop::Hold, other_fault: Stop::Limp, hold_for: Some(ms(5000)) };
+    let kept =
+        StopSpec { own_fault: Stop::Hold, other_fault: Stop::Limp, emergency: Stop::Damp, hold_for: Some(ms(5000)) };
     assert_eq!((thumb.watch.margin, thumb.watch.blocked_after, thumb.stop), (0.05, None, kept));
     let axes = hand.action.as_ref().unwrap();
     assert_eq!(

@@ -41,6 +41,7 @@ pub(super) fn registry(depth: usize) -> Registry {
             ),
         }],
         modules: Vec::new(),
+        stops: Vec::new(),
         path: None,
         text: String::new(),
     }

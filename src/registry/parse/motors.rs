@@ -11,7 +11,7 @@ use crate::registry::spec::{
 };
 use crate::registry::units::show_duration;
 
-const KEYS: [&str; 19] = [
+const KEYS: [&str; 20] = [
     "name",
     "slave",
     "master",
@@ -28,6 +28,7 @@ const KEYS: [&str; 19] = [
     "blocked_after",
     "own_fault",
     "other_fault",
+    "emergency",
     "hold_for",
     "max_mos",
     "max_rotor",
@@ -246,15 +247,17 @@ fn watch(entry: &Section<'_>, problems: &mut Problems<'_>) -> WatchSpec {
     }
 }
 
-/// How the motor stops at a fault.
+/// How the motor stops at a fault, or at an emergency stop.
 fn stop(entry: &Section<'_>, problems: &mut Problems<'_>) -> StopSpec {
     let default = StopSpec::default();
     let words = [("limp", Stop::Limp), ("damp", Stop::Damp), ("hold", Stop::Hold)];
     let mut choice = |key| entry.has(key).then(|| entry.choice(problems, key, &words)).flatten();
     let (own_fault, other_fault) = (choice("own_fault"), choice("other_fault"));
+    let emergency = choice("emergency");
     StopSpec {
         own_fault: own_fault.unwrap_or(default.own_fault),
         other_fault: other_fault.unwrap_or(default.other_fault),
+        emergency: emergency.unwrap_or(default.emergency),
         hold_for: or_never(entry, problems, "hold_for", Duration::from_millis(10), default.hold_for),
     }
 }

@@ -22,7 +22,7 @@ fn second(world: &World) -> Option<CanFrame> {
 }
 
 const fn others(other_fault: Stop) -> StopSpec {
-    StopSpec { own_fault: Stop::Limp, other_fault, hold_for: None }
+    StopSpec { own_fault: Stop::Limp, other_fault, emergency: Stop::Limp, hold_for: None }
 }
 
 #[test]
@@ -36,7 +36,7 @@ fn by_default_a_faulty_joint_is_limp_and_the_others_are_damped() {
         let mut world = armed(MIT, StopSpec::default());
         trouble(&mut world.sims[0]);
         let fault = world.run_to_fault();
-        assert_eq!(fault.motor(), 0);
+        assert_eq!(fault.motor(), Some(0));
         assert_eq!(world.told(Notice::Kept { damped: 2, held: 0 }), 1, "{:?}", world.notices);
         // No action moves it, however long it is kept so.
         for _ in 0..20 {

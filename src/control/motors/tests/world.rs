@@ -174,7 +174,7 @@ pub(super) fn motor(slave: u16, master: u16, mode: MotorMode) -> MotorSpec {
         slew: 5.0,
         watch: WatchSpec::default(),
         // A joint that stops otherwise has tests of its own.
-        stop: StopSpec { own_fault: Stop::Limp, other_fault: Stop::Limp, hold_for: None },
+        stop: StopSpec { own_fault: Stop::Limp, other_fault: Stop::Limp, emergency: Stop::Limp, hold_for: None },
         max_mos: 80.0,
         max_rotor: 100.0,
     }

@@ -32,7 +32,7 @@ fn spec(count: u16, hz: u32) -> DamiaoSpec {
         torque: 5.0,
         slew: 5.0,
         watch: WatchSpec::default(),
-        stop: StopSpec { own_fault: Stop::Limp, other_fault: Stop::Limp, hold_for: None },
+        stop: StopSpec { own_fault: Stop::Limp, other_fault: Stop::Limp, emergency: Stop::Limp, hold_for: None },
         max_mos: 80.0,
         max_rotor: 80.0,
     };
