@@ -98,4 +98,18 @@ mod tests {
         joints.write(&mut payload);
         assert!((first(&payload) - 1.0).abs() < f64::EPSILON, "disarmed");
     }
+
+    #[test]
+    fn an_emergency_stop_is_told_where_something_moved() {
+        let mut joints = Joints::new(1);
+        joints.name_stops(&["pendant".into()].into());
+        let trip = Order::Emergency(crate::action::Trip { stop: 0, is_lost: true });
+        joints.order(trip);
+        assert_eq!(joints.take_notice(), None);
+        joints.order(Order::Arm);
+        joints.order(trip);
+        let notice = joints.take_notice().expect("a notice");
+        assert_eq!((notice.arming, notice.is_problem), (Arming::Faulted, true));
+        assert_eq!(notice.text, "emergency stop pendant lost: simulated motors are stopped");
+    }
 }

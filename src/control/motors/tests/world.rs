@@ -3,6 +3,7 @@
 use std::collections::VecDeque;
 
 use super::*;
+use crate::action::Trip;
 use crate::control::damiao::codec::{Feedback, MotorStatus, Ranges};
 use crate::control::damiao::parameter::{Parameter, Value};
 use crate::registry::{MotorKind, MotorSpec, Stop, StopSpec, WatchSpec};
@@ -282,6 +283,11 @@ impl World {
     pub(super) fn disarm(&mut self) {
         self.bus.disarm(self.now);
         (self.judge.may_move, self.judge.may_keep) = (false, false);
+    }
+
+    pub(super) fn emergency(&mut self, trip: Trip) {
+        self.bus.emergency(trip, self.now);
+        self.judge.may_move = false;
     }
 
     pub(super) fn stop(&mut self) -> Vec<CanFrame> {
