@@ -130,7 +130,8 @@ fn an_arm_needs_every_input_and_a_stop_is_an_order_and_an_event_of_the_episode()
     place.write("sim.toml", PULLED);
     pendant.say(STOP);
     let arguments = ["--sim", "sim.toml", "--config", "devices.toml", "--headless", "--json", "--arm", "--record"];
-    let running = place.start(&[&arguments[..], &["--out", "out"]].concat(), "\"mask\":\"0x03\"");
+    // What comes before the episode begins is not of it.
+    let running = place.start(&[&arguments[..], &["--out", "out"]].concat(), "\"event\":\"recording\"");
     last(&running, "pendant", "stopped");
     last(&running, "buttons", "runs");
     // Neither `--arm` nor an order arms it while the pendant is pressed.

@@ -74,6 +74,8 @@ impl Watched {
             let thread = match spec.input.clone() {
                 InterlockInput::Field(field) => {
                     let tap = Tap::new(&field, reporter)?;
+                    // Before any sample can come.
+                    tap.lose(&format!("no sample of {} has come", field.device));
                     watched.taps.push(tap.clone());
                     begin(Box::new(move || tap.watch(&stop)))?
                 }

@@ -79,7 +79,6 @@ impl Tap {
     pub(super) fn watch(&self, stop: &OwnedFd) {
         let _lost = self.0.reporter.lost_at_a_panic();
         let tap = &*self.0;
-        tap.reporter.report(InputState::Lost, &format!("no sample of {} has come", tap.device));
         loop {
             let heard = tap.heard.load(Ordering::SeqCst);
             let wake = (heard > 0).then(|| Stamp(heard).after(tap.silence));

@@ -135,7 +135,7 @@ fn need(table: &Section<'_>, keys: &[(&str, &str)], problems: &mut Problems<'_>)
 
 fn key(table: &Section<'_>, kind: StopKind, problems: &mut Problems<'_>) -> Option<KeyInput> {
     table.allow(problems, &["device", "code", "runs_while"]);
-    let device = "write device = \"/dev/input/by-id/...\", or the name that `rapid doctor` and `evtest` show";
+    let device = "write device = \"/dev/input/by-id/...\", or the name that `evtest` shows";
     need(
         table,
         &[("device", device), ("code", "write code = \"KEY_...\" or \"BTN_...\", as `evtest` shows it")],
