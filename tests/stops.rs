@@ -187,6 +187,11 @@ fn an_arm_needs_every_input_and_a_stop_is_an_order_and_an_event_of_the_episode()
         .map(|message| serde_json::from_str(&message.decode::<EventMessage>().json).expect("JSON"))
         .collect();
     let recorded = words(&recorded);
+    // What they said when it began stands first.
+    assert!(
+        recorded.iter().take(2).all(|word| word.starts_with("pendant ") || word.starts_with("buttons ")),
+        "{recorded:?}"
+    );
     for word in ["pendant stopped", "pendant runs", "arm armed", "arm faulted", "pendant lost", "buttons lost"] {
         assert!(recorded.iter().any(|is| is == word), "{word} not in {recorded:?}");
     }

@@ -17,6 +17,9 @@ use crate::registry::LineInput;
 /// Longest line that is looked at; one that is longer is another than those that mean something.
 const LONGEST: usize = 128;
 
+/// Reads in a row.
+const MOST_READS: usize = 64;
+
 /// An open port.
 #[derive(Debug)]
 pub(super) struct Line {
@@ -46,7 +49,8 @@ impl Line {
 
     pub(super) fn take(&mut self, tell: &mut dyn FnMut(InputState)) -> Result<(), String> {
         let mut bytes = [0; 256];
-        loop {
+        // A port that is flooded must not keep the thread from the end of the run.
+        for _ in 0..MOST_READS {
             match rustix::io::read(&self.fd, &mut bytes) {
                 Ok(0) => return Err(format!("{} is not plugged in", self.shown)),
                 Ok(count) => self.words.feed(bytes.get(..count).unwrap_or_default(), tell),
@@ -55,6 +59,7 @@ impl Line {
                 Err(error) => return Err(failure(&self.shown, "dialout", &error.into())),
             }
         }
+        Ok(())
     }
 
     pub(super) const fn silence(&self) -> Duration {

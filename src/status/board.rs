@@ -147,6 +147,12 @@ impl Board {
         }
     }
 
+    /// Emergency stops and enabling switches, in the order of the registry.
+    #[must_use]
+    pub fn stops(&self) -> Vec<StopStatus> {
+        lock(&self.stops).clone()
+    }
+
     /// Reports a publication of the mask.
     pub fn set_mask(&self, mask: PhysicalMask, sequence: u64) {
         self.mask.store(mask.0, Ordering::Relaxed);
@@ -275,7 +281,7 @@ impl Board {
             mask: self.mask(),
             mask_sequence: self.mask_sequence.load(Ordering::Relaxed),
             devices: devices.collect(),
-            stops: lock(&self.stops).clone(),
+            stops: self.stops(),
             recording: lock(&self.recording).clone(),
             policy: lock(&self.policy).clone(),
             last_episode,

@@ -9,7 +9,7 @@ use std::time::Duration;
 use tokio::time::{Instant, interval, timeout};
 
 use super::*;
-use crate::action::Arming;
+use crate::action::{Arming, Trip};
 use crate::control::can::CanFrame;
 use crate::control::damiao::codec::{self, Feedback, MotorStatus, Ranges};
 use crate::control::damiao::parameter::{Parameter, Reply, Value};
@@ -120,6 +120,28 @@ async fn told(motors: &mut Motors, wanted: impl Fn(&ActuatorNotice) -> bool) -> 
         }
         assert!(begun.elapsed() < PATIENCE, "not told; {all:?}");
     }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_emergency_stop_turns_the_motor_off_and_is_named() {
+    let (link, bus) = bus();
+    let (fate, thread) = motor(bus);
+    let mut motors = Motors::start(link, &spec(1, 200)).unwrap();
+    motors.name_stops(&["door".into(), "pendant".into()].into());
+    motors.order(Order::Arm).unwrap();
+    told(&mut motors, |notice| notice.arming == Arming::Holding).await;
+    motors.order(Order::Emergency(Trip { stop: 1, is_lost: true })).unwrap();
+    let notice = told(&mut motors, |notice| notice.arming == Arming::Faulted).await;
+    assert_eq!(notice.text, "emergency stop pendant lost: all motors are stopped");
+    assert!(notice.is_problem);
+    let begun = Instant::now();
+    while fate.is_on.load(Ordering::Acquire) {
+        assert!(begun.elapsed() < PATIENCE);
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
+    motors.close().await;
+    fate.ends.store(true, Ordering::Release);
+    thread.join().unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
