@@ -86,7 +86,8 @@
 //!   does not clear it; the slot says `Stalled`.
 //! * Only [`rig`] decides the mask, and nothing it does may hold up its publication. [`lockstep`] applies the
 //!   same slots on its virtual clock.
-//! * Motors move only after an arm, and are turned off on every way out.
+//! * Motors move only after an arm, and are turned off on every way out. Nothing is armed while an emergency stop or an
+//!   enabling switch does not say that it runs, and what it stops is stopped until a newer arm.
 //! * A writer never waits for a reader: who falls behind loses the oldest, and sees a hole in `seq`.
 //!   What is lost is counted and said.
 //! * Nothing downstream is re-wired on plug and unplug: topics live as long as the run.

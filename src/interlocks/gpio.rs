@@ -53,9 +53,23 @@ impl Gpio {
     }
 }
 
+/// Why the kernel refused, for people.
 fn say(shown: &str, error: &gpiocdev::Error) -> String {
     match error {
         gpiocdev::Error::Os(error) => failure(shown, "gpio", &std::io::Error::from_raw_os_error(error.0)),
         error => format!("{shown}: {error}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_chip_that_is_not_there_or_none_is_named() {
+        let why =
+            |chip: &str| Gpio::open(&GpioInput { chip: chip.into(), line: 1, runs_while_high: false }).unwrap_err();
+        assert_eq!(why("/dev/gpiochip_none"), "/dev/gpiochip_none is not plugged in");
+        assert!(why("/dev/null").contains("/dev/null"), "{}", why("/dev/null"));
     }
 }

@@ -41,16 +41,16 @@ impl Source {
         }
     }
 
-    /// Tells every state that it has had since the last call, without waiting; at the first call what it is now, where
+    /// Reports every state that it has had since the last call, without waiting; at the first call what it is now, where
     /// it can be asked.
     ///
     /// # Errors
     /// When it cannot be read any more, for people.
-    pub(super) fn take(&mut self, is_first: bool, tell: &mut dyn FnMut(InputState)) -> Result<(), String> {
+    pub(super) fn take(&mut self, is_first: bool, report: &mut dyn FnMut(InputState)) -> Result<(), String> {
         match self {
-            Self::Key(key) => key.take(is_first, tell),
-            Self::Gpio(gpio) => gpio.take(is_first, tell),
-            Self::Line(line) => line.take(tell),
+            Self::Key(key) => key.take(is_first, report),
+            Self::Gpio(gpio) => gpio.take(is_first, report),
+            Self::Line(line) => line.take(report),
         }
     }
 

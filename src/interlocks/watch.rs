@@ -77,16 +77,16 @@ fn follow(source: &mut Source, reporter: &Reporter, stop: &OwnedFd) -> Option<St
     let mut is_silent = false;
     let mut is_first = true;
     loop {
-        let mut has_said = false;
+        let mut has_reported = false;
         let taken = source.take(is_first, &mut |state| {
-            has_said = true;
+            has_reported = true;
             reporter.report(state, "");
         });
         if let Err(why) = taken {
             return Some(why);
         }
         is_first = false;
-        if has_said {
+        if has_reported {
             (heard, is_silent) = (Stamp::now(), false);
         }
         let until = silence.filter(|_| !is_silent).map(|silence| heard.after(silence));

@@ -48,7 +48,9 @@ pub(super) fn rules(registry: &Registry) -> String {
         let InterlockInput::Gpio(GpioInput { chip, .. }) = &stop.input else { continue };
         // A name of a chip as the kernel gives it; any other is a link of somebody's rule.
         let chip = chip.to_str().and_then(|chip| chip.strip_prefix("/dev/gpiochip"));
-        if let Some(number) = chip.filter(|number| number.bytes().all(|byte| byte.is_ascii_digit())) {
+        if let Some(number) =
+            chip.filter(|number| (1..=5).contains(&number.len()) && number.bytes().all(|byte| byte.is_ascii_digit()))
+        {
             let rule = format!("SUBSYSTEM==\"gpio\", KERNEL==\"gpiochip{number}\", GROUP=\"gpio\", MODE=\"0660\"");
             let _ = writeln!(text, "\n# stop {}\n{rule}", stop.name);
         }
