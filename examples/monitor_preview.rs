@@ -98,6 +98,7 @@ fn registry(count: u8) -> Registry {
         },
         devices: (0..count).filter_map(device).collect(),
         modules: Vec::new(),
+        stops: Vec::new(),
         path: None,
         text: String::new(),
     }

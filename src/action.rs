@@ -4,6 +4,7 @@
 //! order of the actuator's `[device.NAME.action]` table, in its units. Its capture time is the tick of
 //! the control grid it is the action of.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, Ordering};
 
 use serde::Serialize;
@@ -43,38 +44,73 @@ impl Arming {
     }
 }
 
-/// What an operator asks of an actuator.
+/// What is asked of an actuator.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Order {
     /// It may move from now on.
     Arm,
     /// It may not.
     Disarm,
+    /// It may not, and each joint stops as it is configured for an emergency stop.
+    Emergency(Trip),
+}
+
+/// What tripped an emergency stop.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Trip {
+    /// Which stop, by its position in the registry, below [`MAX_STOPS`](crate::interlock::MAX_STOPS).
+    pub stop: u8,
+    /// Its input was lost; otherwise it says stop.
+    pub is_lost: bool,
+}
+
+impl Trip {
+    /// In words; `stops` are the names of all stops.
+    #[must_use]
+    pub fn text(self, stops: &[Arc<str>]) -> String {
+        let name = stops.get(usize::from(self.stop)).map_or("?", |name| name);
+        format!("emergency stop {name} {}", if self.is_lost { "lost" } else { "pressed" })
+    }
 }
 
 /// Orders on their way to whoever carries them out.
 ///
-/// Invariant: a disarm is never lost, and nothing is left of what was said before it.
+/// Invariant: neither a disarm nor an emergency stop is lost, and no arm is left of before them. Of several emergency
+/// stops the first is named.
 #[derive(Debug, Default)]
 pub struct OrderSlot(AtomicU8);
 
 impl OrderSlot {
     const DISARM: u8 = 1;
     const ARM: u8 = 2;
+    const EMERGENCY: u8 = 4;
+    const LOST: u8 = 8;
+    /// Which stop is in the bits from here.
+    const STOP: u32 = 4;
 
     /// Leaves an order there.
     pub fn give(&self, order: Order) {
-        match order {
-            Order::Disarm => self.0.store(Self::DISARM, Ordering::SeqCst),
-            Order::Arm => drop(self.0.fetch_or(Self::ARM, Ordering::SeqCst)),
-        }
+        let left = |given: u8| match order {
+            Order::Arm => given | Self::ARM,
+            Order::Disarm => (given & !Self::ARM) | Self::DISARM,
+            Order::Emergency(_) if given & Self::EMERGENCY != 0 => given & !Self::ARM,
+            Order::Emergency(Trip { stop, is_lost }) => {
+                let cause = (stop << Self::STOP) | if is_lost { Self::LOST } else { 0 };
+                (given & Self::DISARM) | Self::EMERGENCY | cause
+            }
+        };
+        // It never refuses.
+        let _ = self.0.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |given| Some(left(given)));
     }
 
-    /// Takes what is there, in the order in which it is to be carried out.
+    /// Takes what is there, in the order in which it is to be carried out. An emergency stop comes before a disarm,
+    /// which turns off also what an emergency stop would hold.
     pub fn take(&self) -> impl Iterator<Item = Order> + use<> {
         let given = self.0.swap(0, Ordering::SeqCst);
-        let orders = [(Self::DISARM, Order::Disarm), (Self::ARM, Order::Arm)].into_iter();
-        orders.filter(move |(bit, _)| given & bit != 0).map(|(_, order)| order)
+        let trip = Trip { stop: given >> Self::STOP, is_lost: given & Self::LOST != 0 };
+        let orders =
+            [(Self::EMERGENCY, Order::Emergency(trip)), (Self::DISARM, Order::Disarm), (Self::ARM, Order::Arm)];
+        orders.into_iter().filter(move |(bit, _)| given & bit != 0).map(|(_, order)| order)
     }
 }
 
@@ -94,8 +130,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_disarm_is_never_lost_and_ends_what_was_said_before() {
-        use Order::{Arm, Disarm};
+    fn a_stop_is_never_lost_and_no_arm_is_left_of_before_it() {
+        use Order::{Arm, Disarm, Emergency};
+        let [one, two] = [Trip { stop: 0, is_lost: false }, Trip { stop: 15, is_lost: true }].map(Emergency);
         let slot = OrderSlot::default();
         for (given, taken) in [
             (&[][..], &[][..]),
@@ -105,6 +142,12 @@ mod tests {
             (&[Disarm, Arm], &[Disarm, Arm]),
             (&[Arm, Disarm, Arm, Arm], &[Disarm, Arm]),
             (&[Disarm, Arm, Disarm], &[Disarm]),
+            (&[Arm, two], &[two]),
+            (&[two, Arm], &[two, Arm]),
+            (&[one, two, Arm], &[one, Arm]),
+            (&[two, Arm, one], &[two]),
+            (&[Disarm, one, Arm], &[one, Disarm, Arm]),
+            (&[two, Arm, Disarm], &[two, Disarm]),
         ] {
             for order in given {
                 slot.give(*order);

@@ -36,6 +36,8 @@ use crate::hotplug::HotplugStream;
 use crate::hotplug::lan::LanMonitor;
 use crate::hotplug::script::Script;
 use crate::hotplug::udev::UdevMonitor;
+use crate::interlock::Interlocks;
+use crate::interlocks::{self, Watched};
 use crate::logging::{self, Stderr};
 use crate::mask::MASK_PATH;
 use crate::orders::receive::Orders;
@@ -134,9 +136,9 @@ pub async fn run(options: Options) -> Result<(), AppError> {
         panics::to_log();
     }
     // Before anything that a full or damaged machine may refuse.
-    let (permission, _orders) = take_orders(options.instance.as_deref(), options.arm)?;
-    let signals = Signals::listen()?;
-    let _fed = Watchdog::feed();
+    let interlocks = interlocks::of(&registry);
+    let (permission, _orders) = take_orders(options.instance.as_deref(), options.arm, interlocks)?;
+    let (signals, _fed) = (Signals::listen()?, Watchdog::feed());
 
     bus::check_memory()?;
     // First of all: are we the only one? A registry has at most 64 devices.
@@ -169,8 +171,10 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     let rig_stop = CancellationToken::new();
     let (rig_commands, rig_asked) = mpsc::channel(16);
     let asked = asked::sorted(from_screen, rig_commands);
-    let mut rig =
-        Rig::new(&registry, &bus, presence, Arc::clone(&board)).following(recorder.episode()).obeying(&permission);
+    // To the very end: what is being taken down may still move.
+    let watched = Watched::begin(&registry, &permission, &board).map_err(AppError::Interlocks)?;
+    let rig = Rig::new(&registry, &bus, presence, Arc::clone(&board)).following(recorder.episode());
+    let mut rig = rig.obeying(&permission).tapped(watched.taps());
     let rig_ended = CancellationToken::new();
     let (hurry, rig_ending) = (rig.hurry(), rig.ending());
     let rig = tokio::spawn({
@@ -207,6 +211,7 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     let (kind, screen) = (options.screen, Some(screen));
     let mut running = Running {
         permission,
+        watched,
         rig,
         rig_ending,
         rig_ended,
@@ -233,8 +238,12 @@ pub async fn run(options: Options) -> Result<(), AppError> {
 }
 
 /// Lets other programs, and signals, say whether motors may move, whatever else the run waits for.
-fn take_orders(instance: Option<&str>, arm: bool) -> Result<(Arc<Permission>, Orders), AppError> {
-    let permission = Arc::new(Permission::new(arm));
+fn take_orders(
+    instance: Option<&str>,
+    arm: bool,
+    interlocks: Interlocks,
+) -> Result<(Arc<Permission>, Orders), AppError> {
+    let permission = Arc::new(Permission::new(arm).with_interlocks(interlocks));
     let orders = Orders::receive(instance, Arc::clone(&permission)).map_err(AppError::Orders)?;
     tokio::spawn({
         let (mut signals, permission) = (Signals::listen()?, Arc::clone(&permission));
@@ -262,6 +271,7 @@ const LAST_OUTPUT_IN_A_HURRY: Duration = Duration::from_secs(1);
 /// The tasks of a run, and what can be asked of it from outside.
 struct Running {
     permission: Arc<Permission>,
+    watched: Watched,
     rig: JoinHandle<(Rig, Result<(), RigError>)>,
     /// The rig ends by itself: it has begun to close its devices.
     rig_ending: CancellationToken,
@@ -297,6 +307,7 @@ async fn finish(
     // First of all nothing moves any more, whoever publishes actions. A chunk that is being computed is waited for
     // with the rest.
     running.permission.disarm(Stamp::now());
+    running.watched.end();
     let policy_ended = async {
         match &mut running.autopilot {
             Some(autopilot) => timeout(LAST_CHUNK, autopilot.stop()).await.unwrap_or(Err(AppError::Stuck)),

@@ -208,7 +208,9 @@ pub enum Command {
     },
     /// Lets the actuator of a running rapid move: motors are enabled, and follow actions
     #[command(
-        after_help = "An actuator that was unplugged, failed, was disarmed or got no actions for a while needs this again.\n\nExamples:\n  \
+        after_help = "An actuator that was unplugged, failed, was disarmed or got no actions for a while needs this again, and \
+        so does one that an emergency stop or an enabling switch has stopped. It is refused while one of these does not \
+        run.\n\nExamples:\n  \
         rapid arm\n  rapid arm --instance left"
     )]
     Arm,

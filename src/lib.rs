@@ -21,6 +21,7 @@
 //!
 //!  L2   calibration                                how late a sensor is
 //!       orders                                     may motors move? what other programs say
+//!       interlocks                                 and what emergency stops and enabling switches say
 //!
 //!  L1   registry                                 devices.toml, checked
 //!       status                                   the board every stage reports on
@@ -31,7 +32,7 @@
 //!       panics                                   where their messages go
 //!       peer                                     who is at the other end of a socket
 //!       episode_format                           an episode's file, record by record
-//!  L0   modality   mask   sample   action   permission   time   random   provenance   flash     nouns
+//!  L0   modality   mask   sample   action   interlock   permission   time   random   provenance   flash   nouns
 //! ```
 //!
 //! The arrows are the way of the data. Imports point down only; the stages of L3 do not know one
@@ -85,7 +86,8 @@
 //!   does not clear it; the slot says `Stalled`.
 //! * Only [`rig`] decides the mask, and nothing it does may hold up its publication. [`lockstep`] applies the
 //!   same slots on its virtual clock.
-//! * Motors move only after an arm, and are turned off on every way out.
+//! * Motors move only after an arm, and are turned off on every way out. Nothing is armed while an emergency stop or an
+//!   enabling switch does not say that it runs, and what it stops is stopped until a newer arm.
 //! * A writer never waits for a reader: who falls behind loses the oldest, and sees a hole in `seq`.
 //!   What is lost is counted and said.
 //! * Nothing downstream is re-wired on plug and unplug: topics live as long as the run.
@@ -116,6 +118,8 @@ pub mod flash;
 pub mod folder;
 pub mod headless;
 pub mod hotplug;
+pub mod interlock;
+pub mod interlocks;
 pub mod lockstep;
 pub mod logging;
 pub mod mask;

@@ -1,10 +1,13 @@
 //! Permission: may the actuator of this run move?
 //!
-//! Every order of a run is given here, whoever gives it: the operator at the screen, another program, the end of the run.
+//! Every order of a run is given here, whoever gives it: the operator at the screen, another program, an emergency stop or
+//! an enabling switch, the end of the run.
 //!
 //! Invariant: a disarm holds for the rest of the run, whether or not an actuator is plugged in, until a newer arm.
 //! Invariant: an arm that was given before the last disarm arrived does nothing, in whatever order the two arrive. Nor does
 //! one that is older than [`VOID_AFTER`], or comes while no actuator is plugged in. A disarm is never refused.
+//! Invariant: no arm is given while an input of an [`Interlock`](crate::interlock) does not run, nor one that was given
+//! before it stopped, whatever it says since.
 //! Invariant: nothing here waits, locks or allocates.
 
 use std::sync::Arc;
@@ -12,6 +15,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::time::Duration;
 
 use crate::action::{Order, OrderSlot};
+use crate::interlock::{Blocked, InputState, Interlocks};
 use crate::time::Stamp;
 
 /// An arm that took longer on its way does nothing.
@@ -28,10 +32,12 @@ pub struct Permission {
     actuators: AtomicUsize,
     /// The actuator is to be armed when it is first plugged in: no other order came since.
     at_first_plug: AtomicBool,
+    /// Emergency stops and enabling switches.
+    interlocks: Interlocks,
 }
 
 /// Why an arm does nothing.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum Void {
     /// Nothing is there that could move.
     #[error("no actuator is plugged in: plug it in, then arm it")]
@@ -45,6 +51,9 @@ pub enum Void {
     /// Its time has not come yet: it was given on another machine, or is made up.
     #[error("the order is of a later time than now")]
     Early,
+    /// An emergency stop or an enabling switch is in the way.
+    #[error(transparent)]
+    Blocked(#[from] Blocked),
 }
 
 impl Permission {
@@ -52,6 +61,31 @@ impl Permission {
     #[must_use]
     pub fn new(at_first_plug: bool) -> Self {
         Self { at_first_plug: AtomicBool::new(at_first_plug), ..Self::default() }
+    }
+
+    /// The same with these emergency stops and enabling switches: nothing may move before each of them runs.
+    #[must_use]
+    pub fn with_interlocks(self, interlocks: Interlocks) -> Self {
+        Self { interlocks, ..self }
+    }
+
+    /// Emergency stops and enabling switches.
+    #[must_use]
+    pub const fn interlocks(&self) -> &Interlocks {
+        &self.interlocks
+    }
+
+    /// Input `index` of the interlocks has this state, as found out at `now`. Whatever does not run stops the actuator
+    /// before this returns. Says whether it is news.
+    pub fn report(&self, index: usize, state: InputState, now: Stamp) -> bool {
+        let is_news = self.interlocks.set(index, state);
+        if is_news && state != InputState::Runs {
+            self.at_first_plug.store(false, Ordering::SeqCst);
+            // Before it is given: see `arm`.
+            self.disarmed.fetch_max(now.0.max(1), Ordering::SeqCst);
+            self.slot.give(self.interlocks.order(index).unwrap_or(Order::Disarm));
+        }
+        is_news
     }
 
     /// The actuator may not move, from `now` on. Says whether one is plugged in.
@@ -79,8 +113,15 @@ impl Permission {
         } else if self.actuators.load(Ordering::SeqCst) == 0 {
             return Err(Void::NoActuator);
         }
+        self.interlocks.check()?;
         self.slot.give(Order::Arm);
-        // A disarm that came meanwhile may have been given to the slot before this.
+        // What came meanwhile may have been given to the slot before this.
+        let blocked = self.interlocks.check();
+        if let Err(blocked) = blocked {
+            // Not always a disarm: a joint that is to hold at an emergency stop must not fall.
+            self.slot.give(self.interlocks.order(blocked.index).unwrap_or(Order::Disarm));
+            return Err(blocked.into());
+        }
         if self.is_overtaken(given) {
             self.slot.give(Order::Disarm);
             return Err(Void::Overtaken);
@@ -107,9 +148,18 @@ pub struct Attended(Arc<Permission>);
 
 impl Attended {
     /// Is it to be armed now, without an order? At most once a run.
+    ///
+    /// # Errors
+    /// When it was to be, and an interlock is in the way.
+    pub fn is_to_be_armed(&self) -> Result<bool, Blocked> {
+        let is_first = self.0.at_first_plug.swap(false, Ordering::SeqCst);
+        if is_first { self.0.interlocks.check().map(|()| true) } else { Ok(false) }
+    }
+
+    /// Names of the emergency stops that an order may be of.
     #[must_use]
-    pub fn is_to_be_armed(&self) -> bool {
-        self.0.at_first_plug.swap(false, Ordering::SeqCst)
+    pub fn stops(&self) -> &Arc<[Arc<str>]> {
+        self.0.interlocks.names()
     }
 
     /// It could not be armed as [`Self::is_to_be_armed`] says: the next one is to be, unless an order came meanwhile.

@@ -20,7 +20,7 @@ use proc_macro2::{Delimiter, TokenStream, TokenTree};
 
 /// Modules by layer, lowest first. A module sees those of lower layers.
 const LAYERS: &[&[&str]] = &[
-    &["modality", "mask", "sample", "time", "action", "permission", "random", "provenance", "flash"],
+    &["modality", "mask", "sample", "time", "action", "interlock", "permission", "random", "provenance", "flash"],
     &[
         "registry",
         "status",
@@ -35,7 +35,7 @@ const LAYERS: &[&[&str]] = &[
         "realtime",
         "control",
     ],
-    &["hotplug", "driver", "bus", "orders", "sync", "calibration"],
+    &["hotplug", "driver", "bus", "orders", "interlocks", "sync", "calibration"],
     &["rig", "record", "policy"],
     &["app", "lockstep", "compare", "tui", "headless", "logging"],
     &["main", "dispatch", "cli", "commands"],
@@ -67,7 +67,9 @@ const HOMES: &[(&str, &[&str])] = &[
     ("clap_complete", &["cli", "dispatch", "main", "commands"]),
     ("crc32fast", &["episode_format"]),
     ("crossterm", &["tui"]),
+    ("evdev", &["registry/parse", "interlocks"]),
     ("futures", &["hotplug", "driver", "bus", "rig", "record", "app", "tui", "headless", "commands"]),
+    ("gpiocdev", &["interlocks"]),
     ("hdrhistogram", &["record/quality", "policy/live", "driver/can"]),
     ("http_body_util", &["driver/lan"]),
     ("humantime", &["registry", "cli", "commands"]),
@@ -77,7 +79,7 @@ const HOMES: &[(&str, &[&str])] = &[
     ("iceoryx2_bb_elementary_traits", &["bus"]),
     ("iceoryx2_cal", &["bus"]),
     ("jpeg_encoder", &["driver/sim"]),
-    ("libc", &["registry", "bus", "hotplug", "driver", "rig", "app", "peer", "policy/library"]),
+    ("libc", &["registry", "bus", "hotplug", "driver", "rig", "app", "peer", "policy/library", "interlocks"]),
     ("lz4", &["episode_format"]),
     ("mcap", &["record"]),
     ("mdns_sd", &["hotplug/lan"]),

@@ -176,8 +176,14 @@ async fn only_chunks_allocate() {
         disk_reserve: None,
         expect: Vec::new(),
     };
-    let registry =
-        Arc::new(Registry { rig, devices: vec![device], modules: Vec::new(), path: None, text: String::new() });
+    let registry = Arc::new(Registry {
+        rig,
+        devices: vec![device],
+        modules: Vec::new(),
+        stops: Vec::new(),
+        path: None,
+        text: String::new(),
+    });
     let board = Arc::new(Board::new(&registry));
     let (starter, begun) = mpsc::channel();
     let [allocations, quiet, done] = std::array::from_fn(|_| Arc::new(AtomicU64::new(0)));

@@ -10,12 +10,13 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use proptest::prelude::*;
+use rapid::interlock::StopKind;
 use rapid::modality::ModalityKind;
 use rapid::registry::scenario::Scenario;
 use rapid::registry::{
-    BUILTIN, CanAdapter, CanProtocol, DeviceSpec, Framing, Hook, LanFind, LanPicture, LanProtocol, Loaded, MotionSpec,
-    MotorKind, MotorMode, NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream, Probe, Registry, Stop, StopSpec,
-    VerdictSpec, WatchSpec,
+    BUILTIN, CanAdapter, CanProtocol, DeviceSpec, Framing, Hook, InterlockInput, LanFind, LanPicture, LanProtocol,
+    Loaded, MotionSpec, MotorKind, MotorMode, NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream, Probe, Registry, Stop,
+    StopSpec, VerdictSpec, WatchSpec,
 };
 
 fn files(folder: &str) -> Vec<PathBuf> {
@@ -29,7 +30,7 @@ fn valid(name: &str) -> Loaded {
 
 #[test]
 fn every_mistake_is_told_in_full() {
-    mistakes::check("registry/invalid", "toml", 178, |text| {
+    mistakes::check("registry/invalid", "toml", 202, |text| {
         let errors = Registry::parse(text, Some(Path::new("devices.toml"))).err()?;
         Some((errors.to_string(), errors.diagnostics))
     });
@@ -215,7 +216,8 @@ fn a_bus_and_its_motors_arrive() {
     assert_eq!((wheel.master, wheel.mode, wheel.slew), (0x7fe, MotorMode::Velocity, 20.0));
     assert_eq!((gripper.watch, gripper.stop), (WatchSpec::default(), StopSpec::default()));
     assert_eq!((roll.watch, roll.stop), (WatchSpec { lag: 0.5, ..WatchSpec::default() }, StopSpec::default()));
-    let kept = StopSpec { own_fault: Stop::Hold, other_fault: Stop::Limp, hold_for: Some(ms(5000)) };
+    let kept =
+        StopSpec { own_fault: Stop::Hold, other_fault: Stop::Limp, emergency: Stop::Damp, hold_for: Some(ms(5000)) };
     assert_eq!((thumb.watch.margin, thumb.watch.blocked_after, thumb.stop), (0.05, None, kept));
     let started = MotionSpec { acceleration: 8.0, soft_start: ms(250), first_target: 0.2 };
     assert_eq!((roll.motion, thumb.motion), (MotionSpec::of_slew(4.0), started));
@@ -225,6 +227,42 @@ fn a_bus_and_its_motors_arrive() {
         ("gripper wrist.roll wheel thumb".into(), "rad rad rad/s rad".into())
     );
     assert_eq!((axes.min.as_slice(), axes.max.as_slice()), (&[-1.5, -3.0, -2.0, 0.0][..], &[0.25, 3.0, 2.0, 1.0][..]));
+}
+
+#[test]
+fn emergency_stops_and_enabling_switches_arrive() {
+    let Loaded { registry, warnings } = valid("stops");
+    assert_eq!(warnings, []);
+    let [pendant, pedal, panel, door, wrist] = registry.stops.as_slice() else { panic!("five stops") };
+    assert_eq!((pendant.name.as_str(), pendant.kind, pedal.kind), ("pendant", StopKind::Emergency, StopKind::Enabling));
+    assert!(registry.stops.iter().all(|stop| stop.actuators == ["arm"]), "the default is all");
+    let InterlockInput::Serial(line) = &pendant.input else { panic!("a serial port") };
+    assert_eq!((line.baud, line.run.as_str(), line.stop.as_deref()), (9600, "RUN", Some("STOP")));
+    assert_eq!((line.path.to_str(), line.silence.as_millis()), (Some("/dev/serial/by-id/usb-pendant"), 150));
+    // A switch is held, an emergency stop is not pressed, unless they say otherwise.
+    let keys = [pedal, panel].map(|stop| {
+        let InterlockInput::Key(key) = &stop.input else { panic!("a key") };
+        (key.device.as_str(), key.number, key.runs_while_pressed)
+    });
+    assert_eq!(keys, [("PCsensor FootSwitch Keyboard", 48, true), ("/dev/input/by-id/panel", 0x120, true)]);
+    let InterlockInput::Gpio(gpio) = &door.input else { panic!("a line of a chip") };
+    assert_eq!((gpio.chip.to_str(), gpio.line, gpio.runs_while_high), (Some("/dev/gpiochip0"), 17, false));
+    let InterlockInput::Field(field) = &wrist.input else { panic!("a number") };
+    assert_eq!((field.device.as_str(), field.index, field.silence.as_millis()), ("buttons", 1, 200));
+    assert!(field.runs.holds(-0.6) && !field.runs.holds(-0.5) && !field.runs.holds(f64::NAN));
+    let NodeSpec::Can(can) = &registry.named("arm").unwrap().node else { panic!("a CAN adapter") };
+    let CanProtocol::Damiao(damiao) = &can.protocol else { panic!("motors") };
+    assert_eq!(damiao.motors[0].stop, StopSpec { emergency: Stop::Hold, ..StopSpec::default() });
+}
+
+#[test]
+fn stops_that_stop_nothing_are_warned_of() {
+    let stop = "[stop.key]\nkind = \"emergency\"\nkey = { device = \"pad\", code = \"KEY_B\" }\n";
+    for (name, words) in [("minimal", "the rig has no actuator"), ("actuator", "[device.arm] is moved by a program")] {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/registry/valid/{name}.toml"));
+        let warnings = Registry::parse(&format!("{}{stop}", mistakes::read(&path)), None).unwrap().warnings;
+        assert!(warnings.iter().any(|warning| warning.message.contains(words)), "{warnings:?}");
+    }
 }
 
 #[test]

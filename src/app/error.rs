@@ -63,6 +63,9 @@ pub enum AppError {
     /// Other programs could not stop it.
     #[error("orders to the actuator cannot be received: {0}")]
     Orders(#[source] io::Error),
+    /// Emergency stops would not be noticed.
+    #[error("emergency stops cannot be read: {0}")]
+    Interlocks(#[source] io::Error),
     /// A run without a screen recorded something that is not to be used.
     #[error("{}", bad(*count, file))]
     Bad {

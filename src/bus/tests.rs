@@ -2,6 +2,7 @@ use super::*;
 use crate::action::MAX_ACTION;
 use crate::modality::ModalityId;
 use crate::registry::{DeviceSpec, IdentitySpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbSpec, WhenStale};
+use crate::sample::Encoding;
 use std::time::Duration;
 
 pub(super) fn registry(depth: usize) -> Registry {
@@ -42,6 +43,7 @@ pub(super) fn registry(depth: usize) -> Registry {
             ),
         }],
         modules: Vec::new(),
+        stops: Vec::new(),
         path: None,
         text: String::new(),
     }
@@ -245,7 +247,7 @@ fn stranger(bus: &Bus, id: TopicId) -> iceoryx2::port::publisher::Publisher<Serv
 
 fn give(stranger: &iceoryx2::port::publisher::Publisher<Service, [u8], SampleHeader>, seq: u64) {
     let mut sample = stranger.loan_slice_uninit(8).expect("loan");
-    *sample.user_header_mut() = SampleHeader { seq, encoding: 2, ..SampleHeader::default() };
+    *sample.user_header_mut() = SampleHeader { seq, encoding: Encoding::F64 as u32, ..SampleHeader::default() };
     sample.write_from_slice(&[0; 8]).send().expect("send");
 }
 
@@ -288,11 +290,13 @@ fn actions_of_another_program_are_its_right_until_a_policy_of_ours_gives_some() 
     let other = stranger(&bus, TopicId::Action);
     let (actions, mut numbers) = (bus.actions().expect("an actuator"), [0.0; MAX_ACTION]);
     give(&other, 1);
-    assert!(matches!(actions.newest(&mut numbers), Ok(Some(([0.0], _)))));
+    let encoding = actions.newest(&mut numbers);
+    assert_eq!(encoding.map(|action| action.map(|(numbers, _)| numbers.to_vec())), Ok(Some(vec![0.0])));
     let taken = |inbox: &Inbox| sequences(inbox).into_iter().map(|(_, seq, _)| seq).collect::<Vec<_>>();
     assert_eq!((taken(&inbox), foreign(&inbox)), (vec![1], vec![]));
     let ours = bus.writer(TopicId::Action).expect("writer");
-    ours.publish(SampleHeader { seq: 2, ..SampleHeader::default() }, &[0; 8]).expect("publish");
+    let header = SampleHeader { seq: 2, encoding: Encoding::F64 as u32, ..SampleHeader::default() };
+    ours.publish(header, &[0; 8]).expect("publish");
     assert_eq!((taken(&inbox), foreign(&inbox)), (vec![2], vec![]));
     // It is recorded, and moves nothing.
     assert!(matches!(actions.newest(&mut numbers), Ok(Some(_))));

@@ -6,7 +6,10 @@ use std::path::Path;
 use serde::Serialize;
 
 use super::{Format, Outcome};
-use crate::registry::{DeviceSpec, Diagnostic, IdentitySpec, Loaded, ModuleSpec, Mount, Registry, UsbSpec};
+use crate::interlock::StopKind;
+use crate::registry::{
+    DeviceSpec, Diagnostic, IdentitySpec, InterlockInput, InterlockSpec, Loaded, ModuleSpec, Mount, Registry, UsbSpec,
+};
 use crate::text;
 
 /// Reads the registry at `path` and writes its entries, or every problem, to `out`.
@@ -20,6 +23,9 @@ pub fn check(path: &Path, format: Format, out: &mut dyn Write) -> io::Result<Out
             for module in &loaded.registry.modules {
                 writeln!(out, "{}", module_line(module))?;
             }
+            for stop in &loaded.registry.stops {
+                writeln!(out, "{}", stop_line(stop))?;
+            }
             let count = loaded.registry.devices.len();
             let devices = if count == 1 { "device" } else { "devices" };
             writeln!(out, "{}: {count} {devices}, ok", text::plain(&path.display().to_string()))?;
@@ -31,6 +37,9 @@ pub fn check(path: &Path, format: Format, out: &mut dyn Write) -> io::Result<Out
             }
             for module in &loaded.registry.modules {
                 line(out, &Line::Module(module))?;
+            }
+            for stop in &loaded.registry.stops {
+                line(out, &Line::Stop(StopRow::of(stop)))?;
             }
             for warning in &loaded.warnings {
                 line(out, &Line::Warning(warning))?;
@@ -63,8 +72,24 @@ pub fn check(path: &Path, format: Format, out: &mut dyn Write) -> io::Result<Out
 enum Line<'a> {
     Device(Row<'a>),
     Module(&'a ModuleSpec),
+    Stop(StopRow<'a>),
     Warning(&'a Diagnostic),
     Error(&'a Diagnostic),
+}
+
+/// `kind` of a line is what the line is of.
+#[derive(Serialize)]
+struct StopRow<'a> {
+    name: &'a str,
+    stops_as: StopKind,
+    actuators: &'a [String],
+    input: &'a InterlockInput,
+}
+
+impl<'a> StopRow<'a> {
+    fn of(stop: &'a InterlockSpec) -> Self {
+        Self { name: &stop.name, stops_as: stop.kind, actuators: &stop.actuators, input: &stop.input }
+    }
 }
 
 #[derive(Serialize)]
@@ -112,6 +137,12 @@ fn module_line(module: &ModuleSpec) -> String {
             line += &[", ", what, " ", &words.join(" ")].concat();
         }
     }
+    text::plain(&line).into_owned()
+}
+
+fn stop_line(stop: &InterlockSpec) -> String {
+    let what = if stop.actuators.is_empty() { "nothing".to_owned() } else { stop.actuators.join(" ") };
+    let line = format!("{} {}: {}; stops {what}", stop.kind.label(), stop.name, stop.input);
     text::plain(&line).into_owned()
 }
 
@@ -184,6 +215,30 @@ mod tests {
             "devices.toml:4:8: [device.a] node \"camrea\" is neither built in nor a program\n    fix: did you mean \"camera\"?\n\
              devices.toml: 1 problem\n"
         );
+    }
+
+    #[test]
+    fn stops_are_listed() {
+        let stops = "[stop.pendant]\nkind = \"emergency\"\n\
+                     serial = { path = \"/dev/ttyUSB7\", run = \"RUN\" }\n[stop.pedal]\nkind = \"enabling\"\n\
+                     field = { device = \"motor_state\", index = 2, runs_above = 0.5 }\n[stop.door]\n\
+                     kind = \"emergency\"\ngpio = { chip = \"/dev/gpiochip0\", line = 17, runs_while = \"low\" }\n\
+                     [stop.key]\nkind = \"emergency\"\nkey = { device = \"a pad\", code = \"KEY_B\" }\n";
+        let text = format!("{}{stops}", crate::registry::BUILTIN);
+        let (_, text_out) = checked(&text, Format::Text);
+        for line in [
+            "emergency stop pendant: /dev/ttyUSB7 at 115200 baud, runs with \"RUN\" every 200ms; stops nothing",
+            "enabling switch pedal: number 2 of motor_state, runs above 0.5, every 200ms; stops nothing",
+            "emergency stop door: line 17 of /dev/gpiochip0, runs while low; stops nothing",
+            "emergency stop key: KEY_B of a pad, runs while not pressed; stops nothing",
+        ] {
+            assert!(text_out.lines().any(|is| is == line), "{line} not in {text_out}");
+        }
+        let (_, json) = checked(&text, Format::Json);
+        let rows: Vec<serde_json::Value> = json.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+        let pedal = rows.iter().find(|row| row["name"] == "pedal").unwrap();
+        assert_eq!((&pedal["kind"], &pedal["stops_as"]), (&"stop".into(), &"enabling".into()));
+        assert_eq!(pedal["input"]["field"]["runs"]["above"], 0.5);
     }
 
     #[test]

@@ -22,6 +22,7 @@
 //! fault none but to damp a joint or to keep it where it is.
 //! Invariant: one motor that is silent, faulty or hot stops all, each in its way ([`Stop`](crate::registry::Stop)): an
 //! arm must not continue without its elbow, nor fall because of it. None of them follows an action before the next arm.
+//! An emergency stop is a fault of no motor, with a way to stop of its own.
 //! Invariant: the first command is where the joint is. From there a commanded position changes by the
 //! slew limit at most, as softly as [`Ramp`] says, and goes nowhere beyond the limits; of a joint that is beyond them it stays or
 //! comes back. In MIT mode the stiffness asks for no more than the torque limit: the command comes towards the joint as
@@ -58,6 +59,7 @@ use super::deadman::Deadman;
 use super::interpolate::Interpolator;
 use super::limits::Limits;
 use super::ramp::Ramp;
+use crate::action::Trip;
 use crate::registry::DamiaoSpec;
 use crate::time::Stamp;
 
@@ -293,6 +295,11 @@ impl MotorBus {
             self.enter(BusState::Arming, now);
             self.notices.tell(Notice::Arming);
         }
+    }
+
+    /// Stops all motors at an emergency stop, each in its way, until the next arm.
+    pub fn emergency(&mut self, trip: Trip, now: Stamp) {
+        self.stop_at_emergency(trip, now);
     }
 
     /// Disables all motors.

@@ -173,6 +173,15 @@ impl Driver {
         }
     }
 
+    /// Names the emergency stops that orders may be of, before the first.
+    pub fn name_stops(&mut self, stops: &Arc<[Arc<str>]>) {
+        match self {
+            Self::Motors(driver) => driver.name_stops(stops),
+            Self::Sim(driver) => driver.joints.name_stops(stops),
+            _ => {}
+        }
+    }
+
     /// What an actuator has to tell, oldest first.
     pub fn take_notice(&mut self) -> Option<ActuatorNotice> {
         match self {

@@ -140,6 +140,10 @@ impl Columns {
                 let word = pad(arming.word());
                 (device, Some(bit), if *is_problem { palette.warn(&word) } else { word }, text.clone())
             }
+            What::Stop(stop) => {
+                let word = pad(stop.word());
+                (&stop.stop, None, if stop.is_problem() { palette.warn(&word) } else { word }, stop.sentence())
+            }
             What::Publisher { .. } => {
                 let (level, text) = event.what.sentence().unwrap_or((Level::Warn, String::new()));
                 (&"bus".to_owned(), None, palette.level(level, &pad(level.word())), text)

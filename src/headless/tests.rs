@@ -3,12 +3,13 @@ use std::sync::Mutex;
 use serde_json::Value;
 
 use super::*;
+use crate::interlock::{InputState, StopKind};
 use crate::provenance::{KernelDriver, Negotiated};
 use crate::registry::UsbIdentity;
 use crate::sample::Epoch;
 use crate::status::literal::{TAKEN, WALL_NS, board, every_state, id, policy, recording, three_streaming};
 use crate::status::{
-    Chunk, Grade, Level, PolicyStatus, Provenance, RecordingStatus, Sensors, SlotState, Verdict, What,
+    Chunk, Grade, Level, PolicyStatus, Provenance, RecordingStatus, Sensors, SlotState, StopStatus, Verdict, What,
 };
 
 /// An output that keeps what it is given.
@@ -107,6 +108,10 @@ fn policy_end(chunks: u64) -> What {
     What::PolicyEnd { actions: 812, held: 14, chunks, unused: 0, latency_p50_ms: 34.52, latency_p99_ms: 48.0 }
 }
 
+fn stop(kind: StopKind, state: InputState, detail: &str) -> What {
+    What::Stop(StopStatus { stop: "pendant".to_owned(), kind, state, detail: detail.to_owned() })
+}
+
 fn all_events() -> Vec<What> {
     vec![
         What::Attach {
@@ -153,6 +158,9 @@ fn all_events() -> Vec<What> {
         hold("a\x1b[2Jrm", "a modality that the policy requires is missing"),
         policy_end(104),
         policy_end(0),
+        stop(StopKind::Emergency, InputState::Stopped, ""),
+        stop(StopKind::Enabling, InputState::Runs, ""),
+        stop(StopKind::Enabling, InputState::Lost, "nothing was received for 200ms"),
         What::Log { level: Level::Warn, text: "something".to_owned() },
     ]
 }
@@ -186,6 +194,9 @@ fn lines_for_people_have_their_columns() {
     22:13:20.000Z  policy             holds         a modality that the policy requires is missing: a [2Jrm
     22:13:20.000Z  policy             ended         812 actions  14 ticks held  104 chunks  0 unused  latency p50 34.5 ms  p99 48.0 ms
     22:13:20.000Z  policy             ended         812 actions  14 ticks held  0 chunks  0 unused
+    22:13:20.000Z  pendant            pressed       emergency stop pendant pressed
+    22:13:20.000Z  pendant            held          enabling switch pendant held: the actuator moves after the next arm
+    22:13:20.000Z  pendant            lost          enabling switch pendant lost (nothing was received for 200ms)
     22:13:20.000Z  log                warn          something
     "#);
 }

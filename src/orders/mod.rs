@@ -49,7 +49,8 @@ fn this_user() -> u32 {
 fn line(order: Order, given: Stamp) -> String {
     let word = match order {
         Order::Arm => "arm",
-        Order::Disarm => "disarm",
+        // Of an emergency stop no other program gives more.
+        Order::Disarm | Order::Emergency(_) => "disarm",
     };
     format!("{word} {}\n", given.0)
 }

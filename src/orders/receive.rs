@@ -130,7 +130,7 @@ impl Waiting {
         let line = self.line.get(..end).and_then(|line| str::from_utf8(line).ok());
         let answer = match line.and_then(order) {
             None => "not an order: write `arm NS` or `disarm NS`".to_owned(),
-            Some((Order::Disarm, _)) => {
+            Some((Order::Disarm | Order::Emergency(_), _)) => {
                 permission.disarm(Stamp::now());
                 DONE.to_owned()
             }

@@ -3,6 +3,8 @@
 use proptest::prelude::*;
 
 use super::*;
+use crate::action::Trip;
+use crate::interlock::StopKind;
 use Order::{Arm, Disarm};
 
 const fn at(seconds: u64) -> Stamp {
@@ -14,7 +16,7 @@ fn a_disarm_without_an_actuator_is_remembered_until_a_newer_arm() {
     let permission = Arc::new(Permission::new(true));
     assert!(!permission.disarm(at(1)));
     let attended = permission.attend();
-    assert!(!attended.is_to_be_armed());
+    assert!(!attended.is_to_be_armed().unwrap());
     assert_eq!(attended.take().count(), 0);
     // Given before the disarm arrived.
     assert_eq!(permission.arm(at(1), at(1)), Err(Void::Overtaken));
@@ -28,7 +30,7 @@ fn an_arm_that_is_old_early_or_for_nothing_does_nothing() {
     let permission = Arc::new(Permission::new(false));
     assert_eq!(permission.arm(at(1), at(1)), Err(Void::NoActuator));
     let attended = permission.attend();
-    assert!(!attended.is_to_be_armed());
+    assert!(!attended.is_to_be_armed().unwrap());
     assert_eq!(permission.arm(at(1), at(3)), Err(Void::Old(Duration::from_secs(2))));
     assert_eq!(permission.arm(at(4), at(3)), Err(Void::Early));
     assert_eq!(attended.take().count(), 0);
@@ -42,13 +44,13 @@ fn an_arm_that_is_old_early_or_for_nothing_does_nothing() {
 fn an_arm_at_the_first_plug_is_given_once_and_not_after_an_order() {
     let permission = Arc::new(Permission::new(true));
     let attended = permission.attend();
-    assert!(attended.is_to_be_armed() && !attended.is_to_be_armed());
+    assert!(attended.is_to_be_armed().unwrap() && !attended.is_to_be_armed().unwrap());
     attended.was_not_armed();
-    assert!(permission.attend().is_to_be_armed());
+    assert!(permission.attend().is_to_be_armed().unwrap());
     attended.was_not_armed();
     permission.disarm(at(1));
     attended.was_not_armed();
-    assert!(!permission.attend().is_to_be_armed());
+    assert!(!permission.attend().is_to_be_armed().unwrap());
 }
 
 proptest! {
@@ -97,5 +99,136 @@ fn of_two_threads_at_once_the_disarm_counts() {
             scope.spawn(|| permission.disarm(Stamp::now()));
         });
         assert_eq!(attended.take().last(), Some(Disarm));
+    }
+}
+
+const STOPS: [StopKind; 3] = [StopKind::Emergency, StopKind::Enabling, StopKind::Emergency];
+
+fn with_stops(arm: bool) -> Arc<Permission> {
+    let stops = ["pendant", "pedal", "door"].into_iter().zip(STOPS);
+    Arc::new(Permission::new(arm).with_interlocks(Interlocks::new(stops)))
+}
+
+fn all_run(permission: &Permission) {
+    for index in 0..STOPS.len() {
+        permission.report(index, InputState::Runs, at(1));
+    }
+}
+
+#[test]
+fn an_arm_is_refused_until_every_input_runs_and_says_why() {
+    let permission = with_stops(false);
+    let attended = permission.attend();
+    let why = |permission: &Permission| permission.arm(at(2), at(2)).map_err(|void| void.to_string());
+    let lost = "emergency stop pendant is lost: the log says why: restore it, then arm again";
+    assert_eq!(why(&permission), Err(lost.to_owned()), "not reported yet");
+    all_run(&permission);
+    assert_eq!(why(&permission), Ok(()));
+    permission.report(1, InputState::Stopped, at(3));
+    permission.report(2, InputState::Stopped, at(3));
+    let refused = permission.arm(at(4), at(4)).unwrap_err().to_string();
+    assert_eq!(refused, "enabling switch pedal is released: hold it, then arm again");
+    permission.report(1, InputState::Runs, at(5));
+    let refused = permission.arm(at(6), at(6)).unwrap_err().to_string();
+    assert_eq!(refused, "emergency stop door is pressed: release it, then arm again");
+    let door = Order::Emergency(Trip { stop: 2, is_lost: false });
+    assert_eq!(attended.take().collect::<Vec<_>>(), [door, Disarm]);
+}
+
+#[test]
+fn an_arm_of_before_a_trip_is_void_though_the_input_runs_again() {
+    let permission = with_stops(false);
+    let attended = permission.attend();
+    all_run(&permission);
+    permission.report(0, InputState::Lost, at(3));
+    permission.report(0, InputState::Runs, at(4));
+    assert_eq!(permission.arm(at(3), at(4)), Err(Void::Overtaken));
+    assert_eq!(attended.take().collect::<Vec<_>>(), [Order::Emergency(Trip { stop: 0, is_lost: true })]);
+    assert_eq!(permission.arm(at(4), at(4)), Ok(()));
+}
+
+#[test]
+fn an_arm_at_the_first_plug_is_refused_too_and_does_not_wait_for_an_input() {
+    for (reports, expected) in [
+        (&[][..], None),
+        (&[InputState::Runs], Some(true)),
+        (&[InputState::Stopped, InputState::Runs], Some(false)),
+        (&[InputState::Runs, InputState::Lost, InputState::Runs], Some(false)),
+    ] {
+        let permission = with_stops(true);
+        for state in reports {
+            for index in 0..STOPS.len() {
+                permission.report(index, *state, at(1));
+            }
+        }
+        let attended = permission.attend();
+        assert_eq!(attended.is_to_be_armed().ok(), expected, "{reports:?}");
+        all_run(&permission);
+        assert_eq!((attended.is_to_be_armed(), attended.take().count()), (Ok(false), 0), "once");
+    }
+}
+
+proptest! {
+    /// Whatever inputs and operators do: an actuator that carries out its orders is armed only while every input has run
+    /// without a break since the arm, and is stopped by the very call that reports anything else.
+    #[test]
+    fn nothing_moves_unless_every_input_runs(
+        steps in prop::collection::vec((0..5_usize, 0..3_u8, 0..3_u64), 1..60),
+        looks in prop::collection::vec(any::<bool>(), 60),
+    ) {
+        let permission = with_stops(true);
+        let attended = permission.attend();
+        let (mut is_armed, mut is_given, mut now) = (attended.is_to_be_armed().unwrap_or(false), false, 1);
+        let mut states = [InputState::Lost; 3];
+        for ((what, state, back), looks) in steps.into_iter().zip(looks) {
+            now += 1;
+            let state = [InputState::Runs, InputState::Stopped, InputState::Lost][usize::from(state)];
+            if let Some(input) = states.get_mut(what) {
+                *input = state;
+                let is_news = permission.report(what, state, Stamp(now));
+                let orders: Vec<Order> = attended.take().collect();
+                is_armed = orders.iter().fold(is_armed, |_, order| *order == Arm);
+                if state == InputState::Runs {
+                    prop_assert!(!orders.contains(&Arm) || is_given, "an input alone arms nothing");
+                } else {
+                    prop_assert!(!is_armed);
+                    let emergency = orders.iter().any(|order| matches!(order, Order::Emergency(_)));
+                    prop_assert!(!is_news || emergency || STOPS[what] == StopKind::Enabling);
+                    prop_assert!(!is_news || !orders.is_empty());
+                }
+                is_given = false;
+            } else if what == 3 {
+                let armed = permission.arm(Stamp(now - back.min(now)), Stamp(now));
+                let runs = states.iter().all(|state| *state == InputState::Runs);
+                prop_assert!(runs || armed.is_err());
+                is_given |= armed.is_ok();
+                if !runs && back == 0 {
+                    prop_assert!(matches!(armed, Err(Void::Blocked(_))));
+                }
+            } else {
+                permission.disarm(Stamp(now));
+            }
+            if looks {
+                is_armed = attended.take().fold(is_armed, |_, order| order == Arm);
+                is_given = false;
+            }
+            prop_assert!(!is_armed || states.iter().all(|state| *state == InputState::Runs));
+        }
+    }
+}
+
+#[test]
+fn of_an_arm_and_a_trip_at_once_the_trip_counts() {
+    for _ in 0..2_000 {
+        let permission = with_stops(false);
+        let attended = permission.attend();
+        all_run(&permission);
+        let given = Stamp::now();
+        std::thread::scope(|scope| {
+            scope.spawn(|| permission.arm(given, Stamp::now()));
+            scope.spawn(|| permission.report(0, InputState::Stopped, Stamp::now()));
+        });
+        let orders: Vec<Order> = attended.take().collect();
+        assert_eq!(orders, [Order::Emergency(Trip { stop: 0, is_lost: false })]);
     }
 }

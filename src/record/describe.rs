@@ -23,6 +23,7 @@ pub(super) fn describe(what: &What) -> String {
         What::Episode { file, .. } => format!("finished {}", file.display()),
         What::Recovered { text, .. } | What::Log { text, .. } => text.clone(),
         What::Actuator { .. }
+        | What::Stop(_)
         | What::Publisher { .. }
         | What::Dropped { .. }
         | What::DiskLow { .. }

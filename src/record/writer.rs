@@ -249,7 +249,11 @@ impl Writer {
             clock,
             begin,
         };
-        let session = Session::begin(beginning, &self.streams.masks).map_err(failed)?;
+        let mut session = Session::begin(beginning, &self.streams.masks).map_err(failed)?;
+        // An episode says what they say from its beginning, not only what changes.
+        for stop in self.config.board.stops() {
+            session.event(&Event { stamp: begin, what: What::Stop(stop) });
+        }
         // Withdrawn before the next one shows.
         self.set_short(None);
         self.config.board.set_recording(Some(session.status(begin)));

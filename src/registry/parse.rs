@@ -13,6 +13,7 @@ mod device;
 mod file;
 mod hooks;
 mod identity;
+mod interlock;
 mod lan;
 mod module;
 mod motors;
@@ -86,7 +87,7 @@ impl Registry {
         let document = read(text, &mut problems);
         problems.check()?;
         let root = Section::new(document.get_ref(), 0, String::new());
-        root.allow(&mut problems, &["rig", "verdict", "device", "module"]);
+        root.allow(&mut problems, &["rig", "verdict", "device", "module", "stop"]);
         let mut rig = rig(&root, &mut problems);
         let verdict = verdict::read(&root, Whose::Rig, &mut problems);
         let programs = path.map_or(Programs::Nowhere, Programs::Beside);
@@ -104,6 +105,7 @@ impl Registry {
         warnings.extend(drafts.iter().flat_map(|draft| program::distrusted(draft, &problems)));
         warnings.extend(budget::fit(&mut drafts, rig.memory_budget, root.at_of("rig"), &mut problems));
         let modules = module::modules(&root, &drafts, &mut problems);
+        let stops = interlock::interlocks(&root, &drafts, &mut problems, &mut warnings);
         problems.check()?;
         let entries = window::entries(&drafts);
         let mut devices: Vec<_> = drafts.into_iter().filter_map(|draft| draft.finish(&verdict)).collect();
@@ -115,7 +117,7 @@ impl Registry {
                 lan.keep_free(rig.disk_reserve);
             }
         }
-        let registry = Self { rig, devices, modules, path: path.map(Path::to_path_buf), text: text.to_owned() };
+        let registry = Self { rig, devices, modules, stops, path: path.map(Path::to_path_buf), text: text.to_owned() };
         Ok(Loaded { registry, warnings })
     }
 

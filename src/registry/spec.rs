@@ -6,6 +6,7 @@
 
 mod can;
 mod hooks;
+mod interlock;
 mod lan;
 mod module;
 mod motors;
@@ -24,6 +25,7 @@ use crate::sample::SampleHeader;
 pub use can::{
     CAN_BATCH, CAN_RECORD, CAN_RESTART_MS, CanAdapter, CanProtocol, CanSpec, MOTOR_CHANNELS, SLCAN_BITRATES,
 };
+pub use interlock::{Bound, FieldInput, GpioInput, InterlockInput, InterlockSpec, KeyInput, LineInput};
 pub use lan::{LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, Probe, own_side};
 pub use module::{ModuleError, ModuleSpec, mounted};
 pub use motors::{DamiaoSpec, MAX_MOTORS, MotionSpec, MotorKind, MotorMode, MotorSpec, Stop, StopSpec, WatchSpec};
@@ -50,6 +52,8 @@ pub struct Registry {
     pub devices: Vec<DeviceSpec>,
     /// What can be mounted, in the order of the file.
     pub modules: Vec<ModuleSpec>,
+    /// Emergency stops and enabling switches, in the order of the file, at most 16.
+    pub stops: Vec<InterlockSpec>,
     /// Where the text came from, for messages. `None` for the built-in registry.
     pub path: Option<PathBuf>,
     /// The text itself, recorded with every episode.
@@ -306,20 +310,24 @@ impl DeviceSpec {
     /// What this device adds to an observation.
     #[must_use]
     pub fn modality(&self) -> Modality {
-        let kind = self.node.modality_kind();
-        let shape = match (&self.node, kind) {
-            (NodeSpec::Camera(camera), _) => vec![camera.height, camera.width],
-            (NodeSpec::Serial(_), ModalityKind::Bytes) => Vec::new(),
-            (NodeSpec::Serial(serial), _) => vec![u32::try_from(serial.channels).unwrap_or(u32::MAX)],
-            (NodeSpec::Process(process), _) => process.shape.clone(),
-            (NodeSpec::Can(can), _) => can.shape(),
-            (NodeSpec::Lan(lan), _) => lan.shape(),
-        };
-        Modality { name: self.name.clone(), kind, shape }
+        Modality { name: self.name.clone(), kind: self.node.modality_kind(), shape: self.node.shape() }
     }
 }
 
 impl NodeSpec {
+    /// The shape of a sample, as in [`Modality`].
+    #[must_use]
+    pub fn shape(&self) -> Vec<u32> {
+        match (self, self.modality_kind()) {
+            (Self::Camera(camera), _) => vec![camera.height, camera.width],
+            (Self::Serial(_), ModalityKind::Bytes) => Vec::new(),
+            (Self::Serial(serial), _) => vec![u32::try_from(serial.channels).unwrap_or(u32::MAX)],
+            (Self::Process(process), _) => process.shape.clone(),
+            (Self::Can(can), _) => can.shape(),
+            (Self::Lan(lan), _) => lan.shape(),
+        }
+    }
+
     /// Which node of its device it is read from.
     #[must_use]
     pub fn opens(&self) -> Opens {

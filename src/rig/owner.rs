@@ -21,6 +21,7 @@ use super::{RigCommand, RigError};
 use crate::action::Arming;
 use crate::bus::{Bus, TopicId, Writer};
 use crate::hotplug::{HotplugEvent, HotplugStream, Witness};
+use crate::interlocks::tap::Tap;
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::registry::{Assigner, Assignment, Attachment, DeviceSpec, Registry};
@@ -74,6 +75,8 @@ struct Modality {
     post: Option<Post>,
     /// What it is told, if it is the actuator and no program reads it.
     controls: Option<Controls>,
+    /// Emergency stops and enabling switches that are numbers of its samples.
+    taps: Arc<[Tap]>,
     /// What the actuator said last in this epoch.
     arming: Option<Arming>,
     /// A removal was told and no attachment after it.
@@ -107,6 +110,7 @@ impl Rig {
                     .as_ref()
                     .filter(|_| seat.is_none())
                     .and_then(|_| Some(Controls::new(bus.actions()?))),
+                taps: Arc::from([]),
                 arming: None,
                 was_told_gone: false,
                 seat,
@@ -334,6 +338,7 @@ impl Rig {
             stop: modality.stop.clone(),
             seat: modality.seat.clone(),
             controls: modality.controls.clone(),
+            taps: Arc::clone(&modality.taps),
             episode,
         };
         let task = self.streams.spawn(stream.run());

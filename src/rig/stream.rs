@@ -21,6 +21,7 @@ use crate::action::ActuatorNotice;
 use crate::bus::Writer;
 use crate::driver::{Driver, DriverError, Reading};
 use crate::fault;
+use crate::interlocks::tap::{Tap, lost_at_the_end};
 use crate::registry::{Attachment, DeviceSpec, NodeSpec};
 use crate::sample::{Epoch, SampleHeader};
 use crate::status::{Board, EpisodeWatch, Provenance};
@@ -103,6 +104,8 @@ pub(super) struct Stream {
     pub(super) seat: Option<Seat>,
     /// What it is told, if it is the actuator.
     pub(super) controls: Option<Controls>,
+    /// Emergency stops and enabling switches that are numbers of its samples.
+    pub(super) taps: Arc<[Tap]>,
     /// The episode in progress, of which devices are told that record by themselves.
     pub(super) episode: EpisodeWatch,
 }
@@ -110,6 +113,8 @@ pub(super) struct Stream {
 impl Stream {
     /// Reads the device until it ends or the stream is told to stop. The reason is for people.
     pub(super) async fn run(self) -> (End, String) {
+        // However it ends, a panic included, what its samples said is so no more.
+        let _lost = lost_at_the_end(&self.taps);
         let stopped = || (End::Gone, "stopped".to_owned());
         let open = async {
             if let Some(is_over) = Driver::unlinked(&self.spec, &self.attachment.node) {
@@ -278,6 +283,10 @@ impl Stream {
     /// One copy, from the driver's buffer into shared memory.
     fn publish(&self, reading: &Reading<'_>) -> Result<(), String> {
         fault::point("stream");
+        // First of all: whatever becomes of the sample, what it stops is stopped.
+        for tap in &*self.taps {
+            tap.look(reading.encoding, reading.bytes);
+        }
         let (seq, lost) = self.numbers.take(reading.lost);
         let header = SampleHeader {
             seq,

@@ -16,11 +16,12 @@ use tokio::sync::broadcast;
 
 use super::{
     DeviceStatus, Event, Grade, Level, LogLine, PolicyStatus, RecordingStatus, ShortEpisode, SlotState, Snapshot,
-    Verdict, What,
+    StopStatus, Verdict, What,
 };
+use crate::interlock::InputState;
 use crate::mask::PhysicalMask;
 use crate::modality::{MAX_MODALITIES, ModalityId};
-use crate::registry::Registry;
+use crate::registry::{InterlockSpec, Registry};
 use crate::sample::Epoch;
 use crate::text;
 use crate::time::{Stamp, realtime_ns};
@@ -82,6 +83,7 @@ pub struct Board {
     slots: Mutex<Vec<Slot>>,
     mask: AtomicU64,
     mask_sequence: AtomicU64,
+    stops: Mutex<Vec<StopStatus>>,
     recording: Mutex<Option<RecordingStatus>>,
     policy: Mutex<Option<PolicyStatus>>,
     last_episode: Mutex<Option<(PathBuf, Verdict)>>,
@@ -107,6 +109,7 @@ impl Board {
             slots: Mutex::new(vec![Slot::default(); MAX_MODALITIES]),
             mask: AtomicU64::new(0),
             mask_sequence: AtomicU64::new(0),
+            stops: Mutex::new(registry.stops.iter().map(unreported).collect()),
             recording: Mutex::new(None),
             policy: Mutex::new(None),
             last_episode: Mutex::new(None),
@@ -130,6 +133,24 @@ impl Board {
         slot.state = state;
         slot.epoch = epoch;
         detail.clone_into(&mut slot.detail);
+    }
+
+    /// Reports what stop `index` of the registry says, and announces it.
+    pub fn set_stop(&self, index: usize, state: InputState, detail: &str) {
+        let changed = lock(&self.stops).get_mut(index).map(|stop| {
+            stop.state = state;
+            detail.clone_into(&mut stop.detail);
+            stop.clone()
+        });
+        if let Some(stop) = changed {
+            self.announce(What::Stop(stop));
+        }
+    }
+
+    /// Emergency stops and enabling switches, in the order of the registry.
+    #[must_use]
+    pub fn stops(&self) -> Vec<StopStatus> {
+        lock(&self.stops).clone()
     }
 
     /// Reports a publication of the mask.
@@ -260,6 +281,7 @@ impl Board {
             mask: self.mask(),
             mask_sequence: self.mask_sequence.load(Ordering::Relaxed),
             devices: devices.collect(),
+            stops: self.stops(),
             recording: lock(&self.recording).clone(),
             policy: lock(&self.policy).clone(),
             last_episode,
@@ -268,6 +290,11 @@ impl Board {
             log: lock(&self.log).iter().cloned().collect(),
         }
     }
+}
+
+fn unreported(stop: &InterlockSpec) -> StopStatus {
+    let detail = "it has not reported yet".to_owned();
+    StopStatus { stop: stop.name.clone(), kind: stop.kind, state: InputState::Lost, detail }
 }
 
 /// A poisoned lock here guards plain values that are whole at every moment: go on with them.

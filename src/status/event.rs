@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use serde::Serialize;
 
-use super::{Chunk, Grade, Level, SlotState, Verdict};
+use super::{Chunk, Grade, Level, SlotState, StopStatus, Verdict};
 use crate::action::Arming;
 use crate::modality::ModalityId;
 use crate::provenance::{KernelDriver, Negotiated};
@@ -203,6 +203,8 @@ pub enum What {
         /// What happened, for people.
         text: String,
     },
+    /// The input of an emergency stop or an enabling switch says something else than before, or is lost.
+    Stop(StopStatus),
     /// Another program publishes on a topic of ours; once an episode for each topic and program.
     Publisher {
         /// The topic.
@@ -339,6 +341,7 @@ impl What {
             Self::Actuator { device, is_problem, text, .. } => {
                 (if *is_problem { Level::Warn } else { Level::Info }, format!("{device}: {text}"))
             }
+            Self::Stop(stop) => (if stop.is_problem() { Level::Warn } else { Level::Info }, stop.sentence()),
             Self::Publisher { topic, process, command } => {
                 let text = format!("another program publishes on {topic}: process {process} ({command}); end it");
                 (Level::Warn, text)

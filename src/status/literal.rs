@@ -50,6 +50,7 @@ pub(crate) fn snapshot(devices: Vec<DeviceStatus>) -> Snapshot {
         mask,
         mask_sequence: 377_000,
         devices,
+        stops: Vec::new(),
         recording: None,
         policy: None,
         last_episode: None,
@@ -168,6 +169,7 @@ pub(crate) fn board(names: &[&str]) -> Board {
         },
         devices: names.iter().enumerate().map(device).collect(),
         modules: Vec::new(),
+        stops: Vec::new(),
         path: None,
         text: String::new(),
     })

@@ -11,6 +11,7 @@ mod event;
 pub(crate) mod literal;
 mod policy;
 pub mod rates;
+mod stop;
 mod verdict;
 
 use std::path::PathBuf;
@@ -28,6 +29,7 @@ pub use board::{Board, EpisodeEnd};
 pub use episode::{Episode, EpisodeWatch, ShortEpisode};
 pub use event::{Event, Provenance, What};
 pub use policy::{Chunk, ObservedSamples, PolicyStatus};
+pub use stop::StopStatus;
 pub use verdict::{Grade, Sensors, Verdict};
 
 /// What the device of a modality is doing.
@@ -160,6 +162,8 @@ pub struct Snapshot {
     pub mask_sequence: u64,
     /// One a modality, ascending by bit.
     pub devices: Vec<DeviceStatus>,
+    /// Emergency stops and enabling switches, in the order of the registry.
+    pub stops: Vec<StopStatus>,
     /// The recording in progress.
     pub recording: Option<RecordingStatus>,
     /// The policy at the controls, if one is.

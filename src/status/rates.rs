@@ -130,6 +130,7 @@ mod tests {
             uptime: Duration::from_millis(ms),
             mask: PhysicalMask(1),
             mask_sequence: ms / 2,
+            stops: Vec::new(),
             devices: vec![DeviceStatus {
                 name: "cam".to_owned(),
                 id: id(),

@@ -1,4 +1,5 @@
-//! The first line: which rig, since when, the mask as a number, and whether an episode is recorded.
+//! The first line: which rig, since when, the mask as a number, emergency stops and enabling switches, and whether an
+//! episode is recorded.
 
 use ratatui::Frame;
 use ratatui::layout::Rect;
@@ -7,6 +8,8 @@ use ratatui::text::{Line, Span};
 
 use super::model::Model;
 use super::theme::Theme;
+use crate::interlock::{InputState, StopKind};
+use crate::status::StopStatus;
 use crate::text;
 
 pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
@@ -68,8 +71,36 @@ fn publication(model: &Model, theme: Theme) -> Line<'static> {
     ])
 }
 
+/// The first stop that is in the way, and how many more are; without any, that they run.
+fn stops(model: &Model, theme: Theme) -> Vec<Span<'static>> {
+    let all = &model.shown().stops;
+    let is_blocked = |stop: &&StopStatus| stop.state != InputState::Runs;
+    // An emergency comes before a switch that nobody holds.
+    let blocked = all.iter().filter(is_blocked).min_by_key(|stop| !stop.is_problem());
+    let word = match (blocked.or_else(|| all.first()), all.len()) {
+        (None, _) => return Vec::new(),
+        (Some(stop), count) if blocked.is_some() || count == 1 => {
+            let what = match (stop.kind, stop.state) {
+                (StopKind::Enabling, _) => "enable",
+                (StopKind::Emergency, InputState::Runs) => "stop",
+                (StopKind::Emergency, _) => "STOP",
+            };
+            format!("{what} {} {}", text::cut(&theme.safe(&stop.stop), 16, theme.ellipsis()), stop.word())
+        }
+        (Some(_), count) => format!("{count} stops run"),
+    };
+    let more = all.iter().filter(is_blocked).count().saturating_sub(1);
+    let more = if more > 0 { format!(" +{more}") } else { String::new() };
+    let style = match blocked {
+        None => theme.faint(),
+        Some(stop) if stop.is_problem() => theme.alarm(),
+        Some(_) => theme.warning(),
+    };
+    vec![Span::styled(word + &more, style), Span::raw("  ")]
+}
+
 fn right(model: &Model, theme: Theme) -> Line<'static> {
-    let mut spans = Vec::new();
+    let mut spans = stops(model, theme);
     if model.is_paused() {
         spans.push(Span::styled("view paused", theme.warning()));
         spans.push(Span::raw("  "));

@@ -96,7 +96,7 @@ impl Asked {
     fn carry_out(&self, effect: Effect) -> Result<Option<Msg>, Ended> {
         match effect {
             Effect::None => Ok(None),
-            Effect::Order(Order::Disarm) => {
+            Effect::Order(Order::Disarm | Order::Emergency(_)) => {
                 self.permission.disarm(Stamp::now());
                 Ok(None)
             }

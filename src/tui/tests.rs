@@ -10,10 +10,11 @@ use ratatui::buffer::Buffer;
 use ratatui::style::{Color, Modifier, Style};
 
 use super::*;
+use crate::interlock::{InputState, StopKind};
 use crate::status::literal::{
     TAKEN, board, device, every_state, line, recording, sixty_four, snapshot, three_streaming,
 };
-use crate::status::{Grade, Level, RecordingStatus, Sensors, ShortEpisode, SlotState, Snapshot, Verdict};
+use crate::status::{Grade, Level, RecordingStatus, Sensors, ShortEpisode, SlotState, Snapshot, StopStatus, Verdict};
 use crate::time::Stamp;
 use theme::{Charset, Colours};
 
@@ -400,4 +401,35 @@ async fn pasted_text_drops_nothing_whether_the_terminal_marks_it_or_not() {
     let (outcome, ()) = tokio::join!(screen, app);
     outcome.unwrap();
     assert!(asked);
+}
+
+#[test]
+fn the_first_stop_that_is_in_the_way_is_in_the_header() {
+    use InputState::{Lost, Runs, Stopped};
+    use StopKind::{Emergency, Enabling};
+    let stop = |stop: &str, kind, state| StopStatus { stop: stop.into(), kind, state, detail: String::new() };
+    let head = |stops: &[StopStatus], theme| {
+        let mut snapshot = three_streaming();
+        snapshot.stops = stops.to_vec();
+        let screen = draw(&Model::new(snapshot), (120, 24), theme);
+        let line: String = screen.buffer().content.iter().take(120).map(ratatui::buffer::Cell::symbol).collect();
+        (line.trim_end().to_owned(), screen)
+    };
+    let (pendant, pedal) = (|state| stop("pendant", Emergency, state), |state| stop("pedal", Enabling, state));
+    for (stops, end) in [
+        (vec![pendant(Runs)], "stop pendant released"),
+        (vec![pedal(Runs)], "enable pedal held"),
+        (vec![pendant(Runs), pedal(Runs)], "2 stops run"),
+        (vec![pendant(Runs), pedal(Stopped)], "enable pedal released"),
+        (vec![pedal(Stopped), pendant(Stopped)], "STOP pendant pressed +1"),
+        (vec![pedal(Lost), pendant(Lost), pendant(Runs)], "enable pedal lost +1"),
+        (vec![stop("an_emergency_stop_of_a_long_name", Emergency, Lost)], "STOP an_emergency_st… lost"),
+    ] {
+        let (line, _) = head(&stops, THEME);
+        assert!(line.ends_with(end), "{line:?} does not end with {end:?}");
+    }
+    let (_, screen) = head(&[pendant(Stopped)], THEME);
+    assert_eq!(style_of(screen.buffer(), "STOP pendant").fg, THEME.alarm().fg);
+    // Without a stop nothing is there.
+    assert_eq!(head(&[], THEME).0.matches("stop").count(), 0);
 }

@@ -7,6 +7,7 @@ use tokio::task::JoinHandle;
 use super::super::Signals;
 use super::*;
 use crate::bus::TopicId;
+use crate::interlocks::Watched;
 use crate::record::{RecorderConfig, Sink, Source};
 use crate::registry::Registry;
 use crate::sample::{Epoch, SampleHeader};
@@ -86,6 +87,7 @@ impl Bench {
             autopilot: None,
             rig: never(),
             permission: Arc::default(),
+            watched: Watched::begin(&Registry::builtin(), &Arc::default(), &board).unwrap(),
             rig_ending: CancellationToken::new(),
             rig_ended: CancellationToken::new(),
             rig_stop: CancellationToken::new(),

@@ -6,6 +6,7 @@ use super::MotorBus;
 use super::motor::{Motor, Phase};
 use super::notice::{BusState, Fault, Notice, Reason};
 use super::watch::Commanded;
+use crate::action::Trip;
 use crate::control::deadman::Verdict;
 use crate::control::ramp::Ramp;
 use crate::registry::{MotorMode, Stop};
@@ -242,11 +243,29 @@ impl MotorBus {
         // What came first is what it is about.
         let is_keeping = matches!(self.state, BusState::Faulted(_)) && self.is_keeping();
         for (index, (motor, command)) in self.motors.iter_mut().zip(&mut self.commands).enumerate() {
-            motor.stop_at_fault(own == Some(index), command);
+            motor.stop_at_fault(Some(index) == own, command);
         }
         if !is_keeping {
             self.enter(BusState::Faulted(fault), now);
         }
+        self.report_stopped(fault);
+    }
+
+    /// Stops all motors at an emergency stop, each as it is to be stopped, and those that a fault has left on. Not
+    /// twice before an arm; motors that are disabled, or are being disabled, stay so.
+    pub(super) fn stop_at_emergency(&mut self, trip: Trip, now: Stamp) {
+        let is_news = !matches!(self.state, BusState::Faulted(Fault::EmergencyStop(_)));
+        if !(self.is_armed() || self.state == BusState::Arming || is_news && self.is_keeping()) {
+            return;
+        }
+        for (motor, command) in self.motors.iter_mut().zip(&mut self.commands) {
+            motor.stop_at_emergency(command);
+        }
+        self.enter(BusState::Faulted(Fault::EmergencyStop(trip)), now);
+        self.report_stopped(Fault::EmergencyStop(trip));
+    }
+
+    fn report_stopped(&mut self, fault: Fault) {
         self.counts.faults += 1;
         self.notices.tell(Notice::Fault(fault));
         self.name_latched(fault);

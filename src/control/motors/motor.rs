@@ -16,6 +16,7 @@
 mod judged;
 mod last_will;
 mod parameters;
+mod stopping;
 
 use std::time::Duration;
 
@@ -27,7 +28,7 @@ use crate::control::damiao::codec::{self, Feedback, Mit, MotorStatus, Order, Ran
 use crate::control::damiao::parameter::{self, Parameter, Reply, TIMEOUT_UNIT_US, Value};
 use crate::control::limits::{Limits, stiffness, within_torque};
 use crate::control::ramp::Ramp;
-use crate::registry::{MotorMode, MotorSpec, Stop, StopSpec};
+use crate::registry::{MotorMode, MotorSpec, Stop};
 use crate::time::Stamp;
 use parameters::PROBE;
 
@@ -160,23 +161,6 @@ impl Motor {
     pub(super) fn turn_off(&mut self) {
         self.watch.reset();
         self.phase = Phase::Off { told: false };
-    }
-
-    /// Stops it at a fault; `is_own`: its own. One that is not on is turned off, one that is kept already stays so.
-    pub(super) fn stop_at_fault(&mut self, is_own: bool, command: &mut f64) {
-        let StopSpec { own_fault, other_fault, .. } = self.spec.stop;
-        match (self.phase, if is_own { own_fault } else { other_fault }) {
-            (Phase::Kept(_), _) if !is_own => {}
-            // One that has turned itself off, or reports a fault, follows no command.
-            (Phase::On, stop @ (Stop::Damp | Stop::Hold)) if self.status == Some(MotorStatus::Enabled) => {
-                self.watch.reset();
-                self.phase = Phase::Kept(stop);
-                if self.spec.mode == MotorMode::Velocity {
-                    *command = 0.0;
-                }
-            }
-            _ => self.turn_off(),
-        }
     }
 
     /// It was stopped by a fault, and is still enabled.

@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use super::words::Words;
+use crate::action::Trip;
 use crate::control::damiao::codec::{MotorStatus, Ranges};
 use crate::control::damiao::parameter::{Parameter, Value};
 
@@ -177,6 +178,8 @@ pub enum Fault {
         /// Which.
         parameter: Parameter,
     },
+    /// An emergency stop: nothing is wrong with a motor.
+    EmergencyStop(Trip),
     /// A parameter of a motor is one that nothing can be done with, or stayed so when it was set.
     Unusable {
         /// Which.
@@ -344,16 +347,16 @@ impl Notice {
     /// In words; `names` are those of the motors.
     #[must_use]
     pub const fn words<'a>(&'a self, names: &'a [String]) -> Words<'a, Self> {
-        Words { what: self, names }
+        Words::new(self, names)
     }
 }
 
 impl Fault {
-    /// The motor that it is of, by its position in the entry, if it is of one.
+    /// The motor that it is of, by its position in the entry; `None` where it is of none.
     #[must_use]
     pub const fn motor(&self) -> Option<usize> {
         match *self {
-            Self::Stalled { .. } => None,
+            Self::EmergencyStop(_) | Self::Stalled { .. } => None,
             Self::Silent { motor }
             | Self::Latched { motor, .. }
             | Self::Hot { motor, .. }
@@ -384,6 +387,6 @@ impl Fault {
     /// In words; `names` are those of the motors.
     #[must_use]
     pub const fn words<'a>(&'a self, names: &'a [String]) -> Words<'a, Self> {
-        Words { what: self, names }
+        Words::new(self, names)
     }
 }

@@ -1,6 +1,7 @@
 //! What happened on a bus of motors, in words.
 
 use std::fmt;
+use std::sync::Arc;
 
 use super::notice::{Fault, Notice, Part, Reason, Refusal, Strange};
 use crate::control::damiao::parameter::Parameter;
@@ -8,11 +9,22 @@ use crate::control::damiao::parameter::Parameter;
 /// Something to be shown, with the names of the motors it speaks of.
 #[derive(Debug)]
 pub struct Words<'a, T> {
-    pub(super) what: &'a T,
-    pub(super) names: &'a [String],
+    what: &'a T,
+    names: &'a [String],
+    stops: &'a [Arc<str>],
 }
 
-impl<T> Words<'_, T> {
+impl<'a, T> Words<'a, T> {
+    pub(super) const fn new(what: &'a T, names: &'a [String]) -> Self {
+        Self { what, names, stops: &[] }
+    }
+
+    /// With the names of emergency stops.
+    #[must_use]
+    pub const fn with_stops(self, stops: &'a [Arc<str>]) -> Self {
+        Self { stops, ..self }
+    }
+
     fn name(&self, motor: usize) -> &str {
         self.names.get(motor).map_or("?", String::as_str)
     }
@@ -77,6 +89,7 @@ impl fmt::Display for Words<'_, Fault> {
                 write!(f, "rapid was held up: no motor was commanded for {} ms", after.as_millis())
             }
             Fault::Dropped { motor } => write!(f, "motor {} is no longer enabled", self.name(motor)),
+            Fault::EmergencyStop(trip) => f.write_str(&trip.text(self.stops)),
             Fault::NotEnabled { motor } => write!(f, "motor {} does not become enabled", self.name(motor)),
             Fault::NotDisabled { motor } => write!(f, "motor {} does not become disabled", self.name(motor)),
             Fault::Unread { motor, parameter } => write!(f, "motor {} does not tell its {parameter}", self.name(motor)),
@@ -143,7 +156,9 @@ impl fmt::Display for Words<'_, Notice> {
             Notice::Holding => f.write_str("no action came in time: motors hold"),
             Notice::Disabled(Reason::Asked) => f.write_str("motors are disabled"),
             Notice::Disabled(Reason::Deadman) => f.write_str("no action came for too long: motors are disabled"),
-            Notice::Fault(fault) => write!(f, "{}: all motors are stopped", fault.words(self.names)),
+            Notice::Fault(fault) => {
+                write!(f, "{}: all motors are stopped", fault.words(self.names).with_stops(self.stops))
+            }
             Notice::Kept { damped, held } => {
                 let parts = [("damped", damped), ("holding", held)].into_iter().filter(|(_, bits)| **bits != 0);
                 for (word, bits) in parts {
@@ -159,7 +174,7 @@ impl fmt::Display for Words<'_, Notice> {
                 write!(f, "target {target} of motor {} is beyond its limits; {used} is used", self.name(*motor))
             }
             Notice::Refused(refusal) => {
-                write!(f, "an action moves nothing: {}", Words { what: refusal, names: self.names })
+                write!(f, "an action moves nothing: {}", Words { what: refusal, names: self.names, stops: self.stops })
             }
         }
     }

@@ -141,6 +141,12 @@ impl Motors {
         })
     }
 
+    /// Names the emergency stops that orders may be of, before the first.
+    pub fn name_stops(&mut self, stops: &Arc<[Arc<str>]>) {
+        // They stay the same for a whole run.
+        let _ = self.shared.stops.set(Arc::clone(stops));
+    }
+
     /// Lets the motors move, or stops them, with the next cycle. There is room for it however many actions
     /// wait.
     ///

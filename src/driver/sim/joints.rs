@@ -1,5 +1,7 @@
 //! Simulated motors: once armed, each is where it was last told to be.
 
+use std::sync::Arc;
+
 use crate::action::{ActuatorNotice, Arming, Order};
 use crate::registry::MOTOR_CHANNELS;
 
@@ -10,6 +12,8 @@ pub(in crate::driver) struct Joints {
     is_armed: bool,
     has_moved: bool,
     notice: Option<ActuatorNotice>,
+    /// Names of the emergency stops that orders are of.
+    stops: Arc<[Arc<str>]>,
 }
 
 impl Joints {
@@ -35,17 +39,24 @@ impl Joints {
         true
     }
 
+    pub(in crate::driver) fn name_stops(&mut self, stops: &Arc<[Arc<str>]>) {
+        self.stops = Arc::clone(stops);
+    }
+
     pub(in crate::driver) fn order(&mut self, order: Order) {
         if self.positions.is_empty() {
             return;
         }
-        self.is_armed = order == Order::Arm;
-        let (arming, text) = if self.is_armed {
-            (Arming::Armed, "simulated motors follow actions")
-        } else {
-            (Arming::Disarmed, "simulated motors are disabled")
+        let was_armed = std::mem::replace(&mut self.is_armed, order == Order::Arm);
+        let (arming, text) = match order {
+            Order::Arm => (Arming::Armed, "simulated motors follow actions".to_owned()),
+            Order::Disarm => (Arming::Disarmed, "simulated motors are disabled".to_owned()),
+            Order::Emergency(_) if !was_armed => return,
+            Order::Emergency(trip) => {
+                (Arming::Faulted, format!("{}: simulated motors are stopped", trip.text(&self.stops)))
+            }
         };
-        self.notice = Some(ActuatorNotice { arming, text: text.to_owned(), is_problem: false });
+        self.notice = Some(ActuatorNotice { arming, text, is_problem: arming == Arming::Faulted });
     }
 
     pub(in crate::driver) fn take_notice(&mut self) -> Option<ActuatorNotice> {
@@ -86,5 +97,19 @@ mod tests {
         assert!(joints.command(&[3.0, 2.0]));
         joints.write(&mut payload);
         assert!((first(&payload) - 1.0).abs() < f64::EPSILON, "disarmed");
+    }
+
+    #[test]
+    fn an_emergency_stop_is_told_where_something_moved() {
+        let mut joints = Joints::new(1);
+        joints.name_stops(&["pendant".into()].into());
+        let trip = Order::Emergency(crate::action::Trip { stop: 0, is_lost: true });
+        joints.order(trip);
+        assert_eq!(joints.take_notice(), None);
+        joints.order(Order::Arm);
+        joints.order(trip);
+        let notice = joints.take_notice().expect("a notice");
+        assert_eq!((notice.arming, notice.is_problem), (Arming::Faulted, true));
+        assert_eq!(notice.text, "emergency stop pendant lost: simulated motors are stopped");
     }
 }

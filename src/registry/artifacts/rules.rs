@@ -13,7 +13,9 @@
 use std::fmt::Write as _;
 
 use super::HEADER;
-use crate::registry::spec::{CAN_RESTART_MS, DeviceSpec, NodeSpec, Opens, Registry, UsbSpec};
+use crate::registry::spec::{
+    CAN_RESTART_MS, DeviceSpec, GpioInput, InterlockInput, NodeSpec, Opens, Registry, UsbSpec,
+};
 
 /// What `linux/if_arp.h` calls a CAN interface (`ARPHRD_CAN`).
 const ARPHRD_CAN: u32 = 280;
@@ -41,6 +43,17 @@ pub(super) fn rules(registry: &Registry) -> String {
                 Err(reason) => writeln!(text, "# No stable name: {reason}."),
             },
         };
+    }
+    for stop in &registry.stops {
+        let InterlockInput::Gpio(GpioInput { chip, .. }) = &stop.input else { continue };
+        // A name of a chip as the kernel gives it; any other is a link of somebody's rule.
+        let chip = chip.to_str().and_then(|chip| chip.strip_prefix("/dev/gpiochip"));
+        if let Some(number) =
+            chip.filter(|number| (1..=5).contains(&number.len()) && number.bytes().all(|byte| byte.is_ascii_digit()))
+        {
+            let rule = format!("SUBSYSTEM==\"gpio\", KERNEL==\"gpiochip{number}\", GROUP=\"gpio\", MODE=\"0660\"");
+            let _ = writeln!(text, "\n# stop {}\n{rule}", stop.name);
+        }
     }
     text
 }

@@ -118,6 +118,32 @@ fn the_service_may_open_usb_devices_only_where_a_program_does() {
     }
 }
 
+#[test]
+fn the_service_may_open_keys_and_gpio_chips_only_where_a_stop_is_one() {
+    let key = "[stop.pedal]\nkind = \"enabling\"\nkey = { device = \"a pedal\", code = \"KEY_B\" }\n";
+    let gpio = "[stop.door]\nkind = \"emergency\"\n\
+                gpio = { chip = \"/dev/gpiochip3\", line = 1, runs_while = \"low\" }\n";
+    for (stops, keys, chips) in
+        [("", false, false), (key, true, false), (gpio, false, true), (&[key, gpio].concat(), true, true)]
+    {
+        let text = format!("{}{stops}", crate::registry::BUILTIN);
+        let all = artifacts(&Registry::parse(&text, None).unwrap().registry);
+        let (rules, unit) = (text_of(&all, "99-rapid.rules"), text_of(&all, "rapid.service"));
+        assert_eq!(rules.contains("SUBSYSTEM==\"gpio\", KERNEL==\"gpiochip3\", GROUP=\"gpio\""), chips, "{rules}");
+        let has = |line: &str| unit.lines().any(|is| is == line);
+        assert_eq!((has("DeviceAllow=char-input rw"), has("DeviceAllow=char-gpiochip rw")), (keys, chips), "{unit}");
+        let groups = unit.lines().find_map(|line| line.strip_prefix("SupplementaryGroups=")).unwrap();
+        for (group, is_needed) in [("input", keys), ("gpio", chips)] {
+            assert_eq!(groups.split(' ').any(|is| is == group), is_needed, "{unit}");
+            assert_eq!(unit.contains(&format!("groupadd --system --force {group}\n")), is_needed, "{unit}");
+        }
+        assert!(has(&format!(
+            "#   useradd --system --user-group --no-create-home --groups {} rapid",
+            groups.replace(' ', ",")
+        )));
+    }
+}
+
 /// Entries of every kind that differs in what the service must be able to do: a name, the entry, and the kinds of
 /// sockets it needs besides those of udev and the journal.
 const KINDS: &[(&str, &str, &[&str])] = &[

@@ -17,18 +17,32 @@
 use std::collections::BTreeSet;
 
 use super::HEADER;
-use crate::registry::spec::{CanAdapter, CanProtocol, NodeSpec, Opens, Registry};
+use crate::registry::spec::{CanAdapter, CanProtocol, InterlockInput, NodeSpec, Opens, Registry};
 
 /// Where the unit expects the registry.
 pub const SYSTEM_REGISTRY: &str = "/etc/rapid/devices.toml";
+
+/// Device nodes: the group that may open them, that of our rules or of udev's own, and what /proc/devices calls them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+struct Nodes {
+    group: &'static str,
+    kind: &'static str,
+}
+
+/// A program opens the USB device itself.
+const USB: Nodes = Nodes { group: "plugdev", kind: "char-usb_device" };
+/// A stop is a key.
+const KEYS: Nodes = Nodes { group: "input", kind: "char-input" };
+/// A stop is a line of a GPIO chip.
+const GPIO: Nodes = Nodes { group: "gpio", kind: "char-gpiochip" };
 
 /// What the entries of a registry need of the system.
 #[derive(Debug, Default)]
 struct Needs {
     /// Kinds of sockets, besides those of udev, the journal and programs. A CAN adapter on a serial line has none.
     sockets: BTreeSet<&'static str>,
-    /// A program opens the USB device itself.
-    usb: bool,
+    /// Nodes that only some registries need.
+    nodes: BTreeSet<Nodes>,
     /// Programs of others run: nodes and hooks.
     programs: bool,
     /// Motors have a guard, which outlives the program.
@@ -50,13 +64,33 @@ impl Needs {
                 }
                 NodeSpec::Process(process) => {
                     needs.programs = true;
-                    needs.usb |= process.opens == Opens::Usb;
+                    if process.opens == Opens::Usb {
+                        needs.nodes.insert(USB);
+                    }
                 }
                 NodeSpec::Can(_) | NodeSpec::Camera(_) | NodeSpec::Serial(_) => {}
             }
             needs.programs |= !device.hooks.is_empty();
         }
+        for stop in &registry.stops {
+            match stop.input {
+                InterlockInput::Key(_) => needs.nodes.insert(KEYS),
+                InterlockInput::Gpio(_) => needs.nodes.insert(GPIO),
+                InterlockInput::Serial(_) | InterlockInput::Field(_) => false,
+            };
+        }
         needs
+    }
+
+    /// Of nodes that only some registries need: commands that make their groups, the groups, and what is allowed.
+    fn nodes(&self) -> (String, String, String) {
+        let (mut make, mut groups, mut allow) = (String::new(), String::new(), String::new());
+        for Nodes { group, kind } in &self.nodes {
+            make += &["#   groupadd --system --force ", group, "\n"].concat();
+            groups += &[" ", group].concat();
+            allow += &["DeviceAllow=", kind, " rw\n"].concat();
+        }
+        (make, groups, allow)
     }
 
     /// `RestrictAddressFamilies=`: udev speaks netlink, the journal and programs `AF_UNIX`.
@@ -103,15 +137,11 @@ pub(super) fn unit(registry: &Registry) -> String {
     let rig = &registry.rig.name;
     let needs = Needs::of(registry);
     let (families, only_without, kill_mode) = (needs.families(), needs.only_without(), needs.kill_mode());
-    // The group is that of the rules.
-    let (make_group, group, allow) = if needs.usb {
-        ("#   groupadd --system --force plugdev\n", " plugdev", "DeviceAllow=char-usb_device rw\n")
-    } else {
-        ("", "", "")
-    };
+    let (make_group, group, allow) = needs.nodes();
     let groups = format!("video dialout{group}");
     let listed = groups.replace(' ', ",");
-    let touched = if needs.usb { "cameras, serial lines, USB devices" } else { "cameras, serial lines" };
+    let touched =
+        if needs.nodes.contains(&USB) { "cameras, serial lines, USB devices" } else { "cameras, serial lines" };
     format!(
         r"{HEADER}
 # Before the first start:

@@ -9,7 +9,7 @@ use super::name::name_problem;
 use super::program::{For, Programs};
 use super::verdict::{VerdictTable, Whose};
 use super::{action, can, hooks, identity, lan, motors, node, process, verdict};
-use crate::modality::ModalityId;
+use crate::modality::{ModalityId, ModalityKind};
 use crate::registry::diagnostic::did_you_mean;
 use crate::registry::limits::VerdictSpec;
 use crate::registry::section::{At, Problems, Section};
@@ -120,6 +120,21 @@ impl Draft<'_> {
             action: self.action,
             hooks: self.hooks,
         })
+    }
+
+    /// How many numbers a sample holds, 0 if it holds none; `None` if a problem with the node was reported.
+    pub(super) fn numbers(&self) -> Option<usize> {
+        let node = self.node.as_ref()?;
+        let count = match node.modality_kind() {
+            ModalityKind::Scalars => node.shape().first().copied().unwrap_or(0),
+            ModalityKind::Image | ModalityKind::Bytes => 0,
+        };
+        usize::try_from(count).ok()
+    }
+
+    /// It is moved by a program that reads it as well.
+    pub(super) fn is_moved_by_a_program(&self) -> bool {
+        self.action.is_some() && self.kind == Some(Kind::Process)
     }
 
     pub(super) fn default_topic(&self) -> String {

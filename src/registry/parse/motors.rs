@@ -1,17 +1,19 @@
 //! The motors of `[device.NAME.can]`, and the axes of actions that follow from them.
 
+mod conduct;
+
 use std::time::Duration;
 
 use super::window::Entry;
 use crate::registry::diagnostic::{Diagnostic, did_you_mean};
 use crate::registry::section::{Problems, Section};
 use crate::registry::spec::{
-    ActionSpec, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, NodeSpec,
-    Stop, StopSpec, WatchSpec,
+    ActionSpec, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, MotorKind, MotorMode, MotorSpec, NodeSpec,
 };
 use crate::registry::units::show_duration;
+use conduct::{motion, or_never, stop, watch};
 
-const KEYS: [&str; 22] = [
+const KEYS: [&str; 23] = [
     "name",
     "slave",
     "master",
@@ -31,6 +33,7 @@ const KEYS: [&str; 22] = [
     "blocked_after",
     "own_fault",
     "other_fault",
+    "emergency",
     "hold_for",
     "max_mos",
     "max_rotor",
@@ -240,64 +243,6 @@ fn position(entry: &Section<'_>, mode: Option<MotorMode>, problems: &mut Problem
             None
         }
     }
-}
-
-/// How the command of a position starts and changes.
-fn motion(entry: &Section<'_>, slew: f64, mode: Option<MotorMode>, problems: &mut Problems<'_>) -> MotionSpec {
-    let default = MotionSpec::of_slew(slew);
-    if mode == Some(MotorMode::Velocity) {
-        for key in ["acceleration", "soft_start", "first_target"].into_iter().filter(|key| entry.has(key)) {
-            let message = format!("a commanded velocity has no {key}");
-            entry.report(problems, key, message, format!("remove {key}; slew limits its acceleration"));
-        }
-        return default;
-    }
-    let soft_start = entry.duration(problems, "soft_start", Duration::ZERO..=Duration::from_secs(10));
-    MotionSpec {
-        acceleration: above_zero(entry, "acceleration", 100_000.0, problems).unwrap_or(default.acceleration),
-        soft_start: soft_start.unwrap_or(default.soft_start),
-        first_target: above_zero(entry, "first_target", 200.0, problems).unwrap_or(default.first_target),
-    }
-}
-
-/// When what the motor does is a fault.
-fn watch(entry: &Section<'_>, problems: &mut Problems<'_>) -> WatchSpec {
-    let default = WatchSpec::default();
-    let half_a_second = Duration::from_millis(500);
-    WatchSpec {
-        margin: entry.number(problems, "margin", 0.0..=1.0).unwrap_or(default.margin),
-        lag: above_zero(entry, "lag", 10.0, problems).unwrap_or(default.lag),
-        blocked_after: or_never(entry, problems, "blocked_after", half_a_second, default.blocked_after),
-    }
-}
-
-/// How the motor stops at a fault.
-fn stop(entry: &Section<'_>, problems: &mut Problems<'_>) -> StopSpec {
-    let default = StopSpec::default();
-    let words = [("limp", Stop::Limp), ("damp", Stop::Damp), ("hold", Stop::Hold)];
-    let mut choice = |key| entry.has(key).then(|| entry.choice(problems, key, &words)).flatten();
-    let (own_fault, other_fault) = (choice("own_fault"), choice("other_fault"));
-    StopSpec {
-        own_fault: own_fault.unwrap_or(default.own_fault),
-        other_fault: other_fault.unwrap_or(default.other_fault),
-        hold_for: or_never(entry, problems, "hold_for", Duration::from_millis(10), default.hold_for),
-    }
-}
-
-/// A time of `least` to an hour, or the word "never".
-fn or_never(
-    table: &Section<'_>,
-    problems: &mut Problems<'_>,
-    key: &str,
-    least: Duration,
-    default: Option<Duration>,
-) -> Option<Duration> {
-    if !table.has(key) {
-        return default;
-    }
-    let mut fields = table.fields().into_iter();
-    let is_never = fields.any(|(_, name, value)| name == key && value.get_ref().as_str() == Some("never"));
-    if is_never { None } else { table.duration(problems, key, least..=Duration::from_hours(1)) }
 }
 
 /// A number above zero.

@@ -61,7 +61,7 @@ pub struct MotorSpec {
     pub max_rotor: f64,
 }
 
-/// How a joint stops at a fault. A disarm, and the end of the program, disable it whatever this is.
+/// How a joint stops at a fault or an emergency stop. A disarm, and the end of the program, disable it whatever this is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Stop {
     /// Disabled: a joint under load falls.
@@ -80,14 +80,16 @@ pub struct StopSpec {
     pub own_fault: Stop,
     /// At another motor's.
     pub other_fault: Stop,
+    /// At an emergency stop.
+    pub emergency: Stop,
     /// How long it holds before it is disabled; `None` is until a disarm.
     pub hold_for: Option<Duration>,
 }
 
 impl Default for StopSpec {
-    /// What is wrong with a joint is not driven on; the others sink slowly with it.
+    /// What is wrong with a joint is not driven on; the others sink slowly with it. An emergency stop disables all.
     fn default() -> Self {
-        Self { own_fault: Stop::Limp, other_fault: Stop::Damp, hold_for: None }
+        Self { own_fault: Stop::Limp, other_fault: Stop::Damp, emergency: Stop::Limp, hold_for: None }
     }
 }
 

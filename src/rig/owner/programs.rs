@@ -5,6 +5,7 @@ use std::sync::Arc;
 use tokio_util::sync::CancellationToken;
 
 use super::Rig;
+use crate::interlocks::tap::Tap;
 use crate::modality::ModalityId;
 use crate::permission::Permission;
 use crate::registry::Attachment;
@@ -23,6 +24,15 @@ impl Rig {
     pub fn obeying(mut self, permission: &Arc<Permission>) -> Self {
         for controls in self.modalities.iter_mut().filter_map(|modality| modality.controls.as_mut()) {
             controls.obey(permission);
+        }
+        self
+    }
+
+    /// Samples of its devices are looked at for these emergency stops and enabling switches.
+    #[must_use]
+    pub fn tapped(mut self, taps: &[Tap]) -> Self {
+        for modality in &mut self.modalities {
+            modality.taps = taps.iter().filter(|tap| tap.device() == modality.spec.name).cloned().collect();
         }
         self
     }

@@ -62,6 +62,7 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
         },
         devices: [(0, "a"), (1, "b")].into_iter().map(device).collect(),
         modules: Vec::new(),
+        stops: Vec::new(),
         path: None,
         text: String::new(),
     }
@@ -133,7 +134,7 @@ impl Bench {
             Give(order) => {
                 let _ = match order {
                     Order::Arm => self.permission.arm(Stamp::now(), Stamp::now()),
-                    Order::Disarm => {
+                    Order::Disarm | Order::Emergency(_) => {
                         self.permission.disarm(Stamp::now());
                         Ok(())
                     }

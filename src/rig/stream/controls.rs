@@ -46,8 +46,11 @@ impl Controls {
     pub(super) fn begin(&self, source: &mut Source) -> Result<Controlled, DriverError> {
         self.actions.discard();
         let orders = self.permission.attend();
-        if orders.is_to_be_armed() {
-            source.order(Order::Arm).inspect_err(|_| orders.was_not_armed())?;
+        source.name_stops(orders.stops());
+        match orders.is_to_be_armed() {
+            Ok(true) => source.order(Order::Arm).inspect_err(|_| orders.was_not_armed())?,
+            Ok(false) => {}
+            Err(blocked) => tracing::warn!("not armed at the start: {blocked}"),
         }
         Ok(Controlled { actions: Arc::clone(&self.actions), orders, action: [0.0; MAX_ACTION] })
     }

@@ -62,6 +62,12 @@ impl Source {
         }
     }
 
+    pub(super) fn name_stops(&mut self, stops: &Arc<[Arc<str>]>) {
+        if let Self::Driver(driver) = self {
+            driver.name_stops(stops);
+        }
+    }
+
     pub(super) fn take_notice(&mut self) -> Option<ActuatorNotice> {
         match self {
             Self::Driver(driver) => driver.take_notice(),

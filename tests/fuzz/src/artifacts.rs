@@ -8,7 +8,10 @@ use std::time::Duration;
 
 use rapid::modality::ModalityKind;
 use rapid::registry::artifacts::{ArtifactKind, artifacts};
-use rapid::registry::{CanAdapter, DeviceSpec, Hook, LanFind, LanProtocol, LanSpec, NodeSpec, ProcessSpec, Registry};
+use rapid::registry::{
+    CanAdapter, DeviceSpec, Hook, InterlockInput, InterlockSpec, LanFind, LanProtocol, LanSpec, NodeSpec, ProcessSpec,
+    Registry,
+};
 use yaml_rust2::{Yaml, YamlLoader};
 
 use crate::rules::{self, Token};
@@ -19,6 +22,7 @@ pub(crate) fn check(registry: &Registry) {
     // A harmless registry whose entries have as much to open: of all that is in a registry only that may change the unit.
     let mut harmless = Registry::builtin();
     harmless.devices = registry.devices.iter().map(harmless_device).collect();
+    harmless.stops = registry.stops.iter().map(harmless_stop).collect();
     let expected = unit_without_names(&text_of_unit(&harmless).replace(&harmless.rig.name, ""));
     for artifact in artifacts(registry) {
         let text = &artifact.contents;
@@ -28,6 +32,20 @@ pub(crate) fn check(registry: &Registry) {
             ArtifactKind::Descriptor => check_descriptor(registry, &artifact.path, text),
         }
     }
+}
+
+/// A stop that opens the same kind of node as `stop`, and has nothing else in common with it.
+fn harmless_stop(stop: &InterlockSpec) -> InterlockSpec {
+    let mut harmless = stop.clone();
+    "x".clone_into(&mut harmless.name);
+    harmless.actuators = Vec::new();
+    match &mut harmless.input {
+        InterlockInput::Key(key) => "x".clone_into(&mut key.device),
+        InterlockInput::Gpio(gpio) => gpio.chip = "/dev/gpiochip0".into(),
+        InterlockInput::Serial(line) => line.path = "/dev/x".into(),
+        InterlockInput::Field(field) => "x".clone_into(&mut field.device),
+    }
+    harmless
 }
 
 /// A device of which the system is asked the same as of `device`, and that has nothing else in common with it.
@@ -83,6 +101,10 @@ fn check_rules(registry: &Registry, text: &str) {
             check_commands(registry, rule);
             continue;
         }
+        if value("SUBSYSTEM") == Some("gpio") {
+            check_chip(registry, rule);
+            continue;
+        }
         let link = value("SYMLINK").expect("every rule gives a name");
         assert!(named.insert(link.to_owned()), "two rules for {link}");
         let device = registry.devices.iter().find(|device| format!("rapid/{}", device.name) == link);
@@ -108,6 +130,17 @@ fn check_rules(registry: &Registry, text: &str) {
             }
         }
     }
+}
+
+/// The chip of a stop becomes that of our group, and nothing else happens to it.
+fn check_chip(registry: &Registry, rule: &[Token]) {
+    let [subsystem, kernel, group, mode] = rule else { panic!("{} words for a chip", rule.len()) };
+    let words = |token: &Token| format!("{}{}{}", token.key, token.operator, token.value);
+    assert_eq!([subsystem, group, mode].map(words), ["SUBSYSTEM==gpio", "GROUP=gpio", "MODE=0660"]);
+    let chip = Path::new("/dev").join(&kernel.value);
+    let is_its = |stop: &InterlockSpec| matches!(&stop.input, InterlockInput::Gpio(gpio) if gpio.chip == chip);
+    assert!(kernel.key == "KERNEL" && registry.stops.iter().any(is_its), "a rule for {}", chip.display());
+    assert!(kernel.value.bytes().all(|byte| byte.is_ascii_alphanumeric()), "{}", kernel.value);
 }
 
 /// A CAN interface is brought up, and nothing else: the words are ours and a number of the registry.

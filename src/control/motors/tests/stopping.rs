@@ -1,6 +1,7 @@
 //! How joints stop at a fault: each in its way, and none until the next arm in another.
 
 use super::*;
+use crate::action::Trip;
 use crate::registry::{Stop, StopSpec};
 
 /// Two motors that are armed, the second of which stops in this way.
@@ -22,7 +23,7 @@ fn second(world: &World) -> Option<CanFrame> {
 }
 
 const fn others(other_fault: Stop) -> StopSpec {
-    StopSpec { own_fault: Stop::Limp, other_fault, hold_for: None }
+    StopSpec { own_fault: Stop::Limp, other_fault, emergency: Stop::Limp, hold_for: None }
 }
 
 #[test]
@@ -117,4 +118,77 @@ fn an_arm_takes_joints_that_are_kept_again() {
     assert!(world.target(&[0.6, 0.6]));
     world.run(30);
     assert!((world.sims[1].q - 0.6).abs() < 1e-3);
+}
+
+const TRIP: Trip = Trip { stop: 1, is_lost: false };
+
+fn emergency(world: &mut World) {
+    world.emergency(TRIP);
+}
+
+#[test]
+fn at_an_emergency_stop_each_joint_stops_in_its_way_in_the_next_cycle() {
+    for (way, damped, held) in [(Stop::Limp, 0, 0), (Stop::Damp, 2, 0), (Stop::Hold, 0, 2)] {
+        let mut world = armed(MIT, StopSpec { emergency: way, ..StopSpec::default() });
+        emergency(&mut world);
+        world.cycle();
+        assert_eq!(world.bus.state(), BusState::Faulted(Fault::EmergencyStop(TRIP)));
+        let disabled = Order::Disable.frame(1);
+        assert!(world.sent.contains(&disabled), "the first is limp: {:x?}", world.sent);
+        assert_eq!(world.told(Notice::Kept { damped, held }), usize::from(damped | held != 0));
+        // Pressed again, or lost meanwhile: that is the same stop.
+        emergency(&mut world);
+        assert!(!world.target(&[1.0, 1.0]));
+        world.run(200);
+        assert_eq!((world.sims[0].is_on(), world.sims[1].is_on()), (false, way != Stop::Limp));
+        assert_eq!(world.told(Notice::Fault(Fault::EmergencyStop(TRIP))), 1, "{:?}", world.notices);
+        // A disarm turns off what is held, an arm begins anew.
+        world.disarm();
+        world.run(5);
+        assert!(!world.sims[1].is_on());
+        world.arm();
+        world.run_until(BusState::Holding);
+        assert!(world.target(&[0.6, 0.6]));
+    }
+}
+
+#[test]
+fn an_emergency_stop_is_named() {
+    let mut world = armed(MIT, StopSpec::default());
+    emergency(&mut world);
+    world.cycle();
+    let fault = world.run_to_fault();
+    assert_eq!(fault.motor(), None);
+    let stops = ["door".into(), "pendant".into()];
+    let text = |trip| Notice::Fault(Fault::EmergencyStop(trip)).words(&[]).with_stops(&stops).to_string();
+    assert_eq!(text(TRIP), "emergency stop pendant pressed: all motors are stopped");
+    assert_eq!(text(Trip { stop: 0, is_lost: true }), "emergency stop door lost: all motors are stopped");
+}
+
+#[test]
+fn an_emergency_stop_ends_an_arm_and_what_a_fault_has_left_on() {
+    let mut world = World::ready();
+    // Nothing is on: there is nothing to stop.
+    emergency(&mut world);
+    world.run(20);
+    assert_eq!(world.bus.state(), BusState::Disarmed);
+    world.arm();
+    world.cycle();
+    emergency(&mut world);
+    world.run(100);
+    assert_eq!(world.bus.state(), BusState::Faulted(Fault::EmergencyStop(TRIP)));
+    assert!(world.sims.iter().all(|sim| !sim.is_on()));
+
+    for (way, is_on) in [(Stop::Limp, false), (Stop::Damp, true), (Stop::Hold, true)] {
+        let mut world = armed(MIT, StopSpec { emergency: way, ..others(Stop::Hold) });
+        world.sims[0].status = MotorStatus::OverCurrent;
+        world.run_to_fault();
+        world.run(20);
+        emergency(&mut world);
+        world.run(20);
+        assert_eq!(world.bus.state(), BusState::Faulted(Fault::EmergencyStop(TRIP)));
+        assert_eq!(world.sims[1].is_on(), is_on, "{way:?}");
+        let kp = second(&world).map_or(0, |frame| u16::from_be_bytes([frame.data[3] & 0xf, frame.data[4]]));
+        assert!(way != Stop::Damp || kp == 0, "it holds no more than it is to");
+    }
 }

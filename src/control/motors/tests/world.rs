@@ -3,6 +3,7 @@
 use std::collections::VecDeque;
 
 use super::*;
+use crate::action::Trip;
 use crate::control::damiao::codec::{Feedback, MotorStatus, Ranges};
 use crate::control::damiao::parameter::{Parameter, Value};
 use crate::registry::{MotionSpec, MotorKind, MotorSpec, Stop, StopSpec, WatchSpec};
@@ -76,6 +77,9 @@ impl Sim {
             let [low, high, verb, rid, value @ ..] = frame.data;
             if u16::from_le_bytes([low, high]) != self.slave {
                 return None;
+            }
+            if !self.is_on() {
+                self.dq = 0.0;
             }
             return if verb == 0xcc { self.feedback() } else { self.parameter(verb, rid, value) };
         }
@@ -176,7 +180,7 @@ pub(super) fn motor(slave: u16, master: u16, mode: MotorMode) -> MotorSpec {
         motion: MotionSpec { acceleration: f64::INFINITY, soft_start: Duration::ZERO, first_target: 100.0 },
         watch: WatchSpec::default(),
         // A joint that stops otherwise has tests of its own.
-        stop: StopSpec { own_fault: Stop::Limp, other_fault: Stop::Limp, hold_for: None },
+        stop: StopSpec { own_fault: Stop::Limp, other_fault: Stop::Limp, emergency: Stop::Limp, hold_for: None },
         max_mos: 80.0,
         max_rotor: 100.0,
     }
@@ -284,6 +288,11 @@ impl World {
     pub(super) fn disarm(&mut self) {
         self.bus.disarm(self.now);
         (self.judge.may_move, self.judge.may_keep) = (false, false);
+    }
+
+    pub(super) fn emergency(&mut self, trip: Trip) {
+        self.bus.emergency(trip, self.now);
+        self.judge.may_move = false;
     }
 
     pub(super) fn stop(&mut self) -> Vec<CanFrame> {

@@ -74,6 +74,8 @@ impl Target {
 pub(super) struct Shared {
     asked: AtomicBool,
     pub(super) orders: OrderSlot,
+    /// Names of the emergency stops that orders are of.
+    pub(super) stops: OnceLock<Arc<[Arc<str>]>>,
     reason: OnceLock<LinkError>,
     pub(super) punctuality: OnceLock<Punctuality>,
 }
@@ -248,6 +250,7 @@ impl Beat {
             match order {
                 Order::Arm => bus.arm(now),
                 Order::Disarm => bus.disarm(now),
+                Order::Emergency(trip) => bus.emergency(trip, now),
             }
         }
         while let Ok(target) = self.targets.try_recv() {
@@ -320,7 +323,8 @@ impl Beat {
             let (text, is_problem) = if let Some(text) = self.troubles.pop_front() {
                 (text, true)
             } else if let Some(notice) = bus.take_notice() {
-                (notice.words(bus.names()).to_string(), notice.is_problem())
+                let stops = self.shared.stops.get().map_or(&[][..], |stops| stops);
+                (notice.words(bus.names()).with_stops(stops).to_string(), notice.is_problem())
             } else {
                 return;
             };

@@ -9,7 +9,7 @@ use std::time::Duration;
 use tokio::time::{Instant, interval, timeout};
 
 use super::*;
-use crate::action::Arming;
+use crate::action::{Arming, Trip};
 use crate::control::can::CanFrame;
 use crate::control::damiao::codec::{self, Feedback, MotorStatus, Ranges};
 use crate::control::damiao::parameter::{Parameter, Reply, Value};
@@ -33,7 +33,7 @@ fn spec(count: u16, hz: u32) -> DamiaoSpec {
         slew: 5.0,
         motion: MotionSpec { first_target: 10.0, ..MotionSpec::of_slew(5.0) },
         watch: WatchSpec::default(),
-        stop: StopSpec { own_fault: Stop::Limp, other_fault: Stop::Limp, hold_for: None },
+        stop: StopSpec { own_fault: Stop::Limp, other_fault: Stop::Limp, emergency: Stop::Limp, hold_for: None },
         max_mos: 80.0,
         max_rotor: 80.0,
     };
@@ -124,6 +124,28 @@ async fn told(motors: &mut Motors, wanted: impl Fn(&ActuatorNotice) -> bool) -> 
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_emergency_stop_turns_the_motor_off_and_is_named() {
+    let (link, bus) = bus();
+    let (fate, thread) = motor(bus);
+    let mut motors = Motors::start(link, &spec(1, 200)).unwrap();
+    motors.name_stops(&["door".into(), "pendant".into()].into());
+    motors.order(Order::Arm).unwrap();
+    told(&mut motors, |notice| notice.arming == Arming::Holding).await;
+    motors.order(Order::Emergency(Trip { stop: 1, is_lost: true })).unwrap();
+    let notice = told(&mut motors, |notice| notice.arming == Arming::Faulted).await;
+    assert_eq!(notice.text, "emergency stop pendant lost: all motors are stopped");
+    assert!(notice.is_problem);
+    let begun = Instant::now();
+    while fate.is_on.load(Ordering::Acquire) {
+        assert!(begun.elapsed() < PATIENCE);
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
+    motors.close().await;
+    fate.ends.store(true, Ordering::Release);
+    thread.join().unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_bus_off_without_a_return_is_told_and_ends_the_driver() {
     let (link, bus) = bus();
     let mut motors = Motors::start(link, &spec(1, 200)).unwrap();
@@ -176,18 +198,16 @@ async fn there_is_room_for_an_order_where_there_is_none_for_actions() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn notices_wait_for_room() {
     const COUNT: usize = NOTICES + 30;
-    let (link, _bus) = bus();
+    let (link, bus) = bus();
     let mut motors = Motors::start(link, &spec(1, 1000)).unwrap();
-    let begun = Instant::now();
+    // Warm, and cool again: each time it is warm is a notice.
     for at in 0..2 * COUNT {
-        let target = if at % 2 == 0 { f64::NAN } else { 0.0 };
-        while motors.command(&[target], Stamp::now()).is_err() {
-            assert!(begun.elapsed() < PATIENCE, "actions are not taken");
-            tokio::time::sleep(Duration::from_millis(1)).await;
-        }
+        let mos = if at % 2 == 0 { 75 } else { 30 };
+        let feedback = Feedback { id: 1, status: MotorStatus::Disabled, q: 0.5, dq: 0.0, tau: 0.1, mos, rotor: 41 };
+        bus.send(&bytes(&feedback.encode(0x11, &Ranges::new(12.5, 30.0, 10.0).unwrap()).unwrap())).unwrap();
     }
     for _ in 0..COUNT {
-        told(&mut motors, |notice| notice.text.contains("not finite")).await;
+        told(&mut motors, |notice| notice.text.contains("of at most 80 °C")).await;
     }
 }
 

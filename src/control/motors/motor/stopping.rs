@@ -1,0 +1,40 @@
+//! How a motor is stopped: off, damped, or where it is.
+
+use super::{Motor, Phase};
+use crate::control::damiao::codec::MotorStatus;
+use crate::registry::{MotorMode, Stop, StopSpec};
+
+impl Motor {
+    /// Stops it at a fault; `is_own`: its own. One that is not on is turned off, one that is kept already stays so.
+    pub(in crate::control::motors) fn stop_at_fault(&mut self, is_own: bool, command: &mut f64) {
+        let StopSpec { own_fault, other_fault, .. } = self.spec.stop;
+        match (self.phase, if is_own { own_fault } else { other_fault }) {
+            (Phase::Kept(_), _) if !is_own => {}
+            (_, stop) => self.stop_as(stop, command),
+        }
+    }
+
+    /// Stops it at an emergency stop. What a fault has left on may hold no more than before.
+    pub(in crate::control::motors) fn stop_at_emergency(&mut self, command: &mut f64) {
+        match (self.phase, self.spec.stop.emergency) {
+            (Phase::Kept(_), Stop::Limp) => self.turn_off(),
+            (Phase::Kept(Stop::Hold), Stop::Damp) => self.phase = Phase::Kept(Stop::Damp),
+            (Phase::Kept(_), _) => {}
+            (_, stop) => self.stop_as(stop, command),
+        }
+    }
+
+    fn stop_as(&mut self, stop: Stop, command: &mut f64) {
+        match (self.phase, stop) {
+            // One that has turned itself off, or reports a fault, follows no command.
+            (Phase::On, stop @ (Stop::Damp | Stop::Hold)) if self.status == Some(MotorStatus::Enabled) => {
+                self.watch.reset();
+                self.phase = Phase::Kept(stop);
+                if self.spec.mode == MotorMode::Velocity {
+                    *command = 0.0;
+                }
+            }
+            _ => self.turn_off(),
+        }
+    }
+}

@@ -1,0 +1,176 @@
+//! Interlocks: emergency stops and enabling switches, each with an input that has to run for the actuator to move.
+//!
+//! | input says | emergency stop         | enabling switch        |
+//! |------------|------------------------|------------------------|
+//! | runs       | an arm is possible     | an arm is possible     |
+//! | stopped    | emergency stop         | disarm                 |
+//! | lost       | emergency stop         | disarm                 |
+//!
+//! What an input is read from, and when it is lost, is known to whoever reports it; who gives the orders is
+//! [`Permission`](crate::permission::Permission).
+//!
+//! Invariant: an input that has not reported yet is lost.
+//! Invariant: nothing here moves anything: an input that runs again alone permits an arm.
+//! Invariant: nothing here waits, locks or, but to refuse an arm, allocates.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU8, Ordering};
+
+use serde::Serialize;
+
+use crate::action::{Order, Trip};
+
+/// Stops of a rig, at most.
+pub const MAX_STOPS: usize = 16;
+
+/// What an input stops.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum StopKind {
+    /// An emergency stop: the joints stop as each is configured, and stay so until an arm.
+    Emergency,
+    /// A switch that has to be held: released, the actuator is disarmed.
+    Enabling,
+}
+
+impl StopKind {
+    /// What it is, for people.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Emergency => "emergency stop",
+            Self::Enabling => "enabling switch",
+        }
+    }
+
+    /// What an input of this state is doing, for people.
+    #[must_use]
+    pub const fn word(self, state: InputState) -> &'static str {
+        match (self, state) {
+            (_, InputState::Lost) => "lost",
+            (Self::Emergency, InputState::Stopped) => "pressed",
+            (Self::Emergency, InputState::Runs) | (Self::Enabling, InputState::Stopped) => "released",
+            (Self::Enabling, InputState::Runs) => "held",
+        }
+    }
+}
+
+/// What an input says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum InputState {
+    /// The actuator may move.
+    Runs,
+    /// It may not.
+    Stopped,
+    /// Nothing: it is unplugged, silent, or cannot be read.
+    Lost,
+}
+
+/// Which input keeps the actuator from being armed.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Blocked {
+    /// Its position in the registry.
+    pub index: usize,
+    /// Its name.
+    pub stop: Arc<str>,
+    /// What it is.
+    pub kind: StopKind,
+    /// What it says.
+    pub state: InputState,
+}
+
+impl std::error::Error for Blocked {}
+
+impl std::fmt::Display for Blocked {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let (kind, name, word) = (self.kind.label(), &self.stop, self.kind.word(self.state));
+        let remedy = match (self.kind, self.state) {
+            (_, InputState::Lost) => "the log says why: restore it",
+            (StopKind::Emergency, _) => "release it",
+            (StopKind::Enabling, _) => "hold it",
+        };
+        write!(f, "{kind} {name} is {word}: {remedy}, then arm again")
+    }
+}
+
+/// See the module's comment.
+#[derive(Debug, Default)]
+pub struct Interlocks {
+    all: Box<[Interlock]>,
+    names: Arc<[Arc<str>]>,
+}
+
+#[derive(Debug)]
+struct Interlock {
+    kind: StopKind,
+    state: AtomicU8,
+}
+
+const RUNS: u8 = 0;
+const STOPPED: u8 = 1;
+const LOST: u8 = 2;
+const UNREPORTED: u8 = 3;
+
+const fn state_of(code: u8) -> InputState {
+    match code {
+        RUNS => InputState::Runs,
+        STOPPED => InputState::Stopped,
+        _ => InputState::Lost,
+    }
+}
+
+impl Interlocks {
+    /// Of stops with these names, [`MAX_STOPS`] at most.
+    #[must_use]
+    pub fn new<'a>(stops: impl Iterator<Item = (&'a str, StopKind)>) -> Self {
+        let (names, all): (Vec<Arc<str>>, Vec<_>) =
+            stops.map(|(name, kind)| (name.into(), Interlock { kind, state: AtomicU8::new(UNREPORTED) })).unzip();
+        Self { all: all.into(), names: names.into() }
+    }
+
+    /// Names of the stops.
+    #[must_use]
+    pub const fn names(&self) -> &Arc<[Arc<str>]> {
+        &self.names
+    }
+
+    /// What an input says.
+    #[must_use]
+    pub fn state(&self, index: usize) -> InputState {
+        self.all.get(index).map_or(InputState::Lost, |one| state_of(one.state.load(Ordering::SeqCst)))
+    }
+
+    /// Does every input run?
+    ///
+    /// # Errors
+    /// With the first that does not.
+    pub fn check(&self) -> Result<(), Blocked> {
+        let states = self.all.iter().map(|one| state_of(one.state.load(Ordering::SeqCst))).enumerate();
+        let Some((index, state)) = states.into_iter().find(|(_, state)| *state != InputState::Runs) else {
+            return Ok(());
+        };
+        let kind = self.all.get(index).map_or(StopKind::Emergency, |one| one.kind);
+        Err(Blocked { index, stop: self.names.get(index).cloned().unwrap_or_default(), kind, state })
+    }
+
+    /// Notes what an input says. Says whether that is news.
+    pub(crate) fn set(&self, index: usize, state: InputState) -> bool {
+        let code = match state {
+            InputState::Runs => RUNS,
+            InputState::Stopped => STOPPED,
+            InputState::Lost => LOST,
+        };
+        self.all.get(index).is_some_and(|one| one.state.swap(code, Ordering::SeqCst) != code)
+    }
+
+    /// What an input that does not run orders.
+    pub(crate) fn order(&self, index: usize) -> Option<Order> {
+        let trip =
+            || Trip { stop: u8::try_from(index).unwrap_or(u8::MAX), is_lost: self.state(index) == InputState::Lost };
+        Some(match self.all.get(index)?.kind {
+            StopKind::Emergency => Order::Emergency(trip()),
+            StopKind::Enabling => Order::Disarm,
+        })
+    }
+}

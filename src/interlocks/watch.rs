@@ -1,0 +1,104 @@
+//! The thread of an input: opens it, follows what it says, and opens it again when it was lost.
+//!
+//! Invariant: between two states it sleeps in the kernel, and wakes when there is something to read, when the input has
+//! been silent for too long, or at the end.
+
+use std::os::fd::{AsFd, OwnedFd};
+use std::time::Duration;
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+
+use super::Reporter;
+use super::source::Source;
+use crate::interlock::InputState;
+use crate::registry::InterlockInput;
+use crate::time::Stamp;
+
+/// How long after a loss an input is opened again.
+const AGAIN: Duration = Duration::from_millis(500);
+
+/// Why a thread woke.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) enum Woken {
+    /// The run ends.
+    Stop,
+    /// There is something to read, or with `true` nothing will be any more.
+    Ready(bool),
+    /// The moment has come.
+    Late,
+}
+
+/// Sleeps until the end of the run, until `input` can be read, or until a moment.
+pub(super) fn wait(stop: &OwnedFd, input: Option<&dyn AsFd>, until: Option<Stamp>) -> Woken {
+    loop {
+        let left = until.map(|until| until.since(Stamp::now()));
+        let limit = left.and_then(|left| Timespec::try_from(left).ok());
+        let mut all = vec![PollFd::new(stop, PollFlags::IN)];
+        all.extend(input.map(|input| PollFd::from_borrowed_fd(input.as_fd(), PollFlags::IN)));
+        match poll(&mut all, limit.as_ref()) {
+            Ok(_) | Err(rustix::io::Errno::INTR) => {}
+            // Without memory for a moment; asked again at once it would only be more.
+            Err(_) => std::thread::sleep(Duration::from_millis(10)),
+        }
+        let mut happened = all.iter().map(PollFd::revents);
+        if happened.next().is_some_and(|events| !events.is_empty()) {
+            return Woken::Stop;
+        }
+        // Before what there is to read: one that speaks again was silent all the same.
+        if until.is_some_and(|until| Stamp::now() >= until) {
+            return Woken::Late;
+        }
+        if let Some(events) = happened.next().filter(|events| !events.is_empty()) {
+            return Woken::Ready(!events.contains(PollFlags::IN));
+        }
+    }
+}
+
+/// Follows `input` until `stop`.
+pub(super) fn watch(input: &InterlockInput, reporter: &Reporter, stop: &OwnedFd) {
+    let _lost = reporter.lost_at_a_panic();
+    loop {
+        let why = match Source::open(input) {
+            Ok(mut source) => follow(&mut source, reporter, stop),
+            Err(why) => Some(why),
+        };
+        let Some(why) = why else { return };
+        reporter.report(InputState::Lost, &why);
+        if wait(stop, None, Some(Stamp::now().after(AGAIN))) == Woken::Stop {
+            return;
+        }
+    }
+}
+
+/// Why an open input was lost; `None` at the end of the run.
+fn follow(source: &mut Source, reporter: &Reporter, stop: &OwnedFd) -> Option<String> {
+    let silence = source.silence();
+    let mut heard = Stamp::now();
+    let mut is_silent = false;
+    let mut is_first = true;
+    loop {
+        let mut has_reported = false;
+        let taken = source.take(is_first, &mut |state| {
+            has_reported = true;
+            reporter.report(state, "");
+        });
+        if let Err(why) = taken {
+            return Some(why);
+        }
+        is_first = false;
+        if has_reported {
+            (heard, is_silent) = (Stamp::now(), false);
+        }
+        let until = silence.filter(|_| !is_silent).map(|silence| heard.after(silence));
+        match wait(stop, Some(&source.fd()), until) {
+            Woken::Stop => return None,
+            Woken::Ready(false) => {}
+            Woken::Ready(true) => return Some("unplugged".to_owned()),
+            Woken::Late => {
+                is_silent = true;
+                let silence = silence.unwrap_or_default();
+                reporter.report(InputState::Lost, &format!("nothing was received for {silence:?}"));
+            }
+        }
+    }
+}

@@ -1,0 +1,72 @@
+//! How a motor starts, when what it does is a fault, and how it stops.
+
+use std::time::Duration;
+
+use super::above_zero;
+use crate::registry::section::{Problems, Section};
+use crate::registry::spec::{MotionSpec, MotorMode, Stop, StopSpec, WatchSpec};
+
+/// How the command of a position starts and changes.
+pub(super) fn motion(
+    entry: &Section<'_>,
+    slew: f64,
+    mode: Option<MotorMode>,
+    problems: &mut Problems<'_>,
+) -> MotionSpec {
+    let default = MotionSpec::of_slew(slew);
+    if mode == Some(MotorMode::Velocity) {
+        for key in ["acceleration", "soft_start", "first_target"].into_iter().filter(|key| entry.has(key)) {
+            let message = format!("a commanded velocity has no {key}");
+            entry.report(problems, key, message, format!("remove {key}; slew limits its acceleration"));
+        }
+        return default;
+    }
+    let soft_start = entry.duration(problems, "soft_start", Duration::ZERO..=Duration::from_secs(10));
+    MotionSpec {
+        acceleration: above_zero(entry, "acceleration", 100_000.0, problems).unwrap_or(default.acceleration),
+        soft_start: soft_start.unwrap_or(default.soft_start),
+        first_target: above_zero(entry, "first_target", 200.0, problems).unwrap_or(default.first_target),
+    }
+}
+
+/// When what the motor does is a fault.
+pub(super) fn watch(entry: &Section<'_>, problems: &mut Problems<'_>) -> WatchSpec {
+    let default = WatchSpec::default();
+    let half_a_second = Duration::from_millis(500);
+    WatchSpec {
+        margin: entry.number(problems, "margin", 0.0..=1.0).unwrap_or(default.margin),
+        lag: above_zero(entry, "lag", 10.0, problems).unwrap_or(default.lag),
+        blocked_after: or_never(entry, problems, "blocked_after", half_a_second, default.blocked_after),
+    }
+}
+
+/// How the motor stops at a fault, or at an emergency stop.
+pub(super) fn stop(entry: &Section<'_>, problems: &mut Problems<'_>) -> StopSpec {
+    let default = StopSpec::default();
+    let words = [("limp", Stop::Limp), ("damp", Stop::Damp), ("hold", Stop::Hold)];
+    let mut choice = |key| entry.has(key).then(|| entry.choice(problems, key, &words)).flatten();
+    let (own_fault, other_fault) = (choice("own_fault"), choice("other_fault"));
+    let emergency = choice("emergency");
+    StopSpec {
+        own_fault: own_fault.unwrap_or(default.own_fault),
+        other_fault: other_fault.unwrap_or(default.other_fault),
+        emergency: emergency.unwrap_or(default.emergency),
+        hold_for: or_never(entry, problems, "hold_for", Duration::from_millis(10), default.hold_for),
+    }
+}
+
+/// A time of `least` to an hour, or the word "never".
+pub(super) fn or_never(
+    table: &Section<'_>,
+    problems: &mut Problems<'_>,
+    key: &str,
+    least: Duration,
+    default: Option<Duration>,
+) -> Option<Duration> {
+    if !table.has(key) {
+        return default;
+    }
+    let mut fields = table.fields().into_iter();
+    let is_never = fields.any(|(_, name, value)| name == key && value.get_ref().as_str() == Some("never"));
+    if is_never { None } else { table.duration(problems, key, least..=Duration::from_hours(1)) }
+}
