@@ -220,6 +220,9 @@ impl MotorBus {
         {
             self.fail(fault, now);
         }
+        if matches!(self.state, BusState::Faulted(_)) {
+            self.name_latched(None);
+        }
     }
 
     /// An action: a number for each motor, and its tick. Says whether it is followed.

@@ -268,7 +268,7 @@ impl MotorBus {
     fn report_stopped(&mut self, fault: Fault) {
         self.counts.faults += 1;
         self.notices.tell(Notice::Fault(fault));
-        self.name_latched(fault);
+        self.name_latched(Some(fault));
         let kept = |stop| {
             let kept = self.motors.iter().enumerate().filter(|(_, motor)| motor.phase == Phase::Kept(stop));
             kept.fold(0, |bits, (index, _)| bits | 1_u16 << (index % 16))
@@ -280,10 +280,10 @@ impl MotorBus {
     }
 
     /// Reports every fault that motors have latched, once: it is for the next arm to clear them.
-    fn name_latched(&mut self, reported: Fault) {
+    pub(super) fn name_latched(&mut self, reported: Option<Fault>) {
         for (motor, latching) in self.motors.iter_mut().enumerate() {
             let Some(status) = latching.status.filter(|status| status.is_fault()) else { continue };
-            if latching.named.replace(status) != Some(status) && reported != (Fault::Latched { motor, status }) {
+            if latching.named.replace(status) != Some(status) && reported != Some(Fault::Latched { motor, status }) {
                 self.notices.tell(Notice::Latched { motor, status });
             }
         }

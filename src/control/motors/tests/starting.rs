@@ -122,3 +122,17 @@ fn a_fault_that_nobody_has_seen_is_reported_before_an_arm_clears_it() {
         assert_eq!(world.told(Notice::Cleared { motor, status }), 1);
     }
 }
+
+#[test]
+fn a_fault_that_comes_to_light_behind_another_is_reported_at_once() {
+    let mut world = World::armed();
+    world.sims[1].silent = true;
+    let fault = world.run_to_fault();
+    world.sims[1].silent = false;
+    world.sims[1].status = MotorStatus::CommunicationLost;
+    world.run(3);
+    let latched = Notice::Latched { motor: 1, status: MotorStatus::CommunicationLost };
+    assert_eq!((world.bus.state(), world.told(latched)), (BusState::Faulted(fault), 1));
+    world.arm();
+    world.run_until(BusState::Holding);
+}

@@ -205,6 +205,11 @@ async fn notices_wait_for_room() {
         let mos = if at % 2 == 0 { 75 } else { 30 };
         let feedback = Feedback { id: 1, status: MotorStatus::Disabled, q: 0.5, dq: 0.0, tau: 0.1, mos, rotor: 41 };
         bus.send(&bytes(&feedback.encode(0x11, &Ranges::new(12.5, 30.0, 10.0).unwrap()).unwrap())).unwrap();
+        let begun = Instant::now();
+        while at == NOTICES && motors.notices.len() < NOTICES / 2 {
+            assert!(begun.elapsed() < PATIENCE, "the first half is not told");
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
     }
     for _ in 0..COUNT {
         told(&mut motors, |notice| notice.text.contains("of at most 80 °C")).await;
