@@ -19,7 +19,7 @@ impl Motor {
         notices: &mut Notices,
     ) -> Result<bool, Fault> {
         let motor = self.index;
-        let before = self.feedback.as_ref().filter(|_| matches!(self.phase, Phase::Enabling | Phase::On));
+        let before = self.feedback.as_ref().filter(|_| matches!(self.phase, Phase::Enabling | Phase::On | Phase::Kept(_)));
         let heard = self
             .watch
             .hear(before, feedback, (&self.spec, ranges), now)
