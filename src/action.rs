@@ -5,7 +5,7 @@
 //! the control grid it is the action of.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU8, Ordering};
+use std::sync::atomic::{AtomicU16, Ordering};
 
 use serde::Serialize;
 
@@ -49,6 +49,8 @@ impl Arming {
 pub enum Order {
     /// It may move from now on.
     Arm,
+    /// Likewise; joints that are outside their limits are driven back into them first, slowly.
+    ArmBack,
     /// It may not.
     Disarm,
     /// It may not, and each joint stops as it is configured for an emergency stop.
@@ -78,24 +80,29 @@ impl Trip {
 /// Invariant: neither a disarm nor an emergency stop is lost, and no arm is left of before them. Of several emergency
 /// stops the first is named.
 #[derive(Debug, Default)]
-pub struct OrderSlot(AtomicU8);
+pub struct OrderSlot(AtomicU16);
 
 impl OrderSlot {
-    const DISARM: u8 = 1;
-    const ARM: u8 = 2;
-    const EMERGENCY: u8 = 4;
-    const LOST: u8 = 8;
+    const DISARM: u16 = 1;
+    const ARM: u16 = 2;
+    const EMERGENCY: u16 = 4;
+    const LOST: u16 = 8;
+    /// The arm is one that drives joints back.
+    const BACK: u16 = 16;
+    const ANY_ARM: u16 = Self::ARM | Self::BACK;
     /// Which stop is in the bits from here.
-    const STOP: u32 = 4;
+    const STOP: u32 = 8;
 
     /// Leaves an order there.
     pub fn give(&self, order: Order) {
-        let left = |given: u8| match order {
-            Order::Arm => given | Self::ARM,
-            Order::Disarm => (given & !Self::ARM) | Self::DISARM,
-            Order::Emergency(_) if given & Self::EMERGENCY != 0 => given & !Self::ARM,
+        let left = |given: u16| match order {
+            // The newer arm counts.
+            Order::Arm => (given & !Self::ANY_ARM) | Self::ARM,
+            Order::ArmBack => (given & !Self::ANY_ARM) | Self::BACK,
+            Order::Disarm => (given & !Self::ANY_ARM) | Self::DISARM,
+            Order::Emergency(_) if given & Self::EMERGENCY != 0 => given & !Self::ANY_ARM,
             Order::Emergency(Trip { stop, is_lost }) => {
-                let cause = (stop << Self::STOP) | if is_lost { Self::LOST } else { 0 };
+                let cause = (u16::from(stop) << Self::STOP) | if is_lost { Self::LOST } else { 0 };
                 (given & Self::DISARM) | Self::EMERGENCY | cause
             }
         };
@@ -107,9 +114,14 @@ impl OrderSlot {
     /// which turns off also what an emergency stop would hold.
     pub fn take(&self) -> impl Iterator<Item = Order> + use<> {
         let given = self.0.swap(0, Ordering::SeqCst);
-        let trip = Trip { stop: given >> Self::STOP, is_lost: given & Self::LOST != 0 };
-        let orders =
-            [(Self::EMERGENCY, Order::Emergency(trip)), (Self::DISARM, Order::Disarm), (Self::ARM, Order::Arm)];
+        let [stop, _] = (given >> Self::STOP).to_le_bytes();
+        let trip = Trip { stop, is_lost: given & Self::LOST != 0 };
+        let orders = [
+            (Self::EMERGENCY, Order::Emergency(trip)),
+            (Self::DISARM, Order::Disarm),
+            (Self::ARM, Order::Arm),
+            (Self::BACK, Order::ArmBack),
+        ];
         orders.into_iter().filter(move |(bit, _)| given & bit != 0).map(|(_, order)| order)
     }
 }
@@ -131,12 +143,17 @@ mod tests {
 
     #[test]
     fn a_stop_is_never_lost_and_no_arm_is_left_of_before_it() {
-        use Order::{Arm, Disarm, Emergency};
+        use Order::{Arm, ArmBack, Disarm, Emergency};
         let [one, two] = [Trip { stop: 0, is_lost: false }, Trip { stop: 15, is_lost: true }].map(Emergency);
         let slot = OrderSlot::default();
         for (given, taken) in [
             (&[][..], &[][..]),
             (&[Arm], &[Arm]),
+            (&[Arm, ArmBack], &[ArmBack]),
+            (&[ArmBack, Arm], &[Arm]),
+            (&[ArmBack, Disarm], &[Disarm]),
+            (&[two, ArmBack], &[two, ArmBack]),
+            (&[ArmBack, two], &[two]),
             (&[Disarm], &[Disarm]),
             (&[Arm, Disarm], &[Disarm]),
             (&[Disarm, Arm], &[Disarm, Arm]),

@@ -211,9 +211,13 @@ pub enum Command {
         after_help = "An actuator that was unplugged, failed, was disarmed or got no actions for a while needs this again, and \
         so does one that an emergency stop or an enabling switch has stopped. It is refused while one of these does not \
         run.\n\nExamples:\n  \
-        rapid arm\n  rapid arm --instance left"
+        rapid arm\n  rapid arm --instance left\n  rapid arm --drive-back"
     )]
-    Arm,
+    Arm {
+        /// Drive joints that are outside their limits back into them, slowly: without this the arm is refused. Stand clear
+        #[arg(long)]
+        drive_back: bool,
+    },
     /// Stops the actuator of a running rapid: its motors are disabled
     #[command(
         after_help = "It holds for the rest of the run, with or without an actuator, until the next arm, and needs neither \

@@ -111,7 +111,10 @@ fn print(global: &Global, before: SimArgs, command: Command) -> Result<(), Failu
             Ok(commands::artifacts::write(&registry, &to, out)?)
         }
         Command::Mask { watch } => mask(global, watch),
-        Command::Arm => Ok(commands::arm::order(global.instance.as_deref(), Order::Arm, out)?),
+        Command::Arm { drive_back } => {
+            let order = if drive_back { Order::ArmBack } else { Order::Arm };
+            Ok(commands::arm::order(global.instance.as_deref(), order, out)?)
+        }
         Command::Disarm => Ok(commands::arm::order(global.instance.as_deref(), Order::Disarm, out)?),
         Command::Calibrate { what: Calibration::Latency { device, duration, led, light_delay, simulation } } => {
             let source = Source::of(if simulation.sim.is_some() { simulation } else { before });

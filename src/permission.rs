@@ -102,6 +102,18 @@ impl Permission {
     /// # Errors
     /// When it does nothing, and why.
     pub fn arm(&self, given: Stamp, now: Stamp) -> Result<(), Void> {
+        self.allow(Order::Arm, given, now)
+    }
+
+    /// As [`Self::arm`], for an actuator that drives joints back that are outside their limits.
+    ///
+    /// # Errors
+    /// When it does nothing, and why.
+    pub fn arm_back(&self, given: Stamp, now: Stamp) -> Result<(), Void> {
+        self.allow(Order::ArmBack, given, now)
+    }
+
+    fn allow(&self, arm: Order, given: Stamp, now: Stamp) -> Result<(), Void> {
         self.at_first_plug.store(false, Ordering::SeqCst);
         let age = now.since(given);
         if given > now {
@@ -114,7 +126,7 @@ impl Permission {
             return Err(Void::NoActuator);
         }
         self.interlocks.check()?;
-        self.slot.give(Order::Arm);
+        self.slot.give(arm);
         // What came meanwhile may have been given to the slot before this.
         let blocked = self.interlocks.check();
         if let Err(blocked) = blocked {

@@ -23,7 +23,7 @@ pub enum OrderError {
 pub fn order(instance: Option<&str>, order: Order, out: &mut dyn Write) -> Result<(), OrderError> {
     give(instance, order)?;
     let what = match order {
-        Order::Arm => "the actuator is being armed: what came of it is in the log of the run",
+        Order::Arm | Order::ArmBack => "the actuator is being armed: what came of it is in the log of the run",
         Order::Disarm | Order::Emergency(_) => "the actuator is disarmed, and stays so until it is armed again",
     };
     Ok(writeln!(out, "{what}")?)

@@ -41,6 +41,7 @@ mod last_will;
 mod motor;
 mod notice;
 mod notices;
+mod returning;
 mod watch;
 mod words;
 
@@ -50,6 +51,7 @@ pub use last_will::stalled_after;
 use motor::Motor;
 pub use notice::{BusState, Fault, Notice, Part, Reason, Refusal, Strange};
 use notices::{Notices, Seldom};
+pub use returning::RETURN_SPEED;
 pub use words::Words;
 
 use super::can::CanFrame;
@@ -101,6 +103,8 @@ pub struct MotorBus {
     clamped: Vec<Seldom>,
     /// The motor that another program commanded last, and when.
     other_master: Option<(usize, Stamp)>,
+    /// Joints outside their limits are being driven back into them, or are to be once they are armed.
+    is_returning: bool,
     /// The motor whose frames are sent first: where there is no room for all, each has its turn.
     first: usize,
     notices: Notices,
@@ -153,6 +157,7 @@ impl MotorBus {
             refused: Seldom::default(),
             clamped: vec![Seldom::default(); axes],
             other_master: None,
+            is_returning: false,
             first: 0,
             notices: Notices::new(),
             counts: Counts::default(),
@@ -274,6 +279,8 @@ impl MotorBus {
             Some(Refusal::NotFinite)
         } else if tick > now.after(EARLY) {
             Some(Refusal::Early)
+        } else if self.is_returning && self.is_armed() {
+            Some(Refusal::Returning)
         } else if now.since(tick) >= self.deadman.patience(self.line.period()) {
             Some(Refusal::Old)
         } else if self.is_armed() && tick >= self.armed && self.line.tick().is_none() {
@@ -295,6 +302,7 @@ impl MotorBus {
     pub fn arm(&mut self, now: Stamp) {
         if matches!(self.state, BusState::Probing | BusState::Disarmed | BusState::Faulted(_) | BusState::Disabling) {
             self.turn_off();
+            self.is_returning = false;
             self.enter(BusState::Arming, now);
             self.notices.tell(Notice::Arming);
         }
@@ -303,6 +311,14 @@ impl MotorBus {
     /// Stops all motors at an emergency stop, each in its way, until the next arm.
     pub fn emergency(&mut self, trip: Trip, now: Stamp) {
         self.stop_at_emergency(trip, now);
+    }
+
+    /// As [`Self::arm`], also where joints are outside their limits: those are driven back first, at
+    /// [`RETURN_SPEED`], and no action is followed meanwhile.
+    pub fn arm_back(&mut self, now: Stamp) {
+        let was_armed = self.is_armed();
+        self.arm(now);
+        self.is_returning |= self.state == BusState::Arming && !was_armed;
     }
 
     /// Disables all motors.

@@ -68,7 +68,7 @@ pub fn give(instance: Option<&str>, order: Order) -> Result<(), GiveError> {
     if runs.is_empty() {
         return Err(GiveError::NoRun(instance.map(str::to_owned)));
     }
-    if order == Order::Arm && runs.len() > 1 {
+    if matches!(order, Order::Arm | Order::ArmBack) && runs.len() > 1 {
         return Err(GiveError::Several(runs.iter().map(|run| run.process).collect()));
     }
     let sent: Vec<_> = runs.into_iter().map(|run| (run.process, run.send(order, given))).collect();

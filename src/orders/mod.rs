@@ -49,6 +49,7 @@ fn this_user() -> u32 {
 fn line(order: Order, given: Stamp) -> String {
     let word = match order {
         Order::Arm => "arm",
+        Order::ArmBack => "arm-back",
         // Of an emergency stop no other program gives more.
         Order::Disarm | Order::Emergency(_) => "disarm",
     };
@@ -60,6 +61,7 @@ fn order(line: &str) -> Option<(Order, Stamp)> {
     let (word, given) = line.split_once(' ')?;
     let order = match word {
         "arm" => Order::Arm,
+        "arm-back" => Order::ArmBack,
         "disarm" => Order::Disarm,
         _ => return None,
     };

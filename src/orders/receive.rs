@@ -135,7 +135,10 @@ impl Waiting {
                 DONE.to_owned()
             }
             // Whoever gave it is dead, or waits no more.
-            Some((Order::Arm, _)) if self.is_left() => return false,
+            Some((Order::Arm | Order::ArmBack, _)) if self.is_left() => return false,
+            Some((Order::ArmBack, given)) => {
+                permission.arm_back(given, Stamp::now()).map_or_else(|void| void.to_string(), |()| DONE.to_owned())
+            }
             Some((Order::Arm, given)) => {
                 permission.arm(given, Stamp::now()).map_or_else(|void| void.to_string(), |()| DONE.to_owned())
             }

@@ -100,7 +100,8 @@ impl Asked {
                 self.permission.disarm(Stamp::now());
                 Ok(None)
             }
-            Effect::Order(Order::Arm) => {
+            // The monitor gives the plain one: to drive a joint back is asked for by its name.
+            Effect::Order(Order::Arm | Order::ArmBack) => {
                 let now = Stamp::now();
                 Ok(self.permission.arm(now, now).err().map(Msg::Void))
             }

@@ -152,14 +152,16 @@ impl MotorBus {
             self.fail(Fault::OtherMaster { motor }, now);
             return;
         }
-        if let Some(fault) = self.far_from_actions(now) {
+        let far = (!self.is_returning).then(|| self.far_from_actions(now)).flatten();
+        if let Some(fault) = far {
             self.fail(fault, now);
             return;
         }
         if self.ask() {
             let axes = self.motors.iter_mut().zip(&mut self.commands).zip(&mut self.limits);
-            let mut enabled =
-                axes.map(|((motor, command), limits)| motor.enable(command, limits, passed, &mut self.notices));
+            let mut enabled = axes.map(|((motor, command), limits)| {
+                motor.enable(command, limits, (passed, self.is_returning), &mut self.notices)
+            });
             if let Some(fault) = enabled.find_map(Result::err) {
                 self.fail(fault, now);
                 return;
@@ -171,7 +173,7 @@ impl MotorBus {
             self.line.restart(&self.commands);
             self.ramps.iter_mut().for_each(Ramp::restart);
             self.hold(now);
-            self.notices.tell(Notice::Armed);
+            self.notices.tell(if self.is_returning { Notice::Returning } else { Notice::Armed });
         } else if waited >= ARM_WITHIN.max(self.cycle * ARM_CYCLES)
             && let Some(fault) = self.motors.iter().find_map(Motor::arm_fault)
         {
@@ -191,7 +193,7 @@ impl MotorBus {
     }
 
     /// Stays where the last command was, or where it can stop.
-    fn hold(&mut self, now: Stamp) {
+    pub(super) fn hold(&mut self, now: Stamp) {
         let axes = self.targets.iter_mut().zip(&self.commands).zip(&self.motors).zip(&self.ramps).zip(&self.limits);
         for ((((target, command), motor), ramp), limits) in axes {
             let [low, high] = limits.range();
@@ -212,6 +214,7 @@ impl MotorBus {
         for (axis, (((motor, limits), command), ramp)) in axes.enumerate() {
             let (before, target) = (*command, self.line.at(axis, now));
             let wanted = match motor.spec.mode {
+                _ if self.is_returning => motor.way_back(before, limits, passed),
                 MotorMode::Velocity => limits.slew(before, target, passed),
                 _ => ramp.next(limits, before, target, passed),
             };
@@ -219,11 +222,17 @@ impl MotorBus {
             // What a motor reports moves the command no faster than an action does.
             *command = if motor.spec.mode == MotorMode::Velocity { bound } else { limits.slew(before, bound, passed) };
             ramp.took(*command - before, passed);
-            let fault = motor.strange(Commanded { command: *command, wanted }, now, &mut self.notices);
+            let fault = motor.strange(
+                Commanded { command: *command, wanted, is_returning: self.is_returning },
+                now,
+                &mut self.notices,
+            );
             first = first.or(fault);
         }
         if let Some(fault) = first {
             self.fail(fault, now);
+        } else if self.is_returning {
+            self.look_for_return(now);
         }
     }
 

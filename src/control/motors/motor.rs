@@ -254,14 +254,14 @@ impl Motor {
         &mut self,
         command: &mut f64,
         limits: &mut Limits,
-        passed: Duration,
+        (passed, is_returning): (Duration, bool),
         notices: &mut Notices,
     ) -> Result<(), Fault> {
         let (Some(ranges), Some(feedback), Some(status)) = (self.ranges, self.feedback, self.status) else {
             return Ok(());
         };
         if self.phase == Phase::Probed {
-            if let Some(fault) = self.unfit() {
+            if let Some(fault) = self.unfit(is_returning) {
                 return Err(fault);
             }
             if status.is_fault() && self.named != Some(status) {

@@ -211,6 +211,8 @@ pub enum Refusal {
     Old,
     /// Its tick is in the future.
     Early,
+    /// Joints are being driven back into their limits.
+    Returning,
     /// It is the first after an arm, and far from where a joint is.
     Far {
         /// Which motor.
@@ -289,6 +291,10 @@ pub enum Notice {
     Arming,
     /// All motors are enabled. They hold until an action comes.
     Armed,
+    /// All motors are enabled, and joints outside their limits are driven back into them.
+    Returning,
+    /// All joints are within their limits again, and hold.
+    Returned,
     /// Motors follow actions.
     Following,
     /// Motors hold: no fresh action.
@@ -326,12 +332,14 @@ impl Notice {
             | Self::ParameterSet { .. }
             | Self::Arming
             | Self::Armed
+            | Self::Returned
             | Self::Following
             | Self::Disabled(Reason::Asked) => false,
             Self::Unanswered { .. }
             | Self::RangesDiffer { .. }
             | Self::Warm { .. }
             | Self::Holding
+            | Self::Returning
             | Self::Disabled(Reason::Deadman)
             | Self::Fault(_)
             | Self::Strange { .. }

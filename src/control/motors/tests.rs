@@ -4,6 +4,7 @@
 mod always;
 mod arming;
 mod following;
+mod returning;
 mod starting;
 mod stopping;
 mod watched;

@@ -111,6 +111,8 @@ pub(super) struct Commanded {
     pub(super) command: f64,
     /// What it would be without the bound of the torque.
     pub(super) wanted: f64,
+    /// It is outside its limits, and on its way back.
+    pub(super) is_returning: bool,
 }
 
 impl Watch {
@@ -187,7 +189,7 @@ impl Watch {
         let frozen = self.frozen().filter(|(_, lasted)| *lasted >= FROZEN_WORD).map(|(what, _)| what);
         let table = [
             (frozen, [at_once, FROZEN_AFTER]),
-            (beyond(spec, feedback), [at_once, BEYOND_AFTER]),
+            (beyond(spec, feedback).filter(|_| !commanded.is_returning), [at_once, BEYOND_AFTER]),
             (fast(spec, feedback), [at_once, EXCEED_AFTER]),
             (strong(spec, feedback), [at_once, EXCEED_AFTER]),
             (driven(spec, feedback, commanded), [at_once, DRIVEN_AFTER]),

@@ -112,6 +112,7 @@ impl fmt::Display for Words<'_, Refusal> {
             Refusal::NotFinite => f.write_str("a number of it is not finite"),
             Refusal::Old => f.write_str("it is too old"),
             Refusal::Early => f.write_str("its time is in the future"),
+            Refusal::Returning => f.write_str("joints are being driven back into their limits"),
             Refusal::Far { motor } => write!(
                 f,
                 "it is the first after the arm, and motor {} is farther from it than `first_target`",
@@ -152,6 +153,10 @@ impl fmt::Display for Words<'_, Notice> {
             }
             Notice::Arming => f.write_str("motors are being armed"),
             Notice::Armed => f.write_str("motors are armed, and hold until an action comes"),
+            Notice::Returning => {
+                f.write_str("motors are armed, and joints outside their limits are driven back slowly")
+            }
+            Notice::Returned => f.write_str("all joints are within their limits: motors hold until an action comes"),
             Notice::Following => f.write_str("motors follow actions"),
             Notice::Holding => f.write_str("no action came in time: motors hold"),
             Notice::Disabled(Reason::Asked) => f.write_str("motors are disabled"),

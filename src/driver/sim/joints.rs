@@ -47,9 +47,9 @@ impl Joints {
         if self.positions.is_empty() {
             return;
         }
-        let was_armed = std::mem::replace(&mut self.is_armed, order == Order::Arm);
+        let was_armed = std::mem::replace(&mut self.is_armed, matches!(order, Order::Arm | Order::ArmBack));
         let (arming, text) = match order {
-            Order::Arm => (Arming::Armed, "simulated motors follow actions".to_owned()),
+            Order::Arm | Order::ArmBack => (Arming::Armed, "simulated motors follow actions".to_owned()),
             Order::Disarm => (Arming::Disarmed, "simulated motors are disabled".to_owned()),
             Order::Emergency(_) if !was_armed => return,
             Order::Emergency(trip) => {

@@ -19,7 +19,8 @@ impl Motor {
         notices: &mut Notices,
     ) -> Result<bool, Fault> {
         let motor = self.index;
-        let before = self.feedback.as_ref().filter(|_| matches!(self.phase, Phase::Enabling | Phase::On | Phase::Kept(_)));
+        let before =
+            self.feedback.as_ref().filter(|_| matches!(self.phase, Phase::Enabling | Phase::On | Phase::Kept(_)));
         let heard = self
             .watch
             .hear(before, feedback, (&self.spec, ranges), now)
@@ -45,9 +46,9 @@ impl Motor {
     }
 
     /// Is it too far outside its limits, or too fast, to be armed?
-    pub(super) fn unfit(&self) -> Option<Fault> {
+    pub(super) fn unfit(&self, is_returning: bool) -> Option<Fault> {
         let feedback = self.feedback.as_ref()?;
-        let what = beyond(&self.spec, feedback).or_else(|| fast(&self.spec, feedback))?;
+        let what = beyond(&self.spec, feedback).filter(|_| !is_returning).or_else(|| fast(&self.spec, feedback))?;
         Some(Fault::Strange { motor: self.index, what })
     }
 

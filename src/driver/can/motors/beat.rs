@@ -249,6 +249,7 @@ impl Beat {
         for order in self.shared.orders.take() {
             match order {
                 Order::Arm => bus.arm(now),
+                Order::ArmBack => bus.arm_back(now),
                 Order::Disarm => bus.disarm(now),
                 Order::Emergency(trip) => bus.emergency(trip, now),
             }
