@@ -19,7 +19,8 @@ impl Motor {
         notices: &mut Notices,
     ) -> Result<bool, Fault> {
         let motor = self.index;
-        let before = self.feedback.as_ref().filter(|_| matches!(self.phase, Phase::Enabling | Phase::On | Phase::Kept(_)));
+        let before =
+            self.feedback.as_ref().filter(|_| matches!(self.phase, Phase::Enabling | Phase::On | Phase::Kept(_)));
         let heard = self
             .watch
             .hear(before, feedback, (&self.spec, ranges), now)
