@@ -16,6 +16,8 @@ pub const RETURN_SPEED: f64 = 0.1;
 impl MotorBus {
     /// Ends the way back once every joint is within its limits.
     pub(super) fn look_for_return(&mut self, now: Stamp) {
+        // The way is no want of actions, however long it takes.
+        self.deadman.arm(now);
         if self
             .motors
             .iter()

@@ -133,7 +133,7 @@ impl Bench {
             }
             Give(order) => {
                 let _ = match order {
-                    Order::Arm => self.permission.arm(Stamp::now(), Stamp::now()),
+                    Order::Arm | Order::ArmBack => self.permission.arm(Stamp::now(), Stamp::now()),
                     Order::Disarm | Order::Emergency(_) => {
                         self.permission.disarm(Stamp::now());
                         Ok(())
