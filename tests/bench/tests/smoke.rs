@@ -30,8 +30,8 @@ fn measured(sections: &[&str]) -> Vec<serde_json::Value> {
 #[test]
 fn every_section_that_needs_no_guest_measures() {
     let sections = [
-        "start", "infer", "sync", "picture", "policy", "control", "motors", "safety", "can", "eval", "replug",
-        "unplug", "mask", "many", "load", "write",
+        "start", "infer", "sync", "picture", "policy", "control", "motors", "safety", "disarm", "can", "eval",
+        "replug", "unplug", "mask", "many", "load", "write",
     ];
     let figures = measured(&sections);
     for section in sections {

@@ -9,8 +9,7 @@ use std::time::Duration;
 use rapid::modality::ModalityKind;
 use rapid::registry::artifacts::{ArtifactKind, artifacts};
 use rapid::registry::{
-    CanAdapter, DeviceSpec, Hook, InterlockInput, InterlockSpec, LanFind, LanProtocol, LanSpec, NodeSpec, ProcessSpec,
-    Registry,
+    DeviceSpec, Hook, InterlockInput, InterlockSpec, LanFind, LanProtocol, LanSpec, NodeSpec, ProcessSpec, Registry,
 };
 use yaml_rust2::{Yaml, YamlLoader};
 
@@ -62,7 +61,8 @@ fn harmless_device(device: &DeviceSpec) -> DeviceSpec {
                 shape: Vec::new(),
             });
         }
-        NodeSpec::Can(can) if can.adapter == CanAdapter::SocketCan => harmless.node = device.node.clone(),
+        // Motors have a guard, and what is read of them is in no unit.
+        NodeSpec::Can(_) => harmless.node = device.node.clone(),
         NodeSpec::Lan(lan) => {
             let hosts = [Ipv4Addr::LOCALHOST.into(), Ipv6Addr::LOCALHOST.into()];
             let find = match (&lan.find, lan.find.families()) {
@@ -73,7 +73,7 @@ fn harmless_device(device: &DeviceSpec) -> DeviceSpec {
             harmless.node =
                 NodeSpec::Lan(LanSpec { protocol: LanProtocol::Udp { port: 1 }, find, lease: Duration::from_secs(3) });
         }
-        NodeSpec::Can(_) | NodeSpec::Camera(_) | NodeSpec::Serial(_) => {}
+        NodeSpec::Camera(_) | NodeSpec::Serial(_) => {}
     }
     if !device.hooks.is_empty() {
         harmless.hooks.attach = Some(Hook { program: program(), args: Vec::new() });

@@ -6,11 +6,12 @@ use crate::control::limits::Limits;
 use crate::control::motors::notice::{Fault, Notice};
 use crate::control::motors::notices::Notices;
 use crate::control::motors::watch::{Commanded, beyond, fast};
-use crate::registry::MotorMode;
+use crate::registry::{MotorMode, Stop};
 use crate::time::Stamp;
 
 impl Motor {
-    /// Can it be where it says? One that is off may be turned by hand, and its zero set.
+    /// Can it be where it says? One that is off may be turned by hand, and its zero set; one that is damped sinks without
+    /// regard to where it is.
     pub(super) fn is_possible(
         &mut self,
         feedback: &Feedback,
@@ -19,8 +20,10 @@ impl Motor {
         notices: &mut Notices,
     ) -> Result<bool, Fault> {
         let motor = self.index;
-        let before =
-            self.feedback.as_ref().filter(|_| matches!(self.phase, Phase::Enabling | Phase::On | Phase::Kept(_)));
+        let before = self
+            .feedback
+            .as_ref()
+            .filter(|_| matches!(self.phase, Phase::Enabling | Phase::On | Phase::Kept(Stop::Hold)));
         let heard = self
             .watch
             .hear(before, feedback, (&self.spec, ranges), now)
