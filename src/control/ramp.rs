@@ -38,16 +38,15 @@ impl Ramp {
     #[must_use]
     pub fn next(&self, limits: &Limits, before: f64, wanted: f64, passed: Duration) -> f64 {
         let seconds = passed.as_secs_f64();
+        if passed.is_zero() || !(wanted.is_finite() && before.is_finite()) {
+            return before;
+        }
         let distance = wanted - before;
         let change = self.acceleration * seconds;
         let speed = (distance.abs() / seconds).min(self.stopping(distance.abs(), seconds)).copysign(distance);
         let speed = speed.clamp(self.speed - change, self.speed + change);
-        // Without time, or acceleration, there is no motion; what is in reach is reached without rounding.
-        let next = if (speed * seconds - distance).abs() < 1e-12 || seconds == 0.0 {
-            wanted
-        } else {
-            before + speed * seconds
-        };
+        // What is in reach is reached without rounding.
+        let next = if (speed * seconds - distance).abs() < 1e-12 { wanted } else { before + speed * seconds };
         limits.slew(before, next, passed.mul_f64(self.share(passed)))
     }
 
@@ -128,6 +127,20 @@ mod tests {
         }
         ramp.restart();
         assert!(ramp.next(&limits, 0.0, 9.0, STEP) <= 4.0 * 0.005 * 0.005 + 1e-12);
+    }
+
+    #[test]
+    fn without_time_and_without_a_number_nothing_moves() {
+        let limits = Limits::new(-2.0, 2.0, 4.0);
+        for acceleration in [40.0, f64::INFINITY] {
+            let mut ramp = Ramp::new(acceleration, Duration::from_secs(1));
+            ramp.took(0.01, STEP);
+            for (wanted, passed) in
+                [(1.0, Duration::ZERO), (0.5, Duration::ZERO), (f64::NAN, STEP), (f64::INFINITY, STEP)]
+            {
+                assert_eq!(ramp.next(&limits, 0.5, wanted, passed), 0.5, "{acceleration} {wanted} {passed:?}");
+            }
+        }
     }
 
     proptest! {
