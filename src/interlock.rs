@@ -11,17 +11,24 @@
 //!
 //! Invariant: an input that has not reported yet is lost.
 //! Invariant: nothing here moves anything: an input that runs again alone permits an arm.
+//! Invariant: an input that has stopped runs again once nothing but that was reported for [`SETTLES_IN`]: a contact that
+//! chatters is one stop.
 //! Invariant: nothing here waits, locks or, but to refuse an arm, allocates.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU8, Ordering};
+use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
+use std::time::Duration;
 
 use serde::Serialize;
 
 use crate::action::{Order, Trip};
+use crate::time::Stamp;
 
 /// Stops of a rig, at most.
 pub const MAX_STOPS: usize = 16;
+
+/// An input that has stopped, or was lost, runs again after this at the earliest.
+pub const SETTLES_IN: Duration = Duration::from_millis(100);
 
 /// What an input stops.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -105,6 +112,8 @@ pub struct Interlocks {
 struct Interlock {
     kind: StopKind,
     state: AtomicU8,
+    /// When it was last reported not to run; 0 before the first time.
+    stopped: AtomicU64,
 }
 
 const RUNS: u8 = 0;
@@ -124,8 +133,11 @@ impl Interlocks {
     /// Of stops with these names, [`MAX_STOPS`] at most.
     #[must_use]
     pub fn new<'a>(stops: impl Iterator<Item = (&'a str, StopKind)>) -> Self {
-        let (names, all): (Vec<Arc<str>>, Vec<_>) =
-            stops.map(|(name, kind)| (name.into(), Interlock { kind, state: AtomicU8::new(UNREPORTED) })).unzip();
+        let (names, all): (Vec<Arc<str>>, Vec<_>) = stops
+            .map(|(name, kind)| {
+                (name.into(), Interlock { kind, state: AtomicU8::new(UNREPORTED), stopped: AtomicU64::new(0) })
+            })
+            .unzip();
         Self { all: all.into(), names: names.into() }
     }
 
@@ -155,13 +167,19 @@ impl Interlocks {
     }
 
     /// Notes what an input says. Says whether that is news.
-    pub(crate) fn set(&self, index: usize, state: InputState) -> bool {
+    pub(crate) fn set(&self, index: usize, state: InputState, now: Stamp) -> bool {
         let code = match state {
             InputState::Runs => RUNS,
             InputState::Stopped => STOPPED,
             InputState::Lost => LOST,
         };
-        self.all.get(index).is_some_and(|one| one.state.swap(code, Ordering::SeqCst) != code)
+        let Some(one) = self.all.get(index) else { return false };
+        if code != RUNS {
+            one.stopped.store(now.0.max(1), Ordering::SeqCst);
+        } else if matches!(one.stopped.load(Ordering::SeqCst), at if at > 0 && now.since(Stamp(at)) < SETTLES_IN) {
+            return false;
+        }
+        one.state.swap(code, Ordering::SeqCst) != code
     }
 
     /// What an input that does not run orders.

@@ -116,6 +116,7 @@ pub mod episode_format;
 pub mod fault;
 pub mod flash;
 pub mod folder;
+pub mod gpio;
 pub mod headless;
 pub mod hotplug;
 pub mod interlock;

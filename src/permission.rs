@@ -78,7 +78,7 @@ impl Permission {
     /// Input `index` of the interlocks has this state, as found out at `now`. Whatever does not run stops the actuator
     /// before this returns. Says whether it is news.
     pub fn report(&self, index: usize, state: InputState, now: Stamp) -> bool {
-        let is_news = self.interlocks.set(index, state);
+        let is_news = self.interlocks.set(index, state, now);
         if is_news && state != InputState::Runs {
             self.at_first_plug.store(false, Ordering::SeqCst);
             // Before it is given: see `arm`.

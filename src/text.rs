@@ -11,10 +11,26 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use rustix::io::Errno;
 use serde::{Serialize, Serializer};
 use serde_json::ser::Formatter;
 use unicode_segmentation::UnicodeSegmentation;
 use unicode_width::UnicodeWidthStr;
+
+/// What an open, a read or a write of a device that failed says to people; `group` is the one that may open it.
+#[must_use]
+pub fn not_opened(what: &str, group: &str, error: &io::Error) -> String {
+    match Errno::from_io_error(error) {
+        Some(Errno::NOENT | Errno::NODEV | Errno::NXIO | Errno::IO) => format!("{what} is not plugged in"),
+        Some(Errno::ACCESS | Errno::PERM) => {
+            format!("{what} may not be opened: add the user to group {group} (`sudo usermod -aG {group} $USER`)")
+        }
+        Some(Errno::BUSY | Errno::AGAIN) => {
+            format!("{what} is held by another program: end it (`fuser {what}` names it)")
+        }
+        _ => format!("{what}: {error}"),
+    }
+}
 
 /// Columns `text` takes.
 #[must_use]

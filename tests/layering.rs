@@ -34,6 +34,7 @@ const LAYERS: &[&[&str]] = &[
         "peer",
         "realtime",
         "control",
+        "gpio",
     ],
     &["hotplug", "driver", "bus", "orders", "interlocks", "sync", "calibration"],
     &["rig", "record", "policy"],
@@ -45,6 +46,7 @@ const LAYERS: &[&[&str]] = &[
 const SIDEWAYS: &[(&str, &[&str])] = &[
     ("status", &["registry", "text"]),
     ("control", &["registry"]),
+    ("gpio", &["text"]),
     ("episode_format", &["text"]),
     ("app", &["tui", "headless", "logging"]),
     // Without a screen the log is lines among the lines of the run.
@@ -69,7 +71,8 @@ const HOMES: &[(&str, &[&str])] = &[
     ("crossterm", &["tui"]),
     ("evdev", &["registry/parse", "interlocks"]),
     ("futures", &["hotplug", "driver", "bus", "rig", "record", "app", "tui", "headless", "commands"]),
-    ("gpiocdev", &["interlocks"]),
+    ("gpiocdev", &["gpio"]),
+    ("gpiocdev_uapi", &["gpio"]),
     ("hdrhistogram", &["record/quality", "policy/live", "driver/can"]),
     ("http_body_util", &["driver/lan"]),
     ("humantime", &["registry", "cli", "commands"]),

@@ -14,9 +14,9 @@ use rapid::interlock::StopKind;
 use rapid::modality::ModalityKind;
 use rapid::registry::scenario::Scenario;
 use rapid::registry::{
-    BUILTIN, CanAdapter, CanProtocol, DeviceSpec, Framing, Hook, InterlockInput, LanFind, LanPicture, LanProtocol,
-    Loaded, MotionSpec, MotorKind, MotorMode, NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream, Probe, Registry, Stop,
-    StopSpec, VerdictSpec, WatchSpec,
+    BUILTIN, BrakeSpec, CanAdapter, CanProtocol, DeviceSpec, Framing, Hook, InterlockInput, LanFind, LanPicture,
+    LanProtocol, Loaded, MotionSpec, MotorKind, MotorMode, NodeSpec, Opens, POOL_SPARE, Parse, PhoneStream, Probe,
+    Registry, Stop, StopSpec, VerdictSpec, WatchSpec,
 };
 
 fn files(folder: &str) -> Vec<PathBuf> {
@@ -30,7 +30,7 @@ fn valid(name: &str) -> Loaded {
 
 #[test]
 fn every_mistake_is_told_in_full() {
-    mistakes::check("registry/invalid", "toml", 202, |text| {
+    mistakes::check("registry/invalid", "toml", 208, |text| {
         let errors = Registry::parse(text, Some(Path::new("devices.toml"))).err()?;
         Some((errors.to_string(), errors.diagnostics))
     });
@@ -215,7 +215,18 @@ fn a_bus_and_its_motors_arrive() {
     assert_eq!((roll.max_mos, roll.max_rotor), (70.0, 90.0));
     assert_eq!((wheel.master, wheel.mode, wheel.slew), (0x7fe, MotorMode::Velocity, 20.0));
     assert_eq!((gripper.watch, gripper.stop), (WatchSpec::default(), StopSpec::default()));
-    assert_eq!((roll.watch, roll.stop), (WatchSpec { lag: 0.5, ..WatchSpec::default() }, StopSpec::default()));
+    // Its frames have none for damping.
+    let undamped = StopSpec { other_fault: Stop::Hold, ..StopSpec::default() };
+    assert_eq!((roll.watch, roll.stop), (WatchSpec { lag: 0.5, ..WatchSpec::default() }, undamped));
+    assert_eq!((&roll.brake, &wheel.brake), (&None, &None));
+    let brake = BrakeSpec {
+        chip: "/dev/gpiochip1".into(),
+        line: 3,
+        released_high: false,
+        engages_in: ms(30),
+        releases_in: ms(100),
+    };
+    assert_eq!(thumb.brake, Some(brake));
     let kept =
         StopSpec { own_fault: Stop::Hold, other_fault: Stop::Limp, emergency: Stop::Damp, hold_for: Some(ms(5000)) };
     assert_eq!((thumb.watch.margin, thumb.watch.blocked_after, thumb.stop), (0.05, None, kept));

@@ -36,7 +36,9 @@
 //! Invariant: a motor that answers is in samples sooner or later, whatever befell the bus before its ranges
 //! were read, unless they cannot be used.
 
+mod brakes;
 mod due;
+mod fault;
 mod last_will;
 mod motor;
 mod notice;
@@ -47,9 +49,11 @@ mod words;
 
 use std::time::Duration;
 
+pub use brakes::Brakes;
+pub use fault::{Fault, Part, Strange};
 pub use last_will::stalled_after;
 use motor::Motor;
-pub use notice::{BusState, Fault, Notice, Part, Reason, Refusal, Strange};
+pub use notice::{BusState, Notice, Reason, Refusal};
 use notices::{Notices, Seldom};
 pub use returning::RETURN_SPEED;
 pub use words::Words;
@@ -93,6 +97,8 @@ pub struct MotorBus {
     since: Stamp,
     reason: Reason,
     cycle: Duration,
+    /// The longest time that a brake takes to be released.
+    slowest_brake: Duration,
     silent_after: Duration,
     stalled_after: Duration,
     stepped: Option<Stamp>,
@@ -149,6 +155,7 @@ impl MotorBus {
             since: now,
             reason: Reason::Asked,
             cycle,
+            slowest_brake: brakes::slowest(spec),
             silent_after: spec.silent_after.max(cycle * SILENT_CYCLES),
             stalled_after: stalled_after(spec),
             stepped: None,

@@ -2,12 +2,17 @@
 
 use std::io::ErrorKind;
 use std::os::fd::{AsFd as _, BorrowedFd};
+use std::time::Duration;
 
 use evdev::{Device, EventSummary, InputEvent, KeyCode};
 
-use super::source::{failure, state};
+use super::source::state;
 use crate::interlock::InputState;
 use crate::registry::KeyInput;
+use crate::text::not_opened;
+
+/// The key is asked for at least this often.
+pub(super) const LOOK: Duration = Duration::from_millis(50);
 
 /// An open device.
 #[derive(Debug)]
@@ -24,7 +29,7 @@ impl Key {
         let code = KeyCode(spec.number);
         let has_key = |device: &Device| device.supported_keys().is_some_and(|keys| keys.contains(code));
         let shown = spec.device.clone();
-        let say = |error: std::io::Error| failure(&spec.device, "input", &error);
+        let say = |error: std::io::Error| not_opened(&spec.device, "input", &error);
         let device = if shown.starts_with('/') {
             Device::open(&shown).map_err(say)?
         } else {
@@ -44,29 +49,28 @@ impl Key {
         self.device.as_fd()
     }
 
-    pub(super) fn take(&mut self, is_first: bool, tell: &mut dyn FnMut(InputState)) -> Result<(), String> {
+    pub(super) fn take(&mut self, report: &mut dyn FnMut(InputState)) -> Result<(), String> {
         let Self { device, shown, code, runs_while_pressed } = self;
-        let say = |error: std::io::Error| failure(shown, "input", &error);
-        if is_first {
-            let is_pressed = device.get_key_state().map_err(say)?.contains(*code);
-            tell(state(is_pressed, *runs_while_pressed));
-        }
+        let say = |error: std::io::Error| not_opened(shown, "input", &error);
         match device.fetch_events() {
             // Where the kernel had no room for all, the crate makes up what has changed.
-            Ok(events) => events.for_each(|event| judge(event, *code, *runs_while_pressed, tell)),
+            Ok(events) => events.for_each(|event| judge(event, *code, *runs_while_pressed, report)),
             Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted) => {}
             Err(error) => return Err(say(error)),
         }
+        // Of a device that another program has grabbed no event comes.
+        let is_pressed = device.get_key_state().map_err(say)?.contains(*code);
+        report(state(is_pressed, *runs_while_pressed));
         Ok(())
     }
 }
 
 /// What an event says of the key: 1 is a press, 2 a press that lasts, 0 a release.
-fn judge(event: InputEvent, key: KeyCode, runs_while_pressed: bool, tell: &mut dyn FnMut(InputState)) {
+fn judge(event: InputEvent, key: KeyCode, runs_while_pressed: bool, report: &mut dyn FnMut(InputState)) {
     if let EventSummary::Key(_, code, value) = event.destructure()
         && code == key
     {
-        tell(state(value != 0, runs_while_pressed));
+        report(state(value != 0, runs_while_pressed));
     }
 }
 

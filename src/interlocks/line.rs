@@ -10,9 +10,9 @@ use rustix::fs::{FlockOperation, Mode, OFlags, flock, open};
 use rustix::io::Errno;
 use rustix::termios::{ControlModes, OptionalActions, QueueSelector, ioctl_tiocexcl, tcflush, tcgetattr, tcsetattr};
 
-use super::source::failure;
 use crate::interlock::InputState;
 use crate::registry::LineInput;
+use crate::text::not_opened;
 
 /// Longest line that is looked at; one that is longer is another than those that mean something.
 const LONGEST: usize = 128;
@@ -32,7 +32,7 @@ impl Line {
     /// Opens the port for ourselves alone, 8 bits without parity.
     pub(super) fn open(spec: &LineInput) -> Result<Self, String> {
         let shown = spec.path.display().to_string();
-        let say = |error: Errno| failure(&shown, "dialout", &error.into());
+        let say = |error: Errno| not_opened(&shown, "dialout", &error.into());
         let flags = OFlags::RDONLY | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
         let fd = open(&spec.path, flags, Mode::empty()).map_err(say)?;
         flock(&fd, FlockOperation::NonBlockingLockExclusive).map_err(say)?;
@@ -47,19 +47,30 @@ impl Line {
         Ok(Self { fd, shown, words: Words::new(spec) })
     }
 
-    pub(super) fn take(&mut self, tell: &mut dyn FnMut(InputState)) -> Result<(), String> {
+    pub(super) fn take(&mut self, report: &mut dyn FnMut(InputState)) -> Result<(), String> {
         let mut bytes = [0; 256];
         // A port that is flooded must not keep the thread from the end of the run.
         for _ in 0..MOST_READS {
             match rustix::io::read(&self.fd, &mut bytes) {
                 Ok(0) => return Err(format!("{} is not plugged in", self.shown)),
-                Ok(count) => self.words.feed(bytes.get(..count).unwrap_or_default(), tell),
+                Ok(count) => self.words.feed(bytes.get(..count).unwrap_or_default(), report),
                 Err(Errno::INTR) => {}
                 Err(Errno::AGAIN) => return Ok(()),
-                Err(error) => return Err(failure(&self.shown, "dialout", &error.into())),
+                Err(error) => return Err(not_opened(&self.shown, "dialout", &error.into())),
             }
         }
         Ok(())
+    }
+
+    /// Why it is silent, and what came all the same.
+    pub(super) fn why_silent(&mut self) -> String {
+        let Words { run, silence, unused, .. } = &mut self.words;
+        match std::mem::take(unused) {
+            0 => format!("nothing was received for {silence:?}"),
+            bytes => format!(
+                "no line {run:?} for {silence:?}, though {bytes} bytes came: check `baud`, and that lines end with \\n"
+            ),
+        }
     }
 
     pub(super) const fn silence(&self) -> Duration {
@@ -83,6 +94,8 @@ struct Words {
     /// The line began before the port was opened, or is too long.
     is_part: bool,
     is_first: bool,
+    /// Bytes since the last line that meant something.
+    unused: u64,
 }
 
 impl Words {
@@ -94,11 +107,13 @@ impl Words {
             line: Vec::with_capacity(LONGEST),
             is_part: true,
             is_first: true,
+            unused: 0,
         }
     }
 
-    fn feed(&mut self, bytes: &[u8], tell: &mut dyn FnMut(InputState)) {
+    fn feed(&mut self, bytes: &[u8], report: &mut dyn FnMut(InputState)) {
         for byte in bytes {
+            self.unused += 1;
             match byte {
                 b'\n' => {
                     let says = if self.is_part { None } else { Some(self.line.trim_ascii()) };
@@ -108,7 +123,8 @@ impl Words {
                         None => !is_run && !self.is_first,
                     };
                     if is_run || is_stop {
-                        tell(if is_run { InputState::Runs } else { InputState::Stopped });
+                        self.unused = 0;
+                        report(if is_run { InputState::Runs } else { InputState::Stopped });
                     }
                     self.line.clear();
                     (self.is_part, self.is_first) = (false, false);

@@ -1,11 +1,10 @@
 //! An open input, whatever it is.
 
-use std::io;
 use std::os::fd::{AsFd, BorrowedFd};
 use std::time::Duration;
 
 use super::gpio::Gpio;
-use super::key::Key;
+use super::key::{self, Key};
 use super::line::Line;
 use crate::interlock::InputState;
 use crate::registry::InterlockInput;
@@ -41,16 +40,32 @@ impl Source {
         }
     }
 
-    /// Reports every state that it has had since the last call, without waiting; at the first call what it is now, where
-    /// it can be asked.
+    /// Reports every state that it has had since the last call, and what it is now where it can be asked, without waiting.
     ///
     /// # Errors
     /// When it cannot be read any more, for people.
-    pub(super) fn take(&mut self, is_first: bool, report: &mut dyn FnMut(InputState)) -> Result<(), String> {
+    pub(super) fn take(&mut self, report: &mut dyn FnMut(InputState)) -> Result<(), String> {
         match self {
-            Self::Key(key) => key.take(is_first, report),
-            Self::Gpio(gpio) => gpio.take(is_first, report),
+            Self::Key(key) => key.take(report),
+            Self::Gpio(gpio) => gpio.take(report),
             Self::Line(line) => line.take(report),
+        }
+    }
+
+    /// How long after a call of [`Self::take`] the next one is due at the latest; `None` where it cannot be asked.
+    pub(super) const fn poll_after(&self) -> Option<Duration> {
+        match self {
+            Self::Gpio(gpio) => Some(gpio.poll_after()),
+            Self::Key(_) => Some(key::LOOK),
+            Self::Line(_) => None,
+        }
+    }
+
+    /// Why it is silent, for people.
+    pub(super) fn why_silent(&mut self) -> String {
+        match self {
+            Self::Key(_) | Self::Gpio(_) => String::new(),
+            Self::Line(line) => line.why_silent(),
         }
     }
 
@@ -66,18 +81,4 @@ impl Source {
 /// The state of an input that runs while it is on, or while it is off.
 pub(super) const fn state(is_on: bool, runs_while_on: bool) -> InputState {
     if is_on == runs_while_on { InputState::Runs } else { InputState::Stopped }
-}
-
-/// What an open or a read that failed says to people.
-pub(super) fn failure(what: &str, group: &str, error: &io::Error) -> String {
-    match error.raw_os_error() {
-        Some(libc::ENOENT | libc::ENODEV | libc::ENXIO | libc::EIO) => format!("{what} is not plugged in"),
-        Some(libc::EACCES | libc::EPERM) => {
-            format!("{what} may not be opened: add the user to group {group} (`sudo usermod -aG {group} $USER`)")
-        }
-        Some(libc::EBUSY | libc::EAGAIN) => {
-            format!("{what} is held by another program: end it (`fuser {what}` names it)")
-        }
-        _ => format!("{what}: {error}"),
-    }
 }

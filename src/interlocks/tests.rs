@@ -187,6 +187,14 @@ fn a_number_of_a_stream_stops_by_value_by_silence_and_by_the_end_of_its_stream()
     assert_eq!(taps[0].device(), "buttons");
     let bytes = |value: f64| [9.0_f64.to_le_bytes(), value.to_le_bytes()].concat();
     let look = |value: f64| taps[0].look(Encoding::F64, &bytes(value));
+    // Until what was a stop has settled.
+    let run_again = |run: &Run| {
+        let end = Instant::now() + PATIENCE;
+        while run.stop().state != InputState::Runs {
+            assert!(Instant::now() < end);
+            look(0.6);
+        }
+    };
     let end = Instant::now() + PATIENCE;
     while run.stop().detail.contains("not reported yet") {
         assert!(Instant::now() < end);
@@ -197,25 +205,26 @@ fn a_number_of_a_stream_stops_by_value_by_silence_and_by_the_end_of_its_stream()
     assert!(run.arm().unwrap_err().contains("pedal is released: hold it"));
     assert_eq!(run.orders(), [Order::Disarm]);
     look(0.6);
+    assert!(run.arm().unwrap_err().contains("pedal is released"), "it may be a contact that chatters");
+    run_again(&run);
     assert_eq!((run.orders(), run.arm()), (vec![], Ok(())));
     assert_eq!(run.orders(), [Order::Arm]);
     // What is no number, is missing, or is none of the stream's.
     for bytes in [bytes(f64::NAN), bytes(1.0)[..15].to_vec(), Vec::new()] {
-        look(0.6);
+        run_again(&run);
         taps[0].look(Encoding::F64, &bytes);
         assert_eq!(run.orders(), [Order::Disarm]);
     }
-    look(0.6);
+    run_again(&run);
     let lost = run.until(InputState::Lost);
     assert_eq!((lost.detail.as_str(), run.orders()), ("no sample of buttons for 300ms", vec![Order::Disarm]));
-    look(0.6);
-    assert_eq!(run.stop().state, InputState::Runs);
+    run_again(&run);
     drop(tap::lost_at_the_end(&taps));
     assert_eq!((run.stop().detail.as_str(), run.orders()), ("buttons is no longer read", vec![Order::Disarm]));
     let told = run.told();
     assert!(told.starts_with(&["lost", "released", "held", "released"]), "{told:?}");
     // What is lost at the end of a run is lost, and no word is made of it.
-    look(0.6);
+    run_again(&run);
     run.told();
     run.watched.end();
     drop(tap::lost_at_the_end(&taps));
@@ -235,7 +244,10 @@ fn an_input_whose_thread_panics_is_lost() {
     while run.stop().detail.contains("not reported yet") {
         assert!(Instant::now() < end);
     }
-    reporter.report(InputState::Runs, "");
+    while run.stop().state != InputState::Runs {
+        assert!(Instant::now() < end);
+        reporter.report(InputState::Runs, "");
+    }
     run.orders();
     let panicked = std::thread::spawn({
         let reporter = reporter.clone();
@@ -246,4 +258,34 @@ fn an_input_whose_thread_panics_is_lost() {
     });
     assert!(panicked.join().is_err());
     assert_eq!((run.stop().state, run.orders()), (InputState::Lost, vec![Order::Disarm]));
+}
+
+#[test]
+fn a_contact_that_chatters_is_one_stop() {
+    let (port, path) = pendant();
+    let mut run = run(&serial(&path));
+    send(&port, "RUN\n", || run.stop().state == InputState::Runs);
+    run.told();
+    let chatter = "STOP\nRUN\n".repeat(100);
+    for _ in 0..30 {
+        let _ = rustix::io::write(&port, chatter.as_bytes());
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let told = run.told();
+    // A machine that stands still in between makes two stops of one.
+    assert!(told.starts_with(&["pressed"]) && told.len() < 20, "{}: {:?}", told.len(), &told[..told.len().min(20)]);
+    send(&port, "RUN\n", || run.stop().state == InputState::Runs);
+}
+
+#[test]
+fn a_port_on_which_something_else_comes_is_not_called_silent() {
+    let (port, path) = pendant();
+    let run = run(&serial(&path));
+    let run_says = |words: &str| run.stop().detail.contains(words);
+    send(&port, "RUN\r", || run_says("bytes came: check `baud`"));
+    send(&port, "RUN\n", || run.stop().state == InputState::Runs);
+    let end = Instant::now() + PATIENCE;
+    while !run_says("nothing was received for") {
+        assert!(Instant::now() < end, "{:?}", run.stop());
+    }
 }

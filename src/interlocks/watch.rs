@@ -1,7 +1,7 @@
 //! The thread of an input: opens it, follows what it says, and opens it again when it was lost.
 //!
 //! Invariant: between two states it sleeps in the kernel, and wakes when there is something to read, when the input has
-//! been silent for too long, or at the end.
+//! been silent for too long, when it has to be asked, or at the end.
 
 use std::os::fd::{AsFd, OwnedFd};
 use std::time::Duration;
@@ -75,29 +75,28 @@ fn follow(source: &mut Source, reporter: &Reporter, stop: &OwnedFd) -> Option<St
     let silence = source.silence();
     let mut heard = Stamp::now();
     let mut is_silent = false;
-    let mut is_first = true;
     loop {
         let mut has_reported = false;
-        let taken = source.take(is_first, &mut |state| {
+        let taken = source.take(&mut |state| {
             has_reported = true;
             reporter.report(state, "");
         });
         if let Err(why) = taken {
             return Some(why);
         }
-        is_first = false;
         if has_reported {
             (heard, is_silent) = (Stamp::now(), false);
         }
-        let until = silence.filter(|_| !is_silent).map(|silence| heard.after(silence));
+        let poll = source.poll_after().map(|after| Stamp::now().after(after));
+        let until = poll.or(silence.filter(|_| !is_silent).map(|silence| heard.after(silence)));
         match wait(stop, Some(&source.fd()), until) {
             Woken::Stop => return None,
             Woken::Ready(false) => {}
+            Woken::Late if poll.is_some() => {}
             Woken::Ready(true) => return Some("unplugged".to_owned()),
             Woken::Late => {
                 is_silent = true;
-                let silence = silence.unwrap_or_default();
-                reporter.report(InputState::Lost, &format!("nothing was received for {silence:?}"));
+                reporter.report(InputState::Lost, &source.why_silent());
             }
         }
     }

@@ -1,17 +1,24 @@
 //! The side of whoever gives an order.
 
 use std::fs;
-use std::io::{self, BufRead, BufReader, Read, Write};
+use std::io::{self, BufRead, BufReader, ErrorKind, Read, Write};
 use std::os::unix::net::UnixStream;
 use std::time::Duration;
 
-use super::{DONE, LONGEST, address, instance_part, line, this_user};
+use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, socket_with};
+
+use super::{DONE, LONGEST, instance_part, line, this_user};
 use crate::action::Order;
 use crate::peer::Peer;
+use crate::text::plain;
 use crate::time::Stamp;
 
 /// A run answers within milliseconds; one that is stopped does not.
 const ANSWER_LIMIT: Duration = Duration::from_secs(2);
+/// How long a run is tried whose socket accepts nothing at the moment, where no other can be reached...
+const BUSY_LIMIT: Duration = Duration::from_secs(1);
+/// ...and how often.
+const BUSY_AGAIN: Duration = Duration::from_millis(2);
 /// The sockets of this network namespace, see proc(5). An abstract name begins with `@` there.
 const SOCKETS: &str = "/proc/net/unix";
 /// Of the flags there: it accepts connections (`__SO_ACCEPTCON`, linux/net.h).
@@ -20,11 +27,16 @@ const ACCEPTS: u32 = 1 << 16;
 /// Why an order was not carried out.
 #[derive(Debug, thiserror::Error)]
 pub enum GiveError {
-    /// No run of that instance.
-    #[error("{}", no_run(.0.as_deref()))]
-    NoRun(Option<String>),
-    /// Runs of several users.
-    #[error("several runs are here (processes {0:?}): arm as the user of one of them")]
+    /// No run of that instance and user.
+    #[error("{}", no_run(.instance.as_deref(), .others))]
+    NoRun {
+        /// The instance.
+        instance: Option<String>,
+        /// Runs of other instances and users.
+        others: Vec<Other>,
+    },
+    /// Several runs.
+    #[error("several runs are here (processes {0:?}): arm as the user of one of them, or name it with --instance")]
     Several(Vec<u32>),
     /// The run answered so.
     #[error("process {process}: {why}")]
@@ -36,8 +48,8 @@ pub enum GiveError {
     },
     /// The run does not answer.
     #[error(
-        "process {process} does not answer ({error}): end it, with `kill -9 {process}` if nothing else does; its motors \
-         then stop by their own time limit"
+        "process {process} does not answer ({error}): its motors may still move, so cut their power, or end it with `kill \
+         -9 {process}`, after which its guard stops them"
     )]
     NoAnswer {
         /// Its process.
@@ -50,10 +62,30 @@ pub enum GiveError {
     Sockets(#[from] io::Error),
 }
 
-fn no_run(instance: Option<&str>) -> String {
-    match instance {
-        None => "no rapid runs here: start it, or name it with --instance".to_owned(),
-        Some(name) => format!("no rapid runs here as instance {name}: start it"),
+fn no_run(instance: Option<&str>, others: &[Other]) -> String {
+    let what = instance.map_or_else(|| "no rapid".to_owned(), |name| format!("no rapid of instance {name}"));
+    if others.is_empty() {
+        return format!("{what} runs here: start it");
+    }
+    let others: Vec<String> = others.iter().map(ToString::to_string).collect();
+    format!("{what} runs here for this user, but {}", others.join(", "))
+}
+
+/// A run of another instance or user.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Other {
+    process: String,
+    user: String,
+    /// `None`: it has no name.
+    instance: Option<String>,
+}
+
+impl std::fmt::Display for Other {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { process, user, instance } = self;
+        write!(f, "process {process} of user {user} does")?;
+        // Anybody may make a socket of any name.
+        instance.iter().try_for_each(|name| write!(f, " (`--instance {}`)", plain(name)))
     }
 }
 
@@ -64,9 +96,11 @@ fn no_run(instance: Option<&str>) -> String {
 /// When no run has carried it out.
 pub fn give(instance: Option<&str>, order: Order) -> Result<(), GiveError> {
     let given = Stamp::now();
-    let runs = runs(instance)?;
+    let sockets = fs::read_to_string(SOCKETS)?;
+    let runs = runs(&sockets, instance)?;
     if runs.is_empty() {
-        return Err(GiveError::NoRun(instance.map(str::to_owned)));
+        let others = sockets.lines().filter_map(|line| other_of(line, instance)).collect();
+        return Err(GiveError::NoRun { instance: instance.map(str::to_owned), others });
     }
     if matches!(order, Order::Arm | Order::ArmBack) && runs.len() > 1 {
         return Err(GiveError::Several(runs.iter().map(|run| run.process).collect()));
@@ -83,6 +117,7 @@ pub fn give(instance: Option<&str>, order: Order) -> Result<(), GiveError> {
 struct Run {
     stream: UnixStream,
     process: u32,
+    user: u32,
 }
 
 impl Run {
@@ -93,25 +128,62 @@ impl Run {
 }
 
 /// Those of this user; where root has none, everyone's.
-fn runs(instance: Option<&str>) -> io::Result<Vec<Run>> {
-    let sockets = fs::read_to_string(SOCKETS)?;
-    let mut ours = Vec::new();
-    let mut others = Vec::new();
-    for name in sockets.lines().filter_map(|line| name_of(line, instance)) {
-        // One that has ended meanwhile is none.
-        let Ok(stream) = address(name).and_then(|address| UnixStream::connect_addr(&address)) else { continue };
-        stream.set_read_timeout(Some(ANSWER_LIMIT))?;
-        stream.set_write_timeout(Some(ANSWER_LIMIT))?;
-        let Peer { process, user } = Peer::of(&stream)?;
-        // As it numbers itself, where its processes are not seen from here.
-        let process = process.or_else(|| name.rsplit('/').next()?.parse().ok()).unwrap_or_default();
-        if user == this_user() { &mut ours } else { &mut others }.push(Run { stream, process });
+///
+/// Anybody may make a socket with such a name, and let it accept nothing: none is waited for while another can be reached.
+fn runs(sockets: &str, instance: Option<&str>) -> io::Result<Vec<Run>> {
+    let mut names: Vec<&str> = sockets.lines().filter_map(|line| name_of(line, instance)).collect();
+    let (mut ours, mut others) = (Vec::new(), Vec::new());
+    let end = Stamp::now().after(BUSY_LIMIT);
+    loop {
+        let mut busy = Vec::new();
+        for name in names {
+            match connect(name) {
+                Ok(run) if run.user == this_user() => ours.push(run),
+                Ok(run) => others.push(run),
+                Err(error) if error.kind() == ErrorKind::WouldBlock => busy.push(name),
+                // One that has ended meanwhile is none.
+                Err(_) => {}
+            }
+        }
+        if busy.is_empty() || !ours.is_empty() || Stamp::now() >= end {
+            return Ok(if ours.is_empty() && this_user() == 0 { others } else { ours });
+        }
+        names = busy;
+        std::thread::sleep(BUSY_AGAIN);
     }
-    Ok(if ours.is_empty() && this_user() == 0 { others } else { ours })
+}
+
+/// Connects to the run that has this socket, without waiting.
+fn connect(name: &str) -> io::Result<Run> {
+    let address = SocketAddrUnix::new_abstract_name(name.as_bytes())?;
+    let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+    let socket = socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None)?;
+    rustix::net::connect(&socket, &address)?;
+    let stream = UnixStream::from(socket);
+    stream.set_nonblocking(false)?;
+    stream.set_read_timeout(Some(ANSWER_LIMIT))?;
+    stream.set_write_timeout(Some(ANSWER_LIMIT))?;
+    let Peer { process, user } = Peer::of(&stream)?;
+    // As it numbers itself, where its processes are not seen from here.
+    let process = process.or_else(|| name.rsplit('/').next()?.parse().ok()).unwrap_or_default();
+    Ok(Run { stream, process, user })
 }
 
 /// The name in a line of [`SOCKETS`], if a run of `instance` listens there.
 fn name_of<'a>(line: &'a str, instance: Option<&str>) -> Option<&'a str> {
+    parts_of(line).filter(|[_, _, of, _]| *of == instance_part(instance)).map(|[name, ..]| name)
+}
+
+/// The run of another instance or user in a line of [`SOCKETS`], if one listens there.
+fn other_of(line: &str, instance: Option<&str>) -> Option<Other> {
+    let [_, user, of, process] = parts_of(line)?;
+    let is_meant = of == instance_part(instance) && user.parse() == Ok(this_user());
+    let instance = (of != instance_part(None)).then(|| of.to_owned());
+    (!is_meant).then(|| Other { process: process.to_owned(), user: user.to_owned(), instance })
+}
+
+/// Name, user, instance and process in a line of [`SOCKETS`], if a run listens there.
+fn parts_of(line: &str) -> Option<[&str; 4]> {
     let mut columns = line.split_ascii_whitespace();
     let flags = u32::from_str_radix(columns.nth(3)?, 16).ok()?;
     // A connection has the name of the socket that accepted it.
@@ -119,7 +191,7 @@ fn name_of<'a>(line: &'a str, instance: Option<&str>) -> Option<&'a str> {
     let mut parts = name.strip_prefix("rapid/")?.split('/');
     let (user, of, process) = (parts.next()?, parts.next()?, parts.next()?);
     let is_number = |part: &str| part.parse::<u32>().is_ok();
-    (is_number(user) && of == instance_part(instance) && is_number(process) && parts.next().is_none()).then_some(name)
+    (is_number(user) && is_number(process) && parts.next().is_none()).then_some([name, user, of, process])
 }
 
 fn answer(stream: UnixStream) -> io::Result<String> {

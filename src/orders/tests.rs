@@ -4,6 +4,8 @@ use std::io::{Read, Write};
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::sync::Arc;
 
+use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, bind, listen, socket_with};
+
 use super::give::{GiveError, give};
 use super::receive::Orders;
 use super::*;
@@ -64,11 +66,48 @@ fn orders_are_carried_out_when_they_are_answered() {
 #[test]
 fn without_a_run_there_is_an_error_at_once_and_after_its_end_too() {
     let none = give(Some("orders-none"), Disarm).unwrap_err();
-    assert!(matches!(none, GiveError::NoRun(_)) && none.to_string().contains("orders-none"), "{none}");
+    assert!(matches!(none, GiveError::NoRun { .. }) && none.to_string().contains("orders-none"), "{none}");
     let run = run("b");
     let instance = run.instance.clone();
     drop(run);
-    assert!(matches!(give(Some(&instance), Disarm), Err(GiveError::NoRun(_))));
+    assert!(matches!(give(Some(&instance), Disarm), Err(GiveError::NoRun { .. })));
+}
+
+#[test]
+fn a_socket_that_accepts_nothing_holds_up_no_order() {
+    let run = run("busy");
+    let attended = run.permission.attend();
+    // As anyone may make one: with room for no connection more.
+    let process = u32::MAX;
+    let address = address(&name(this_user(), Some(&run.instance), process)).unwrap();
+    let socket = socket_with(AddressFamily::UNIX, SocketType::STREAM, SocketFlags::NONBLOCK, None).unwrap();
+    let bound = SocketAddrUnix::new_abstract_name(address.as_abstract_name().unwrap()).unwrap();
+    bind(&socket, &bound).unwrap();
+    listen(&socket, 0).unwrap();
+    let mut waiting = Vec::new();
+    loop {
+        let one = socket_with(AddressFamily::UNIX, SocketType::STREAM, SocketFlags::NONBLOCK, None).unwrap();
+        if rustix::net::connect(&one, &bound).is_err() {
+            break;
+        }
+        waiting.push(one);
+    }
+    assert_eq!(run.give(Disarm), Ok(()));
+    assert_eq!(taken(&attended), [Disarm]);
+    // Alone it is no run, and that is found out.
+    let instance = run.instance.clone();
+    drop(run);
+    assert!(matches!(give(Some(&instance), Disarm), Err(GiveError::NoRun { .. })));
+}
+
+#[test]
+fn who_gives_an_order_to_no_run_learns_of_those_of_other_instances() {
+    let run = run("other");
+    let why = give(Some("orders-none-at-all"), Disarm).unwrap_err().to_string();
+    let process = std::process::id();
+    let meant = format!("process {process} of user {} does (`--instance {}`)", this_user(), run.instance);
+    assert!(why.starts_with("no rapid of instance orders-none-at-all runs here for this user, but "), "{why}");
+    assert!(why.contains(&meant), "{why}");
 }
 
 #[test]

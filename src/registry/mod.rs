@@ -29,10 +29,10 @@ pub use identity::{Assigner, Assignment, Detached, Explanation};
 pub use limits::{Limits, VerdictSpec};
 pub use parse::{BUILTIN, Loaded, like_a_name, name_problem, read_file};
 pub use spec::{
-    ActionSpec, Bound, CAN_BATCH, CAN_RECORD, CAN_RESTART_MS, CameraSpec, CanAdapter, CanProtocol, CanSpec, DamiaoSpec,
-    DeviceSpec, FieldInput, Framing, GpioInput, Hook, Hooks, IdentitySpec, InterlockInput, InterlockSpec, KeyInput,
-    LanFind, LanPicture, LanProtocol, LanSpec, LineInput, MAX_BORROWED, MAX_MOTORS, MAX_SUBSCRIBERS, MOTOR_CHANNELS,
-    ModuleError, ModuleSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Mount, NodeSpec, Opens, POOL_SPARE, Parse,
-    PhoneStream, PixelFormat, Probe, ProcessSpec, Registry, RigSpec, SLCAN_BITRATES, SerialSpec, Stop, StopSpec,
-    UsbSpec, WatchSpec, WhenStale, mounted, own_side,
+    ActionSpec, Bound, BrakeSpec, CAN_BATCH, CAN_RECORD, CAN_RESTART_MS, CameraSpec, CanAdapter, CanProtocol, CanSpec,
+    DamiaoSpec, DeviceSpec, FieldInput, Framing, GpioInput, Hook, Hooks, IdentitySpec, InterlockInput, InterlockSpec,
+    KeyInput, LanFind, LanPicture, LanProtocol, LanSpec, LineInput, MAX_BORROWED, MAX_MOTORS, MAX_SUBSCRIBERS,
+    MOTOR_CHANNELS, ModuleError, ModuleSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Mount, NodeSpec, Opens,
+    POOL_SPARE, Parse, PhoneStream, PixelFormat, Probe, ProcessSpec, Registry, RigSpec, SLCAN_BITRATES, SerialSpec,
+    Stop, StopSpec, UsbSpec, WatchSpec, WhenStale, mounted, own_side,
 };

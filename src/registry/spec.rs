@@ -28,7 +28,9 @@ pub use can::{
 pub use interlock::{Bound, FieldInput, GpioInput, InterlockInput, InterlockSpec, KeyInput, LineInput};
 pub use lan::{LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, Probe, own_side};
 pub use module::{ModuleError, ModuleSpec, mounted};
-pub use motors::{DamiaoSpec, MAX_MOTORS, MotionSpec, MotorKind, MotorMode, MotorSpec, Stop, StopSpec, WatchSpec};
+pub use motors::{
+    BrakeSpec, DamiaoSpec, MAX_MOTORS, MotionSpec, MotorKind, MotorMode, MotorSpec, Stop, StopSpec, WatchSpec,
+};
 
 /// Samples that the pool of a topic holds beyond its depth: what 8 subscribers hold back, 4 each, the
 /// one being written, and one that is on its way out. The bus reserves them.

@@ -20,6 +20,7 @@ pub(crate) fn motor(slave: u16) -> MotorSpec {
         motion: MotionSpec { acceleration: f64::INFINITY, soft_start: Duration::ZERO, first_target: 100.0 },
         watch: WatchSpec::default(),
         stop: StopSpec { own_fault: Stop::Limp, other_fault: Stop::Limp, emergency: Stop::Limp, hold_for: None },
+        brake: None,
         max_mos: 80.0,
         max_rotor: 100.0,
     }

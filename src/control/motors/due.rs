@@ -3,8 +3,9 @@
 use std::time::Duration;
 
 use super::MotorBus;
+use super::fault::Fault;
 use super::motor::{Motor, Phase};
-use super::notice::{BusState, Fault, Notice, Reason};
+use super::notice::{BusState, Notice, Reason};
 use super::watch::Commanded;
 use crate::action::Trip;
 use crate::control::deadman::Verdict;
@@ -85,7 +86,8 @@ impl MotorBus {
     fn keep(&mut self, waited: Duration, now: Stamp) {
         for motor in &mut self.motors {
             let is_over = match motor.phase {
-                Phase::Kept(Stop::Hold) => motor.spec.stop.hold_for.is_some_and(|limit| waited >= limit),
+                Phase::Kept(Stop::Brake) if motor.has_braked(now) => true,
+                Phase::Kept(Stop::Hold | Stop::Brake) => motor.spec.stop.hold_for.is_some_and(|limit| waited >= limit),
                 _ => false,
             };
             if is_over || motor.is_kept() && motor.unanswered(now) >= self.silent_after {
@@ -167,14 +169,14 @@ impl MotorBus {
                 return;
             }
         }
-        if self.motors.iter().all(|motor| motor.phase == Phase::On) {
+        if self.motors.iter().all(|motor| motor.phase == Phase::On && motor.is_free(now)) {
             self.armed = now;
             self.deadman.arm(now);
             self.line.restart(&self.commands);
             self.ramps.iter_mut().for_each(Ramp::restart);
             self.hold(now);
             self.notices.tell(if self.is_returning { Notice::Returning } else { Notice::Armed });
-        } else if waited >= ARM_WITHIN.max(self.cycle * ARM_CYCLES)
+        } else if waited >= ARM_WITHIN.max(self.cycle * ARM_CYCLES) + self.slowest_brake
             && let Some(fault) = self.motors.iter().find_map(Motor::arm_fault)
         {
             self.fail(fault, now);
@@ -251,8 +253,13 @@ impl MotorBus {
         let own = fault.own();
         // What came first is what it is about.
         let is_keeping = matches!(self.state, BusState::Faulted(_)) && self.is_keeping();
+        let mut is_news = !is_keeping;
         for (index, (motor, command)) in self.motors.iter_mut().zip(&mut self.commands).enumerate() {
-            motor.stop_at_fault(Some(index) == own, command);
+            is_news |= motor.stop_at_fault(Some(index) == own, command);
+        }
+        // A joint that is too hot is so with each of its frames.
+        if !is_news {
+            return;
         }
         if !is_keeping {
             self.enter(BusState::Faulted(fault), now);
@@ -282,9 +289,9 @@ impl MotorBus {
             let kept = self.motors.iter().enumerate().filter(|(_, motor)| motor.phase == Phase::Kept(stop));
             kept.fold(0, |bits, (index, _)| bits | 1_u16 << (index % 16))
         };
-        let [damped, held] = [Stop::Damp, Stop::Hold].map(kept);
-        if damped | held != 0 {
-            self.notices.tell(Notice::Kept { damped, held });
+        let [damped, held, braked] = [Stop::Damp, Stop::Hold, Stop::Brake].map(kept);
+        if damped | held | braked != 0 {
+            self.notices.tell(Notice::Kept { damped, held, braked });
         }
     }
 

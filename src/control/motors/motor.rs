@@ -13,6 +13,7 @@
 //! Invariant: a command is sent in `Enabling` and `On` alone, and in `Kept` the last one.
 //! Invariant: who is found enabled without having been armed is disabled.
 
+mod brake;
 mod judged;
 mod last_will;
 mod parameters;
@@ -20,7 +21,8 @@ mod stopping;
 
 use std::time::Duration;
 
-use super::notice::{Fault, Notice, Part};
+use super::fault::{Fault, Part};
+use super::notice::Notice;
 use super::notices::Notices;
 use super::watch::Watch;
 use crate::control::can::CanFrame;
@@ -30,6 +32,7 @@ use crate::control::limits::{Limits, stiffness, within_torque};
 use crate::control::ramp::Ramp;
 use crate::registry::{MotorMode, MotorSpec, Stop};
 use crate::time::Stamp;
+use brake::Brake;
 use parameters::PROBE;
 
 /// Ids of commands and orders, from a motor's own.
@@ -104,6 +107,7 @@ pub(super) struct Motor {
     read: [f64; 3],
     warm: [bool; 2],
     watch: Watch,
+    brake: Brake,
     /// When a parameter is read again, and which was.
     look: Option<Stamp>,
     looks: usize,
@@ -134,6 +138,7 @@ impl Motor {
             read: [0.0; 3],
             warm: [false; 2],
             watch: Watch::default(),
+            brake: Brake::default(),
             look: None,
             looks: 0,
             differs: false,

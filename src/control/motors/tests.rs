@@ -3,6 +3,7 @@
 
 mod always;
 mod arming;
+mod braking;
 mod following;
 mod returning;
 mod starting;

@@ -6,7 +6,8 @@
 
 use std::time::Duration;
 
-use super::notice::{Notice, Strange};
+use super::fault::Strange;
+use super::notice::Notice;
 use super::notices::Notices;
 use crate::control::damiao::codec::{Feedback, Ranges};
 use crate::registry::{MotorMode, MotorSpec};

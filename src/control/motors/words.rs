@@ -3,7 +3,8 @@
 use std::fmt;
 use std::sync::Arc;
 
-use super::notice::{Fault, Notice, Part, Reason, Refusal, Strange};
+use super::fault::{Fault, Part, Strange};
+use super::notice::{Notice, Reason, Refusal};
 use crate::control::damiao::parameter::Parameter;
 
 /// Something to be shown, with the names of the motors it speaks of.
@@ -88,6 +89,12 @@ impl fmt::Display for Words<'_, Fault> {
             Fault::Stalled { after } => {
                 write!(f, "rapid was held up: no motor was commanded for {} ms", after.as_millis())
             }
+            Fault::Brake { motor } => {
+                write!(f, "the brake of motor {} cannot be driven: the log says why", self.name(motor))
+            }
+            Fault::NotReleased { motor } => {
+                write!(f, "the brake of motor {} was not released in time", self.name(motor))
+            }
             Fault::Dropped { motor } => write!(f, "motor {} is no longer enabled", self.name(motor)),
             Fault::EmergencyStop(trip) => f.write_str(&trip.text(self.stops)),
             Fault::NotEnabled { motor } => write!(f, "motor {} does not become enabled", self.name(motor)),
@@ -164,16 +171,20 @@ impl fmt::Display for Words<'_, Notice> {
             Notice::Fault(fault) => {
                 write!(f, "{}: all motors are stopped", fault.words(self.names).with_stops(self.stops))
             }
-            Notice::Kept { damped, held } => {
-                let parts = [("damped", damped), ("holding", held)].into_iter().filter(|(_, bits)| **bits != 0);
-                for (word, bits) in parts {
-                    write!(f, "{word} until a disarm: ")?;
+            Notice::Kept { damped, held, braked } => {
+                let parts = [
+                    ("damped until a disarm", damped),
+                    ("holding until a disarm", held),
+                    ("holding until the brake is engaged", braked),
+                ];
+                for (word, bits) in parts.into_iter().filter(|(_, bits)| **bits != 0) {
+                    write!(f, "{word}: ")?;
                     let named = self.names.iter().enumerate().filter(|(index, _)| bits >> (index % 16) & 1 == 1);
                     for (_, name) in named {
                         write!(f, "{name} ")?;
                     }
                 }
-                f.write_str("(the others are disabled)")
+                f.write_str("(any others are disabled)")
             }
             Notice::Clamped { motor, target, used } => {
                 write!(f, "target {target} of motor {} is beyond its limits; {used} is used", self.name(*motor))

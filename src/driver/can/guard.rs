@@ -8,7 +8,10 @@
 //!
 //! The guard is this program started once more, under the name [`NAME`], when an adapter with motors is opened. It has one
 //! end of a pair of sockets as its standard input, the adapter as its standard output, and nothing else that is open here.
-//! A message is a byte, [`OFF`], [`ON`] or [`DISMISSED`], and after [`ON`] a frame of [`FRAME`] bytes for each motor.
+//! A message is a byte, [`OFF`], [`ON`], [`DISMISSED`] or [`BRAKE`]. After [`ON`] come the bits of the motors whose brakes are
+//! to be engaged at once (u16, little endian; the others are when the motors are disabled), and a frame of [`FRAME`] bytes
+//! for each motor; after [`BRAKE`] the bits of the motors of a brake, and the level that engages it, 0 or 1, with the open
+//! line as a descriptor, or without one when it was closed.
 //!
 //! Invariant: the guard sends nothing while the cycles come, nor while no motor is on.
 //! Invariant: what the motors answer is left to the guarded process as long as that runs.
@@ -16,17 +19,22 @@
 //! Invariant: the guard has ended, or was killed, before the adapter is closed here: a serial line that it held open would
 //! come back under another name.
 
+mod held;
 mod process;
 
-use std::io;
-use std::os::fd::OwnedFd;
+use std::io::{self, IoSlice};
+use std::mem::MaybeUninit;
+use std::os::fd::{BorrowedFd, OwnedFd};
 use std::os::unix::process::CommandExt as _;
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
-use rustix::net::{AddressFamily, SendFlags, SocketFlags, SocketType, send, socketpair};
+use rustix::net::{
+    AddressFamily, SendAncillaryBuffer, SendAncillaryMessage, SendFlags, SocketFlags, SocketType, send, sendmsg,
+    socketpair,
+};
 use rustix::process::{Pid, PidfdFlags, pidfd_open, setsid};
 
 use super::link::Link;
@@ -49,10 +57,12 @@ const OFF: u8 = 0;
 const ON: u8 = 1;
 /// It is no longer needed.
 const DISMISSED: u8 = 2;
+/// The line of a brake.
+const BRAKE: u8 = 3;
 /// Bytes of a frame: identifier (u32, little endian), length, three zeros, data.
 const FRAME: usize = 16;
 /// Longest message.
-const LONGEST: usize = 1 + MAX_MOTORS * FRAME;
+const LONGEST: usize = 3 + MAX_MOTORS * FRAME;
 /// It ends within this when it is dismissed, or is killed.
 const ENDS_WITHIN: Duration = Duration::from_millis(200);
 
@@ -99,6 +109,8 @@ impl Guard {
         let mut length = 1;
         if let Some(frames) = bus.last_will() {
             message[0] = ON;
+            [message[1], message[2]] = bus.engages_at_death().to_le_bytes();
+            length = 3;
             for frame in frames {
                 if let Some(place) = message.get_mut(length..length + FRAME) {
                     place.copy_from_slice(&encode(&frame));
@@ -120,6 +132,14 @@ impl Guard {
             Err(_) => "has ended",
         };
         (!std::mem::replace(&mut self.is_reported, true)).then_some(problem)
+    }
+
+    /// Another descriptor of what it listens to, for [`hand_over`].
+    ///
+    /// # Errors
+    /// When the system gives none.
+    pub(super) fn socket(&self) -> io::Result<OwnedFd> {
+        self.socket.try_clone()
     }
 
     /// The motors are off, or were ordered to be: it is to end. Returns when it has.
@@ -146,6 +166,22 @@ impl Drop for Guard {
             self.end();
         }
     }
+}
+
+/// Hands the line of a brake to the guard, or has it closed there. Says whether that was done: otherwise it is to be tried
+/// again.
+pub(super) fn hand_over(guard: &OwnedFd, motors: u16, engaged_high: bool, line: Option<BorrowedFd<'_>>) -> bool {
+    let [low, high] = motors.to_le_bytes();
+    let message = [BRAKE, low, high, engaged_high.into()];
+    let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
+    let mut control = SendAncillaryBuffer::new(&mut space);
+    let lines = line.into_iter().collect::<Vec<_>>();
+    if !lines.is_empty() && !control.push(SendAncillaryMessage::ScmRights(&lines)) {
+        return false;
+    }
+    let sent = sendmsg(guard, &[IoSlice::new(&message)], &mut control, SendFlags::DONTWAIT | SendFlags::NOSIGNAL);
+    // A guard that has ended holds nothing.
+    !matches!(sent, Err(Errno::INTR | Errno::NOMEM | Errno::NOBUFS | Errno::AGAIN))
 }
 
 /// Runs in the guard before its program does.

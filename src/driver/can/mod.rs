@@ -5,6 +5,7 @@
 //! thread of its own; a [`link::AsyncLink`] is one for a task. [`raw`] is the driver of a bus whose frames are
 //! recorded as they come.
 
+mod brakes;
 mod claim;
 pub mod damiao_serial;
 pub mod guard;

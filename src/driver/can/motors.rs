@@ -9,6 +9,7 @@ mod beat;
 mod powered;
 mod tally;
 
+use std::io;
 use std::sync::Arc;
 use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
 use std::thread::JoinHandle;
@@ -84,7 +85,9 @@ impl Motors {
         Self::begin(Powered::new(link, spec, None, None), spec)
     }
 
-    fn begin(powered: Powered, spec: &DamiaoSpec) -> Result<Self, DriverError> {
+    fn begin(powered: io::Result<Powered>, spec: &DamiaoSpec) -> Result<Self, DriverError> {
+        let powered =
+            powered.map_err(|error| DriverError::Retry(format!("no thread for the motors' brakes: {error}")))?;
         let description = format!("{}, {} motors at {} Hz", powered.description(), spec.motors.len(), spec.hz);
         let (told, samples) = mpsc::channel(SAMPLES);
         let (tell, notices) = mpsc::channel(NOTICES);

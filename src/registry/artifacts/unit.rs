@@ -17,7 +17,7 @@
 use std::collections::BTreeSet;
 
 use super::HEADER;
-use crate::registry::spec::{CanAdapter, CanProtocol, InterlockInput, NodeSpec, Opens, Registry};
+use crate::registry::spec::{CanAdapter, CanProtocol, CanSpec, InterlockInput, NodeSpec, Opens, Registry};
 
 /// Where the unit expects the registry.
 pub const SYSTEM_REGISTRY: &str = "/etc/rapid/devices.toml";
@@ -33,7 +33,7 @@ struct Nodes {
 const USB: Nodes = Nodes { group: "plugdev", kind: "char-usb_device" };
 /// A stop is a key.
 const KEYS: Nodes = Nodes { group: "input", kind: "char-input" };
-/// A stop is a line of a GPIO chip.
+/// A stop, or the brake of a joint, is a line of a GPIO chip.
 const GPIO: Nodes = Nodes { group: "gpio", kind: "char-gpiochip" };
 
 /// What the entries of a registry need of the system.
@@ -53,7 +53,12 @@ impl Needs {
     fn of(registry: &Registry) -> Self {
         let mut needs = Self::default();
         for device in &registry.devices {
-            needs.guard |= matches!(&device.node, NodeSpec::Can(can) if matches!(can.protocol, CanProtocol::Damiao(_)));
+            if let NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(motors), .. }) = &device.node {
+                needs.guard = true;
+                if motors.motors.iter().any(|motor| motor.brake.is_some()) {
+                    needs.nodes.insert(GPIO);
+                }
+            }
             match &device.node {
                 NodeSpec::Can(can) if can.adapter == CanAdapter::SocketCan => {
                     needs.sockets.insert("AF_CAN");

@@ -14,6 +14,8 @@ use crate::registry::spec::{Bound, FieldInput, GpioInput, InterlockInput, Interl
 const KEYS: [&str; 6] = ["kind", "actuators", "key", "gpio", "serial", "field"];
 const INPUTS: [&str; 4] = ["key", "gpio", "serial", "field"];
 const KINDS: [(&str, StopKind); 2] = [("emergency", StopKind::Emergency), ("enabling", StopKind::Enabling)];
+/// Levels of a line of a GPIO chip.
+pub(super) const LEVELS: [(&str, bool); 2] = [("high", true), ("low", false)];
 /// Longest line that is looked for on a serial port, bytes.
 const LONGEST_LINE: usize = 64;
 /// A stop that is silent for this long is lost, unless it says otherwise.
@@ -46,10 +48,28 @@ pub(super) fn interlocks(
         let actuators = actuators(&section, drafts, problems, warnings);
         let input = input(&section, kind.unwrap_or(StopKind::Emergency), drafts, problems);
         if let (Some(kind), Some(input)) = (kind, input) {
+            let earlier = stops.iter().find(|earlier: &&InterlockSpec| are_one(&earlier.input, &input));
+            if let Some(earlier) = earlier {
+                let message = format!("[stop.{}] reads the same input", earlier.name);
+                problems.report(section.at, &section.entry, message, "remove one of them, or name another input");
+            }
             stops.push(InterlockSpec { name: name.to_owned(), kind, actuators, input });
         }
     }
     stops
+}
+
+/// Are they one input, which only one can read?
+fn are_one(one: &InterlockInput, other: &InterlockInput) -> bool {
+    match (one, other) {
+        (InterlockInput::Key(one), InterlockInput::Key(other)) => {
+            (&one.device, one.number) == (&other.device, other.number)
+        }
+        (InterlockInput::Gpio(one), InterlockInput::Gpio(other)) => (&one.chip, one.line) == (&other.chip, other.line),
+        (InterlockInput::Serial(one), InterlockInput::Serial(other)) => one.path == other.path,
+        // Several numbers of a device may stop, and one number within a range.
+        _ => false,
+    }
 }
 
 /// The actuators that it stops: all by default.
@@ -173,16 +193,21 @@ fn key(table: &Section<'_>, kind: StopKind, problems: &mut Problems<'_>) -> Opti
 fn gpio(table: &Section<'_>, problems: &mut Problems<'_>) -> Option<GpioInput> {
     table.allow(problems, &["chip", "line", "runs_while"]);
     let runs = "write runs_while = \"high\" or \"low\": the level of a closed contact, so that a broken wire stops";
+    let (chip, line) = gpio_line(table, problems);
+    need(table, &[("runs_while", runs)], problems);
+    let runs = table.choice(problems, "runs_while", &LEVELS);
+    Some(GpioInput { chip: chip?, line: line?, runs_while_high: runs? })
+}
+
+/// Reads `chip` and `line`, the level of which is a third key.
+pub(super) fn gpio_line(table: &Section<'_>, problems: &mut Problems<'_>) -> (Option<PathBuf>, Option<u32>) {
     let keys = [
         ("chip", "write chip = \"/dev/gpiochip0\"; `gpiodetect` lists them"),
         ("line", "write line = its number on the chip; `gpioinfo` lists them"),
-        ("runs_while", runs),
     ];
     need(table, &keys, problems);
     let chip = absolute(table, "chip", problems);
-    let line = table.integer(problems, "line", 0..=65_535).and_then(|line| u32::try_from(line.value).ok());
-    let runs = table.choice(problems, "runs_while", &[("high", true), ("low", false)]);
-    Some(GpioInput { chip: chip?, line: line?, runs_while_high: runs? })
+    (chip, table.integer(problems, "line", 0..=65_535).and_then(|line| u32::try_from(line.value).ok()))
 }
 
 fn line(table: &Section<'_>, problems: &mut Problems<'_>) -> Option<LineInput> {

@@ -11,9 +11,9 @@ use crate::registry::spec::{
     ActionSpec, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, MotorKind, MotorMode, MotorSpec, NodeSpec,
 };
 use crate::registry::units::show_duration;
-use conduct::{motion, or_never, stop, watch};
+use conduct::{brake, motion, or_never, stop, watch};
 
-const KEYS: [&str; 23] = [
+const KEYS: [&str; 24] = [
     "name",
     "slave",
     "master",
@@ -35,6 +35,7 @@ const KEYS: [&str; 23] = [
     "other_fault",
     "emergency",
     "hold_for",
+    "brake",
     "max_mos",
     "max_rotor",
 ];
@@ -165,7 +166,7 @@ fn motor(entry: &Section<'_>, problems: &mut Problems<'_>) -> Option<MotorSpec> 
     let default_slew = if mode == Some(MotorMode::Velocity) { 10.0 * velocity } else { velocity };
     let slew = above_zero(entry, "slew", most_slew, problems).unwrap_or(default_slew);
     let motion = motion(entry, slew, mode, problems);
-    let (watch, stop) = (watch(entry, problems), stop(entry, problems));
+    let (watch, stop, brake) = (watch(entry, problems), stop(entry, mode, problems), brake(entry, problems));
     let mut temperature = |key| entry.number(problems, key, 20.0..=150.0).unwrap_or(TEMPERATURE);
     let (max_mos, max_rotor) = (temperature("max_mos"), temperature("max_rotor"));
     let slave = slave?;
@@ -183,6 +184,7 @@ fn motor(entry: &Section<'_>, problems: &mut Problems<'_>) -> Option<MotorSpec> 
         motion,
         watch,
         stop,
+        brake,
         max_mos,
         max_rotor,
     })
@@ -304,6 +306,17 @@ fn check_pairs(motors: &[(Section<'_>, Option<MotorSpec>)], problems: &mut Probl
                     earlier.name, motor.master
                 );
                 refuse("master", message, "give each motor its own master, with its maker's program");
+            }
+        }
+        let brakes = known().take(at).filter_map(|(_, earlier)| Some((earlier, earlier.brake.as_ref()?)));
+        for (earlier, brake) in brakes {
+            let Some(own) = motor.brake.as_ref().filter(|own| (&own.chip, own.line) == (&brake.chip, brake.line))
+            else {
+                continue;
+            };
+            if own.released_high != brake.released_high {
+                let message = format!("the same line releases the brake of {} at the other level", earlier.name);
+                refuse("brake", message, "write the same released for both, or another line");
             }
         }
         if motor.master == PARAMETERS {

@@ -3,6 +3,7 @@
 //! Invariant: which ranges a motor counts in is read from the motor. [`MotorKind`] says what the maker
 //! ships, to compare it with.
 
+use std::path::PathBuf;
 use std::time::Duration;
 
 /// Motors of one bus, at the most: an action has an axis each, a sample 6 numbers each.
@@ -55,6 +56,8 @@ pub struct MotorSpec {
     pub watch: WatchSpec,
     /// How it stops at a fault.
     pub stop: StopSpec,
+    /// Its holding brake, if it has one that is driven from here.
+    pub brake: Option<BrakeSpec>,
     /// Highest temperature of its transistors, °C.
     pub max_mos: f64,
     /// Highest temperature of its winding, °C.
@@ -67,10 +70,34 @@ pub enum Stop {
     /// Disabled: a joint under load falls.
     Limp,
     /// Without stiffness, with its damping alone: a joint under load sinks slowly. Motors in the modes
-    /// [`MotorMode::PositionVelocity`] and [`MotorMode::Velocity`] have no frame for it and stop as with [`Stop::Hold`].
+    /// [`MotorMode::PositionVelocity`] and [`MotorMode::Velocity`] have no frame for it: they are not configured so, and
+    /// stop as with [`Stop::Hold`].
     Damp,
-    /// Where it was commanded last, within its torque.
+    /// Where it was commanded last; within its torque in [`MotorMode::Mit`], with all that the motor has in the others.
     Hold,
+    /// As [`Stop::Hold`] until its brake is engaged, then disabled.
+    Brake,
+}
+
+/// A brake that holds a joint while its motor is off: a line of a GPIO chip releases it. It is released while the motor is
+/// on, unless that stops as [`Stop::Brake`], and engaged at all other times.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct BrakeSpec {
+    /// The chip, for example `/dev/gpiochip0`.
+    pub chip: PathBuf,
+    /// Its line; joints of one line share a brake, which is released while it may be for all of them.
+    pub line: u32,
+    /// The level that releases it.
+    pub released_high: bool,
+    /// Until it holds, from the level on.
+    pub engages_in: Duration,
+    /// Until it holds no more, from the level on; up to [`BrakeSpec::SLOWEST`], as the other one.
+    pub releases_in: Duration,
+}
+
+impl BrakeSpec {
+    /// A brake that takes longer is none.
+    pub const SLOWEST: Duration = Duration::from_secs(2);
 }
 
 /// How a motor stops at which fault.
@@ -268,6 +295,7 @@ mod tests {
             motion: MotionSpec::of_slew(1.0),
             watch: WatchSpec::default(),
             stop: StopSpec::default(),
+            brake: None,
             max_mos: 80.0,
             max_rotor: 80.0,
         };

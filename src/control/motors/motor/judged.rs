@@ -3,7 +3,8 @@
 use super::{Motor, Phase};
 use crate::control::damiao::codec::{Feedback, MotorStatus, Ranges};
 use crate::control::limits::Limits;
-use crate::control::motors::notice::{Fault, Notice};
+use crate::control::motors::fault::Fault;
+use crate::control::motors::notice::Notice;
 use crate::control::motors::notices::Notices;
 use crate::control::motors::watch::{Commanded, beyond, fast};
 use crate::registry::{MotorMode, Stop};
@@ -23,7 +24,7 @@ impl Motor {
         let before = self
             .feedback
             .as_ref()
-            .filter(|_| matches!(self.phase, Phase::Enabling | Phase::On | Phase::Kept(Stop::Hold)));
+            .filter(|_| matches!(self.phase, Phase::Enabling | Phase::On | Phase::Kept(Stop::Hold | Stop::Brake)));
         let heard = self
             .watch
             .hear(before, feedback, (&self.spec, ranges), now)
@@ -68,6 +69,7 @@ impl Motor {
     pub(in crate::control::motors) fn arm_fault(&self) -> Option<Fault> {
         let motor = self.index;
         match (self.phase, self.status) {
+            (Phase::On, _) if self.is_braked() => Some(Fault::NotReleased { motor }),
             // Who is probed waits for the others, which come to their own.
             (Phase::On | Phase::Probed, _) => None,
             (Phase::Off { .. }, Some(MotorStatus::Enabled)) | (Phase::Kept(_), _) => Some(Fault::NotDisabled { motor }),

@@ -13,21 +13,28 @@ impl Motor {
     /// push back with more than its torque limit.
     pub(in crate::control::motors) fn last_will(&self, command: f64) -> CanFrame {
         let slave = self.spec.slave;
-        let stop = match self.phase {
-            Phase::On => self.spec.stop.other_fault,
-            Phase::Kept(stop) => stop,
-            _ => Stop::Limp,
-        };
-        let frame = match (stop, self.spec.mode, self.ranges, self.feedback) {
-            (Stop::Damp | Stop::Hold, MotorMode::Mit { kd, .. }, Some(ranges), Some(Feedback { q, .. })) => {
-                codec::mit(slave, &Mit { kp: 0.0, kd, q, dq: 0.0, tau: 0.0 }, &ranges).ok()
-            }
-            (Stop::Damp | Stop::Hold, MotorMode::PositionVelocity, ..) => {
+        let frame = match (self.last_stop(), self.spec.mode, self.ranges, self.feedback) {
+            (
+                Stop::Damp | Stop::Hold | Stop::Brake,
+                MotorMode::Mit { kd, .. },
+                Some(ranges),
+                Some(Feedback { q, .. }),
+            ) => codec::mit(slave, &Mit { kp: 0.0, kd, q, dq: 0.0, tau: 0.0 }, &ranges).ok(),
+            (Stop::Damp | Stop::Hold | Stop::Brake, MotorMode::PositionVelocity, ..) => {
                 codec::position_velocity(slave, command, self.spec.velocity).ok()
             }
-            (Stop::Damp | Stop::Hold, MotorMode::Velocity, ..) => codec::velocity(slave, 0.0).ok(),
+            (Stop::Damp | Stop::Hold | Stop::Brake, MotorMode::Velocity, ..) => codec::velocity(slave, 0.0).ok(),
             _ => None,
         };
         frame.unwrap_or_else(|| Order::Disable.frame(slave))
+    }
+
+    /// How it stops when this program can command it no more.
+    pub(in crate::control::motors) const fn last_stop(&self) -> Stop {
+        match self.phase {
+            Phase::On => self.spec.stop.other_fault,
+            Phase::Kept(stop) => stop,
+            _ => Stop::Limp,
+        }
     }
 }

@@ -21,6 +21,8 @@ enum Happening {
     Heat(usize, u8),
     Deaf(usize, Option<Order>),
     PowerCycle(usize),
+    StuckBrakes(bool),
+    BrokenBrakes(u16),
     Latency(usize),
     HeldUp(u64),
     Frame(u32, [u8; 8]),
@@ -48,6 +50,8 @@ fn happening() -> impl Strategy<Value = Happening> {
             Just(None), Just(Some(Order::Enable)), Just(Some(Order::Disable)), Just(Some(Order::ClearError)),
         ]).prop_map(|(motor, order)| Deaf(motor, order)),
         1 => motor.prop_map(PowerCycle),
+        1 => any::<bool>().prop_map(StuckBrakes),
+        1 => (0..4_u16).prop_map(BrokenBrakes),
         1 => (0..4_usize).prop_map(Latency),
         1 => (1..200_u64).prop_map(HeldUp),
         1 => (0..0x20_u32, any::<[u8; 8]>()).prop_map(|(id, data)| Frame(id, data)),
@@ -76,6 +80,8 @@ impl Happening {
                 let Sim { slave, master, .. } = world.sims[motor];
                 world.sims[motor] = Sim { mode: 2, ..Sim::new(slave, master) };
             }
+            Self::StuckBrakes(are_stuck) => world.are_brakes_stuck = are_stuck,
+            Self::BrokenBrakes(broken) => world.brakes.broken = broken,
             Self::Latency(cycles) => world.latency = cycles,
             Self::HeldUp(ms) => world.now = world.now.after(Duration::from_millis(ms)),
             // A stranger's: one of a motor would be the motor's word.
@@ -94,7 +100,8 @@ proptest! {
     #[test]
     fn motors_move_only_as_they_may(
         happenings in prop::collection::vec(happening(), 1..60), torque in prop_oneof![Just(1000.0), 0.5..5.0],
-        stop in prop::sample::select(vec![Stop::Limp, Stop::Damp, Stop::Hold]),
+        stop in prop::sample::select(vec![Stop::Limp, Stop::Damp, Stop::Hold, Stop::Brake]),
+        has_brakes in any::<bool>(),
         modes in prop::sample::select(vec![
             [MIT, MIT], [MIT, MotorMode::PositionVelocity], [MotorMode::Velocity, MIT],
         ]),
@@ -103,6 +110,7 @@ proptest! {
         spec.motors.iter_mut().for_each(|motor| motor.torque = torque);
         spec.motors[0].stop.other_fault = stop;
         spec.motors[1].stop.own_fault = stop;
+        spec.motors.iter_mut().for_each(|motor| motor.brake = has_brakes.then(world::brake));
         let mut world = World::new(spec);
         for happening in happenings {
             happening.happen(&mut world);
@@ -115,6 +123,7 @@ proptest! {
             }
         }
         world.latency = 0;
+        (world.are_brakes_stuck, world.brakes.broken) = (false, 0);
         world.run(300);
         world.disarm();
         world.run(300);

@@ -38,7 +38,7 @@ fn by_default_a_faulty_joint_is_limp_and_the_others_are_damped() {
         trouble(&mut world.sims[0]);
         let fault = world.run_to_fault();
         assert_eq!(fault.motor(), Some(0));
-        assert_eq!(world.told(Notice::Kept { damped: 2, held: 0 }), 1, "{:?}", world.notices);
+        assert_eq!(world.told(Notice::Kept { damped: 2, held: 0, braked: 0 }), 1, "{:?}", world.notices);
         // No action moves it, however long it is kept so.
         for _ in 0..20 {
             assert!(!world.target(&[1.0, 1.0]));
@@ -108,6 +108,18 @@ fn a_joint_that_is_kept_and_has_a_fault_of_its_own_is_disabled() {
 }
 
 #[test]
+fn a_joint_that_is_too_hot_stops_as_it_is_to_and_is_reported_once() {
+    for (own_fault, is_on) in [(Stop::Limp, false), (Stop::Damp, true), (Stop::Hold, true)] {
+        let mut world = armed(MIT, StopSpec { own_fault, ..others(Stop::Limp) });
+        world.sims[1].mos = 99;
+        let fault = world.run_to_fault();
+        world.run(100);
+        assert_eq!(world.sims[1].is_on(), is_on, "{own_fault:?}");
+        assert_eq!((world.told(Notice::Fault(fault)), world.bus.counts().faults), (1, 1));
+    }
+}
+
+#[test]
 fn an_arm_takes_joints_that_are_kept_again() {
     let mut world = armed(MIT, StopSpec::default());
     world.sims[0].status = MotorStatus::OverCurrent;
@@ -135,7 +147,7 @@ fn at_an_emergency_stop_each_joint_stops_in_its_way_in_the_next_cycle() {
         assert_eq!(world.bus.state(), BusState::Faulted(Fault::EmergencyStop(TRIP)));
         let disabled = Order::Disable.frame(1);
         assert!(world.sent.contains(&disabled), "the first is limp: {:x?}", world.sent);
-        assert_eq!(world.told(Notice::Kept { damped, held }), usize::from(damped | held != 0));
+        assert_eq!(world.told(Notice::Kept { damped, held, braked: 0 }), usize::from(damped | held != 0));
         // Pressed again, or lost meanwhile: that is the same stop.
         emergency(&mut world);
         assert!(!world.target(&[1.0, 1.0]));

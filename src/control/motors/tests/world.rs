@@ -6,7 +6,7 @@ use super::*;
 use crate::action::Trip;
 use crate::control::damiao::codec::{Feedback, MotorStatus, Ranges};
 use crate::control::damiao::parameter::{Parameter, Value};
-use crate::registry::{MotionSpec, MotorKind, MotorSpec, Stop, StopSpec, WatchSpec};
+use crate::registry::{BrakeSpec, MotionSpec, MotorKind, MotorSpec, Stop, StopSpec, WatchSpec};
 
 pub(super) const CYCLE: Duration = Duration::from_millis(5);
 
@@ -181,9 +181,16 @@ pub(super) fn motor(slave: u16, master: u16, mode: MotorMode) -> MotorSpec {
         watch: WatchSpec::default(),
         // A joint that stops otherwise has tests of its own.
         stop: StopSpec { own_fault: Stop::Limp, other_fault: Stop::Limp, emergency: Stop::Limp, hold_for: None },
+        brake: None,
         max_mos: 80.0,
         max_rotor: 100.0,
     }
+}
+
+/// A brake that is neither quick nor as quick in both directions.
+pub(super) fn brake() -> BrakeSpec {
+    let ms = Duration::from_millis;
+    BrakeSpec { chip: "/dev/gpiochip0".into(), line: 4, released_high: true, engages_in: ms(60), releases_in: ms(40) }
 }
 
 pub(super) const MIT: MotorMode = MotorMode::Mit { kp: 10.0, kd: 1.0 };
@@ -213,6 +220,9 @@ pub(super) struct World {
     /// What motors sent, and when.
     answers: VecDeque<(Stamp, Vec<CanFrame>)>,
     judge: Judge,
+    pub(super) brakes: Brakes,
+    /// They stay as they are.
+    pub(super) are_brakes_stuck: bool,
 }
 
 /// What must never happen, from the frames and from what was asked for alone.
@@ -258,6 +268,8 @@ impl World {
             sent: Vec::new(),
             answers: VecDeque::new(),
             judge: Judge { axes: vec![Axis::default(); axes], ..Judge::default() },
+            brakes: Brakes::default(),
+            are_brakes_stuck: false,
         }
     }
 
@@ -348,7 +360,9 @@ impl World {
             }
         }
         let mut sent = Vec::new();
+        self.bus.feed_brakes(self.brakes, self.now);
         self.bus.step(self.now, |frame| sent.push(frame));
+        self.turn_brakes();
         assert!(sent.len() <= 2 * self.sims.len());
         let mut answers = Vec::new();
         for frame in &sent {
@@ -360,6 +374,18 @@ impl World {
         while let Some(notice) = self.bus.take_notice() {
             assert!(!notice.words(self.bus.names()).to_string().is_empty());
             self.notices.push(notice);
+        }
+    }
+
+    /// The brakes do what they are to do, unless they are stuck, or hang in the air.
+    fn turn_brakes(&mut self) {
+        let released = self.bus.releases();
+        for (index, (sim, motor)) in self.sims.iter().zip(&self.spec.motors).enumerate() {
+            let told = self.judge.axes[index].told || sim.is_on();
+            assert!(released >> index & 1 == 0 || told, "the brake of {} is released, and its motor off", motor.name);
+        }
+        if !self.are_brakes_stuck {
+            self.brakes.released = released;
         }
     }
 

@@ -1,15 +1,18 @@
 //! The guard's own process: what it does when, and the loop around that.
 
 use std::ffi::OsString;
+use std::io::IoSliceMut;
+use std::mem::MaybeUninit;
 use std::process::ExitCode;
 use std::time::Duration;
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
-use rustix::fd::{AsFd, BorrowedFd};
+use rustix::fd::{AsFd, BorrowedFd, OwnedFd};
 use rustix::io::Errno;
-use rustix::net::{RecvFlags, recv};
+use rustix::net::{RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, RecvMsg, recvmsg};
 
-use super::{DISMISSED, FRAME, KEEP_FOR, LONGEST, NAME, ON, decode};
+use super::held::Held;
+use super::{BRAKE, DISMISSED, FRAME, KEEP_FOR, LONGEST, NAME, ON, decode};
 use crate::control::can::CanFrame;
 use crate::control::damiao::codec::Order;
 use crate::driver::can::claim::Claim;
@@ -66,19 +69,22 @@ struct Ward {
     post: Post,
     state: State,
     will: Vec<CanFrame>,
+    /// Bits of motors whose brakes are engaged first.
+    engages_first: u16,
     /// The guarded process has ended.
     is_orphan: bool,
 }
 
 impl Ward {
     fn new(post: Post) -> Self {
-        Self { post, state: State::Idle, will: Vec::with_capacity(MAX_MOTORS), is_orphan: false }
+        Self { post, state: State::Idle, will: Vec::with_capacity(MAX_MOTORS), engages_first: 0, is_orphan: false }
     }
 
     /// A message came.
     fn hear(&mut self, message: &[u8], now: Stamp) {
         match message {
-            [ON, frames @ ..] => {
+            [ON, low, high, frames @ ..] => {
+                self.engages_first = u16::from_le_bytes([*low, *high]);
                 self.will.clear();
                 self.will.extend(frames.as_chunks::<FRAME>().0.iter().map(decode));
                 self.state = State::Watching(now);
@@ -118,6 +124,16 @@ impl Ward {
         if passed < keep_for { &self.will } else { &self.post.off }
     }
 
+    /// Bits of the motors whose brakes are to be engaged by now.
+    fn engages(&self, now: Stamp) -> u16 {
+        match self.state {
+            State::Stopping(since) if now.since(since) < self.keep_for() => self.engages_first,
+            State::Stopping(_) | State::Stopped => u16::MAX,
+            State::Done if self.is_orphan => u16::MAX,
+            State::Idle | State::Watching(_) | State::Done => 0,
+        }
+    }
+
     /// When [`Self::due`] is to be asked again, if no message comes; `None` is never.
     fn next(&self, now: Stamp) -> Option<Duration> {
         match self.state {
@@ -154,8 +170,9 @@ pub fn run(args: impl Iterator<Item = OsString>) -> ExitCode {
 fn guard(ward: &mut Ward, input: BorrowedFd<'_>, output: BorrowedFd<'_>) -> bool {
     let mut claim = None;
     let mut has_sent = false;
+    let mut brakes = Held::default();
     loop {
-        listen(ward, input);
+        listen(ward, &mut brakes, input);
         let now = Stamp::now();
         let adapter = ward.post.adapter;
         let frames = ward.due(now);
@@ -169,6 +186,7 @@ fn guard(ward: &mut Ward, input: BorrowedFd<'_>, output: BorrowedFd<'_>) -> bool
             }
             discard(adapter, output);
         }
+        brakes.engage(ward.engages(now));
         if ward.is_orphan && claim.is_none() {
             // Until the motors are off no other program is to command them.
             claim = ward.post.interface.as_deref().and_then(|name| Claim::take(name).ok());
@@ -184,16 +202,32 @@ fn guard(ward: &mut Ward, input: BorrowedFd<'_>, output: BorrowedFd<'_>) -> bool
 }
 
 /// Takes all messages that wait.
-fn listen(ward: &mut Ward, input: BorrowedFd<'_>) {
+fn listen(ward: &mut Ward, brakes: &mut Held, input: BorrowedFd<'_>) {
     let mut message = [0; LONGEST];
     while !ward.is_orphan {
-        match recv(input, &mut message[..], RecvFlags::DONTWAIT) {
-            Ok((0, _)) | Err(Errno::CONNRESET) => ward.lose(Stamp::now()),
-            Ok((count, _)) => ward.hear(message.get(..count).unwrap_or_default(), Stamp::now()),
+        let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
+        let mut control = RecvAncillaryBuffer::new(&mut space);
+        let mut parts = [IoSliceMut::new(&mut message)];
+        match recvmsg(input, &mut parts, &mut control, RecvFlags::DONTWAIT | RecvFlags::CMSG_CLOEXEC) {
+            Ok(RecvMsg { bytes: 0, .. }) | Err(Errno::CONNRESET) => ward.lose(Stamp::now()),
+            Ok(RecvMsg { bytes, .. }) => match message.get(..bytes).unwrap_or_default() {
+                [BRAKE, low, high, level] => {
+                    brakes.take(u16::from_le_bytes([*low, *high]), *level == 1, descriptor(&mut control));
+                }
+                message => ward.hear(message, Stamp::now()),
+            },
             Err(Errno::INTR) => {}
             Err(_) => return,
         }
     }
+}
+
+/// The descriptor of a message.
+fn descriptor(control: &mut RecvAncillaryBuffer<'_>) -> Option<OwnedFd> {
+    control.drain().find_map(|message| match message {
+        RecvAncillaryMessage::ScmRights(mut descriptors) => descriptors.next(),
+        _ => None,
+    })
 }
 
 /// Waits for a message, or for so long.
@@ -236,7 +270,7 @@ mod tests {
     }
 
     fn will(frames: &[CanFrame]) -> Vec<u8> {
-        std::iter::once(ON).chain(frames.iter().flat_map(encode)).collect()
+        [ON, 2, 0].into_iter().chain(frames.iter().flat_map(encode)).collect()
     }
 
     fn damping(slave: u16) -> CanFrame {

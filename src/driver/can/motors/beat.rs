@@ -263,7 +263,10 @@ impl Beat {
     }
 
     fn step(&mut self, now: Stamp) -> Result<(), LinkError> {
-        let Powered { link, bus, guard, .. } = &mut self.powered;
+        let Powered { link, bus, brakes, guard, .. } = &mut self.powered;
+        if let Some(brakes) = brakes {
+            bus.feed_brakes(brakes.state(), now);
+        }
         let mut end = None;
         let (mut sent, mut full) = (false, 0);
         bus.step(now, |frame| match link.send(&frame) {
@@ -272,6 +275,9 @@ impl Beat {
             Err(LinkError::Full | LinkError::BusOff) => full += 1,
             Err(error) => end = Some(error),
         });
+        if let Some(brakes) = brakes {
+            brakes.release(bus.releases());
+        }
         let trouble = guard.as_mut().and_then(|guard| guard.beat(bus));
         if sent && let Some(tick) = self.unsent.take() {
             self.tally.on_the_wire(Stamp::now().0.saturating_sub(tick.0));

@@ -1,9 +1,11 @@
 //! An adapter with motors behind it: however it is dropped, they are ordered to turn off.
 
+use std::io;
 use std::time::Duration;
 
 use crate::control::can::CanFrame;
 use crate::control::motors::MotorBus;
+use crate::driver::can::brakes::Brakes;
 use crate::driver::can::claim::Claim;
 use crate::driver::can::guard::Guard;
 use crate::driver::can::link::{Link, LinkError};
@@ -22,14 +24,20 @@ const AGAIN: Duration = Duration::from_millis(5);
 pub(super) struct Powered {
     pub(super) link: Link,
     pub(super) bus: MotorBus,
+    pub(super) brakes: Option<Brakes>,
     pub(super) guard: Option<Guard>,
     /// Until the last frame was sent.
     _claim: Option<Claim>,
 }
 
 impl Powered {
-    pub(super) fn new(link: Link, spec: &DamiaoSpec, guard: Option<Guard>, claim: Option<Claim>) -> Self {
-        Self { link, bus: MotorBus::new(spec, Stamp::now()), guard, _claim: claim }
+    /// Brakes are engaged, and stay so until their motors are on.
+    ///
+    /// # Errors
+    /// When the system gives no thread for them.
+    pub(super) fn new(link: Link, spec: &DamiaoSpec, guard: Option<Guard>, claim: Option<Claim>) -> io::Result<Self> {
+        let brakes = Brakes::start(spec, guard.as_ref())?;
+        Ok(Self { link, bus: MotorBus::new(spec, Stamp::now()), brakes, guard, _claim: claim })
     }
 
     /// The adapter, for people.
@@ -44,6 +52,9 @@ impl Drop for Powered {
         let panics = std::thread::panicking();
         let end = Stamp::now().after(OFF_WITHIN);
         let mut frame = CanFrame::default();
+        if let Some(brakes) = &self.brakes {
+            brakes.release(0);
+        }
         let (mut rounds, mut gone, mut all_off) = (0, false, panics);
         while rounds < TURN_OFF || !(all_off || gone || Stamp::now() >= end) {
             rounds += 1;
@@ -69,6 +80,8 @@ impl Drop for Powered {
             }
             all_off = panics || self.bus.still_on().next().is_none();
         }
+        // The guard holds them as long as they are not engaged.
+        drop(self.brakes.take());
         if let Some(guard) = self.guard.take() {
             guard.dismiss();
         }

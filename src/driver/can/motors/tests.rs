@@ -34,6 +34,7 @@ fn spec(count: u16, hz: u32) -> DamiaoSpec {
         motion: MotionSpec { first_target: 10.0, ..MotionSpec::of_slew(5.0) },
         watch: WatchSpec::default(),
         stop: StopSpec { own_fault: Stop::Limp, other_fault: Stop::Limp, emergency: Stop::Limp, hold_for: None },
+        brake: None,
         max_mos: 80.0,
         max_rotor: 80.0,
     };

@@ -3,8 +3,14 @@
 use std::time::Duration;
 
 use super::above_zero;
+use crate::registry::parse::interlock::{LEVELS, gpio_line};
 use crate::registry::section::{Problems, Section};
-use crate::registry::spec::{MotionSpec, MotorMode, Stop, StopSpec, WatchSpec};
+use crate::registry::spec::{BrakeSpec, MotionSpec, MotorMode, Stop, StopSpec, WatchSpec};
+
+/// What a brake looks like.
+const BRAKE: &str = "brake = { chip = \"/dev/gpiochip0\", line = 4, released = \"high\" }";
+/// A small spring-applied brake takes this long to engage or to release, unless its data sheet says otherwise.
+const BRAKE_TIME: Duration = Duration::from_millis(100);
 
 /// How the command of a position starts and changes.
 pub(super) fn motion(
@@ -41,10 +47,23 @@ pub(super) fn watch(entry: &Section<'_>, problems: &mut Problems<'_>) -> WatchSp
 }
 
 /// How the motor stops at a fault, or at an emergency stop.
-pub(super) fn stop(entry: &Section<'_>, problems: &mut Problems<'_>) -> StopSpec {
-    let default = StopSpec::default();
-    let words = [("limp", Stop::Limp), ("damp", Stop::Damp), ("hold", Stop::Hold)];
-    let mut choice = |key| entry.has(key).then(|| entry.choice(problems, key, &words)).flatten();
+pub(super) fn stop(entry: &Section<'_>, mode: Option<MotorMode>, problems: &mut Problems<'_>) -> StopSpec {
+    let has_damping = mode.is_none_or(|mode| matches!(mode, MotorMode::Mit { .. }));
+    let other_fault = if has_damping { Stop::Damp } else { Stop::Hold };
+    let default = StopSpec { other_fault, ..StopSpec::default() };
+    let words = [("limp", Stop::Limp), ("damp", Stop::Damp), ("hold", Stop::Hold), ("brake", Stop::Brake)];
+    let mut choice = |key| {
+        let stop = entry.has(key).then(|| entry.choice(problems, key, &words)).flatten()?;
+        if stop == Stop::Brake && !entry.has("brake") {
+            let fix = format!("write {BRAKE}, or another way to stop");
+            entry.report(problems, key, format!("{key} = \"brake\", and the motor has no brake"), fix);
+        }
+        if stop == Stop::Damp && !has_damping {
+            let fix = "write \"hold\", which it does with all its torque, \"limp\" or \"brake\"";
+            entry.report(problems, key, "a motor that runs its own loop cannot be damped".to_owned(), fix);
+        }
+        Some(stop)
+    };
     let (own_fault, other_fault) = (choice("own_fault"), choice("other_fault"));
     let emergency = choice("emergency");
     StopSpec {
@@ -53,6 +72,22 @@ pub(super) fn stop(entry: &Section<'_>, problems: &mut Problems<'_>) -> StopSpec
         emergency: emergency.unwrap_or(default.emergency),
         hold_for: or_never(entry, problems, "hold_for", Duration::from_millis(10), default.hold_for),
     }
+}
+
+/// The brake of the joint, if it has one.
+pub(super) fn brake(entry: &Section<'_>, problems: &mut Problems<'_>) -> Option<BrakeSpec> {
+    let table = entry.table(problems, "brake")?;
+    table.allow(problems, &["chip", "line", "released", "engages_in", "releases_in"]);
+    let (chip, line) = gpio_line(&table, problems);
+    if !table.has("released") {
+        let fix = "write released = \"high\" or \"low\": the level that lets the joint turn, best the one that a broken wire \
+                   does not have";
+        table.missing(problems, "released", fix);
+    }
+    let released = table.choice(problems, "released", &LEVELS);
+    let mut time = |key| table.duration(problems, key, Duration::ZERO..=BrakeSpec::SLOWEST).unwrap_or(BRAKE_TIME);
+    let (engages_in, releases_in) = (time("engages_in"), time("releases_in"));
+    Some(BrakeSpec { chip: chip?, line: line?, released_high: released?, engages_in, releases_in })
 }
 
 /// A time of `least` to an hour, or the word "never".

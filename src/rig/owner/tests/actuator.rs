@@ -23,6 +23,7 @@ fn arm() -> Registry {
         motion: MotionSpec::of_slew(1.0),
         watch: WatchSpec::default(),
         stop: StopSpec::default(),
+        brake: None,
         max_mos: 80.0,
         max_rotor: 80.0,
     };

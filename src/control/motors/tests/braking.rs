@@ -1,0 +1,135 @@
+//! Joints with a brake.
+
+use super::*;
+use crate::action::Trip;
+use crate::registry::{Stop, StopSpec};
+use world::brake;
+
+/// Two motors, the second of which has a brake and stops in this way, at any fault and at an emergency stop.
+fn ready(stop: Stop) -> World {
+    let mut spec = spec(vec![motor(1, 0x11, MIT), motor(2, 0x12, MIT)]);
+    spec.motors[1].stop = StopSpec { own_fault: stop, other_fault: stop, emergency: stop, hold_for: None };
+    spec.motors[1].brake = Some(brake());
+    let mut world = World::new(spec);
+    world.run_until(BusState::Disarmed);
+    world
+}
+
+fn armed(stop: Stop) -> World {
+    let mut world = ready(stop);
+    world.arm();
+    world.run_until(BusState::Holding);
+    world.target(&[0.5, 0.5]);
+    world.run(15);
+    world
+}
+
+#[test]
+fn a_brake_is_released_once_its_motor_is_on_and_nothing_is_followed_before() {
+    let mut world = ready(Stop::Limp);
+    assert_eq!(world.bus.releases(), 0);
+    world.arm();
+    let mut released = None;
+    while !world.bus.is_armed() {
+        world.cycle();
+        assert!(world.bus.state() == BusState::Arming || world.bus.is_armed());
+        if world.bus.releases() != 0 && released.is_none() {
+            assert!(world.sims[1].is_on());
+            // What motors without a brake have means nothing.
+            released = Some(world.now);
+        }
+        assert!(!world.target(&[0.5, 0.5]) || world.bus.is_armed());
+    }
+    let waited = world.now.since(released.expect("it is released"));
+    assert!(waited >= brake().releases_in, "{waited:?}");
+    world.disarm();
+    world.cycle();
+    assert_eq!(world.bus.releases(), 0, "a disarm engages it at once");
+}
+
+#[test]
+fn a_joint_that_stops_by_its_brake_holds_until_that_does_and_is_disabled_then() {
+    for trouble in [
+        |world: &mut World| world.sims[0].status = MotorStatus::OverCurrent,
+        |world: &mut World| world.sims[1].mos = 99,
+        |world: &mut World| world.emergency(Trip { stop: 0, is_lost: false }),
+    ] {
+        let mut world = armed(Stop::Brake);
+        trouble(&mut world);
+        world.cycle();
+        world.run_to_fault();
+        world.cycle();
+        assert_eq!(world.told(Notice::Kept { damped: 0, held: 0, braked: 2 }), 1, "{:?}", world.notices);
+        assert_eq!(world.bus.releases(), 0, "it is engaged at once");
+        let (begun, held) = (world.now, world.sims[1].q);
+        while world.sims[1].is_on() {
+            world.cycle();
+            assert!((world.sims[1].q - held).abs() < 1e-3, "it holds");
+        }
+        let kept = world.now.since(begun);
+        assert!(kept >= brake().engages_in && kept <= brake().engages_in + world::CYCLE * 5, "{kept:?}");
+    }
+}
+
+#[test]
+fn a_joint_whose_brake_does_not_engage_goes_on_holding() {
+    for (is_stuck, hold_for) in [(true, None), (false, None), (false, Some(Duration::from_millis(500)))] {
+        let mut world = armed(Stop::Brake);
+        world.spec.motors[1].stop.hold_for = hold_for;
+        let mut spec = world.spec.clone();
+        spec.motors[1].stop.hold_for = hold_for;
+        let mut world = World::new(spec);
+        world.run_until(BusState::Disarmed);
+        world.arm();
+        world.run_until(BusState::Holding);
+        // Its chip hangs, or is gone.
+        (world.are_brakes_stuck, world.brakes.broken) = (true, if is_stuck { 0 } else { 3 });
+        world.emergency(Trip { stop: 0, is_lost: false });
+        world.run(80);
+        assert!(world.sims[1].is_on() && !world.sims[0].is_on());
+        world.run(100);
+        assert_eq!(world.sims[1].is_on(), hold_for.is_none());
+        world.disarm();
+        world.run(5);
+        assert!(!world.sims[1].is_on(), "a disarm disables all");
+    }
+}
+
+#[test]
+fn a_brake_that_cannot_be_driven_refuses_an_arm_and_ends_one() {
+    let mut world = ready(Stop::Hold);
+    world.brakes.broken = 2;
+    world.arm();
+    assert_eq!(world.run_to_fault(), Fault::Brake { motor: 1 });
+    world.brakes.broken = 1;
+    world.arm();
+    world.run_until(BusState::Holding);
+    world.brakes.broken = 2;
+    assert_eq!(world.run_to_fault(), Fault::Brake { motor: 1 });
+    world.run(10);
+    assert!(world.sims[1].is_on() && !world.sims[0].is_on(), "each in its way");
+    let text = Fault::Brake { motor: 1 }.words(world.bus.names()).to_string();
+    assert_eq!(text, "the brake of motor joint_2 cannot be driven: the log says why");
+}
+
+#[test]
+fn a_brake_that_is_not_released_refuses_the_arm() {
+    let mut world = ready(Stop::Limp);
+    world.are_brakes_stuck = true;
+    world.arm();
+    assert_eq!(world.run_to_fault(), Fault::NotReleased { motor: 1 });
+    world.run(5);
+    assert!(!world.sims.iter().any(Sim::is_on), "none was armed");
+}
+
+#[test]
+fn at_the_death_of_the_program_brakes_engage_where_nothing_else_keeps_the_joint() {
+    for (stop, engages) in [(Stop::Limp, 2), (Stop::Brake, 2), (Stop::Hold, 0), (Stop::Damp, 0)] {
+        let mut world = armed(stop);
+        let first = world.bus.engages_at_death();
+        assert_eq!(first & 2, engages, "{stop:?}");
+        world.disarm();
+        world.run(5);
+        assert_eq!(world.bus.engages_at_death() & 2, 2, "it is off");
+    }
+}

@@ -1,0 +1,65 @@
+//! Lines of brakes that the guard holds.
+
+use std::os::fd::OwnedFd;
+use std::thread::JoinHandle;
+
+use crate::gpio::Output;
+
+/// A line that is busy is set again so often.
+const TRIES: usize = 3;
+
+/// See the module's comment. Dropped, it waits until the lines are set that are to be.
+#[derive(Debug, Default)]
+pub(super) struct Held {
+    lines: Vec<Line>,
+    setting: Vec<JoinHandle<()>>,
+}
+
+#[derive(Debug)]
+struct Line {
+    /// Bits of its motors.
+    motors: u16,
+    engaged_high: bool,
+    descriptor: OwnedFd,
+    is_engaged: bool,
+}
+
+impl Held {
+    /// The line of these motors was opened, or closed.
+    pub(super) fn take(&mut self, motors: u16, engaged_high: bool, descriptor: Option<OwnedFd>) {
+        self.lines.retain(|line| line.motors != motors);
+        self.lines.extend(descriptor.map(|descriptor| Line { motors, engaged_high, descriptor, is_engaged: false }));
+    }
+
+    /// Engages the brakes of these motors, those that are not engaged yet. A chip that hangs must not keep the motors from
+    /// their frames: each has a thread of its own.
+    pub(super) fn engage(&mut self, motors: u16) {
+        for line in &mut self.lines {
+            let was_engaged = std::mem::replace(&mut line.is_engaged, line.motors & motors != 0);
+            if was_engaged || !line.is_engaged {
+                continue;
+            }
+            let Ok(descriptor) = line.descriptor.try_clone() else {
+                line.is_engaged = false;
+                continue;
+            };
+            let (output, level) = (Output::of(descriptor), line.engaged_high);
+            let set = move || {
+                let mut tries = 0..TRIES;
+                while tries.next().is_some() && output.set(level).is_err() {}
+            };
+            match std::thread::Builder::new().spawn(set) {
+                Ok(setting) => self.setting.push(setting),
+                Err(_) => line.is_engaged = false,
+            }
+        }
+    }
+}
+
+impl Drop for Held {
+    fn drop(&mut self) {
+        for setting in self.setting.drain(..) {
+            let _ = setting.join();
+        }
+    }
+}
