@@ -12,22 +12,38 @@ use std::time::Duration;
 use gpiocdev::Request;
 use gpiocdev::line::{Bias, EdgeDetection, EdgeKind, Value};
 use gpiocdev_uapi::v2::{LineValues, set_line_values};
+use rustix::io::Errno;
+use rustix::pipe::{PipeFlags, pipe_with};
 
+use crate::realtime::{CONTROL_PRIORITY, use_fifo};
 use crate::text;
 
 /// A line whose chip reports no edges is read again after this: a chip on USB takes about 1 ms.
 const POLL: Duration = Duration::from_millis(5);
-/// Any other one, because the kernel leaves out edges for which it has no room.
+/// For so long it may take, on a machine that is busy with other things.
+const SILENCE: Duration = Duration::from_millis(200);
+/// Any other line is read again after this, because the kernel leaves out edges for which it has no room.
 const LOOK: Duration = Duration::from_millis(50);
 
 /// A line that is read.
 #[derive(Debug)]
 pub struct Input {
-    request: Request,
-    shown: String,
     line: u32,
-    has_edges: bool,
+    shown: String,
+    way: Way,
 }
+
+/// How its levels come.
+#[derive(Debug)]
+enum Way {
+    /// The kernel reports edges.
+    Edges(Request),
+    /// A thread asks for them, because a chip that hangs lets it wait for seconds; a byte each time that it was answered, 0
+    /// or 1. It ends when this is dropped, or with an error, which it sends as text behind a byte [`FAILED`].
+    Asked(OwnedFd),
+}
+
+const FAILED: u8 = 2;
 
 impl Input {
     /// Opens `line` of `chip`, pulled to the level `pulled_high` where the chip can.
@@ -42,39 +58,104 @@ impl Input {
             builder.on_chip(chip).with_consumer("rapid").with_line(line).as_input();
             builder.with_bias(bias).with_edge_detection(edges).request()
         };
-        let with_edges = request(Some(EdgeDetection::BothEdges));
-        let has_edges = with_edges.is_ok();
-        // Chips on USB have no interrupts: of those the kernel refuses edges, and nothing else.
-        let opened = with_edges.or_else(|_| request(None));
-        Ok(Self { request: opened.map_err(|error| why(&shown, &error))?, shown, line, has_edges })
+        let way = if let Ok(request) = request(Some(EdgeDetection::BothEdges)) {
+            Way::Edges(request)
+        } else {
+            // Chips on USB have no interrupts: of those the kernel refuses edges, and nothing else.
+            let request = request(None).map_err(|error| why(&shown, &error))?;
+            Way::Asked(ask(request, line, shown.clone()).map_err(|error| format!("{shown}: {error}"))?)
+        };
+        Ok(Self { line, shown, way })
     }
 
-    /// Readable when there is something to take, where the chip reports edges.
+    /// Readable when there is something to take.
     #[must_use]
     pub fn fd(&self) -> BorrowedFd<'_> {
-        self.request.as_fd()
+        match &self.way {
+            Way::Edges(request) => request.as_fd(),
+            Way::Asked(levels) => levels.as_fd(),
+        }
     }
 
-    /// How long after a call of [`Self::take`] the next one is due at the latest.
+    /// When [`Self::take`] is due at the latest after its last call, where the line can be asked at any time.
     #[must_use]
-    pub const fn poll_after(&self) -> Duration {
-        if self.has_edges { LOOK } else { POLL }
+    pub const fn look_after(&self) -> Option<Duration> {
+        match self.way {
+            Way::Edges(_) => Some(LOOK),
+            Way::Asked(_) => None,
+        }
     }
 
-    /// Reports every level that the line has had since the last call, as far as the chip reports them, and the one of
-    /// now, without waiting. `true` is high.
+    /// Without a level for this long the chip does not answer, where levels have to be asked for.
+    #[must_use]
+    pub const fn silence(&self) -> Option<Duration> {
+        match self.way {
+            Way::Edges(_) => None,
+            Way::Asked(_) => Some(SILENCE),
+        }
+    }
+
+    /// Reports every level that the line has had since the last call, as far as the chip reports them, without waiting.
+    /// `true` is high.
     ///
     /// # Errors
     /// When it cannot be read any more, for people.
     pub fn take(&mut self, report: &mut dyn FnMut(bool)) -> Result<(), String> {
-        let Self { request, shown, line, has_edges } = self;
+        let Self { line, shown, way } = self;
         let failed = |error: gpiocdev::Error| why(shown, &error);
-        while *has_edges && request.has_edge_event().map_err(failed)? {
-            report(request.read_edge_event().map_err(failed)?.kind == EdgeKind::Rising);
+        match way {
+            Way::Edges(request) => {
+                while request.has_edge_event().map_err(failed)? {
+                    report(request.read_edge_event().map_err(failed)?.kind == EdgeKind::Rising);
+                }
+                report(request.value(*line).map_err(failed)? == Value::Active);
+                Ok(())
+            }
+            Way::Asked(levels) => take_asked(levels, shown, report),
         }
-        report(request.value(*line).map_err(failed)? == Value::Active);
-        Ok(())
     }
+}
+
+fn take_asked(levels: &OwnedFd, shown: &str, report: &mut dyn FnMut(bool)) -> Result<(), String> {
+    let mut bytes = [0; 256];
+    loop {
+        let count = match rustix::io::read(levels, &mut bytes) {
+            Ok(0) => return Err(format!("{shown} is read no more")),
+            Ok(count) => count,
+            Err(Errno::AGAIN) => return Ok(()),
+            Err(Errno::INTR) => continue,
+            Err(error) => return Err(format!("{shown}: {error}")),
+        };
+        for (at, byte) in bytes.iter().enumerate().take(count) {
+            if *byte == FAILED {
+                return Err(String::from_utf8_lossy(bytes.get(at + 1..count).unwrap_or_default()).into_owned());
+            }
+            report(*byte == 1);
+        }
+    }
+}
+
+/// Starts the thread that asks for the levels of a line, every [`POLL`].
+fn ask(request: Request, line: u32, shown: String) -> io::Result<OwnedFd> {
+    let (levels, out) = pipe_with(PipeFlags::CLOEXEC | PipeFlags::NONBLOCK)?;
+    let work = move || {
+        // Without the right to it, the motors' thread warns.
+        let _ = use_fifo(CONTROL_PRIORITY);
+        loop {
+            let (message, is_end) = match request.value(line) {
+                Ok(level) => (vec![u8::from(level == Value::Active)], false),
+                Err(error) => ([&[FAILED], why(&shown, &error).as_bytes()].concat(), true),
+            };
+            // Of one that nothing is taken from, what comes out is old, and what is new follows.
+            let sent = rustix::io::write(&out, &message);
+            if is_end || matches!(sent, Err(error) if error != Errno::AGAIN) {
+                return;
+            }
+            std::thread::sleep(POLL);
+        }
+    };
+    std::thread::Builder::new().name("gpio".to_owned()).spawn(work)?;
+    Ok(levels)
 }
 
 /// A line that is driven. Another process may hold it too: see [`Output::of`].

@@ -46,7 +46,7 @@ const LAYERS: &[&[&str]] = &[
 const SIDEWAYS: &[(&str, &[&str])] = &[
     ("status", &["registry", "text"]),
     ("control", &["registry"]),
-    ("gpio", &["text"]),
+    ("gpio", &["text", "realtime"]),
     ("episode_format", &["text"]),
     ("app", &["tui", "headless", "logging"]),
     // Without a screen the log is lines among the lines of the run.

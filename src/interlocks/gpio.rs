@@ -28,8 +28,12 @@ impl Gpio {
         self.input.fd()
     }
 
-    pub(super) const fn poll_after(&self) -> Duration {
-        self.input.poll_after()
+    pub(super) const fn look_after(&self) -> Option<Duration> {
+        self.input.look_after()
+    }
+
+    pub(super) const fn silence(&self) -> Option<Duration> {
+        self.input.silence()
     }
 
     pub(super) fn take(&mut self, report: &mut dyn FnMut(InputState)) -> Result<(), String> {

@@ -53,9 +53,9 @@ impl Source {
     }
 
     /// How long after a call of [`Self::take`] the next one is due at the latest; `None` where it cannot be asked.
-    pub(super) const fn poll_after(&self) -> Option<Duration> {
+    pub(super) const fn look_after(&self) -> Option<Duration> {
         match self {
-            Self::Gpio(gpio) => Some(gpio.poll_after()),
+            Self::Gpio(gpio) => gpio.look_after(),
             Self::Key(_) => Some(key::LOOK),
             Self::Line(_) => None,
         }
@@ -64,7 +64,8 @@ impl Source {
     /// Why it is silent, for people.
     pub(super) fn why_silent(&mut self) -> String {
         match self {
-            Self::Key(_) | Self::Gpio(_) => String::new(),
+            Self::Key(_) => String::new(),
+            Self::Gpio(gpio) => format!("its chip has not answered for {:?}", gpio.silence().unwrap_or_default()),
             Self::Line(line) => line.why_silent(),
         }
     }
@@ -72,7 +73,8 @@ impl Source {
     /// Silent for this long it is lost; `None` where the kernel knows its state at all times.
     pub(super) fn silence(&self) -> Option<Duration> {
         match self {
-            Self::Key(_) | Self::Gpio(_) => None,
+            Self::Key(_) => None,
+            Self::Gpio(gpio) => gpio.silence(),
             Self::Line(line) => Some(line.silence()),
         }
     }

@@ -87,12 +87,12 @@ fn follow(source: &mut Source, reporter: &Reporter, stop: &OwnedFd) -> Option<St
         if has_reported {
             (heard, is_silent) = (Stamp::now(), false);
         }
-        let poll = source.poll_after().map(|after| Stamp::now().after(after));
-        let until = poll.or(silence.filter(|_| !is_silent).map(|silence| heard.after(silence)));
+        let look = source.look_after().map(|after| Stamp::now().after(after));
+        let until = look.or(silence.filter(|_| !is_silent).map(|silence| heard.after(silence)));
         match wait(stop, Some(&source.fd()), until) {
             Woken::Stop => return None,
             Woken::Ready(false) => {}
-            Woken::Late if poll.is_some() => {}
+            Woken::Late if look.is_some() => {}
             Woken::Ready(true) => return Some("unplugged".to_owned()),
             Woken::Late => {
                 is_silent = true;

@@ -4,13 +4,13 @@
 //!
 //! Invariant: a line is opened engaged, and engaged when the thread ends.
 //! Invariant: what is reported engaged or released was taken by the kernel; a line that cannot be driven, or is not open
-//! yet, is reported broken.
+//! yet, is reported broken, and so are all while the thread waits for a chip.
 //! Invariant: what the motors' cycle calls neither waits nor allocates.
 
 use std::io;
 use std::os::fd::OwnedFd;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU16, AtomicU32, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU16, AtomicU32, AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::Duration;
 
@@ -21,9 +21,12 @@ use crate::control::motors::Brakes as State;
 use crate::gpio::Output;
 use crate::realtime::{CONTROL_PRIORITY, use_fifo};
 use crate::registry::{BrakeSpec, DamiaoSpec};
+use crate::time::Stamp;
 
 /// Every line is set again after this, so that a chip that was unplugged is noticed, and one that is back opened.
 const AGAIN: Duration = Duration::from_millis(500);
+/// A chip that takes longer to set a line cannot drive a brake.
+const SET_WITHIN: Duration = Duration::from_millis(200);
 /// The thread engages all brakes within this at its end, or is left behind.
 const ENDS_WITHIN: Duration = Duration::from_millis(200);
 
@@ -40,6 +43,8 @@ struct Shared {
     wanted: AtomicU16,
     /// [`State`], the bits of `broken` above those of `released`.
     state: AtomicU32,
+    /// When the thread began to set lines; 0 while it sleeps.
+    busy: AtomicU64,
     ends: AtomicBool,
     wake: OwnedFd,
 }
@@ -68,6 +73,7 @@ impl Brakes {
         let shared = Arc::new(Shared {
             wanted: AtomicU16::new(0),
             state: AtomicU32::new(u32::from(u16::MAX) << 16),
+            busy: AtomicU64::new(0),
             ends: AtomicBool::new(false),
             wake: eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?,
         });
@@ -86,9 +92,14 @@ impl Brakes {
     }
 
     /// What they are.
-    pub(super) fn state(&self) -> State {
+    pub(super) fn state(&self, now: Stamp) -> State {
+        let busy = self.shared.busy.load(Ordering::SeqCst);
+        let is_stuck = busy > 0 && now.since(Stamp(busy)) >= SET_WITHIN;
         let [low, high, broken_low, broken_high] = self.shared.state.load(Ordering::SeqCst).to_le_bytes();
-        State { released: u16::from_le_bytes([low, high]), broken: u16::from_le_bytes([broken_low, broken_high]) }
+        State {
+            released: u16::from_le_bytes([low, high]),
+            broken: if is_stuck { u16::MAX } else { u16::from_le_bytes([broken_low, broken_high]) },
+        }
     }
 }
 
@@ -115,6 +126,7 @@ impl Tender {
         // Without the right to it, the motors' thread warns.
         let _ = use_fifo(CONTROL_PRIORITY);
         loop {
+            self.shared.busy.store(Stamp::now().0.max(1), Ordering::SeqCst);
             let ends = self.shared.ends.load(Ordering::SeqCst);
             let wanted = if ends { 0 } else { self.shared.wanted.load(Ordering::SeqCst) };
             let mut state = State::default();
@@ -128,6 +140,7 @@ impl Tender {
                 }
             }
             self.shared.publish(state);
+            self.shared.busy.store(0, Ordering::SeqCst);
             if ends {
                 return;
             }

@@ -12,11 +12,11 @@ use vbench::emu::function::{Function, PictureStore};
 use vbench::emu::log::{Log, Moment};
 use vbench::emu::script;
 use vbench::emu::spec::{DeviceSpec, PORTS};
-use vbench::probe::{beat, can, lan, mask, uevent, v4l};
+use vbench::probe::{beat, can, keys, lan, mask, uevent, v4l};
 
 const USAGE: &str = "\
 usage: usbemu SPEC...                    emulate; commands on stdin (plug, unplug, hub, silent, port, sleep, t0,
-                                         at, say, fault, mute, hot, power, ask, flood, busoff, link, quit)
+                                         at, say, fault, mute, hot, power, ask, flood, busoff, link, level, quit)
        usbemu --read NODE FRAMES         read a camera, print what came as one JSON object
        usbemu --first-frames             open each camera that comes, print how soon its first frame came
        usbemu --can NAME FRAME...        send each (ID#DATA), print the next frame that comes or -
@@ -25,13 +25,15 @@ usage: usbemu SPEC...                    emulate; commands on stdin (plug, unplu
        usbemu --lidar PORT PACKETS       read a LiDAR's packets, print how many were lost
        usbemu --watch-mask [SECONDS]     print each change of the physical mask as a JSON line
        usbemu --watch-uevents            print what the kernel and udev tell of devices, a JSON line each
+       usbemu --keys NAME KEY...         an input device with these keys: `press KEY`, `release KEY` on stdin
+       usbemu --grab NODE                keep an input device's events from everybody else
        usbemu --beat MICROSECONDS FILE   sleep to absolute deadlines, note each waking in FILE
 
 SPEC: uvc:vid=046d,pid=0825,serial=A,port=0,mode=MJPG-640x480@30[,mode=..]
       acm:vid=2e8a,pid=000a,serial=B,hz=100
       ftdi:vid=0403,pid=6001,serial=C,hz=50
       gsusb:serial=D,motor=5/15/DMH3510[,motor=..]   slcan:..   damiao:..
-      ecm:serial=C3441325012345[,gopro=MEGABYTES][,lidar=HZ]
+      ecm:serial=C3441325012345[,gopro=MEGABYTES][,lidar=HZ]   gpio:serial=E
       feed=FILE with the first three: send the records of this file";
 
 type Failure = Box<dyn std::error::Error>;
@@ -54,6 +56,8 @@ fn main() -> ExitCode {
         ["--lidar", port, packets] => lidar(port, packets),
         ["--watch-mask"] => watch(None),
         ["--watch-mask", seconds] => watch(Some(seconds)),
+        ["--keys", name, ref codes @ ..] if !codes.is_empty() => keys::serve(name, codes, io::stdin().lock()),
+        ["--grab", node] => keys::grab(Path::new(node)),
         _ => emulate(&words),
     };
     match done {

@@ -265,7 +265,7 @@ impl Beat {
     fn step(&mut self, now: Stamp) -> Result<(), LinkError> {
         let Powered { link, bus, brakes, guard, .. } = &mut self.powered;
         if let Some(brakes) = brakes {
-            bus.feed_brakes(brakes.state(), now);
+            bus.feed_brakes(brakes.state(now), now);
         }
         let mut end = None;
         let (mut sent, mut full) = (false, 0);

@@ -12,6 +12,7 @@ use super::can::adapter::Adapter;
 use super::descriptor::{self, Answer, Setup};
 use super::feed::{self, FeedError, Records};
 use super::frame;
+use super::gpio::Gpio;
 use super::lan::ecm::Ecm;
 use super::serial::{Flavour, Serial};
 use super::spec::{DeviceSpec, Format, Identity, Kind, Mode};
@@ -79,6 +80,7 @@ impl Function {
             Kind::Acm { hz } => Role::Serial(Serial::new(Flavour::Acm, *hz, first, given)),
             Kind::Ftdi { hz } => Role::Serial(Serial::new(Flavour::Ftdi, *hz, first, given)),
             Kind::Can { protocol, motors } => Role::Talker(Box::new(Adapter::new(*protocol, motors))),
+            Kind::Gpio => Role::Talker(Box::new(Gpio::default())),
             Kind::Ecm(net) => Role::Talker(Box::new(Ecm::new(net, &spec.identity.serial, first))),
         };
         Ok(Self { identity: spec.identity.clone(), configured: 0, role })
@@ -255,6 +257,7 @@ mod tests {
             DeviceSpec::can(Protocol::GsUsb),
             DeviceSpec::can(Protocol::Slcan),
             DeviceSpec::ecm(),
+            DeviceSpec::gpio(),
         ];
         for spec in specs {
             let mut function = Function::new(&spec, 0, &mut PictureStore::new()).unwrap();

@@ -14,6 +14,7 @@ pub mod device;
 pub mod feed;
 pub mod frame;
 pub mod function;
+pub mod gpio;
 pub mod lan;
 pub mod log;
 pub mod order;

@@ -5,6 +5,7 @@
 //! flood N HZ          busoff N 0|1      link N 0|1
 //! load N[.ID] NM [lever]      friction N[.ID] NM NMS     inertia N[.ID] KGM2     ends N[.ID] LOW HIGH
 //! zero N[.ID] RAD             freeze N[.ID] 0|1          block N[.ID] 0|1
+//! level N.LINE 0|1
 //! ```
 //!
 //! `N.ID` is one motor (its slave id, hexadecimal) behind device N, `N` alone all of them. The first order of the second group
@@ -54,6 +55,8 @@ pub enum Order {
     Flood(f64),
     /// The adapter goes bus-off, or recovers.
     BusOff(bool),
+    /// A line of a GPIO chip is pulled low, or is not.
+    Level(bool),
     /// The network cable behind the adapter is in, or out.
     Link(bool),
 }
@@ -79,6 +82,7 @@ pub fn parse(name: &str, words: &mut SplitWhitespace<'_>) -> Option<(Target, Ord
         "power" => Order::Power(flag()?),
         "busoff" => Order::BusOff(flag()?),
         "link" => Order::Link(flag()?),
+        "level" => Order::Level(flag()?),
         "fault" => {
             let code = u8::from_str_radix(words.next()?, 16).ok();
             Order::Fault(code.filter(|code| *code == 0 || (8..=14).contains(code))?)
@@ -152,6 +156,7 @@ mod tests {
             ("flood 0 8000", Some((all(0), Order::Flood(8000.0)))),
             ("busoff 0 1", Some((all(0), Order::BusOff(true)))),
             ("link 3 0", Some((all(3), Order::Link(false)))),
+            ("level 0.2 1", Some((one(2), Order::Level(true)))),
             ("load 0.1 1.5", Some((one(1), Order::Load { torque: 1.5, is_lever: false }))),
             ("load 0.1 -2 lever", Some((one(1), Order::Load { torque: -2.0, is_lever: true }))),
             ("friction 0 0.1 0.02", Some((all(0), Order::Friction([0.1, 0.02])))),

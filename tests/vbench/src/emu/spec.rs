@@ -80,6 +80,8 @@ pub enum Kind {
     },
     /// A network adapter (CDC-ECM).
     Ecm(NetSpec),
+    /// A chip with GPIO lines (CP2104).
+    Gpio,
 }
 
 /// One picture size of a camera.
@@ -108,7 +110,7 @@ pub enum Format {
 #[derive(Debug, Error, PartialEq, Eq)]
 pub enum SpecError {
     /// No such kind.
-    #[error("unknown kind `{0}`: use uvc, acm, ftdi, gsusb, slcan, damiao or ecm")]
+    #[error("unknown kind `{0}`: use uvc, acm, ftdi, gsusb, slcan, damiao, ecm or gpio")]
     Kind(String),
     /// A key this kind does not have, or no `=`.
     #[error("unknown key `{key}` for {kind}")]
@@ -160,6 +162,11 @@ impl DeviceSpec {
     /// A network adapter with nothing behind it; add `gopro` and `lidar`.
     pub fn ecm() -> Self {
         Self::new(Kind::Ecm(NetSpec::default()), 0x2672, 0x0059)
+    }
+
+    /// A CP2104 with four GPIO lines.
+    pub fn gpio() -> Self {
+        Self::new(Kind::Gpio, 0x10c4, 0xea60)
     }
 
     /// Adds a Damiao motor to the bus. Other kinds have none and ignore it.
@@ -249,6 +256,7 @@ impl Kind {
             Self::Can { protocol: Protocol::Slcan, .. } => "slcan",
             Self::Can { protocol: Protocol::Damiao, .. } => "damiao",
             Self::Ecm(_) => "ecm",
+            Self::Gpio => "gpio",
         }
     }
 }
@@ -266,6 +274,7 @@ impl FromStr for DeviceSpec {
             "slcan" => Self::can(Protocol::Slcan),
             "damiao" => Self::can(Protocol::Damiao),
             "ecm" => Self::ecm(),
+            "gpio" => Self::gpio(),
             other => return Err(SpecError::Kind(other.into())),
         };
         for field in fields.split(',').filter(|field| !field.is_empty()) {
@@ -384,6 +393,7 @@ impl fmt::Display for DeviceSpec {
                 net.gopro.map_or(Ok(()), |megabytes| write!(f, ",gopro={megabytes}"))?;
                 net.lidar.map_or(Ok(()), |hz| write!(f, ",lidar={hz}"))
             }
+            Kind::Gpio => Ok(()),
         }
     }
 }

@@ -19,6 +19,7 @@ fn what_is_printed_is_read_back() {
         DeviceSpec::can(Protocol::Damiao).motor(0x01, 0x11, "DM4340"),
         DeviceSpec::ecm().serial("C3441325012345").gopro(3),
         DeviceSpec::ecm().lidar(100.0),
+        DeviceSpec::gpio().serial("GPIO1"),
     ] {
         assert_eq!(spec.to_string().parse(), Ok(spec));
     }
@@ -27,7 +28,7 @@ fn what_is_printed_is_read_back() {
 #[test]
 fn mistakes_are_named() {
     let cases = [
-        ("cam:", "unknown kind `cam`: use uvc, acm, ftdi, gsusb, slcan, damiao or ecm"),
+        ("cam:", "unknown kind `cam`: use uvc, acm, ftdi, gsusb, slcan, damiao, ecm or gpio"),
         ("uvc:hz=3", "unknown key `hz=3` for uvc"),
         ("acm:serial=%4", "`serial=%4`: expected text, with %25 for a per cent sign"),
         ("gsusb:motor=5/15", "`motor=5/15`: expected SLAVE/MASTER/TYPE, ids in hexadecimal, such as 5/15/DMH3510"),

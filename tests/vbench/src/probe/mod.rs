@@ -5,6 +5,7 @@
 
 pub mod beat;
 pub mod can;
+pub mod keys;
 pub mod lan;
 pub mod mask;
 pub mod tally;

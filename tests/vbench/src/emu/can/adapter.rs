@@ -273,7 +273,7 @@ impl Talker for Adapter {
 
     fn befall(&mut self, motor: Option<u16>, order: Order, now_ns: u64) -> bool {
         match order {
-            Order::Link(_) => false,
+            Order::Link(_) | Order::Level(_) => false,
             Order::BusOff(is_off) => {
                 self.set_off(is_off, now_ns);
                 true

@@ -188,7 +188,7 @@ impl Motor {
                 });
                 self.tell("motor_state", state);
             }
-            Order::Flood(_) | Order::BusOff(_) | Order::Link(_) => {}
+            Order::Flood(_) | Order::BusOff(_) | Order::Link(_) | Order::Level(_) => {}
         }
     }
 

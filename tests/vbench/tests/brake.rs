@@ -1,0 +1,180 @@
+//! A joint with a brake on a line of a USB chip, an emergency stop on another line of it, and an enabling switch on a key:
+//! the kernel's own GPIO and input devices.
+
+use std::time::Duration;
+
+use serde_json::Value;
+use vbench::check::{ms, play};
+use vbench::emu::can::adapter::Protocol;
+use vbench::emu::spec::DeviceSpec;
+use vbench::entries::{can, registry};
+use vbench::outcome::Outcome;
+use vbench::scenario::Scenario;
+
+/// How long the brake takes to engage, by the registry.
+const ENGAGES_IN_MS: u64 = 200;
+
+/// An emulated processor is late by tens of ms now and then: time limits of this bus are wide.
+const BUS: &str = r#"adapter = "damiao"
+protocol = "damiao"
+hz = 50
+timeout = "3s"
+silent_after = "1s"
+disable_after = "never"
+[[device.arm.can.motors]]
+name = "joint"
+slave = 0x05
+master = 0x15
+type = "DM4310"
+mode = "position"
+position = [-1.0, 1.0]
+own_fault = "brake"
+other_fault = "brake"
+emergency = "brake"
+brake = { chip = "/dev/brakes", line = 0, released = "high", engages_in = "200ms", releases_in = "50ms" }
+"#;
+
+const STOPS: &str = r#"
+[stop.door]
+kind = "emergency"
+gpio = { chip = "/dev/brakes", line = 2, runs_while = "low" }
+[stop.pedal]
+kind = "enabling"
+key = { device = "bench pedal", code = "KEY_B" }
+"#;
+
+const SCRIPT: &str = r#"
+modprobe uinput
+mkfifo /tmp/keys
+"${usbemu[@]}" --keys 'bench pedal' KEY_B 0<>/tmp/keys >$out/keys 2>&1 &
+exec 8>/tmp/keys
+wait_for 30 said $out/keys ready || fail "no keys: $(cat $out/keys)"
+key() { echo "$1 KEY_B" >&8; }
+stop_is() { said $out/rapid.jsonl '"event":"stop"' "\"stop\":\"$1\"" "\"state\":\"$2\""; }
+# stops N STOP STATE: this state of the stop was reported N times at least.
+stops() { [ "$(grep -F '"event":"stop"' $out/rapid.jsonl | grep -F "\"stop\":\"$2\"" | grep -cF "\"state\":\"$3\"")" -ge "$1" ]; }
+# arm WORD: what follows is of this round.
+arm() {
+  mark $1
+  wait_for 30 "${rapid[@]}" arm || fail "$1: $("${rapid[@]}" arm 2>&1)"
+  wait_for 30 told motor_enabled || fail "$1: not enabled"
+  wait_for 30 told gpio '"line":0' '"level":1' || fail "$1: the brake is not released"
+  wait_for 30 told commands_begin || fail "$1: no commands"
+  mark $1.armed
+}
+# Its number is another one after a plug, while the kernel remembers who had its lines.
+echo 'SUBSYSTEM=="gpio", KERNEL=="gpiochip*", ATTRS{serial}=="GPIO1", SYMLINK+="brakes"' >/etc/udev/rules.d/90-bench-gpio.rules
+udevadm control --reload
+emu plug 1
+wait_for 30 test -c /dev/brakes || fail 'no GPIO chip'
+emu level 1.2 1
+rapid_start --headless --config /tmp/bench/devices.toml --json
+emu plug 0
+wait_for 60 states 1 arm streaming || fail 'the motor does not stream'
+wait_for 30 stop_is door stopped || fail 'the door is not seen'
+wait_for 30 stop_is pedal stopped || fail 'the pedal is not seen'
+"${rapid[@]}" arm >$out/refused 2>&1 && fail 'armed with the door open'
+emu level 1.2 0
+wait_for 30 stops 1 door runs || fail 'the door is not closed'
+"${rapid[@]}" arm >$out/refused.pedal 2>&1 && fail 'armed without the pedal'
+key press
+wait_for 30 stops 1 pedal runs || fail 'the pedal is not pressed'
+
+arm door
+emu level 1.2 1
+wait_for 30 told motor_disabled || fail 'the door stops nothing'
+emu level 1.2 0
+wait_for 30 stops 2 door runs || fail 'the door is not closed again'
+
+arm pedal
+key release
+wait_for 30 told motor_disabled || fail 'the pedal stops nothing'
+wait_for 30 told gpio '"line":0' '"level":0' || fail 'the brake is not engaged after a disarm'
+key press
+wait_for 30 stops 2 pedal runs || fail 'the pedal is not pressed again'
+
+arm grabbed
+node=$(grep -l 'bench pedal' /sys/class/input/event*/device/name)
+"${usbemu[@]}" --grab /dev/input/$(basename ${node%/device/name}) >$out/grab 2>&1 &
+grab=$!
+wait_for 30 said $out/grab grabbed || fail "not grabbed: $(cat $out/grab)"
+key release
+wait_for 30 told motor_disabled || fail 'a pedal that another program has grabbed stops nothing'
+key press
+wait_for 30 stops 3 pedal runs || fail 'a grabbed pedal is not seen to be pressed'
+kill $grab
+
+arm unplugged
+emu unplug 1
+wait_for 30 stops 1 door lost || fail 'the chip is not missed'
+lost() { said $out/rapid.log 'the brake cannot be driven'; }
+wait_for 30 lost || fail 'the brake is not missed'
+sleep 1
+told motor_disabled && fail 'a joint whose brake is not known to hold was let go'
+"${rapid[@]}" disarm || fail 'no disarm'
+wait_for 30 told motor_disabled || fail 'not disarmed'
+"${rapid[@]}" arm >$out/refused.lost 2>&1 && fail 'armed without the door'
+emu plug 1
+emu level 1.2 0
+wait_for 30 stops 3 door runs || fail 'the chip is not found again'
+
+arm killed
+kill -KILL $rapid_pid
+mark dead
+wait_for 60 told motor_disabled || fail 'nothing stops a motor without rapid'
+wait $rapid_pid
+gone() { ! pgrep -x motor-guard >/dev/null; }
+wait_for 30 gone || fail 'the guard is left'
+emu_done 10
+emu_quit
+exit 0
+"#;
+
+/// The lines of the emulator's log from a word to the next.
+fn round<'a>(outcome: &'a Outcome, word: &str) -> &'a [Value] {
+    let is_word = |line: &Value| line["action"] == "say";
+    let from = outcome.emu.iter().position(|line| is_word(line) && line["word"] == word);
+    let lines = &outcome.emu[from.unwrap_or_else(|| panic!("no word {word}")) + 1..];
+    &lines[..lines.iter().position(is_word).unwrap_or(lines.len())]
+}
+
+/// When a line of these fields was logged, ns.
+fn time(lines: &[Value], action: &str, level: Option<u64>) -> Option<u64> {
+    let is_it = |line: &&Value| line["action"] == action && level.is_none_or(|level| line["level"] == level);
+    lines.iter().find(is_it).and_then(|line| line["mono_ns"].as_u64())
+}
+
+#[test]
+fn a_brake_is_engaged_before_its_joint_is_let_go_whatever_stops_it() {
+    let text = registry(&[can("arm", "/rapid/arm_state", 0, "2e88:4603", "CAN1", BUS)]) + STOPS;
+    let scenario = Scenario::new("brake")
+        .spare(DeviceSpec::can(Protocol::Damiao).serial("CAN1").motor(0x05, 0x15, "DM4310"))
+        .spare(DeviceSpec::gpio().serial("GPIO1"))
+        .registry(&text)
+        .file("devices.toml", text);
+    let outcome = play(scenario.script(SCRIPT).limit(Duration::from_secs(180)));
+    assert_eq!(outcome.code, 0, "the guest's script: {}", outcome.log);
+    assert!(outcome.emulator_errors().is_empty(), "{:?}", outcome.emulator_errors());
+    assert!(outcome.file("refused").contains("emergency stop door is pressed"), "{}", outcome.file("refused"));
+    assert!(outcome.file("refused.pedal").contains("enabling switch pedal is released"));
+    assert!(outcome.file("refused.lost").contains("emergency stop door is lost"));
+    for word in ["door", "pedal", "grabbed", "unplugged", "killed"] {
+        let lines = round(&outcome, word);
+        let (on, released) = (time(lines, "motor_enabled", None), time(lines, "gpio", Some(1)));
+        assert!(on.is_some() && on < released, "{word}: released before the motor is on: {lines:?}");
+    }
+    let lines = round(&outcome, "door.armed");
+    let (engaged, off) = (time(lines, "gpio", Some(0)).unwrap(), time(lines, "motor_disabled", None).unwrap());
+    let held = off.checked_sub(engaged).expect("the brake is engaged first");
+    assert!(held >= ENGAGES_IN_MS * 1_000_000, "for {held} ns only");
+    println!("door: brake engaged, and the motor off {} ms later", ms(off, engaged));
+    for word in ["pedal", "grabbed"] {
+        let lines = round(&outcome, &format!("{word}.armed"));
+        assert!(time(lines, "gpio", Some(0)).is_some(), "{word}: {lines:?}");
+    }
+    // The guard holds the line too.
+    let killed = [round(&outcome, "killed.armed"), round(&outcome, "dead")].concat();
+    let (engaged, off) = (time(&killed, "gpio", Some(0)).unwrap(), time(&killed, "motor_disabled", None).unwrap());
+    assert!(engaged < off, "engaged {} ms after the motor was off", ms(engaged, off));
+    println!("killed: brake engaged, and the motor off {} ms later", ms(off, engaged));
+}
