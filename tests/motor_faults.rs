@@ -16,7 +16,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use motor_world::World;
-use motor_world::motor_spec::{bus, motor};
+use motor_world::motor_spec::{brake, bus, motor};
 use rapid::registry::{DamiaoSpec, MotorMode, Stop};
 use serde::Deserialize;
 
@@ -51,10 +51,12 @@ struct Rig {
     torque: f64,
     /// rad/s.
     slew: f64,
-    /// `limp`, `damp` or `hold`.
+    /// `limp`, `damp`, `hold` or `brake`.
     own_fault: String,
     other_fault: String,
     hold_for_ms: Option<u64>,
+    /// Each joint has a brake.
+    brakes: bool,
     /// 0 is never.
     blocked_after_ms: u64,
     timeout_ms: u64,
@@ -79,6 +81,7 @@ impl Default for Rig {
             own_fault: "limp".to_owned(),
             other_fault: "damp".to_owned(),
             hold_for_ms: None,
+            brakes: false,
             blocked_after_ms: 2000,
             timeout_ms: 400,
             before: vec!["load 0 1.5".to_owned(), "ends 0 -2.5 2.5".to_owned()],
@@ -122,6 +125,7 @@ impl Rig {
             "limp" => Stop::Limp,
             "damp" => Stop::Damp,
             "hold" => Stop::Hold,
+            "brake" => Stop::Brake,
             other => panic!("a joint does not stop `{other}`"),
         };
         let mode = |word: &str| match word {
@@ -136,6 +140,7 @@ impl Rig {
             spec.position = self.position;
             (spec.velocity, spec.torque, spec.slew) = (self.velocity, self.torque, self.slew);
             (spec.stop.own_fault, spec.stop.other_fault) = (stop(&self.own_fault), stop(&self.other_fault));
+            spec.brake = self.brakes.then(|| brake(slave));
             spec.stop.hold_for = self.hold_for_ms.map(Duration::from_millis);
             let blocked_after = Duration::from_millis(self.blocked_after_ms);
             spec.watch.blocked_after = Some(blocked_after).filter(|after| !after.is_zero());

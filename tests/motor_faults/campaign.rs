@@ -14,7 +14,7 @@ use rapid::random::Random;
 use rapid::registry::{DamiaoSpec, MotorMode, Stop};
 use rapid::time::Stamp;
 
-use crate::motor_world::motor_spec::{bus, motor};
+use crate::motor_world::motor_spec::{brake, bus, motor};
 use crate::motor_world::{CYCLE, World};
 
 /// Sequences of a run that names no other number.
@@ -118,10 +118,10 @@ fn play(seed: u64) -> (Vec<String>, String) {
 }
 
 fn spec(random: &mut Random) -> DamiaoSpec {
-    let stops = [Stop::Limp, Stop::Damp, Stop::Hold];
+    let stops = [Stop::Limp, Stop::Damp, Stop::Hold, Stop::Brake];
     let motors = (1..=2).map(|slave| {
         let mut spec = motor(slave);
-        let pick = |random: &mut Random| stops[usize::try_from(random.below(3)).expect("small")];
+        let pick = |random: &mut Random| stops[usize::try_from(random.below(4)).expect("small")];
         spec.mode = match random.below(5) {
             0 => MotorMode::PositionVelocity,
             1 => MotorMode::Velocity,
@@ -130,6 +130,8 @@ fn spec(random: &mut Random) -> DamiaoSpec {
         (spec.velocity, spec.torque, spec.slew) =
             (random.uniform(1.5, 5.0), random.uniform(2.0, 5.0), random.uniform(0.5, 6.0));
         (spec.stop.own_fault, spec.stop.other_fault) = (pick(random), pick(random));
+        let stops_by_it = [spec.stop.own_fault, spec.stop.other_fault].contains(&Stop::Brake);
+        spec.brake = (stops_by_it || random.below(3) == 0).then(|| brake(slave));
         spec.stop.hold_for = (random.below(3) == 0).then_some(Duration::from_millis(200));
         if random.below(4) == 0 {
             spec.watch.blocked_after = None;

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use rapid::registry::{DamiaoSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Stop, StopSpec, WatchSpec};
+use rapid::registry::{BrakeSpec, DamiaoSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Stop, StopSpec, WatchSpec};
 
 /// A motor in MIT mode that listens to `slave` and answers with 0x10 more.
 pub(crate) fn motor(slave: u16) -> MotorSpec {
@@ -23,6 +23,18 @@ pub(crate) fn motor(slave: u16) -> MotorSpec {
         brake: None,
         max_mos: 80.0,
         max_rotor: 100.0,
+    }
+}
+
+/// A brake of its own, which takes some time.
+pub(crate) fn brake(line: u16) -> BrakeSpec {
+    let ms = Duration::from_millis;
+    BrakeSpec {
+        chip: "/dev/brakes".into(),
+        line: line.into(),
+        released_high: true,
+        engages_in: ms(60),
+        releases_in: ms(40),
     }
 }
 

@@ -11,6 +11,8 @@
 //! foreign ID HEX                    another program sends this frame: everybody on the bus receives it
 //! rewrite MOTOR RID VALUE           a register is written in a frame that the program does not receive
 //! damage MOTOR COUNT RAD            so many of its next frames have a position that is off by this
+//! chip 0|1                          the chip of the brakes is unplugged, and all engage, or is back
+//! stuck 0|1                         brakes stay as they are, whatever their lines say
 //! ```
 //!
 //! MOTOR counts from 1, as its id does.
@@ -27,7 +29,7 @@ use std::time::Duration;
 use rapid::control::can::CanFrame;
 use rapid::control::damiao::codec;
 use rapid::control::damiao::parameter::Reply;
-use rapid::control::motors::{BusState, Fault, MotorBus, Notice, Reason};
+use rapid::control::motors::{Brakes, BusState, Fault, MotorBus, Notice, Reason};
 use rapid::driver::can::guard::KEEP_FOR;
 use rapid::registry::{DamiaoSpec, MotorMode, Stop};
 use rapid::time::Stamp;
@@ -81,6 +83,10 @@ pub(crate) struct World {
     action_due: Stamp,
     away_until: Option<Stamp>,
     killed: Option<Stamp>,
+    brakes: Brakes,
+    are_brakes_stuck: bool,
+    /// Of each joint, whether its brake lets it turn, and since when its line says something else.
+    turns: Vec<(bool, Option<Stamp>)>,
     damage: Vec<(usize, usize, f64)>,
 }
 
@@ -101,6 +107,7 @@ pub(crate) struct Judge {
 
 /// What a motor was told and what it said.
 #[derive(Clone, Default)]
+#[expect(clippy::struct_excessive_bools, reason = "each is a fact of its own")]
 pub(crate) struct Axis {
     /// Its newest positions that arrived, the newest last, rad.
     reported: Vec<f64>,
@@ -122,6 +129,8 @@ pub(crate) struct Axis {
     forbidden: Option<Stamp>,
     /// How it is to be stopped, by when.
     kind: Option<(Stop, Stamp)>,
+    /// It is stopping by its brake.
+    brakes: bool,
 }
 
 impl Axis {
@@ -152,9 +161,14 @@ impl World {
             action_due: now,
             away_until: None,
             killed: None,
+            brakes: Brakes::default(),
+            are_brakes_stuck: false,
+            turns: Vec::new(),
             damage: Vec::new(),
         };
         world.play("inertia 0 0.02");
+        world.turns = vec![(true, None); world.motors.len()];
+        world.drive_brakes(0);
         world
     }
 
@@ -197,7 +211,7 @@ impl World {
                 self.bus.arm(self.now);
                 if !self.judge.stopped {
                     (self.judge.may_move, self.judge.may_keep) = (true, true);
-                    self.judge.axes.iter_mut().for_each(|axis| axis.kind = None);
+                    self.judge.axes.iter_mut().for_each(|axis| (axis.kind, axis.brakes) = (None, false));
                 }
             }
             ["disarm"] => {
@@ -231,6 +245,11 @@ impl World {
                     let _unheard = motor.hear(&Frame::data(0x7ff, bytes), now);
                 }
             }
+            ["chip", flag] => {
+                self.brakes.broken = if flag == "1" { 0 } else { u16::MAX };
+                self.drive_brakes(0);
+            }
+            ["stuck", flag] => self.are_brakes_stuck = flag == "1",
             ["damage", ..] => self.damage.push((whole(1) - 1, whole(2), number(3))),
             _ => self.befall(line),
         }
@@ -285,6 +304,7 @@ impl World {
             motor.tend(now.0);
             motor.told().for_each(drop);
         }
+        self.turn_brakes();
         if self.away_until.is_some_and(|until| now < until) {
             self.guard();
             return;
@@ -313,7 +333,9 @@ impl World {
             }
         }
         let mut sent = Vec::new();
+        self.bus.feed_brakes(self.brakes, now);
         self.bus.step(now, |frame| sent.push(frame));
+        self.drive_brakes(self.bus.releases());
         for frame in sent {
             self.judge.look(&frame, &self.spec, now);
             self.deliver(&frame);
@@ -327,11 +349,42 @@ impl World {
             self.followed = None;
         }
         self.judge.end_of_cycle(&self.bus, &self.motors, &self.spec, &self.notices[first..], now);
+        let let_go = self.motors.iter().zip(&self.turns).map(|(motor, (turns, _))| !motor.is_on() && *turns);
+        self.judge.judge_brakes(&let_go.collect::<Vec<_>>(), self.are_brakes_stuck, &self.spec, now);
+    }
+
+    /// The lines of the brakes say this.
+    fn drive_brakes(&mut self, released: u16) {
+        if self.are_brakes_stuck {
+            return;
+        }
+        let (before, now) = (self.brakes.released, self.now);
+        self.brakes.released = if self.brakes.broken == 0 { released } else { 0 };
+        for (index, (_, since)) in self.turns.iter_mut().enumerate() {
+            if (before ^ self.brakes.released) >> index & 1 == 1 || before == 0 && since.is_none() {
+                *since = Some(now);
+            }
+        }
+    }
+
+    /// Brakes engage and release some time after their lines say so.
+    fn turn_brakes(&mut self) {
+        for (index, ((turns, since), spec)) in self.turns.iter_mut().zip(&self.spec.motors).enumerate() {
+            let Some(brake) = &spec.brake else { continue };
+            let is_released = self.brakes.released >> index & 1 == 1;
+            let takes = if is_released { brake.releases_in } else { brake.engages_in };
+            if *turns != is_released && since.is_some_and(|since| self.now.since(since) >= takes) {
+                (*turns, *since) = (is_released, None);
+                self.motors[index].befall(Order::Block(!is_released), self.now.0);
+            }
+        }
     }
 
     /// What the guard of a killed program sends. A program that is no machine of ours has none.
     fn guard(&mut self) {
         let Some(killed) = self.killed.filter(|_| self.instead.is_none()) else { return };
+        let engages = if self.now.since(killed) >= KEEP_FOR { u16::MAX } else { self.bus.engages_at_death() };
+        self.drive_brakes(self.brakes.released & !engages);
         let mut will: Vec<CanFrame> = self.bus.last_will().into_iter().flatten().collect();
         if self.now.since(killed) >= KEEP_FOR {
             will = self.spec.motors.iter().map(|motor| codec::Order::Disable.frame(motor.slave)).collect();
@@ -507,8 +560,9 @@ impl Judge {
                 // Who was stopped before stays so; who is off, or does not hear, cannot be kept.
                 if place == 0 && self.was_armed && motor.is_on() && !axis.is_deaf && self.may_keep {
                     axis.kind = Some((kind, now.after(KIND_WITHIN)));
+                    axis.brakes = kind == Stop::Brake;
                 } else if Some(at) == own {
-                    axis.kind = None;
+                    (axis.kind, axis.brakes) = (None, false);
                 }
             }
         }
@@ -517,6 +571,19 @@ impl Judge {
         }
         self.was_armed = bus.is_armed();
         self.judge_joints(motors, spec, now);
+    }
+
+    /// No joint that stops by its brake is let go before that holds it.
+    fn judge_brakes(&mut self, let_go: &[bool], are_stuck: bool, spec: &DamiaoSpec, now: Stamp) {
+        for (at, motor) in spec.motors.iter().enumerate().filter(|(_, motor)| motor.brake.is_some()) {
+            let axis = &mut self.axes[at];
+            // A disarm lets go at once, and who turns itself off is not asked.
+            let is_braking = axis.brakes && self.may_keep && !axis.is_deaf && !are_stuck;
+            if is_braking && let_go[at] && axis.command.is_none() && motor.stop.hold_for.is_none() {
+                axis.brakes = false;
+                self.note(now, &format!("{} is let go before its brake holds", motor.name));
+            }
+        }
     }
 
     fn judge_joints(&mut self, motors: &[Motor], spec: &DamiaoSpec, now: Stamp) {
@@ -531,7 +598,12 @@ impl Judge {
                     (true, true) => Stop::Damp,
                     (true, false) => Stop::Hold,
                 };
-                let expected = if kind == Stop::Damp && !has_damping { Stop::Hold } else { kind };
+                let expected = match kind {
+                    Stop::Damp if !has_damping => Stop::Hold,
+                    // Until the brake is engaged.
+                    Stop::Brake => Stop::Hold,
+                    kind => kind,
+                };
                 // A motor that disabled itself by then is no fault of the program.
                 if is != expected && !(is == Stop::Limp && axis.command.is_none()) {
                     wrong.push(format!("{name} stops {is:?} and not {expected:?}"));

@@ -43,6 +43,8 @@ impl MotorBus {
             (BusState::Disarmed | BusState::Following | BusState::Holding, _)
             | (BusState::Arming, Phase::Enabling | Phase::On) => status().or_else(|| motor.heat_fault()),
             (BusState::Arming, _) => motor.heat_fault(),
+            // It was stopped for that, in its way.
+            (BusState::Faulted(Fault::Hot { motor, .. }), Phase::Kept(_)) if motor == index => status(),
             // It was stopped, and is on.
             (BusState::Faulted(_), Phase::Kept(_)) => status().or_else(|| motor.heat_fault()),
             _ => None,
@@ -253,13 +255,8 @@ impl MotorBus {
         let own = fault.own();
         // What came first is what it is about.
         let is_keeping = matches!(self.state, BusState::Faulted(_)) && self.is_keeping();
-        let mut is_news = !is_keeping;
         for (index, (motor, command)) in self.motors.iter_mut().zip(&mut self.commands).enumerate() {
-            is_news |= motor.stop_at_fault(Some(index) == own, command);
-        }
-        // A joint that is too hot is so with each of its frames.
-        if !is_news {
-            return;
+            motor.stop_at_fault(Some(index) == own, command);
         }
         if !is_keeping {
             self.enter(BusState::Faulted(fault), now);
