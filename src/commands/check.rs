@@ -8,7 +8,8 @@ use serde::Serialize;
 use super::{Format, Outcome};
 use crate::interlock::StopKind;
 use crate::registry::{
-    DeviceSpec, Diagnostic, IdentitySpec, InterlockInput, InterlockSpec, Loaded, ModuleSpec, Mount, Registry, UsbSpec,
+    CanProtocol, CanSpec, DeviceSpec, Diagnostic, IdentitySpec, InterlockInput, InterlockSpec, Loaded, ModuleSpec,
+    MotorSpec, Mount, NodeSpec, Registry, StopSpec, UsbSpec,
 };
 use crate::text;
 
@@ -22,6 +23,9 @@ pub fn check(path: &Path, format: Format, out: &mut dyn Write) -> io::Result<Out
             table(&loaded, out)?;
             for module in &loaded.registry.modules {
                 writeln!(out, "{}", module_line(module))?;
+            }
+            for motor in motors(&loaded.registry) {
+                writeln!(out, "{}", text::plain(&motor.to_string()))?;
             }
             for stop in &loaded.registry.stops {
                 writeln!(out, "{}", stop_line(stop))?;
@@ -37,6 +41,9 @@ pub fn check(path: &Path, format: Format, out: &mut dyn Write) -> io::Result<Out
             }
             for module in &loaded.registry.modules {
                 line(out, &Line::Module(module))?;
+            }
+            for motor in motors(&loaded.registry) {
+                line(out, &Line::Motor(motor))?;
             }
             for stop in &loaded.registry.stops {
                 line(out, &Line::Stop(StopRow::of(stop)))?;
@@ -72,9 +79,56 @@ pub fn check(path: &Path, format: Format, out: &mut dyn Write) -> io::Result<Out
 enum Line<'a> {
     Device(Row<'a>),
     Module(&'a ModuleSpec),
+    Motor(MotorRow<'a>),
     Stop(StopRow<'a>),
     Warning(&'a Diagnostic),
     Error(&'a Diagnostic),
+}
+
+/// How a joint stops.
+#[derive(Serialize)]
+struct MotorRow<'a> {
+    name: &'a str,
+    device: &'a str,
+    own_fault: &'static str,
+    other_fault: &'static str,
+    emergency: &'static str,
+    /// Its line and chip.
+    brake: Option<String>,
+}
+
+fn motors(registry: &Registry) -> impl Iterator<Item = MotorRow<'_>> {
+    let buses = registry.devices.iter().filter_map(|device| match &device.node {
+        NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(motors), .. }) => Some((device, motors)),
+        _ => None,
+    });
+    buses.flat_map(|(device, bus)| bus.motors.iter().map(|motor| MotorRow::of(device, motor)))
+}
+
+impl<'a> MotorRow<'a> {
+    fn of(device: &'a DeviceSpec, motor: &'a MotorSpec) -> Self {
+        let StopSpec { own_fault, other_fault, emergency, .. } = motor.stop;
+        Self {
+            name: &motor.name,
+            device: &device.name,
+            own_fault: own_fault.word(),
+            other_fault: other_fault.word(),
+            emergency: emergency.word(),
+            brake: motor.brake.as_ref().map(|brake| format!("line {} of {}", brake.line, brake.chip.display())),
+        }
+    }
+}
+
+impl std::fmt::Display for MotorRow<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { name, device, own_fault, other_fault, emergency, brake } = self;
+        write!(
+            f,
+            "motor {name} of {device}: {own_fault} at a fault of its own, {other_fault} at another's, {emergency} at an \
+             emergency stop"
+        )?;
+        brake.iter().try_for_each(|brake| write!(f, "; brake on {brake}"))
+    }
 }
 
 /// `kind` of a line is what the line is of.
@@ -218,6 +272,28 @@ mod tests {
     }
 
     #[test]
+    fn how_each_joint_stops_is_listed() {
+        let motors = "[device.arm]\nvid = \"2e88\"\npid = \"4603\"\nnode = \"can\"\nbit = 0\n[device.arm.can]\n\
+                      adapter = \"damiao\"\nprotocol = \"damiao\"\nmotors = [\n\
+                      { name = \"lift\", slave = 1, type = \"DM4310\", kp = 20, kd = 1, position = [0, 1], \
+                      other_fault = \"brake\", brake = { chip = \"/dev/brakes\", line = 4, released = \"high\" } },\n\
+                      { name = \"wheel\", slave = 2, type = \"DM4310\", mode = \"velocity\", position = [-9, 9] },\n]\n";
+        let (outcome, text) = checked(motors, Format::Text);
+        assert_eq!(outcome, Outcome::Done, "{text}");
+        for line in [
+            "motor lift of arm: limp at a fault of its own, brake at another's, limp at an emergency stop; brake on line 4 \
+             of /dev/brakes\n",
+            "motor wheel of arm: limp at a fault of its own, hold at another's, limp at an emergency stop\n",
+        ] {
+            assert!(text.contains(line), "{text}");
+        }
+        let (_, json) = checked(motors, Format::Json);
+        assert!(
+            json.contains(r#"{"kind":"motor","name":"lift","device":"arm","own_fault":"limp","other_fault":"brake""#)
+        );
+    }
+
+    #[test]
     fn stops_are_listed() {
         let stops = "[stop.pendant]\nkind = \"emergency\"\n\
                      serial = { path = \"/dev/ttyUSB7\", run = \"RUN\" }\n[stop.pedal]\nkind = \"enabling\"\n\
@@ -227,8 +303,8 @@ mod tests {
         let text = format!("{}{stops}", crate::registry::BUILTIN);
         let (_, text_out) = checked(&text, Format::Text);
         for line in [
-            "emergency stop pendant: /dev/ttyUSB7 at 115200 baud, runs with \"RUN\" every 200ms; stops nothing",
-            "enabling switch pedal: number 2 of motor_state, runs above 0.5, every 200ms; stops nothing",
+            "emergency stop pendant: /dev/ttyUSB7 at 115200 baud, runs with \"RUN\", lost after 200ms without it; stops nothing",
+            "enabling switch pedal: number 2 of motor_state, runs above 0.5, lost after 200ms without it; stops nothing",
             "emergency stop door: line 17 of /dev/gpiochip0, runs while low; stops nothing",
             "emergency stop key: KEY_B of a pad, runs while not pressed; stops nothing",
         ] {

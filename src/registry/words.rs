@@ -3,7 +3,7 @@
 
 use std::fmt;
 
-use super::spec::{CanAdapter, CanProtocol, Framing, Mount, NodeSpec, Opens, Parse, PixelFormat, WhenStale};
+use super::spec::{CanAdapter, CanProtocol, Framing, Mount, NodeSpec, Opens, Parse, PixelFormat, Stop, WhenStale};
 use crate::modality::ModalityKind;
 
 impl PixelFormat {
@@ -27,6 +27,18 @@ impl CanAdapter {
     /// Every kind of adapter and its name.
     pub const WORDS: [(&str, Self); 3] =
         [("socketcan", Self::SocketCan), ("slcan", Self::Slcan), ("damiao", Self::Damiao)];
+
+    /// The word for it.
+    #[must_use]
+    pub fn word(self) -> &'static str {
+        word(&Self::WORDS, &self)
+    }
+}
+
+impl Stop {
+    /// Every way to stop and its name.
+    pub const WORDS: [(&str, Self); 4] =
+        [("limp", Self::Limp), ("damp", Self::Damp), ("hold", Self::Hold), ("brake", Self::Brake)];
 
     /// The word for it.
     #[must_use]

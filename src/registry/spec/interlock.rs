@@ -122,7 +122,7 @@ impl fmt::Display for InterlockInput {
             }
             Self::Serial(line) => {
                 let (path, run) = (line.path.display(), &line.run);
-                write!(f, "{path} at {} baud, runs with {run:?} every {:?}", line.baud, line.silence)
+                write!(f, "{path} at {} baud, runs with {run:?}, lost after {:?} without it", line.baud, line.silence)
             }
             Self::Field(field) => {
                 let (device, index) = (&field.device, field.index);
@@ -130,7 +130,7 @@ impl fmt::Display for InterlockInput {
                     Bound::Above(bound) => ("above", bound),
                     Bound::Below(bound) => ("below", bound),
                 };
-                write!(f, "number {index} of {device}, runs {side} {bound}, every {:?}", field.silence)
+                write!(f, "number {index} of {device}, runs {side} {bound}, lost after {:?} without it", field.silence)
             }
         }
     }

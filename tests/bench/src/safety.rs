@@ -16,7 +16,7 @@ use rapid::control::damiao::parameter::Reply;
 use rapid::registry::{DamiaoSpec, MotorMode, Stop};
 use rapid::time::Stamp;
 
-use self::motor_world::motor_spec::{bus, motor};
+use self::motor_world::motor_spec::{brake, bus, motor};
 use self::motor_world::{CYCLE, Input, Program, World};
 use crate::figure::Figure;
 use crate::{Bench, Failure};
@@ -51,7 +51,7 @@ const fn event(name: &'static str, lines: &'static [&'static str]) -> Event {
     Event { name, lines, torque: [3.0, LOAD], stops: true, other: Stop::Damp }
 }
 
-const EVENTS: [Event; 21] = [
+const EVENTS: [Event; 23] = [
     Event { stops: false, ..event("a damaged frame", &["damage 1 1 6.283"]) },
     event("damaged frames", &["damage 1 20 0.3"]),
     event("its zero is set by another", &["foreign 001 fffffffffffffffe"]),
@@ -68,11 +68,13 @@ const EVENTS: [Event; 21] = [
     event("mute", &["mute 0.1 1"]),
     event("over-current", &["fault 0.1 a"]),
     Event { other: Stop::Hold, ..event("over-current, others hold", &["fault 0.1 a"]) },
+    Event { other: Stop::Brake, ..event("over-current, others brake", &["fault 0.1 a"]) },
     event("too hot", &["hot 0.1 101"]),
     event("power lost for 0.02 s", &["power 0.1 0", "wait 20", "power 0.1 1"]),
     event("publisher killed", &["silence"]),
     event("disarm", &["disarm"]),
     event("program killed", &["killed"]),
+    Event { other: Stop::Brake, ..event("program killed, brakes", &["killed"]) },
 ];
 
 pub(crate) fn measure(_bench: &Bench) -> Result<Vec<Figure>, Failure> {
@@ -120,6 +122,7 @@ fn spec(event: &Event) -> DamiaoSpec {
         spec.mode = MotorMode::Mit { kp, kd };
         (spec.torque, spec.velocity, spec.slew) = (event.torque[0], 5.0, 2.0);
         (spec.stop.own_fault, spec.stop.other_fault) = (Stop::Limp, event.other);
+        spec.brake = (event.other == Stop::Brake).then(|| brake(slave));
         spec
     });
     bus(motors.collect())

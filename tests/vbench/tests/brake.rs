@@ -80,6 +80,20 @@ wait_for 30 stops 1 door runs || fail 'the door is not closed'
 key press
 wait_for 30 stops 1 pedal runs || fail 'the pedal is not pressed'
 
+# Pushed out of its limits by hand, it is driven back when that is asked for.
+emu zero 0.5 1.3
+emu_done 10
+"${rapid[@]}" arm || fail 'rapid takes no order'
+actuator() { said $out/rapid.jsonl '"event":"actuator"' "$1"; }
+wait_for 30 actuator 'outside its limits' || fail 'armed outside the limits'
+mark back
+"${rapid[@]}" arm --drive-back || fail 'rapid takes no order'
+wait_for 60 actuator 'all joints are within their limits' || fail 'not driven back'
+emu ask 0
+emu_done 10
+"${rapid[@]}" disarm
+wait_for 30 actuator 'motors are disabled' || fail 'not disarmed'
+
 arm door
 emu level 1.2 1
 wait_for 30 told motor_disabled || fail 'the door stops nothing'
@@ -158,6 +172,9 @@ fn a_brake_is_engaged_before_its_joint_is_let_go_whatever_stops_it() {
     assert!(outcome.file("refused").contains("emergency stop door is pressed"), "{}", outcome.file("refused"));
     assert!(outcome.file("refused.pedal").contains("enabling switch pedal is released"));
     assert!(outcome.file("refused.lost").contains("emergency stop door is lost"));
+    let back = round(&outcome, "back").iter().find(|line| line["action"] == "motor_state");
+    let position = back.and_then(|line| line["position"].as_f64()).expect("it was asked");
+    assert!((0.9..=1.01).contains(&position), "driven back to {position}, and 1 is its limit");
     for word in ["door", "pedal", "grabbed", "unplugged", "killed"] {
         let lines = round(&outcome, word);
         let (on, released) = (time(lines, "motor_enabled", None), time(lines, "gpio", Some(1)));

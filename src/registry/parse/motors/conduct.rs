@@ -51,9 +51,8 @@ pub(super) fn stop(entry: &Section<'_>, mode: Option<MotorMode>, problems: &mut 
     let has_damping = mode.is_none_or(|mode| matches!(mode, MotorMode::Mit { .. }));
     let other_fault = if has_damping { Stop::Damp } else { Stop::Hold };
     let default = StopSpec { other_fault, ..StopSpec::default() };
-    let words = [("limp", Stop::Limp), ("damp", Stop::Damp), ("hold", Stop::Hold), ("brake", Stop::Brake)];
     let mut choice = |key| {
-        let stop = entry.has(key).then(|| entry.choice(problems, key, &words)).flatten()?;
+        let stop = entry.has(key).then(|| entry.choice(problems, key, &Stop::WORDS)).flatten()?;
         if stop == Stop::Brake && !entry.has("brake") {
             let fix = format!("write {BRAKE}, or another way to stop");
             entry.report(problems, key, format!("{key} = \"brake\", and the motor has no brake"), fix);
