@@ -176,8 +176,10 @@ impl Attended {
 
     /// It could not be armed as [`Self::is_to_be_armed`] says: the next one is to be, unless an order came meanwhile.
     pub fn was_not_armed(&self) {
-        if self.0.disarmed.load(Ordering::SeqCst) == 0 {
-            self.0.at_first_plug.store(true, Ordering::SeqCst);
+        self.0.at_first_plug.store(true, Ordering::SeqCst);
+        // A disarm stores its time first, and then takes back what this gives: it is seen here, or comes after.
+        if self.0.disarmed.load(Ordering::SeqCst) != 0 {
+            self.0.at_first_plug.store(false, Ordering::SeqCst);
         }
     }
 

@@ -43,6 +43,7 @@ mod last_will;
 mod motor;
 mod notice;
 mod notices;
+mod refusing;
 mod returning;
 mod watch;
 mod words;
@@ -76,8 +77,6 @@ pub const SAMPLE_VALUES: usize = 6;
 const SILENT_CYCLES: u32 = 3;
 /// A step that comes later than this many cycles moves no farther than after so many.
 const LATE_CYCLES: u32 = 2;
-/// Actions may be this far in the future: clocks are one, ticks are rounded.
-const EARLY: Duration = Duration::from_millis(100);
 
 /// See the module's comment.
 #[derive(Debug)]
@@ -210,6 +209,11 @@ impl MotorBus {
     /// A frame came from the bus.
     pub fn feed(&mut self, frame: &CanFrame, now: Stamp) {
         if codec::data_of(frame).is_none() {
+            // A command of one or two numbers may be shorter.
+            let is_frame = !(frame.extended || frame.remote || frame.error);
+            if let Some(motor) = self.motors.iter().position(|motor| is_frame && motor.is_commanded_by(frame)) {
+                self.heard_master(motor, now);
+            }
             return;
         }
         let reply = Reply::decode(frame);
@@ -279,35 +283,16 @@ impl MotorBus {
         true
     }
 
-    fn refuse(&self, target: &[f64], tick: Stamp, now: Stamp) -> Option<Refusal> {
-        if target.len() != self.motors.len() {
-            Some(Refusal::Length)
-        } else if !target.iter().all(|value| value.is_finite()) {
-            Some(Refusal::NotFinite)
-        } else if tick > now.after(EARLY) {
-            Some(Refusal::Early)
-        } else if self.is_returning && self.is_armed() {
-            Some(Refusal::Returning)
-        } else if now.since(tick) >= self.deadman.patience(self.line.period()) {
-            Some(Refusal::Old)
-        } else if self.is_armed() && tick >= self.armed && self.line.tick().is_none() {
-            // The first one since the arm.
-            self.far(target).map(|motor| Refusal::Far { motor })
-        } else {
-            None
-        }
-    }
-
-    /// The first motor that is too far from an action for it to be the first after an arm.
-    fn far(&self, target: &[f64]) -> Option<usize> {
-        let mut axes = self.motors.iter().zip(&self.limits).zip(target);
-        axes.position(|((motor, limits), target)| motor.is_far(*target, limits))
-    }
-
     /// Enables all motors, after reading their parameters and clearing their faults. A notice says
     /// whether that went well. Changes nothing where they are enabled, or are being enabled.
     pub fn arm(&mut self, now: Stamp) {
         if matches!(self.state, BusState::Probing | BusState::Disarmed | BusState::Faulted(_) | BusState::Disabling) {
+            let passed = self.stepped.map_or(Duration::ZERO, |last| now.since(last));
+            if passed >= self.stalled_after {
+                // The order may be as old.
+                self.fail(Fault::Stalled { after: passed }, now);
+                return;
+            }
             self.turn_off();
             self.is_returning = false;
             self.enter(BusState::Arming, now);

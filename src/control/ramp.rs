@@ -50,10 +50,10 @@ impl Ramp {
         limits.slew(before, next, passed.mul_f64(self.share(passed)))
     }
 
-    /// The command changed so in the time that passed.
-    pub fn took(&mut self, change: f64, passed: Duration) {
+    /// The command changed so in the time that passed; `is_led`: by an action, of which there was one since the start.
+    pub fn took(&mut self, change: f64, passed: Duration, is_led: bool) {
         self.speed = if passed.is_zero() { 0.0 } else { change / passed.as_secs_f64() };
-        if change != 0.0 || !self.moved.is_zero() {
+        if is_led && (change != 0.0 || !self.moved.is_zero()) {
             self.moved = self.moved.saturating_add(passed);
         }
     }
@@ -94,7 +94,7 @@ mod tests {
         for step in 0..steps {
             let before = commands[step];
             let next = ramp.next(limits, before, wanted(step), STEP);
-            ramp.took(next - before, STEP);
+            ramp.took(next - before, STEP, true);
             commands.push(next);
         }
         commands
@@ -134,7 +134,7 @@ mod tests {
         let limits = Limits::new(-2.0, 2.0, 4.0);
         for acceleration in [40.0, f64::INFINITY] {
             let mut ramp = Ramp::new(acceleration, Duration::from_secs(1));
-            ramp.took(0.01, STEP);
+            ramp.took(0.01, STEP, true);
             for (wanted, passed) in
                 [(1.0, Duration::ZERO), (0.5, Duration::ZERO), (f64::NAN, STEP), (f64::INFINITY, STEP)]
             {

@@ -19,6 +19,7 @@ pub mod sim;
 use std::sync::Arc;
 
 use crate::action::{ActuatorNotice, Order};
+use crate::permission::Attended;
 use crate::provenance::Negotiated;
 use crate::registry::scenario::{SimDevice, SimSource};
 use crate::registry::{CanProtocol, DeviceNode, DeviceSpec, NodeSpec};
@@ -173,13 +174,18 @@ impl Driver {
         }
     }
 
-    /// Names the emergency stops that orders may be of, before the first.
-    pub fn name_stops(&mut self, stops: &Arc<[Arc<str>]>) {
+    /// Has it carry out these orders from now on. Says whether it takes them itself; otherwise they are to be passed on to
+    /// [`Self::order`].
+    pub fn attend(&mut self, orders: &Arc<Attended>) -> bool {
         match self {
-            Self::Motors(driver) => driver.name_stops(stops),
-            Self::Sim(driver) => driver.joints.name_stops(stops),
+            Self::Motors(driver) => {
+                driver.attend(orders);
+                return true;
+            }
+            Self::Sim(driver) => driver.joints.name_stops(orders.stops()),
             _ => {}
         }
+        false
     }
 
     /// What an actuator has to tell, oldest first.

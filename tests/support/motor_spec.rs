@@ -27,6 +27,7 @@ pub(crate) fn motor(slave: u16) -> MotorSpec {
 }
 
 /// A brake of its own, which takes some time.
+#[allow(dead_code, reason = "not every test has one")]
 pub(crate) fn brake(line: u16) -> BrakeSpec {
     let ms = Duration::from_millis;
     BrakeSpec {

@@ -214,7 +214,7 @@ impl MotorBus {
     /// The commands of this cycle, and whether each motor does what it was commanded.
     fn follow(&mut self, now: Stamp, passed: Duration) {
         let axes = self.motors.iter_mut().zip(&self.limits).zip(&mut self.commands).zip(&mut self.ramps);
-        let mut first = None;
+        let (mut first, is_led) = (None, self.line.tick().is_some());
         for (axis, (((motor, limits), command), ramp)) in axes.enumerate() {
             let (before, target) = (*command, self.line.at(axis, now));
             let wanted = match motor.spec.mode {
@@ -225,7 +225,7 @@ impl MotorBus {
             let bound = motor.bound(wanted, limits);
             // What a motor reports moves the command no faster than an action does.
             *command = if motor.spec.mode == MotorMode::Velocity { bound } else { limits.slew(before, bound, passed) };
-            ramp.took(*command - before, passed);
+            ramp.took(*command - before, passed, is_led);
             let fault = motor.strange(
                 Commanded { command: *command, wanted, is_returning: self.is_returning },
                 now,

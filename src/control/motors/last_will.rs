@@ -23,7 +23,8 @@ impl MotorBus {
     /// outlives this program; `None` where none is on.
     #[must_use]
     pub fn last_will(&self) -> Option<impl Iterator<Item = CanFrame> + '_> {
-        let is_on = self.motors.iter().any(|motor| motor.may_be_on);
+        // From before the first is ordered to turn on.
+        let is_on = self.state == BusState::Arming || self.motors.iter().any(|motor| motor.may_be_on);
         let axes = self.motors.iter().zip(&self.commands);
         is_on.then(|| axes.map(|(motor, command)| motor.last_will(*command)))
     }

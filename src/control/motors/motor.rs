@@ -24,7 +24,7 @@ use std::time::Duration;
 use super::fault::{Fault, Part};
 use super::notice::Notice;
 use super::notices::Notices;
-use super::watch::Watch;
+use super::watch::{Watch, is_near};
 use crate::control::can::CanFrame;
 use crate::control::damiao::codec::{self, Feedback, Mit, MotorStatus, Order, Ranges};
 use crate::control::damiao::parameter::{self, Parameter, Reply, TIMEOUT_UNIT_US, Value};
@@ -39,6 +39,8 @@ use parameters::PROBE;
 const COMMANDS: [u32; 4] = [0, 0x100, 0x200, 0x300];
 /// A motor is warm this many °C below its limit...
 const WARM: f64 = 10.0;
+/// So many frames in a row make sure that a motor has turned itself off.
+const SURE: u8 = 2;
 /// ...until it is this much cooler.
 const COOLER: f64 = 5.0;
 
@@ -102,6 +104,10 @@ pub(super) struct Motor {
     pub(super) status: Option<MotorStatus>,
     /// The first frame since its last answer.
     asked: Option<Stamp>,
+    /// Frames in a row that say that it is not enabled, though it was.
+    off_frames: u8,
+    /// Its newest two positions are those of one joint.
+    agrees: bool,
     index: usize,
     timeout: u32,
     read: [f64; 3],
@@ -133,6 +139,8 @@ impl Motor {
             is_new: false,
             status: None,
             asked: None,
+            off_frames: 0,
+            agrees: false,
             index,
             timeout: u32::try_from(units).unwrap_or(u32::MAX),
             read: [0.0; 3],
@@ -203,13 +211,22 @@ impl Motor {
             return Ok(());
         };
         self.asked = None;
+        let mut is_possible = true;
+        if let Some(ranges) = self.ranges {
+            is_possible = self.is_possible(&feedback, &ranges, now, notices)?;
+        }
+        // Nothing that a damaged frame says is believed.
+        if !is_possible {
+            return Ok(());
+        }
+        self.count_as_off(feedback.status);
         self.status = Some(feedback.status);
         self.named = self.named.filter(|named| *named == feedback.status);
         self.may_be_on = feedback.status == MotorStatus::Enabled || self.may_be_on && !self.is_off();
         if let Some(ranges) = self.ranges {
-            if !self.is_possible(&feedback, &ranges, now, notices)? {
-                return Ok(());
-            }
+            self.agrees = self
+                .feedback
+                .is_some_and(|before| is_near(&before, &feedback, (&self.spec, &ranges), now.since(self.seen)));
             self.feedback = Some(feedback);
             self.seen = now;
             self.is_new = true;
@@ -237,6 +254,8 @@ impl Motor {
     pub(super) fn status_fault(&self) -> Option<Fault> {
         let motor = self.index;
         match self.status? {
+            // One frame may be damaged, and a joint that is kept from falling falls for it.
+            _ if self.is_kept() && self.off_frames < SURE => None,
             MotorStatus::Disabled if self.phase == Phase::On || self.is_kept() => Some(Fault::Dropped { motor }),
             MotorStatus::Enabled | MotorStatus::Disabled => None,
             status => Some(Fault::Latched { motor, status }),
@@ -266,6 +285,10 @@ impl Motor {
             return Ok(());
         };
         if self.phase == Phase::Probed {
+            // One of two may be of a damaged frame: where the joint is, is not known.
+            if !self.agrees {
+                return Ok(());
+            }
             if let Some(fault) = self.unfit(is_returning) {
                 return Err(fault);
             }

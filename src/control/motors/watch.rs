@@ -138,10 +138,7 @@ impl Watch {
         let step = 2.0 * ranges.position() / f64::from(u16::MAX);
         self.compare_speed(feedback, step, now);
         let (Some(before), Some(last)) = (before, last) else { return Ok(None) };
-        // As fast as it was, and somewhat faster than it may be, which is a fault of its own.
-        let fastest = (before.dq.abs() + too_fast(spec)).min(ranges.velocity());
-        let reach = fastest * (now.since(last) + JITTER).as_secs_f64() + STEPS * step;
-        if (feedback.q - before.q).abs() <= reach {
+        if is_near(before, feedback, (spec, ranges), now.since(last)) {
             self.jumps = 0;
             return Ok(None);
         }
@@ -211,6 +208,19 @@ pub(super) fn beyond(spec: &MotorSpec, feedback: &Feedback) -> Option<Strange> {
 }
 
 /// A speed that is none of noise, rad/s.
+/// Can it have come from there to here in the time that passed?
+pub(super) fn is_near(
+    before: &Feedback,
+    feedback: &Feedback,
+    (spec, ranges): (&MotorSpec, &Ranges),
+    passed: Duration,
+) -> bool {
+    let step = 2.0 * ranges.position() / f64::from(u16::MAX);
+    // As fast as it was, and somewhat faster than it may be, which is a fault of its own.
+    let fastest = (before.dq.abs() + too_fast(spec)).min(ranges.velocity());
+    (feedback.q - before.q).abs() <= fastest * (passed + JITTER).as_secs_f64() + STEPS * step
+}
+
 fn too_fast(spec: &MotorSpec) -> f64 {
     spec.velocity * (1.0 + SHARE) + SLOW
 }

@@ -23,6 +23,7 @@ use crate::action::{ActuatorNotice, Order};
 use crate::control::motors::SAMPLE_VALUES;
 use crate::driver::{DriverError, Reading, unblock};
 use crate::panics::CONTROL_THREAD;
+use crate::permission::Attended;
 use crate::provenance::{Format, Negotiated};
 use crate::registry::{CanSpec, DamiaoSpec, DeviceNode, MAX_MOTORS};
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
@@ -144,10 +145,10 @@ impl Motors {
         })
     }
 
-    /// Names the emergency stops that orders may be of, before the first.
-    pub fn name_stops(&mut self, stops: &Arc<[Arc<str>]>) {
-        // They stay the same for a whole run.
-        let _ = self.shared.stops.set(Arc::clone(stops));
+    /// Carries out these orders from now on. Thread `control` takes them itself: none waits for another thread.
+    pub fn attend(&mut self, orders: &Arc<Attended>) {
+        // They are the same for as long as the adapter is open.
+        let _ = self.shared.attended.set(Arc::clone(orders));
     }
 
     /// Lets the motors move, or stops them, with the next cycle. There is room for it however many actions

@@ -25,7 +25,9 @@ pub(in crate::rig) struct Controls {
 #[derive(Debug)]
 pub(super) struct Controlled {
     actions: Arc<Actions>,
-    orders: Attended,
+    orders: Arc<Attended>,
+    /// The device takes its orders itself.
+    takes_orders: bool,
     action: [f64; MAX_ACTION],
 }
 
@@ -45,14 +47,14 @@ impl Controls {
     /// When it cannot be armed.
     pub(super) fn begin(&self, source: &mut Source) -> Result<Controlled, DriverError> {
         self.actions.discard();
-        let orders = self.permission.attend();
-        source.name_stops(orders.stops());
+        let orders = Arc::new(self.permission.attend());
+        let takes_orders = source.attend(&orders);
         match orders.is_to_be_armed() {
             Ok(true) => source.order(Order::Arm).inspect_err(|_| orders.was_not_armed())?,
             Ok(false) => {}
             Err(blocked) => tracing::warn!("not armed at the start: {blocked}"),
         }
-        Ok(Controlled { actions: Arc::clone(&self.actions), orders, action: [0.0; MAX_ACTION] })
+        Ok(Controlled { actions: Arc::clone(&self.actions), orders, takes_orders, action: [0.0; MAX_ACTION] })
     }
 }
 
@@ -62,6 +64,9 @@ impl Controlled {
     /// # Errors
     /// When it does not take one.
     pub(super) fn pass_on_orders(&mut self, source: &mut Source) -> Result<(), DriverError> {
+        if self.takes_orders {
+            return Ok(());
+        }
         self.orders.take().try_for_each(|order| source.order(order))
     }
 

@@ -8,6 +8,7 @@ use tokio::time::timeout;
 use super::{CLOSE_LIMIT, Stream};
 use crate::action::{ActuatorNotice, Order};
 use crate::driver::{Driver, DriverError, Reading};
+use crate::permission::Attended;
 use crate::provenance::Negotiated;
 use crate::registry::NodeSpec;
 use crate::rig::worker::{MOST_SILENT_BEATS, Worker};
@@ -62,9 +63,11 @@ impl Source {
         }
     }
 
-    pub(super) fn name_stops(&mut self, stops: &Arc<[Arc<str>]>) {
-        if let Self::Driver(driver) = self {
-            driver.name_stops(stops);
+    /// Has it carry out these orders. Says whether it takes them itself.
+    pub(super) fn attend(&mut self, orders: &Arc<Attended>) -> bool {
+        match self {
+            Self::Driver(driver) => driver.attend(orders),
+            Self::Worker(_) => false,
         }
     }
 

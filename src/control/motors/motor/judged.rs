@@ -1,6 +1,6 @@
 //! What a motor reports, judged by its [`Watch`](crate::control::motors::watch::Watch).
 
-use super::{Motor, Phase};
+use super::{Motor, Phase, SURE};
 use crate::control::damiao::codec::{Feedback, MotorStatus, Ranges};
 use crate::control::limits::Limits;
 use crate::control::motors::fault::Fault;
@@ -37,6 +37,18 @@ impl Motor {
         Ok(heard.is_none())
     }
 
+    /// Counts the frames that say that a motor which is on is not.
+    pub(super) fn count_as_off(&mut self, status: MotorStatus) {
+        let is_on = matches!(self.phase, Phase::On | Phase::Kept(_));
+        let is_off = is_on && status != MotorStatus::Enabled;
+        self.off_frames = if is_off { self.off_frames.saturating_add(1) } else { 0 };
+    }
+
+    /// Will it follow a command? It says that it is enabled, or one frame alone says that it is not.
+    pub(super) fn may_follow(&self) -> bool {
+        self.status == Some(MotorStatus::Enabled) || (1..SURE).contains(&self.off_frames)
+    }
+
     /// What is wrong with what it does, once it is a fault.
     pub(in crate::control::motors) fn strange(
         &mut self,
@@ -70,6 +82,7 @@ impl Motor {
         let motor = self.index;
         match (self.phase, self.status) {
             (Phase::On, _) if self.is_braked() => Some(Fault::NotReleased { motor }),
+            (Phase::Probed, _) if !self.agrees => Some(Fault::NotEnabled { motor }),
             // Who is probed waits for the others, which come to their own.
             (Phase::On | Phase::Probed, _) => None,
             (Phase::Off { .. }, Some(MotorStatus::Enabled)) | (Phase::Kept(_), _) => Some(Fault::NotDisabled { motor }),

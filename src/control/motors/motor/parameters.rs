@@ -23,6 +23,7 @@ const LOOK_AGAIN: Duration = Duration::from_millis(150);
 impl Motor {
     /// Reads its parameters, from the first.
     pub(in crate::control::motors) const fn probe(&mut self) {
+        (self.look, self.looks) = (None, 0);
         self.phase = Phase::Asked { at: 0, setting: None };
     }
 

@@ -1,7 +1,6 @@
 //! How a motor is stopped: off, damped, or where it is.
 
 use super::{Motor, Phase};
-use crate::control::damiao::codec::MotorStatus;
 use crate::registry::{MotorMode, Stop, StopSpec};
 
 impl Motor {
@@ -33,9 +32,7 @@ impl Motor {
         let stop = if stop == Stop::Damp && !has_damping { Stop::Hold } else { stop };
         match (self.phase, stop) {
             // One that has turned itself off, or reports a fault, follows no command.
-            (Phase::On, stop @ (Stop::Damp | Stop::Hold | Stop::Brake))
-                if self.status == Some(MotorStatus::Enabled) =>
-            {
+            (Phase::On, stop @ (Stop::Damp | Stop::Hold | Stop::Brake)) if self.may_follow() => {
                 self.watch.reset();
                 self.phase = Phase::Kept(stop);
                 if self.spec.mode == MotorMode::Velocity {

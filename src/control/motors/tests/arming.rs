@@ -388,3 +388,41 @@ fn an_arm_has_time_for_all_its_cycles() {
     }
     assert_eq!(world.bus.state(), BusState::Holding);
 }
+
+#[test]
+fn no_joint_begins_where_one_damaged_frame_says_that_it_is() {
+    for cycles in 0..40 {
+        let mut world = World::ready();
+        world.arm();
+        world.run(cycles);
+        // 1 rad off, and the newest before whatever comes next. The world knows nothing of it, and judges each command.
+        let mut frame = world.sims[0].feedback().unwrap();
+        let count = u16::from_be_bytes([frame.data[1], frame.data[2]]) + 2621;
+        [frame.data[1], frame.data[2]] = count.to_be_bytes();
+        world.bus.feed(&frame, world.now);
+        world.run_until(BusState::Holding);
+    }
+}
+
+#[test]
+fn an_arm_after_the_program_stood_still_is_as_old_as_that_and_refused() {
+    let mut world = World::ready();
+    world.now = world.now.after(Duration::from_mins(1));
+    world.arm();
+    world.cycle();
+    assert!(matches!(world.run_to_fault(), Fault::Stalled { after } if after >= Duration::from_mins(1)));
+    world.arm();
+    world.run_until(BusState::Holding);
+}
+
+#[test]
+fn a_short_command_of_another_program_is_one_too() {
+    let mut world = World::armed();
+    let frame = CanFrame { id: 0x201, len: 4, ..CanFrame::default() };
+    world.bus.feed(&CanFrame { error: true, ..frame }, world.now);
+    world.cycle();
+    assert_eq!(world.bus.state(), BusState::Holding);
+    world.bus.feed(&frame, world.now);
+    world.cycle();
+    assert_eq!(world.run_to_fault(), Fault::OtherMaster { motor: 0 });
+}

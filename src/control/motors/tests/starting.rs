@@ -136,3 +136,29 @@ fn a_fault_that_comes_to_light_behind_another_is_reported_at_once() {
     world.arm();
     world.run_until(BusState::Holding);
 }
+
+#[test]
+fn who_leans_on_a_joint_before_the_first_action_takes_none_of_its_soft_start() {
+    let fastest_after = |push: f64| {
+        let mut world = ready(2.0);
+        world.spec.motors[0].torque = 1.0;
+        let spec = world.spec.clone();
+        world = World::new(spec);
+        world.run_until(BusState::Disarmed);
+        world.arm();
+        world.run_until(BusState::Holding);
+        world.sims[0].q += push;
+        world.run(400);
+        let target = world.sims[0].q + 0.4;
+        let (mut before, mut fastest) = (world.bus.commands()[0], 0.0_f64);
+        for _ in 0..10 {
+            world.target(&[target]);
+            world.run(1);
+            fastest = fastest.max((world.bus.commands()[0] - before).abs() / CYCLE.as_secs_f64());
+            before = world.bus.commands()[0];
+        }
+        fastest
+    };
+    let [rested, leaned] = [0.0, 0.12].map(fastest_after);
+    assert!((rested - leaned).abs() < 0.05 && rested < 0.5, "{rested} and {leaned} rad/s");
+}

@@ -204,3 +204,40 @@ fn an_emergency_stop_ends_an_arm_and_what_a_fault_has_left_on() {
         assert!(way != Stop::Damp || kp == 0, "it holds no more than it is to");
     }
 }
+
+#[test]
+fn one_damaged_frame_lets_no_joint_fall_that_is_to_be_kept() {
+    for (own_fault, is_on) in [(Stop::Limp, false), (Stop::Damp, true), (Stop::Hold, true)] {
+        let mut world = armed(MIT, StopSpec { own_fault, ..others(Stop::Limp) });
+        let damaged = |world: &mut World| {
+            let mut frame = world.sims[1].feedback().unwrap();
+            frame.data[0] = frame.data[0] & 0xf | 0xa0;
+            world.feed(&frame, world.now);
+        };
+        damaged(&mut world);
+        world.cycle();
+        let fault = Fault::Latched { motor: 1, status: MotorStatus::OverCurrent };
+        assert_eq!(world.bus.state(), BusState::Faulted(fault));
+        world.run(10);
+        assert_eq!(world.sims[1].is_on(), is_on, "{own_fault:?}");
+        // Nor is one that is kept let go for it.
+        damaged(&mut world);
+        world.run(10);
+        assert_eq!(world.sims[1].is_on(), is_on, "{own_fault:?}");
+        // Two in a row are no accident.
+        damaged(&mut world);
+        damaged(&mut world);
+        world.run(10);
+        assert!(!world.sims[1].is_on());
+    }
+}
+
+#[test]
+fn what_a_frame_with_an_impossible_position_says_of_the_motor_is_not_believed() {
+    let mut world = armed(MIT, others(Stop::Limp));
+    let mut frame = world.sims[1].feedback().unwrap();
+    (frame.data[0], frame.data[1]) = (frame.data[0] & 0xf | 0xa0, 0xff);
+    world.feed(&frame, world.now);
+    world.run(5);
+    assert_eq!(world.bus.state(), BusState::Following);
+}

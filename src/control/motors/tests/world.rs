@@ -337,16 +337,14 @@ impl World {
             if is_possible {
                 (axis.reported, axis.speed) = (Some(said.q), said.dq);
             }
-            // What it said before it was told to turn off is of the past.
-            if sent < axis.off {
+            // What it said before it was told to turn off is of the past; of a frame that cannot be nothing is taken.
+            if sent < axis.off || !is_possible {
                 continue;
             }
             // Once armed, and once it was on, whatever is not on ends it all.
             let was_on = axis.is_on;
             axis.is_on = axis.told && said.status == MotorStatus::Enabled;
-            // Of a frame that cannot be, nothing but the status is taken.
-            let too_hot =
-                is_possible && (f64::from(said.mos) >= motor.max_mos || f64::from(said.rotor) >= motor.max_rotor);
+            let too_hot = f64::from(said.mos) >= motor.max_mos || f64::from(said.rotor) >= motor.max_rotor;
             self.judge.may_move &= !(was_on && (!axis.is_on || too_hot));
         }
     }
@@ -434,6 +432,10 @@ impl World {
                 continue;
             }
             if !axis.is_on {
+                // One frame alone may have said that it is off.
+                if keeps && !self.judge.may_move {
+                    continue;
+                }
                 assert!((command - measured).abs() <= quantum, "first command {command} at {measured}");
                 continue;
             }

@@ -28,6 +28,7 @@ use crate::control::motors::{BusState, SAMPLE_VALUES};
 use crate::driver::DriverError;
 use crate::driver::can::link::LinkError;
 use crate::fault;
+use crate::permission::Attended;
 use crate::realtime::{CONTROL_PRIORITY, lock_memory, use_fifo};
 use crate::registry::{DamiaoSpec, MAX_MOTORS};
 use crate::time::Stamp;
@@ -74,8 +75,8 @@ impl Target {
 pub(super) struct Shared {
     asked: AtomicBool,
     pub(super) orders: OrderSlot,
-    /// Names of the emergency stops that orders are of.
-    pub(super) stops: OnceLock<Arc<[Arc<str>]>>,
+    /// Orders that are taken from where they were given.
+    pub(super) attended: OnceLock<Arc<Attended>>,
     reason: OnceLock<LinkError>,
     pub(super) punctuality: OnceLock<Punctuality>,
 }
@@ -246,7 +247,8 @@ impl Beat {
 
     fn take_orders(&mut self, now: Stamp) {
         let bus = &mut self.powered.bus;
-        for order in self.shared.orders.take() {
+        let attended = self.shared.attended.get().map(|attended| attended.take());
+        for order in self.shared.orders.take().chain(attended.into_iter().flatten()) {
             match order {
                 Order::Arm => bus.arm(now),
                 Order::ArmBack => bus.arm_back(now),
@@ -330,7 +332,7 @@ impl Beat {
             let (text, is_problem) = if let Some(text) = self.troubles.pop_front() {
                 (text, true)
             } else if let Some(notice) = bus.take_notice() {
-                let stops = self.shared.stops.get().map_or(&[][..], |stops| stops);
+                let stops = self.shared.attended.get().map_or(&[][..], |attended| attended.stops());
                 (notice.words(bus.names()).with_stops(stops).to_string(), notice.is_problem())
             } else {
                 return;

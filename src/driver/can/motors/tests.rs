@@ -9,12 +9,14 @@ use std::time::Duration;
 use tokio::time::{Instant, interval, timeout};
 
 use super::*;
-use crate::action::{Arming, Trip};
+use crate::action::Arming;
 use crate::control::can::CanFrame;
 use crate::control::damiao::codec::{self, Feedback, MotorStatus, Ranges};
 use crate::control::damiao::parameter::{Parameter, Reply, Value};
 use crate::driver::can::link::tests::damiao_link;
 use crate::driver::can::socket::tests::{bus, bytes};
+use crate::interlock::{InputState, Interlocks, StopKind};
+use crate::permission::Permission;
 use crate::registry::{MotionSpec, MotorKind, MotorMode, MotorSpec, Stop, StopSpec, WatchSpec};
 
 /// The longest that a condition is waited for.
@@ -129,10 +131,16 @@ async fn an_emergency_stop_turns_the_motor_off_and_is_named() {
     let (link, bus) = bus();
     let (fate, thread) = motor(bus);
     let mut motors = Motors::start(link, &spec(1, 200)).unwrap();
-    motors.name_stops(&["door".into(), "pendant".into()].into());
-    motors.order(Order::Arm).unwrap();
+    let stops = [("door", StopKind::Emergency), ("pendant", StopKind::Emergency)];
+    let permission = Arc::new(Permission::new(false).with_interlocks(Interlocks::new(stops.into_iter())));
+    motors.attend(&Arc::new(permission.attend()));
+    for stop in 0..2 {
+        permission.report(stop, InputState::Runs, Stamp::now());
+    }
+    permission.arm(Stamp::now(), Stamp::now()).unwrap();
     told(&mut motors, |notice| notice.arming == Arming::Holding).await;
-    motors.order(Order::Emergency(Trip { stop: 1, is_lost: true })).unwrap();
+    // Nobody passes it on.
+    permission.report(1, InputState::Lost, Stamp::now());
     let notice = told(&mut motors, |notice| notice.arming == Arming::Faulted).await;
     assert_eq!(notice.text, "emergency stop pendant lost: all motors are stopped");
     assert!(notice.is_problem);
