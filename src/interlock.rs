@@ -93,7 +93,7 @@ impl std::fmt::Display for Blocked {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let (kind, name, word) = (self.kind.label(), &self.stop, self.kind.word(self.state));
         let remedy = match (self.kind, self.state) {
-            (_, InputState::Lost) => "the log says why: restore it",
+            (_, InputState::Lost) => "restore it, the log names the cause",
             (StopKind::Emergency, _) => "release it",
             (StopKind::Enabling, _) => "hold it",
         };

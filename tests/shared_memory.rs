@@ -174,7 +174,7 @@ fn an_order_needs_no_memory_no_disk_and_no_bus() {
     running.end();
     let none = place.command(&["disarm"]).output().expect("rapid");
     assert_eq!(none.status.code(), Some(3), "{none:?}");
-    assert!(said(&none).contains("no rapid runs here as instance"), "{none:?}");
+    assert!(said(&none).contains("no rapid of instance"), "{none:?}");
 }
 
 /// Fills the memory that a run sees, to the last byte.

@@ -35,7 +35,10 @@ impl Key {
         } else {
             let mut named = evdev::enumerate().map(|(_, device)| device);
             named.find(|device| device.name() == Some(&shown) && has_key(device)).ok_or_else(|| {
-                format!("no input device is called {shown:?} and has {}: plug it in, or see to group input", spec.code)
+                format!(
+                    "no input device is called {shown:?} and has {}: plug it in, or add the user to group input",
+                    spec.code
+                )
             })?
         };
         if !has_key(&device) {

@@ -120,7 +120,7 @@ fn an_arm_is_refused_until_every_input_runs_and_says_why() {
     let permission = with_stops(false);
     let attended = permission.attend();
     let why = |permission: &Permission| permission.arm(at(2), at(2)).map_err(|void| void.to_string());
-    let lost = "emergency stop pendant is lost: the log says why: restore it, then arm again";
+    let lost = "emergency stop pendant is lost: restore it, the log names the cause, then arm again";
     assert_eq!(why(&permission), Err(lost.to_owned()), "not reported yet");
     all_run(&permission);
     assert_eq!(why(&permission), Ok(()));

@@ -39,8 +39,6 @@ use parameters::PROBE;
 const COMMANDS: [u32; 4] = [0, 0x100, 0x200, 0x300];
 /// A motor is warm this many °C below its limit...
 const WARM: f64 = 10.0;
-/// So many frames in a row make sure that a motor has turned itself off.
-const SURE: u8 = 2;
 /// ...until it is this much cooler.
 const COOLER: f64 = 5.0;
 
@@ -248,25 +246,6 @@ impl Motor {
             (Part::Mos, f64::from(feedback.mos), self.spec.max_mos),
             (Part::Rotor, f64::from(feedback.rotor), self.spec.max_rotor),
         ]
-    }
-
-    /// What is wrong with a motor that is to be enabled, or disabled, by what it says of itself.
-    pub(super) fn status_fault(&self) -> Option<Fault> {
-        let motor = self.index;
-        match self.status? {
-            // One frame may be damaged, and a joint that is kept from falling falls for it.
-            _ if self.is_kept() && self.off_frames < SURE => None,
-            MotorStatus::Disabled if self.phase == Phase::On || self.is_kept() => Some(Fault::Dropped { motor }),
-            MotorStatus::Enabled | MotorStatus::Disabled => None,
-            status => Some(Fault::Latched { motor, status }),
-        }
-    }
-
-    /// Is it hotter than it may be?
-    pub(super) fn heat_fault(&self) -> Option<Fault> {
-        let motor = self.index;
-        let hot = |(part, celsius, limit)| (celsius >= limit).then_some(Fault::Hot { motor, part, celsius, limit });
-        self.temperatures(self.feedback.as_ref()?).into_iter().find_map(hot)
     }
 
     /// Goes on to be enabled, once its parameters are read: faults are cleared before. Until it is, its

@@ -11,10 +11,11 @@
 //! after udev's rules, which the kernel takes without spaces and `/` and which no device chooses.
 
 use std::fmt::Write as _;
+use std::path::Path;
 
 use super::HEADER;
 use crate::registry::spec::{
-    CAN_RESTART_MS, DeviceSpec, GpioInput, InterlockInput, NodeSpec, Opens, Registry, UsbSpec,
+    CAN_RESTART_MS, CanProtocol, CanSpec, DeviceSpec, GpioInput, InterlockInput, NodeSpec, Opens, Registry, UsbSpec,
 };
 
 /// What `linux/if_arp.h` calls a CAN interface (`ARPHRD_CAN`).
@@ -44,18 +45,31 @@ pub(super) fn rules(registry: &Registry) -> String {
             },
         };
     }
-    for stop in &registry.stops {
-        let InterlockInput::Gpio(GpioInput { chip, .. }) = &stop.input else { continue };
+    for (user, chip) in chips(registry) {
         // A name of a chip as the kernel gives it; any other is a link of somebody's rule.
         let chip = chip.to_str().and_then(|chip| chip.strip_prefix("/dev/gpiochip"));
         if let Some(number) =
             chip.filter(|number| (1..=5).contains(&number.len()) && number.bytes().all(|byte| byte.is_ascii_digit()))
         {
             let rule = format!("SUBSYSTEM==\"gpio\", KERNEL==\"gpiochip{number}\", GROUP=\"gpio\", MODE=\"0660\"");
-            let _ = writeln!(text, "\n# stop {}\n{rule}", stop.name);
+            let _ = writeln!(text, "\n# {user}\n{rule}");
         }
     }
     text
+}
+
+/// GPIO chips, and what each is for.
+fn chips(registry: &Registry) -> impl Iterator<Item = (String, &Path)> {
+    let stops = registry.stops.iter().filter_map(|stop| match &stop.input {
+        InterlockInput::Gpio(GpioInput { chip, .. }) => Some((format!("stop {}", stop.name), chip.as_path())),
+        _ => None,
+    });
+    let buses = registry.devices.iter().filter_map(|device| match &device.node {
+        NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(bus), .. }) => Some(&bus.motors),
+        _ => None,
+    });
+    let brakes = buses.flatten().filter_map(|motor| Some((motor, motor.brake.as_ref()?)));
+    stops.chain(brakes.map(|(motor, brake)| (format!("brake of {}", motor.name), brake.chip.as_path())))
 }
 
 /// The matches that single out the node of an entry's unit, or why there are none.

@@ -144,6 +144,35 @@ fn the_service_may_open_keys_and_gpio_chips_only_where_a_stop_is_one() {
     }
 }
 
+#[test]
+fn the_service_may_open_the_chips_of_brakes_and_the_serial_ports_of_the_board_where_they_are_needed() {
+    let arm = |brake: &str| {
+        format!(
+            "[device.arm]\nvid = \"2e88\"\npid = \"4603\"\nnode = \"can\"\nbit = 0\n[device.arm.can]\n\
+             protocol = \"damiao\"\nmotors = [{{ name = \"lift\", slave = 5, type = \"DM4310\", kp = 1, kd = 1, \
+             position = [0, 1]{brake} }}]\n"
+        )
+    };
+    let brake = ", brake = { chip = \"/dev/gpiochip2\", line = 1, released = \"high\" }";
+    let stop =
+        |path: &str| format!("[stop.pendant]\nkind = \"emergency\"\nserial = {{ path = \"{path}\", run = \"RUN\" }}\n");
+    for (text, chips, uarts) in [
+        (arm(""), false, false),
+        (arm(brake), true, false),
+        (arm("") + &stop("/dev/serial/by-id/usb-pendant"), false, false),
+        (arm("") + &stop("/dev/ttyAMA0"), false, true),
+    ] {
+        let all = artifacts(&Registry::parse(&text, None).unwrap().registry);
+        let (rules, unit) = (text_of(&all, "99-rapid.rules"), text_of(&all, "rapid.service"));
+        let rule = "# brake of lift\nSUBSYSTEM==\"gpio\", KERNEL==\"gpiochip2\", GROUP=\"gpio\"";
+        assert_eq!(rules.contains(rule), chips, "{rules}");
+        let has = |line: &str| unit.lines().any(|is| is == line);
+        let found =
+            (has("DeviceAllow=char-gpiochip rw"), has("DeviceAllow=char-ttyAMA rw"), has("DeviceAllow=char-ttyS rw"));
+        assert_eq!(found, (chips, uarts, uarts), "{unit}");
+    }
+}
+
 /// Entries of every kind that differs in what the service must be able to do: a name, the entry, and the kinds of
 /// sockets it needs besides those of udev and the journal.
 const KINDS: &[(&str, &str, &[&str])] = &[

@@ -47,6 +47,8 @@ struct Needs {
     programs: bool,
     /// Motors have a guard, which outlives the program.
     guard: bool,
+    /// A stop is on a serial port of the board.
+    uarts: bool,
 }
 
 impl Needs {
@@ -78,11 +80,13 @@ impl Needs {
             needs.programs |= !device.hooks.is_empty();
         }
         for stop in &registry.stops {
-            match stop.input {
-                InterlockInput::Key(_) => needs.nodes.insert(KEYS),
-                InterlockInput::Gpio(_) => needs.nodes.insert(GPIO),
-                InterlockInput::Serial(_) | InterlockInput::Field(_) => false,
-            };
+            match &stop.input {
+                InterlockInput::Key(_) => _ = needs.nodes.insert(KEYS),
+                InterlockInput::Gpio(_) => _ = needs.nodes.insert(GPIO),
+                // Those on USB are allowed to every unit.
+                InterlockInput::Serial(line) => needs.uarts |= !line.path.starts_with("/dev/serial"),
+                InterlockInput::Field(_) => {}
+            }
         }
         needs
     }
@@ -94,6 +98,9 @@ impl Needs {
             make += &["#   groupadd --system --force ", group, "\n"].concat();
             groups += &[" ", group].concat();
             allow += &["DeviceAllow=", kind, " rw\n"].concat();
+        }
+        if self.uarts {
+            allow += UARTS;
         }
         (make, groups, allow)
     }
@@ -116,6 +123,9 @@ impl Needs {
         format!("{network}{programs}")
     }
 }
+
+/// Of a unit with a stop on a serial port of the board.
+const UARTS: &str = "DeviceAllow=char-ttyS rw\nDeviceAllow=char-ttyAMA rw\n";
 
 /// Of a unit without sockets for the network.
 const NO_NETWORK: &str = "IPAddressDeny=any\n";

@@ -1,5 +1,5 @@
 //! The unit that `rapid artifacts --install` writes, under a real systemd: installed as a user would, it records a camera, a
-//! CAN bus and a device on the network, over a restart, an unplug and a kill.
+//! CAN bus and a device on the network, over a restart, an unplug, a kill and a hang.
 
 use vbench::check::{assert_whole, play};
 use vbench::emu::can::adapter::Protocol;
@@ -97,6 +97,25 @@ as stranger head -c 8 "$first" 2>$out/stranger && fail 'everybody can read a rec
 rapid inspect --json /var/lib/rapid >$out/verdicts.jsonl 2>$out/inspect.err || fail "rapid inspect: $(cat $out/inspect.err)"
 mkdir $out/rec
 cp /var/lib/rapid/*.mcap $out/rec/
+
+# One that hangs is killed by the watchdog, and started again.
+mkdir -p $unit.d
+printf '[Service]\nWatchdogSec=6\n' >$unit.d/watchdog.conf
+systemctl daemon-reload
+systemctl start rapid || give_up 'systemctl start rapid'
+main() { systemctl show rapid --property=MainPID --value; }
+hung=$(main)
+beats() { [ "$(cut -d. -f1 /proc/uptime)" -ge "$1" ]; }
+wait_for 60 streams || give_up 'not everything streams'
+# Longer than the watchdog's time: one that runs is left alone.
+wait_for 60 beats $(($(cut -d. -f1 /proc/uptime) + 8))
+is "$hung" main || give_up 'a rapid that runs was killed'
+kill -STOP "$hung"
+again() { [ "$(main)" != 0 ] && [ "$(main)" != "$hung" ]; }
+wait_for 60 again || give_up 'a rapid that hangs is left so'
+wait_for 60 streams || give_up 'not everything streams after the watchdog'
+journalctl -u rapid --no-pager -q | grep -m 1 -i 'watchdog timeout' >$out/watchdog
+systemctl stop rapid || give_up 'systemctl stop rapid'
 emu_quit
 exit 0
 "#;
@@ -129,6 +148,7 @@ fn the_installed_unit_records_cameras_buses_and_the_network() {
     assert_eq!(outcome.code, 0, "{}", outcome.log);
     assert!(outcome.emulator_errors().is_empty(), "{:?}", outcome.emulator_errors());
     exposure(&outcome);
+    assert!(outcome.file("watchdog").contains("Watchdog"), "{}", outcome.file("watchdog"));
     rights(&outcome);
     episodes(&outcome);
 }

@@ -1,6 +1,6 @@
 //! What a motor reports, judged by its [`Watch`](crate::control::motors::watch::Watch).
 
-use super::{Motor, Phase, SURE};
+use super::{Motor, Phase};
 use crate::control::damiao::codec::{Feedback, MotorStatus, Ranges};
 use crate::control::limits::Limits;
 use crate::control::motors::fault::Fault;
@@ -9,6 +9,9 @@ use crate::control::motors::notices::Notices;
 use crate::control::motors::watch::{Commanded, beyond, fast};
 use crate::registry::{MotorMode, Stop};
 use crate::time::Stamp;
+
+/// So many frames in a row make sure that a motor has turned itself off.
+const SURE: u8 = 2;
 
 impl Motor {
     /// Can it be where it says? One that is off may be turned by hand, and its zero set; one that is damped sinks without
@@ -35,6 +38,25 @@ impl Motor {
             notices.tell(Notice::Strange { motor, what });
         }
         Ok(heard.is_none())
+    }
+
+    /// What is wrong with a motor that is to be enabled, or disabled, by what it says of itself.
+    pub(in crate::control::motors) fn status_fault(&self) -> Option<Fault> {
+        let motor = self.index;
+        match self.status? {
+            // One frame may be damaged, and a joint that is kept from falling falls for it.
+            _ if self.is_kept() && self.off_frames < SURE => None,
+            MotorStatus::Disabled if self.phase == Phase::On || self.is_kept() => Some(Fault::Dropped { motor }),
+            MotorStatus::Enabled | MotorStatus::Disabled => None,
+            status => Some(Fault::Latched { motor, status }),
+        }
+    }
+
+    /// Is it hotter than it may be?
+    pub(in crate::control::motors) fn heat_fault(&self) -> Option<Fault> {
+        let motor = self.index;
+        let hot = |(part, celsius, limit)| (celsius >= limit).then_some(Fault::Hot { motor, part, celsius, limit });
+        self.temperatures(self.feedback.as_ref()?).into_iter().find_map(hot)
     }
 
     /// Counts the frames that say that a motor which is on is not.
