@@ -1,6 +1,7 @@
 //! Behind damage: where reading continues.
 //!
-//! 1. A record that is wrong in itself and is followed by one that stands is passed over.
+//! 1. A record that is wrong in itself and is followed by one that stands is passed over. A right chunk within an index of
+//!    messages shows that this one is wrong.
 //! 2. Where the summary of a finished file has the right check value, its index says where the chunks lie.
 //! 3. Otherwise the next place is searched at which a chunk may begin and whose check value is right. Nothing is searched
 //!    within what is known to be whole: in the records of a right chunk, in an attachment, in the records of a damaged
@@ -188,6 +189,18 @@ impl<R: ReadAt> Walk<R> {
             return Ok(false);
         }
         self.walked.damaged_chunks += 1;
+        self.walked.left_out.gaps += 1;
+        (self.sure, self.checked) = (self.at, false);
+        Ok(true)
+    }
+
+    /// Does a right chunk begin in the index of messages at `at`, which ends at `end`? Such a record has no check value and
+    /// holds no payload: bytes of it are missing, and it is as long as it claims to be by those of the records behind it.
+    /// Then reading continues with the chunk.
+    pub(super) fn takes_along(&mut self, at: u64, end: u64) -> io::Result<bool> {
+        if !self.scan(at + HEAD, end)? {
+            return Ok(false);
+        }
         self.walked.left_out.gaps += 1;
         (self.sure, self.checked) = (self.at, false);
         Ok(true)

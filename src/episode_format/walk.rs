@@ -333,6 +333,9 @@ impl<R: ReadAt> Walk<R> {
         if !is_right {
             return self.lost(at, opcode);
         }
+        if opcode == op::MESSAGE_INDEX && self.takes_along(at, at + HEAD + length)? {
+            return Ok(Step::Again);
+        }
         self.sure = at;
         self.take(at, opcode, length)
     }

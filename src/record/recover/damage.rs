@@ -293,6 +293,11 @@ fn foreign() -> Vec<u8> {
 
 /// An episode of ours: its samples lie in chunks of their own.
 fn own(number: u64, payloads: &[Vec<u8>]) -> Vec<u8> {
+    own_in(number, &payloads.iter().map(std::slice::from_ref).collect::<Vec<_>>())
+}
+
+/// An episode of ours with these payloads in each chunk.
+fn own_in(number: u64, chunks: &[&[Vec<u8>]]) -> Vec<u8> {
     let mut bytes = Vec::new();
     let mut file = Chunks::new(&mut bytes, Some(EpisodeId::new(testing::BEGIN, number))).unwrap();
     let begin = [("begin_wall_ns", testing::BEGIN), ("begin_monotonic_ns", number)];
@@ -302,10 +307,14 @@ fn own(number: u64, payloads: &[Vec<u8>]) -> Vec<u8> {
     let none = BTreeMap::new();
     let channel = Channel { schema, topic: "/rapid/bytes", encoding: "protobuf", metadata: &none };
     let channel_id = file.channel(None, &channel).unwrap();
-    for (sequence, payload) in (0..).zip(payloads) {
-        let log_time = testing::BEGIN + u64::from(sequence) * 1_000_000;
-        let header = mcap::records::MessageHeader { channel_id, sequence, log_time, publish_time: log_time };
-        file.message(&header, payload).unwrap();
+    let mut sequence = 0;
+    for chunk in chunks {
+        for payload in *chunk {
+            let log_time = testing::BEGIN + u64::from(sequence) * 1_000_000;
+            let header = mcap::records::MessageHeader { channel_id, sequence, log_time, publish_time: log_time };
+            file.message(&header, payload).unwrap();
+            sequence += 1;
+        }
         file.flush().unwrap();
     }
     file.finish().unwrap();
@@ -357,6 +366,36 @@ fn nested(payload: &[u8], has: fn(u8) -> bool, random: &mut Random) -> (usize, u
         }
     }
     (damaged.len(), undecided, wrong)
+}
+
+/// The index of a chunk's messages has no check value, and one that lacks bytes is as long as it claims to be: by the
+/// bytes of what follows. Wherever it then ends, at the end of a record or of the file, no chunk within is lost.
+#[test]
+fn an_index_that_lacks_bytes_takes_no_chunk_along() {
+    let payloads = |count: u8| (0..count).map(|value| vec![value; 12]).collect::<Vec<_>>();
+    let (many, few) = (payloads(40), payloads(3));
+    let bytes = own_in(1, &[&many, &few, &few]);
+    let chunks = chunks(&bytes);
+    assert_eq!(chunks.len(), 3);
+    let index = chunks[0].content.end;
+    assert!(bytes[index] == op::MESSAGE_INDEX && chunks[1].content.start - index > 500);
+    let mut wrong = Vec::new();
+    let mut tried = 0;
+    for (count, state) in [(3, &bytes[..]), (3, unfinished(&bytes)), (2, &bytes[..chunks[1].content.end])] {
+        for start in (index + 15..chunks[1].content.start - 9).step_by(16) {
+            for end in start + 1..chunks[1].content.start - 9 {
+                let shorter = [&state[..start], &state[end..]].concat();
+                let kept = recover_bytes(&shorter).map(|whole| strictly(&whole).len()).unwrap_or_default();
+                let wanted: usize = chunks[..count].iter().map(|chunk| chunk.messages.len()).sum();
+                tried += 1;
+                if kept != wanted {
+                    wrong.push(format!("{start}..{end} of {} missing: {kept} of {wanted}", state.len()));
+                }
+            }
+        }
+    }
+    println!("{tried} ways to shorten an index, {} with losses", wrong.len());
+    assert!(tried > 10_000 && wrong.is_empty(), "{} cases: {wrong:#?}", wrong.len());
 }
 
 #[test]
