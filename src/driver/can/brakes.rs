@@ -27,6 +27,8 @@ use crate::time::Stamp;
 const AGAIN: Duration = Duration::from_millis(500);
 /// A chip that takes longer to set a line cannot drive a brake.
 const SET_WITHIN: Duration = Duration::from_millis(200);
+/// Lines are open within this, or are reported broken until they are.
+const OPENS_WITHIN: Duration = Duration::from_secs(1);
 /// The thread engages all brakes within this at its end, or is left behind.
 const ENDS_WITHIN: Duration = Duration::from_millis(200);
 
@@ -79,8 +81,10 @@ impl Brakes {
         });
         let guard = guard.map(Guard::socket).transpose()?;
         let (end, ended) = channel();
-        let tender = Tender { lines, shared: Arc::clone(&shared), guard, _end: end };
+        let tender = Tender { lines, shared: Arc::clone(&shared), guard, end };
         std::thread::Builder::new().name("brakes".to_owned()).spawn(move || tender.run())?;
+        // An arm that is ordered at once needs them open.
+        let _ = ended.recv_timeout(OPENS_WITHIN);
         Ok(Some(Self { shared, ended }))
     }
 
@@ -107,8 +111,8 @@ impl Drop for Brakes {
     fn drop(&mut self) {
         self.shared.ends.store(true, Ordering::SeqCst);
         self.shared.wake();
-        // An error says that the thread has ended.
-        let _ = self.ended.recv_timeout(ENDS_WITHIN);
+        // A message may still be there of its beginning; an error says that the thread has ended.
+        while self.ended.recv_timeout(ENDS_WITHIN).is_ok() {}
     }
 }
 
@@ -117,14 +121,15 @@ struct Tender {
     lines: Vec<Line>,
     shared: Arc<Shared>,
     guard: Option<OwnedFd>,
-    /// Dropped at its end.
-    _end: Sender<()>,
+    /// Has a message once all lines were tried, and is dropped at the end.
+    end: Sender<()>,
 }
 
 impl Tender {
     fn run(mut self) {
         // Without the right to it, the motors' thread warns.
         let _ = use_fifo(CONTROL_PRIORITY);
+        let mut is_first = true;
         loop {
             self.shared.busy.store(Stamp::now().0.max(1), Ordering::SeqCst);
             let ends = self.shared.ends.load(Ordering::SeqCst);
@@ -143,6 +148,10 @@ impl Tender {
             self.shared.busy.store(0, Ordering::SeqCst);
             if ends {
                 return;
+            }
+            if std::mem::take(&mut is_first) {
+                // It may be waited for no more.
+                let _ = self.end.send(());
             }
             self.wait();
         }
