@@ -35,7 +35,7 @@ demo: setup-build ## build, then the simulated rig: the monitor on a terminal, o
 test: setup ## set up, format, lints, all tests, and a look at what they left behind
 	cargo fmt --all --check
 	$(TESTS) --no-run
-	scripts/leftovers.sh $(TESTS) --no-fail-fast
+	scripts/leftovers.sh scripts/tests.sh $(TESTS)
 
 lint: ## format and clippy
 	cargo fmt --all --check

@@ -10,7 +10,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use gpiocdev::Request;
-use gpiocdev::line::{Bias, EdgeDetection, EdgeKind, Value};
+use gpiocdev::line::{Bias, Value};
 use gpiocdev_uapi::v2::{LineValues, set_line_values};
 use rustix::io::Errno;
 use rustix::pipe::{PipeFlags, pipe_with};
@@ -18,34 +18,28 @@ use rustix::pipe::{PipeFlags, pipe_with};
 use crate::realtime::{CONTROL_PRIORITY, use_fifo};
 use crate::text;
 
-/// A line whose chip reports no edges is read again after this: a chip on USB takes about 1 ms.
+/// A line is read again after this: a chip on USB takes about 1 ms.
 const POLL: Duration = Duration::from_millis(5);
-/// For so long it may take, on a machine that is busy with other things.
-const SILENCE: Duration = Duration::from_millis(200);
-/// Any other line is read again after this, because the kernel leaves out edges for which it has no room.
-const LOOK: Duration = Duration::from_millis(50);
 
 /// A line that is read.
+///
+/// A thread asks for its level, because a chip that hangs lets it wait for seconds; and asks again and again, because no
+/// event says that a chip hangs, and those on USB report no edges.
 #[derive(Debug)]
 pub struct Input {
-    line: u32,
     shown: String,
-    way: Way,
-}
-
-/// How its levels come.
-#[derive(Debug)]
-enum Way {
-    /// The kernel reports edges.
-    Edges(Request),
-    /// A thread asks for them, because a chip that hangs lets it wait for seconds; a byte each time that it was answered, 0
-    /// or 1. It ends when this is dropped, or with an error, which it sends as text behind a byte [`FAILED`].
-    Asked(OwnedFd),
+    /// A byte each time that the thread was answered, 0 or 1. The thread ends when this is dropped, or with an error, which
+    /// it sends as text behind a byte [`FAILED`].
+    levels: OwnedFd,
 }
 
 const FAILED: u8 = 2;
 
 impl Input {
+    /// Without a level for this long the chip does not answer; so long it may take on a machine that is busy with other
+    /// things.
+    pub const SILENCE: Duration = Duration::from_millis(200);
+
     /// Opens `line` of `chip`, pulled to the level `pulled_high` where the chip can.
     ///
     /// # Errors
@@ -53,66 +47,25 @@ impl Input {
     pub fn open(chip: &Path, line: u32, pulled_high: bool) -> Result<Self, String> {
         let shown = chip.display().to_string();
         let bias = if pulled_high { Bias::PullUp } else { Bias::PullDown };
-        let request = |edges: Option<EdgeDetection>| {
-            let mut builder = Request::builder();
-            builder.on_chip(chip).with_consumer("rapid").with_line(line).as_input();
-            builder.with_bias(bias).with_edge_detection(edges).request()
-        };
-        let way = if let Ok(request) = request(Some(EdgeDetection::BothEdges)) {
-            Way::Edges(request)
-        } else {
-            // Chips on USB have no interrupts: of those the kernel refuses edges, and nothing else.
-            let request = request(None).map_err(|error| why(&shown, &error))?;
-            Way::Asked(ask(request, line, shown.clone()).map_err(|error| format!("{shown}: {error}"))?)
-        };
-        Ok(Self { line, shown, way })
+        let mut builder = Request::builder();
+        builder.on_chip(chip).with_consumer("rapid").with_line(line).as_input().with_bias(bias);
+        let request = builder.request().map_err(|error| why(&shown, &error))?;
+        let levels = ask(request, line, shown.clone()).map_err(|error| format!("{shown}: {error}"))?;
+        Ok(Self { shown, levels })
     }
 
     /// Readable when there is something to take.
     #[must_use]
     pub fn fd(&self) -> BorrowedFd<'_> {
-        match &self.way {
-            Way::Edges(request) => request.as_fd(),
-            Way::Asked(levels) => levels.as_fd(),
-        }
+        self.levels.as_fd()
     }
 
-    /// When [`Self::take`] is due at the latest after its last call, where the line can be asked at any time.
-    #[must_use]
-    pub const fn look_after(&self) -> Option<Duration> {
-        match self.way {
-            Way::Edges(_) => Some(LOOK),
-            Way::Asked(_) => None,
-        }
-    }
-
-    /// Without a level for this long the chip does not answer, where levels have to be asked for.
-    #[must_use]
-    pub const fn silence(&self) -> Option<Duration> {
-        match self.way {
-            Way::Edges(_) => None,
-            Way::Asked(_) => Some(SILENCE),
-        }
-    }
-
-    /// Reports every level that the line has had since the last call, as far as the chip reports them, without waiting.
-    /// `true` is high.
+    /// Reports every level that was read since the last call, without waiting. `true` is high.
     ///
     /// # Errors
     /// When it cannot be read any more, for people.
     pub fn take(&mut self, report: &mut dyn FnMut(bool)) -> Result<(), String> {
-        let Self { line, shown, way } = self;
-        let failed = |error: gpiocdev::Error| why(shown, &error);
-        match way {
-            Way::Edges(request) => {
-                while request.has_edge_event().map_err(failed)? {
-                    report(request.read_edge_event().map_err(failed)?.kind == EdgeKind::Rising);
-                }
-                report(request.value(*line).map_err(failed)? == Value::Active);
-                Ok(())
-            }
-            Way::Asked(levels) => take_asked(levels, shown, report),
-        }
+        take_asked(&self.levels, &self.shown, report)
     }
 }
 

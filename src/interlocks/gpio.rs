@@ -4,7 +4,6 @@
 //! need one beside the contact.
 
 use std::os::fd::BorrowedFd;
-use std::time::Duration;
 
 use super::source::state;
 use crate::gpio::Input;
@@ -26,14 +25,6 @@ impl Gpio {
 
     pub(super) fn fd(&self) -> BorrowedFd<'_> {
         self.input.fd()
-    }
-
-    pub(super) const fn look_after(&self) -> Option<Duration> {
-        self.input.look_after()
-    }
-
-    pub(super) const fn silence(&self) -> Option<Duration> {
-        self.input.silence()
     }
 
     pub(super) fn take(&mut self, report: &mut dyn FnMut(InputState)) -> Result<(), String> {

@@ -6,6 +6,7 @@ use std::time::Duration;
 use super::gpio::Gpio;
 use super::key::{self, Key};
 use super::line::Line;
+use crate::gpio::Input;
 use crate::interlock::InputState;
 use crate::registry::InterlockInput;
 
@@ -55,9 +56,8 @@ impl Source {
     /// How long after a call of [`Self::take`] the next one is due at the latest; `None` where it cannot be asked.
     pub(super) const fn look_after(&self) -> Option<Duration> {
         match self {
-            Self::Gpio(gpio) => gpio.look_after(),
             Self::Key(_) => Some(key::LOOK),
-            Self::Line(_) => None,
+            Self::Gpio(_) | Self::Line(_) => None,
         }
     }
 
@@ -65,7 +65,7 @@ impl Source {
     pub(super) fn why_silent(&mut self) -> String {
         match self {
             Self::Key(_) => String::new(),
-            Self::Gpio(gpio) => format!("its chip has not answered for {:?}", gpio.silence().unwrap_or_default()),
+            Self::Gpio(_) => format!("its chip has not answered for {:?}", Input::SILENCE),
             Self::Line(line) => line.why_silent(),
         }
     }
@@ -74,7 +74,7 @@ impl Source {
     pub(super) fn silence(&self) -> Option<Duration> {
         match self {
             Self::Key(_) => None,
-            Self::Gpio(gpio) => gpio.silence(),
+            Self::Gpio(_) => Some(Input::SILENCE),
             Self::Line(line) => Some(line.silence()),
         }
     }

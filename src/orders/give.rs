@@ -2,6 +2,7 @@
 
 use std::fs;
 use std::io::{self, BufRead, BufReader, ErrorKind, Read, Write};
+use std::os::unix::fs::MetadataExt as _;
 use std::os::unix::net::UnixStream;
 use std::time::Duration;
 
@@ -96,9 +97,16 @@ impl std::fmt::Display for Other {
 /// When no run has carried it out.
 pub fn give(instance: Option<&str>, order: Order) -> Result<(), GiveError> {
     let given = Stamp::now();
-    let sockets = fs::read_to_string(SOCKETS)?;
-    let runs = runs(&sockets, instance)?;
+    // Names are bytes, and anybody's.
+    let sockets = String::from_utf8_lossy(&fs::read(SOCKETS)?).into_owned();
+    let (runs, busy) = runs(&sockets, instance)?;
+    // Of a process that is no run of this user nothing is known but the name that it gave its socket.
+    let busy = busy.into_iter().find(|process| is_of_this_user(*process));
+    let unreached = busy.map(|process| GiveError::NoAnswer { process, error: ErrorKind::WouldBlock.into() });
     if runs.is_empty() {
+        if let Some(error) = unreached {
+            return Err(error);
+        }
         let others = sockets.lines().filter_map(|line| other_of(line, instance)).collect();
         return Err(GiveError::NoRun { instance: instance.map(str::to_owned), others });
     }
@@ -110,7 +118,12 @@ pub fn give(instance: Option<&str>, order: Order) -> Result<(), GiveError> {
     sent.into_iter().try_for_each(|(process, sent)| {
         let why = sent.and_then(answer).map_err(|error| GiveError::NoAnswer { process, error })?;
         if why == DONE { Ok(()) } else { Err(GiveError::Refused { process, why }) }
-    })
+    })?;
+    unreached.map_or(Ok(()), Err)
+}
+
+fn is_of_this_user(process: u32) -> bool {
+    fs::metadata(format!("/proc/{process}")).is_ok_and(|about| about.uid() == this_user())
 }
 
 /// A run that may be given orders.
@@ -127,10 +140,11 @@ impl Run {
     }
 }
 
-/// Those of this user; where root has none, everyone's.
+/// Those of this user; where root has none, everyone's. And the numbers of processes, as the names of their sockets have
+/// them, that accepted nothing.
 ///
 /// Anybody may make a socket with such a name, and let it accept nothing: none is waited for while another can be reached.
-fn runs(sockets: &str, instance: Option<&str>) -> io::Result<Vec<Run>> {
+fn runs(sockets: &str, instance: Option<&str>) -> io::Result<(Vec<Run>, Vec<u32>)> {
     let mut names: Vec<&str> = sockets.lines().filter_map(|line| name_of(line, instance)).collect();
     let (mut ours, mut others) = (Vec::new(), Vec::new());
     let end = Stamp::now().after(BUSY_LIMIT);
@@ -146,7 +160,8 @@ fn runs(sockets: &str, instance: Option<&str>) -> io::Result<Vec<Run>> {
             }
         }
         if busy.is_empty() || !ours.is_empty() || Stamp::now() >= end {
-            return Ok(if ours.is_empty() && this_user() == 0 { others } else { ours });
+            let busy = busy.iter().filter_map(|name| process_of(name)).collect();
+            return Ok((if ours.is_empty() && this_user() == 0 { others } else { ours }, busy));
         }
         names = busy;
         std::thread::sleep(BUSY_AGAIN);
@@ -165,8 +180,13 @@ fn connect(name: &str) -> io::Result<Run> {
     stream.set_write_timeout(Some(ANSWER_LIMIT))?;
     let Peer { process, user } = Peer::of(&stream)?;
     // As it numbers itself, where its processes are not seen from here.
-    let process = process.or_else(|| name.rsplit('/').next()?.parse().ok()).unwrap_or_default();
+    let process = process.or_else(|| process_of(name)).unwrap_or_default();
     Ok(Run { stream, process, user })
+}
+
+/// The process in the name of a socket.
+fn process_of(name: &str) -> Option<u32> {
+    name.rsplit('/').next()?.parse().ok()
 }
 
 /// The name in a line of [`SOCKETS`], if a run of `instance` listens there.
@@ -202,7 +222,35 @@ fn answer(stream: UnixStream) -> io::Result<String> {
 
 #[cfg(test)]
 mod tests {
+    use std::os::linux::net::SocketAddrExt as _;
+    use std::os::unix::net::{SocketAddr, UnixListener};
+
     use super::*;
+
+    fn listener(name: &[u8]) -> UnixListener {
+        UnixListener::bind_addr(&SocketAddr::from_abstract_name(name).unwrap()).unwrap()
+    }
+
+    #[test]
+    fn a_socket_whose_name_is_no_text_hinders_no_order() {
+        let name = [format!("rapid-give-{}-", std::process::id()).as_bytes(), &[0xff, 0xfe]].concat();
+        let _listener = listener(&name);
+        let given = give(Some("no-such-rig"), Order::Disarm);
+        assert!(matches!(given, Err(GiveError::NoRun { .. })), "{given:?}");
+    }
+
+    #[test]
+    fn a_run_that_accepts_nothing_is_named() {
+        let (instance, process) = ("accepts-nothing", std::process::id());
+        let name = format!("rapid/{}/{}/{process}", this_user(), instance_part(Some(instance)));
+        let _listener = listener(name.as_bytes());
+        let mut waiting = Vec::new();
+        while let Ok(run) = connect(&name) {
+            waiting.push(run);
+        }
+        let given = give(Some(instance), Order::Disarm);
+        assert!(matches!(given, Err(GiveError::NoAnswer { process: named, .. }) if named == process), "{given:?}");
+    }
 
     #[test]
     fn a_run_is_found_by_its_instance_among_other_sockets() {

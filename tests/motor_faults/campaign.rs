@@ -27,8 +27,8 @@ const NAMED_WITHIN: Duration = Duration::from_millis(50);
 const AGAIN: Duration = Duration::from_secs(1);
 /// The program looks at parameters of motors again within this.
 const READ_AGAIN: Duration = Duration::from_millis(850);
-/// A motor that does not answer is named so long after, by `silent_after` and two cycles.
-const SILENT: Duration = Duration::from_millis(60);
+/// Of a motor that does not answer any fault may be named, whichever comes first.
+const SILENT: &str = "";
 /// After a pause of the program its first frames say little.
 const SETTLED: Duration = Duration::from_millis(100);
 
@@ -231,7 +231,7 @@ impl Campaign {
                 let word = ["mute", "power"][usize::try_from(self.random.below(2)).expect("small")];
                 let on = u8::from(word == "mute");
                 self.order(&format!("{word} 0.{id} {on}"));
-                self.owe(motor, "", SILENT);
+                self.owe(motor, SILENT, NAMED_WITHIN);
                 let ms = self.random.below(600);
                 self.pass(ms);
                 self.order(&format!("{word} 0.{id} {}", 1 - on));
@@ -326,7 +326,7 @@ impl Campaign {
             std::mem::take(&mut self.dues).into_iter().partition::<Vec<_>, _>(|due| now.since(due.since) >= due.within);
         self.dues = rest;
         for due in past {
-            let is_over = due.within == SILENT && !self.world.judge.axes[due.motor].is_deaf;
+            let is_over = due.words == SILENT && !self.world.judge.axes[due.motor].is_deaf;
             if !is_over && !self.is_named(due.motor, due.words, due.since.before(AGAIN)) {
                 self.note(&format!("`{}` is not named", due.what));
             }

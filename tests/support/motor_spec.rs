@@ -47,6 +47,6 @@ pub(crate) fn bus(motors: Vec<MotorSpec>) -> DamiaoSpec {
         deadman: None,
         disable_after: Some(Duration::from_secs(1)),
         timeout: Duration::from_millis(400),
-        silent_after: Duration::from_millis(50),
+        silent_after: Duration::from_millis(40),
     }
 }

@@ -31,7 +31,7 @@ use rapid::control::damiao::codec;
 use rapid::control::damiao::parameter::Reply;
 use rapid::control::motors::{Brakes, BusState, Fault, MotorBus, Notice, Reason};
 use rapid::driver::can::guard::KEEP_FOR;
-use rapid::registry::{DamiaoSpec, MotorMode, Stop};
+use rapid::registry::{BrakeSpec, DamiaoSpec, MotorMode, Stop};
 use rapid::time::Stamp;
 use vbench::emu::can::Frame;
 use vbench::emu::can::motion::{Mit, from_unsigned, to_unsigned};
@@ -383,7 +383,8 @@ impl World {
     /// What the guard of a killed program sends. A program that is no machine of ours has none.
     fn guard(&mut self) {
         let Some(killed) = self.killed.filter(|_| self.instead.is_none()) else { return };
-        let engages = if self.now.since(killed) >= KEEP_FOR { u16::MAX } else { self.bus.engages_at_death() };
+        let is_late = self.now.since(killed) + BrakeSpec::SLOWEST >= KEEP_FOR;
+        let engages = if is_late { u16::MAX } else { self.bus.engages_at_death() };
         self.drive_brakes(self.brakes.released & !engages);
         let mut will: Vec<CanFrame> = self.bus.last_will().into_iter().flatten().collect();
         if self.now.since(killed) >= KEEP_FOR {

@@ -5,17 +5,35 @@
 
 use std::time::Duration;
 
-use super::{BusState, Fault, Motor, MotorBus};
+use super::motor::BrakeIs;
+use super::{BusState, Fault, Motor, MotorBus, Notice};
 use crate::registry::{DamiaoSpec, Stop};
 use crate::time::Stamp;
 
-/// What brakes are, a bit for each motor, the first one the lowest. Bits of motors without a brake mean nothing.
+/// What brakes are, a bit for each motor, the first one the lowest; those without any are engaged. Bits of motors without
+/// a brake mean nothing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Brakes {
-    /// They are released; the others are engaged.
+    /// They are released.
     pub released: u16,
+    /// Their lines are being set: what they are is not known.
+    pub moving: u16,
     /// They can be neither engaged nor released: what they are is not known.
     pub broken: u16,
+}
+
+impl Brakes {
+    /// Of a motor, by its position in the entry.
+    fn of(self, index: usize) -> BrakeIs {
+        let [broken, moving, released] =
+            [self.broken, self.moving, self.released].map(|bits| bits >> (index % 16) & 1 == 1);
+        match (broken, moving, released) {
+            (true, ..) => BrakeIs::Broken,
+            (_, true, _) => BrakeIs::Moving,
+            (_, _, true) => BrakeIs::Released,
+            _ => BrakeIs::Engaged,
+        }
+    }
 }
 
 /// The longest time that a brake takes to be released.
@@ -41,9 +59,11 @@ impl MotorBus {
     /// Takes what the brakes are; to be called before each step where a motor has one. A brake of a joint that is armed, or
     /// being armed, and that cannot be driven is a fault.
     pub fn feed_brakes(&mut self, brakes: Brakes, now: Stamp) {
-        let bit = |bits: u16, index: usize| bits >> (index % 16) & 1 == 1;
         for (index, motor) in self.motors.iter_mut().enumerate() {
-            motor.take_brake(bit(brakes.released, index), bit(brakes.broken, index), now);
+            motor.take_brake(brakes.of(index), now);
+            if motor.misses_brake() {
+                self.notices.tell(Notice::NotBraked { motor: index });
+            }
         }
         let is_needed = matches!(self.state, BusState::Arming | BusState::Following | BusState::Holding);
         let broken = self.motors.iter().position(Motor::has_broken_brake).filter(|_| is_needed);
@@ -52,7 +72,7 @@ impl MotorBus {
         }
     }
 
-    fn bits(&self, is_set: impl Fn(&Motor) -> bool) -> u16 {
+    pub(super) fn bits(&self, is_set: impl Fn(&Motor) -> bool) -> u16 {
         let set = self.motors.iter().enumerate().filter(|(_, motor)| is_set(motor));
         set.fold(0, |bits, (index, _)| bits | 1 << (index % 16))
     }

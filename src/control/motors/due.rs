@@ -87,12 +87,7 @@ impl MotorBus {
     /// Looks after motors that were stopped by a fault and are still on.
     fn keep(&mut self, waited: Duration, now: Stamp) {
         for motor in &mut self.motors {
-            let is_over = match motor.phase {
-                Phase::Kept(Stop::Brake) if motor.has_braked(now) => true,
-                Phase::Kept(Stop::Hold | Stop::Brake) => motor.spec.stop.hold_for.is_some_and(|limit| waited >= limit),
-                _ => false,
-            };
-            if is_over || motor.is_kept() && motor.unanswered(now) >= self.silent_after {
+            if motor.was_kept(waited, now) || motor.is_kept() && motor.unanswered(now) >= self.silent_after {
                 motor.turn_off();
             }
         }
@@ -282,11 +277,9 @@ impl MotorBus {
         self.counts.faults += 1;
         self.notices.tell(Notice::Fault(fault));
         self.name_latched(Some(fault));
-        let kept = |stop| {
-            let kept = self.motors.iter().enumerate().filter(|(_, motor)| motor.phase == Phase::Kept(stop));
-            kept.fold(0, |bits, (index, _)| bits | 1_u16 << (index % 16))
-        };
-        let [damped, held, braked] = [Stop::Damp, Stop::Hold, Stop::Brake].map(kept);
+        let braked = self.bits(Motor::waits_for_brake);
+        let kept = |stop| self.bits(|motor| motor.phase == Phase::Kept(stop)) & !braked;
+        let [damped, held] = [Stop::Damp, Stop::Hold].map(kept);
         if damped | held | braked != 0 {
             self.notices.tell(Notice::Kept { damped, held, braked });
         }

@@ -204,11 +204,13 @@ impl Fault {
     }
 
     /// The motor whose own joint is at fault, by its position in the entry. A joint that is sound, and overloaded or
-    /// commanded by another program, needs not fall for it.
+    /// commanded by another program, or whose brake cannot be driven, need not fall for it: with that, its motor is all that
+    /// holds it.
     #[must_use]
     pub const fn own(&self) -> Option<usize> {
         match *self {
             Self::OtherMaster { .. }
+            | Self::Brake { .. }
             | Self::Changed { parameter: Parameter::Timeout, .. }
             | Self::Strange { what: Strange::Driven { .. } | Strange::Beyond { .. }, .. } => None,
             _ => self.motor(),

@@ -33,6 +33,7 @@ use crate::control::ramp::Ramp;
 use crate::registry::{MotorMode, MotorSpec, Stop};
 use crate::time::Stamp;
 use brake::Brake;
+pub(super) use brake::BrakeIs;
 use parameters::PROBE;
 
 /// Ids of commands and orders, from a motor's own.
@@ -171,6 +172,7 @@ impl Motor {
     /// Turns it off, from the next frame on.
     pub(super) fn turn_off(&mut self) {
         self.watch.reset();
+        self.dismiss_brake();
         self.phase = Phase::Off { told: false };
     }
 

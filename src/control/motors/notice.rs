@@ -147,6 +147,11 @@ pub enum Notice {
         /// Bits of motors that hold until their brake does.
         braked: u16,
     },
+    /// A motor is kept on until its brake holds the joint, and the brake cannot be driven.
+    NotBraked {
+        /// Which motor.
+        motor: usize,
+    },
     /// A target is beyond the limits of its axis; the limit is used.
     Clamped {
         /// Which motor.
@@ -182,6 +187,7 @@ impl Notice {
             | Self::Strange { .. }
             | Self::OtherMaster { .. }
             | Self::Kept { .. }
+            | Self::NotBraked { .. }
             | Self::Cleared { .. }
             | Self::Latched { .. }
             | Self::Clamped { .. }

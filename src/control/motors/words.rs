@@ -186,6 +186,11 @@ impl fmt::Display for Words<'_, Notice> {
                 }
                 f.write_str("(any others are disabled)")
             }
+            Notice::NotBraked { motor } => write!(
+                f,
+                "the brake of motor {} cannot be driven: its motor alone holds the joint; support it before a disarm",
+                self.name(*motor)
+            ),
             Notice::Clamped { motor, target, used } => {
                 write!(f, "target {target} of motor {} is beyond its limits; {used} is used", self.name(*motor))
             }

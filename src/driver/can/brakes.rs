@@ -1,16 +1,17 @@
-//! Holding brakes of joints: a thread that engages and releases them over lines of GPIO chips.
+//! Holding brakes of joints: threads that engage and release them over lines of GPIO chips.
 //!
-//! A line behind USB takes a millisecond, and one whose chip hangs seconds: no cycle of the motors may wait for that.
+//! A line behind USB takes a millisecond, and one whose chip hangs seconds: no cycle of the motors may wait for that, and no
+//! brake of another chip: each chip has a thread of its own.
 //!
 //! Invariant: a line is opened engaged, and engaged when the thread ends.
-//! Invariant: what is reported engaged or released was taken by the kernel; a line that cannot be driven, or is not open
-//! yet, is reported broken, and so are all while the thread waits for a chip.
+//! Invariant: what is reported engaged or released was taken by the kernel, and nothing else was asked of the line since; a
+//! line that cannot be driven, or is not open yet, is reported broken, and so are all of a chip that is waited for.
 //! Invariant: what the motors' cycle calls neither waits nor allocates.
 
 use std::io;
 use std::os::fd::OwnedFd;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU16, AtomicU32, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU16, AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::Duration;
 
@@ -35,7 +36,16 @@ const ENDS_WITHIN: Duration = Duration::from_millis(200);
 /// The brakes of a bus. Dropped, they are engaged.
 #[derive(Debug)]
 pub(super) struct Brakes {
+    chips: Vec<Chip>,
+}
+
+/// A chip and its thread.
+#[derive(Debug)]
+struct Chip {
     shared: Arc<Shared>,
+    /// Bits of motors whose brakes it has.
+    motors: u16,
+    /// Has a message once all its lines were tried, and an end when the thread has ended.
     ended: Receiver<()>,
 }
 
@@ -43,8 +53,8 @@ pub(super) struct Brakes {
 struct Shared {
     /// Bits of motors whose brakes are to be released.
     wanted: AtomicU16,
-    /// [`State`], the bits of `broken` above those of `released`.
-    state: AtomicU32,
+    /// [`State`]: the bits of `released`, `moving` and `broken`, from the lowest on.
+    state: AtomicU64,
     /// When the thread began to set lines; 0 while it sleeps.
     busy: AtomicU64,
     ends: AtomicBool,
@@ -52,15 +62,39 @@ struct Shared {
 }
 
 impl Shared {
+    fn new() -> io::Result<Self> {
+        let shared = Self {
+            wanted: AtomicU16::new(0),
+            state: AtomicU64::new(0),
+            busy: AtomicU64::new(0),
+            ends: AtomicBool::new(false),
+            wake: eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?,
+        };
+        shared.publish(UNKNOWN);
+        Ok(shared)
+    }
+
     fn wake(&self) {
         // Room for a number is always there.
         let _ = rustix::io::write(&self.wake, &1_u64.to_ne_bytes());
     }
 
     fn publish(&self, state: State) {
-        self.state.store(u32::from(state.broken) << 16 | u32::from(state.released), Ordering::SeqCst);
+        let bits = [state.released, state.moving, state.broken].into_iter().rev();
+        self.state.store(bits.fold(0, |all, bits| all << 16 | u64::from(bits)), Ordering::SeqCst);
+    }
+
+    fn state(&self, now: Stamp) -> State {
+        let busy = self.busy.load(Ordering::SeqCst);
+        let is_stuck = busy > 0 && now.since(Stamp(busy)) >= SET_WITHIN;
+        let bits = self.state.load(Ordering::SeqCst);
+        let [released, moving, broken] = [bits, bits >> 16, bits >> 32].map(|bits| (bits & 0xffff) as u16);
+        State { released, moving, broken: if is_stuck { u16::MAX } else { broken } }
     }
 }
+
+/// Before anything was opened.
+const UNKNOWN: State = State { released: 0, moving: 0, broken: u16::MAX };
 
 impl Brakes {
     /// Opens the brakes of an entry, all engaged; `None` where it has none. What cannot be opened is tried again.
@@ -68,60 +102,77 @@ impl Brakes {
     /// # Errors
     /// When the system gives no thread.
     pub(super) fn start(spec: &DamiaoSpec, guard: Option<&Guard>) -> io::Result<Option<Self>> {
-        let lines = lines(spec);
-        if lines.is_empty() {
-            return Ok(None);
+        let mut brakes = Self { chips: Vec::new() };
+        let mut rest = lines(spec);
+        while let Some(chip) = rest.first().map(|line| line.spec.chip.clone()) {
+            let (lines, others) = rest.into_iter().partition(|line: &Line| line.spec.chip == chip);
+            rest = others;
+            brakes.chips.push(Chip::start(lines, guard)?);
         }
-        let shared = Arc::new(Shared {
-            wanted: AtomicU16::new(0),
-            state: AtomicU32::new(u32::from(u16::MAX) << 16),
-            busy: AtomicU64::new(0),
-            ends: AtomicBool::new(false),
-            wake: eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?,
-        });
-        let guard = guard.map(Guard::socket).transpose()?;
-        let (end, ended) = channel();
-        let tender = Tender { lines, shared: Arc::clone(&shared), guard, end };
-        std::thread::Builder::new().name("brakes".to_owned()).spawn(move || tender.run())?;
         // An arm that is ordered at once needs them open.
-        let _ = ended.recv_timeout(OPENS_WITHIN);
-        Ok(Some(Self { shared, ended }))
+        let end = Stamp::now().after(OPENS_WITHIN);
+        for chip in &brakes.chips {
+            let _ = chip.ended.recv_timeout(end.since(Stamp::now()));
+        }
+        Ok((!brakes.chips.is_empty()).then_some(brakes))
     }
 
     /// These brakes are to be released, a bit for each motor, and all others engaged.
     pub(super) fn release(&self, motors: u16) {
-        if self.shared.wanted.swap(motors, Ordering::SeqCst) != motors {
-            self.shared.wake();
+        for Chip { shared, motors: own, .. } in &self.chips {
+            if shared.wanted.swap(motors & own, Ordering::SeqCst) != motors & own {
+                shared.wake();
+            }
         }
     }
 
     /// What they are.
     pub(super) fn state(&self, now: Stamp) -> State {
-        let busy = self.shared.busy.load(Ordering::SeqCst);
-        let is_stuck = busy > 0 && now.since(Stamp(busy)) >= SET_WITHIN;
-        let [low, high, broken_low, broken_high] = self.shared.state.load(Ordering::SeqCst).to_le_bytes();
-        State {
-            released: u16::from_le_bytes([low, high]),
-            broken: if is_stuck { u16::MAX } else { u16::from_le_bytes([broken_low, broken_high]) },
-        }
+        self.chips.iter().fold(State::default(), |all, chip| {
+            let State { released, moving, broken } = chip.shared.state(now);
+            State {
+                released: all.released | released & chip.motors,
+                moving: all.moving | moving & chip.motors,
+                broken: all.broken | broken & chip.motors,
+            }
+        })
+    }
+}
+
+impl Chip {
+    fn start(lines: Vec<Line>, guard: Option<&Guard>) -> io::Result<Self> {
+        let shared = Arc::new(Shared::new()?);
+        let motors = lines.iter().fold(0, |all, line| all | line.motors);
+        let guard = guard.map(Guard::socket).transpose()?;
+        let (end, ended) = channel();
+        let tender = Tender { lines, shared: Arc::clone(&shared), state: UNKNOWN, guard, end };
+        std::thread::Builder::new().name("brakes".to_owned()).spawn(move || tender.run())?;
+        Ok(Self { shared, motors, ended })
     }
 }
 
 impl Drop for Brakes {
     fn drop(&mut self) {
-        self.shared.ends.store(true, Ordering::SeqCst);
-        self.shared.wake();
-        // A message may still be there of its beginning; an error says that the thread has ended.
-        while self.ended.recv_timeout(ENDS_WITHIN).is_ok() {}
+        for Chip { shared, .. } in &self.chips {
+            shared.ends.store(true, Ordering::SeqCst);
+            shared.wake();
+        }
+        let end = Stamp::now().after(ENDS_WITHIN);
+        for chip in &self.chips {
+            // A message may still be there of its beginning; an error says that the thread has ended.
+            while chip.ended.recv_timeout(end.since(Stamp::now())).is_ok() {}
+        }
     }
 }
 
-/// The thread.
+/// The thread of a chip.
 struct Tender {
     lines: Vec<Line>,
     shared: Arc<Shared>,
+    /// As it was published.
+    state: State,
     guard: Option<OwnedFd>,
-    /// Has a message once all lines were tried, and is dropped at the end.
+    /// See [`Chip::ended`].
     end: Sender<()>,
 }
 
@@ -134,17 +185,7 @@ impl Tender {
             self.shared.busy.store(Stamp::now().0.max(1), Ordering::SeqCst);
             let ends = self.shared.ends.load(Ordering::SeqCst);
             let wanted = if ends { 0 } else { self.shared.wanted.load(Ordering::SeqCst) };
-            let mut state = State::default();
-            for line in &mut self.lines {
-                match line.tend(wanted, self.guard.as_ref()) {
-                    Ok(is_released) => state.released |= if is_released { line.motors } else { 0 },
-                    Err(why) => {
-                        state.broken |= line.motors;
-                        line.complain(why);
-                    }
-                }
-            }
-            self.shared.publish(state);
+            self.tend(wanted);
             self.shared.busy.store(0, Ordering::SeqCst);
             if ends {
                 return;
@@ -154,6 +195,28 @@ impl Tender {
                 let _ = self.end.send(());
             }
             self.wait();
+        }
+    }
+
+    /// Sets every line. What one is, is published before it is set otherwise and right after that, not once all are.
+    fn tend(&mut self, wanted: u16) {
+        let Self { lines, shared, state, guard, .. } = self;
+        for line in lines {
+            let bits = line.motors;
+            let releases = wanted & bits == bits;
+            if releases != (state.released & bits == bits) {
+                state.moving |= bits;
+                shared.publish(*state);
+            }
+            let tended = line.tend(releases, guard.as_ref());
+            let put = |all: &mut u16, is_so: bool| *all = if is_so { *all | bits } else { *all & !bits };
+            put(&mut state.released, releases && tended.is_ok());
+            put(&mut state.broken, tended.is_err());
+            put(&mut state.moving, false);
+            shared.publish(*state);
+            if let Err(why) = tended {
+                line.complain(why);
+            }
         }
     }
 
@@ -168,7 +231,7 @@ impl Drop for Tender {
     fn drop(&mut self) {
         // After a panic nobody drives them any more.
         if std::thread::panicking() {
-            self.shared.publish(State { released: 0, broken: u16::MAX });
+            self.shared.publish(UNKNOWN);
         }
     }
 }
@@ -206,8 +269,8 @@ fn lines(spec: &DamiaoSpec) -> Vec<Line> {
 }
 
 impl Line {
-    /// Releases the brake if all its joints want that, and otherwise engages it. Says whether it is released.
-    fn tend(&mut self, wanted: u16, guard: Option<&OwnedFd>) -> Result<bool, String> {
+    /// Releases the brake, or engages it.
+    fn tend(&mut self, releases: bool, guard: Option<&OwnedFd>) -> Result<(), String> {
         let Self { spec, motors, output, is_handed_over, .. } = self;
         let engaged_high = !spec.released_high;
         let tended = match output {
@@ -219,9 +282,8 @@ impl Line {
                 output.insert(opened)
             }),
         };
-        let released = wanted & *motors == *motors;
         let tended = tended.and_then(|output| {
-            let set = output.set(released != engaged_high);
+            let set = output.set(releases != engaged_high);
             set.map_err(|error| format!("line {} of {}: {error}", spec.line, spec.chip.display()))
         });
         if tended.is_err() && output.take().is_some() {
@@ -234,7 +296,7 @@ impl Line {
         if let Some(why) = self.why.take() {
             tracing::info!(motors = self.names, "the brake can be driven again, after: {why}");
         }
-        Ok(released)
+        Ok(())
     }
 
     fn complain(&mut self, why: String) {

@@ -89,7 +89,7 @@ pub(super) fn damiao(table: &Section<'_>, problems: &mut Problems<'_>) -> Option
         deadman,
         disable_after,
         timeout: timeout.unwrap_or(ms(100).max(least)),
-        silent_after: silent_after.unwrap_or(ms(50)),
+        silent_after: silent_after.unwrap_or(ms(40)),
     })
 }
 

@@ -9,7 +9,8 @@ use std::time::Duration;
 use rapid::modality::ModalityKind;
 use rapid::registry::artifacts::{ArtifactKind, artifacts};
 use rapid::registry::{
-    DeviceSpec, Hook, InterlockInput, InterlockSpec, LanFind, LanProtocol, LanSpec, NodeSpec, ProcessSpec, Registry,
+    CanProtocol, CanSpec, DeviceSpec, Hook, InterlockInput, InterlockSpec, LanFind, LanProtocol, LanSpec, NodeSpec,
+    ProcessSpec, Registry,
 };
 use yaml_rust2::{Yaml, YamlLoader};
 
@@ -132,14 +133,21 @@ fn check_rules(registry: &Registry, text: &str) {
     }
 }
 
-/// The chip of a stop becomes that of our group, and nothing else happens to it.
+/// The chip of a stop or a brake becomes that of our group, and nothing else happens to it.
 fn check_chip(registry: &Registry, rule: &[Token]) {
     let [subsystem, kernel, group, mode] = rule else { panic!("{} words for a chip", rule.len()) };
     let words = |token: &Token| format!("{}{}{}", token.key, token.operator, token.value);
     assert_eq!([subsystem, group, mode].map(words), ["SUBSYSTEM==gpio", "GROUP=gpio", "MODE=0660"]);
     let chip = Path::new("/dev").join(&kernel.value);
     let is_its = |stop: &InterlockSpec| matches!(&stop.input, InterlockInput::Gpio(gpio) if gpio.chip == chip);
-    assert!(kernel.key == "KERNEL" && registry.stops.iter().any(is_its), "a rule for {}", chip.display());
+    let has_brake = |device: &DeviceSpec| match &device.node {
+        NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(bus), .. }) => {
+            bus.motors.iter().filter_map(|motor| motor.brake.as_ref()).any(|brake| brake.chip == chip)
+        }
+        _ => false,
+    };
+    let is_ours = registry.stops.iter().any(is_its) || registry.devices.iter().any(has_brake);
+    assert!(kernel.key == "KERNEL" && is_ours, "a rule for {}", chip.display());
     assert!(kernel.value.bytes().all(|byte| byte.is_ascii_alphanumeric()), "{}", kernel.value);
 }
 

@@ -1,7 +1,10 @@
 //! How a motor is stopped: off, damped, or where it is.
 
+use std::time::Duration;
+
 use super::{Motor, Phase};
 use crate::registry::{MotorMode, Stop, StopSpec};
+use crate::time::Stamp;
 
 impl Motor {
     /// Stops it at a fault; `is_own`: its own. One that is not on is turned off; one that is kept already stays so, but for
@@ -21,10 +24,29 @@ impl Motor {
         match (self.phase, self.spec.stop.emergency) {
             (Phase::Kept(_), Stop::Limp) => self.turn_off(),
             (Phase::Kept(Stop::Hold), Stop::Damp) => self.phase = Phase::Kept(Stop::Damp),
-            (Phase::Kept(_), Stop::Brake) => self.phase = Phase::Kept(Stop::Brake),
+            (Phase::Kept(Stop::Hold), Stop::Brake) => self.phase = Phase::Kept(Stop::Brake),
+            // It has sunk: to hold would be to go back up.
+            (Phase::Kept(Stop::Damp), Stop::Brake) => self.call_brake(),
             (Phase::Kept(_), _) => {}
             (_, stop) => self.stop_as(stop, command),
         }
+    }
+
+    /// Was it kept for long enough, `waited` after the stop? Its brake holds the joint, or its time is over; a brake
+    /// is engaged before that.
+    pub(in crate::control::motors) fn was_kept(&mut self, waited: Duration, now: Stamp) -> bool {
+        let Phase::Kept(stop) = self.phase else { return false };
+        if let (Stop::Hold | Stop::Brake, Some(limit)) = (stop, self.spec.stop.hold_for) {
+            let engages_in =
+                self.spec.brake.as_ref().filter(|_| !self.has_broken_brake()).map(|brake| brake.engages_in);
+            if engages_in.is_none() && waited >= limit {
+                return true;
+            }
+            if engages_in.is_some_and(|engages_in| waited + engages_in >= limit) {
+                self.call_brake();
+            }
+        }
+        self.waits_for_brake() && self.has_braked(now)
     }
 
     fn stop_as(&mut self, stop: Stop, command: &mut f64) {

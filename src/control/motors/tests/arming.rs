@@ -81,7 +81,7 @@ fn a_few_lost_answers_are_no_silence() {
     let mut world = World::armed();
     for _ in 0..15 {
         world.sims[1].silent = true;
-        world.run(9);
+        world.run(7);
         world.sims[1].silent = false;
         world.run(1);
     }

@@ -112,6 +112,119 @@ fn a_brake_that_cannot_be_driven_refuses_an_arm_and_ends_one() {
     assert_eq!(text, "the brake of motor joint_2 cannot be driven: the log says why");
 }
 
+/// Armed, the second motor to stop in these ways.
+fn armed_with(stop: StopSpec) -> World {
+    let mut spec = spec(vec![motor(1, 0x11, MIT), motor(2, 0x12, MIT)]);
+    (spec.motors[1].stop, spec.motors[1].brake) = (stop, Some(brake()));
+    let mut world = World::new(spec);
+    world.run_until(BusState::Disarmed);
+    world.arm();
+    world.run_until(BusState::Holding);
+    world.target(&[0.5, 0.5]);
+    world.run(15);
+    world
+}
+
+const EMERGENCY: Trip = Trip { stop: 0, is_lost: false };
+
+#[test]
+fn a_joint_that_has_sunk_is_not_driven_back_up_by_an_emergency_stop() {
+    for is_broken in [false, true] {
+        let stop = StopSpec { own_fault: Stop::Limp, other_fault: Stop::Damp, emergency: Stop::Brake, hold_for: None };
+        let mut world = armed_with(stop);
+        world.sims[0].status = MotorStatus::OverCurrent;
+        world.run_to_fault();
+        let before = world.sims[1].q;
+        world.sims[1].drift = -1.0;
+        world.run(40);
+        let sunk = world.sims[1].q;
+        assert!(sunk < before - 0.05 && world.sims[1].is_on(), "it sinks: {before} to {sunk}");
+        if is_broken {
+            (world.are_brakes_stuck, world.brakes.broken) = (true, 2);
+        }
+        world.emergency(EMERGENCY);
+        for _ in 0..60 {
+            let last = world.sims[1].q;
+            world.cycle();
+            assert!(world.sims[1].q <= last + 1e-3, "it goes back up from {last} to {}", world.sims[1].q);
+        }
+        assert_eq!(world.sims[1].is_on(), is_broken, "its brake holds it, or its motor damps it");
+        assert_eq!(world.told(Notice::NotBraked { motor: 1 }), usize::from(is_broken), "{:?}", world.notices);
+    }
+}
+
+#[test]
+fn what_a_brake_is_counts_from_when_it_is_known() {
+    let cycles = |limit: Duration| usize::try_from(limit.as_millis() / world::CYCLE.as_millis()).unwrap();
+    let engages = cycles(brake().engages_in);
+    for trouble in [
+        // It was engaged, and an order to release it is on its way.
+        |brakes: &mut Brakes| (brakes.moving, brakes.released) = (2, 0),
+        // Its chip is gone, and comes back.
+        |brakes: &mut Brakes| (brakes.broken, brakes.released) = (2, 0),
+    ] {
+        let mut world = armed(Stop::Brake);
+        world.are_brakes_stuck = true;
+        trouble(&mut world.brakes);
+        world.emergency(EMERGENCY);
+        world.run(engages * 3);
+        assert!(world.sims[1].is_on(), "nothing is known of its brake");
+        world.brakes = Brakes::default();
+        world.run(engages - 1);
+        assert!(world.sims[1].is_on(), "it takes {:?} to engage", brake().engages_in);
+        world.run(10);
+        assert!(!world.sims[1].is_on());
+    }
+    // Nor is one released before its line is.
+    let mut world = ready(Stop::Brake);
+    world.are_brakes_stuck = true;
+    world.brakes.moving = 2;
+    world.arm();
+    world.run(cycles(brake().releases_in) * 2);
+    assert_eq!(world.bus.state(), BusState::Arming);
+    (world.brakes.moving, world.brakes.released) = (0, 2);
+    world.run(cycles(brake().releases_in) - 1);
+    assert_eq!(world.bus.state(), BusState::Arming);
+    world.run_until(BusState::Holding);
+}
+
+#[test]
+fn a_brake_is_engaged_before_the_motor_that_held_its_joint_for_a_time_is_off() {
+    let hold_for = Some(Duration::from_millis(400));
+    for (stop, hold_for) in [(Stop::Hold, hold_for), (Stop::Hold, Some(Duration::from_millis(10)))] {
+        let mut world = armed_with(StopSpec { own_fault: stop, other_fault: stop, emergency: stop, hold_for });
+        world.emergency(EMERGENCY);
+        let mut engaged = None;
+        let begun = world.now;
+        while world.sims[1].is_on() {
+            world.cycle();
+            if world.bus.releases() & 2 == 0 {
+                engaged.get_or_insert(world.now);
+            }
+            assert!(world.now.since(begun) < Duration::from_secs(2));
+        }
+        let before = world.now.since(engaged.expect("it is engaged"));
+        assert!(before >= brake().engages_in, "engaged {before:?} before the motor is off");
+        let late = world.now.since(begun).saturating_sub(hold_for.unwrap_or_default().max(brake().engages_in));
+        assert!(late <= world::CYCLE * 5, "off {late:?} too late");
+    }
+}
+
+#[test]
+fn a_sound_joint_does_not_fall_because_its_brake_cannot_be_driven() {
+    for (other_fault, is_damped) in [(Stop::Hold, 0), (Stop::Damp, 2)] {
+        let stop = StopSpec { own_fault: Stop::Limp, other_fault, emergency: Stop::Limp, hold_for: None };
+        let mut world = armed_with(stop);
+        (world.are_brakes_stuck, world.brakes.broken) = (true, 2);
+        assert_eq!(world.run_to_fault(), Fault::Brake { motor: 1 });
+        world.run(100);
+        assert!(world.sims[1].is_on());
+        let kept = Notice::Kept { damped: is_damped, held: 2 - is_damped, braked: 0 };
+        assert!(world.notices.iter().any(|notice| matches!(notice, Notice::Kept { .. })));
+        assert!(world.told(kept) <= 1);
+    }
+}
+
 #[test]
 fn a_brake_that_is_not_released_refuses_the_arm() {
     let mut world = ready(Stop::Limp);

@@ -2,11 +2,14 @@
 
 use std::os::fd::OwnedFd;
 use std::thread::JoinHandle;
+use std::time::Duration;
 
 use crate::gpio::Output;
 
-/// A line that is busy is set again so often.
-const TRIES: usize = 3;
+/// A line that cannot be set is tried again so often...
+const TRIES: usize = 200;
+/// ...and after this.
+const AGAIN: Duration = Duration::from_millis(10);
 
 /// See the module's comment. Dropped, it waits until the lines are set that are to be.
 #[derive(Debug, Default)]
@@ -46,7 +49,9 @@ impl Held {
             let (output, level) = (Output::of(descriptor), line.engaged_high);
             let set = move || {
                 let mut tries = 0..TRIES;
-                while tries.next().is_some() && output.set(level).is_err() {}
+                while tries.next().is_some() && output.set(level).is_err() {
+                    std::thread::sleep(AGAIN);
+                }
             };
             match std::thread::Builder::new().spawn(set) {
                 Ok(setting) => self.setting.push(setting),

@@ -18,7 +18,7 @@ use crate::control::damiao::codec::Order;
 use crate::driver::can::claim::Claim;
 use crate::driver::can::{damiao_serial, slcan, socket};
 use crate::realtime::{CONTROL_PRIORITY, lock_memory, use_fifo};
-use crate::registry::{CanAdapter, MAX_MOTORS};
+use crate::registry::{BrakeSpec, CanAdapter, MAX_MOTORS};
 use crate::time::Stamp;
 
 /// From one round of frames to the next.
@@ -124,10 +124,11 @@ impl Ward {
         if passed < keep_for { &self.will } else { &self.post.off }
     }
 
-    /// Bits of the motors whose brakes are to be engaged by now.
+    /// Bits of the motors whose brakes are to be engaged by now: all of them so long before motors are disabled that the
+    /// slowest holds its joint then.
     fn engages(&self, now: Stamp) -> u16 {
         match self.state {
-            State::Stopping(since) if now.since(since) < self.keep_for() => self.engages_first,
+            State::Stopping(since) if now.since(since) + BrakeSpec::SLOWEST < self.keep_for() => self.engages_first,
             State::Stopping(_) | State::Stopped => u16::MAX,
             State::Done if self.is_orphan => u16::MAX,
             State::Idle | State::Watching(_) | State::Done => 0,
@@ -331,11 +332,33 @@ mod tests {
     }
 
     #[test]
-    fn motors_that_are_to_be_limp_are_disabled_at_once() {
+    fn brakes_engage_before_motors_that_were_kept_on_are_disabled() {
+        let mut ward = ward();
+        ward.hear(&will(&[damping(5), damping(6)]), at(0));
+        assert_eq!(ward.engages(at(0)), 0);
+        ward.lose(at(0));
+        ward.due(at(0));
+        for (ms, engages) in [(0, 2), (2_999, 2), (3_000, u16::MAX), (5_000, u16::MAX)] {
+            assert_eq!(ward.engages(at(ms)), engages, "{ms}");
+        }
+        // Where none is kept on there is no time for that.
+        let mut ward = ward_of_limp();
+        ward.due(at(1));
+        assert_eq!(ward.engages(at(1)), u16::MAX);
+    }
+
+    fn ward_of_limp() -> Ward {
         let mut ward = ward();
         let off = ward.post.off.clone();
         ward.hear(&will(&off), at(0));
         ward.lose(at(1));
+        ward
+    }
+
+    #[test]
+    fn motors_that_are_to_be_limp_are_disabled_at_once() {
+        let mut ward = ward_of_limp();
+        let off = ward.post.off.clone();
         assert_eq!(ward.due(at(1)), off);
         ward.due(at(101));
         assert_eq!(ward.state, State::Done);

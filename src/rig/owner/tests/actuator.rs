@@ -33,7 +33,7 @@ fn arm() -> Registry {
         deadman: None,
         disable_after: Some(Duration::from_secs(1)),
         timeout: Duration::from_millis(100),
-        silent_after: Duration::from_millis(50),
+        silent_after: Duration::from_millis(40),
     };
     let mut registry = registry(Duration::from_millis(100), Duration::from_secs(10));
     registry.devices.truncate(1);
