@@ -42,6 +42,8 @@ fn harmless_stop(stop: &InterlockSpec) -> InterlockSpec {
     match &mut harmless.input {
         InterlockInput::Key(key) => "x".clone_into(&mut key.device),
         InterlockInput::Gpio(gpio) => gpio.chip = "/dev/gpiochip0".into(),
+        // Whether it is a port of the board may change the unit.
+        InterlockInput::Serial(line) if line.path.starts_with("/dev/serial") => line.path = "/dev/serial/x".into(),
         InterlockInput::Serial(line) => line.path = "/dev/x".into(),
         InterlockInput::Field(field) => "x".clone_into(&mut field.device),
     }
