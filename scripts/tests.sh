@@ -25,11 +25,15 @@ bench() {
 }
 
 output=$(mktemp)
-trap 'kill $(jobs -p) 2>/dev/null; rm -f "$output"' EXIT
+# In a process group of its own: what ends this script ends the bench and its machines too.
+set -m
 bench >"$output" 2>&1 &
+readonly job=$!
+set +m
+trap 'kill -- "-$job" 2>/dev/null || true; rm -f "$output"' EXIT
 code=0
 "$@" --no-fail-fast --exclude vbench || code=1
 echo "     Waiting for the virtual bench"
-wait $! || code=1
+wait "$job" || code=1
 cat "$output"
 exit "$code"

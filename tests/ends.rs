@@ -185,6 +185,30 @@ fn one_interrupt_while_a_run_ends_by_itself_is_not_two() {
 }
 
 #[test]
+fn a_run_that_is_stopped_and_continued_reports_no_error() {
+    let place = Place::new();
+    let mut child = place
+        .command(&RECORD)
+        .stdout(File::create(place.path("output.txt")).expect("output file"))
+        .spawn()
+        .expect("rapid runs");
+    until_recorded(&place);
+    for _ in 0..10 {
+        signal(&child, Signal::STOP);
+        std::thread::sleep(Duration::from_millis(30));
+        signal(&child, Signal::CONT);
+        std::thread::sleep(Duration::from_millis(30));
+    }
+    signal(&child, Signal::INT);
+    let status = child.wait().expect("end");
+    assert!(status.code().is_some(), "{status}");
+    let output = std::fs::read_to_string(place.path("output.txt")).expect("output");
+    let errors: Vec<&str> = output.lines().filter(|line| line.contains("/rapid/wake")).collect();
+    assert!(errors.is_empty(), "{errors:?}");
+    assert!(output.lines().any(|line| line.contains("\"event\":\"recording\"")), "{output}");
+}
+
+#[test]
 fn a_terminal_that_is_closed_ends_the_run_with_a_whole_file() {
     let monitor: &[&str] = &["--sim", "--record", "--out", "out"];
     let headless: &[&str] = &["--sim", "--headless", "--record", "--out", "out"];

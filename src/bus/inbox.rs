@@ -11,7 +11,7 @@ use std::cell::Cell;
 use std::time::Duration;
 
 use iceoryx2::identifiers::UniquePublisherId;
-use iceoryx2::port::listener::Listener;
+use iceoryx2::port::listener::{Listener, ListenerWaitError};
 use iceoryx2::port::subscriber::{Subscriber, SubscriberCreateError};
 use iceoryx2::unique_id_generator::unique_system_id::UniqueSystemId;
 
@@ -104,14 +104,17 @@ impl Inbox {
         Ok(Self { topics, wake: Guarded::new(wake) })
     }
 
-    /// Blocks until a modality was published or `timeout` passed, whichever is first. The mask alone
-    /// wakes nobody.
+    /// Blocks until a modality was published or `timeout` passed, whichever is first, or the process was continued after
+    /// it was stopped. The mask alone wakes nobody.
     ///
     /// # Errors
     /// When the event service is broken.
     pub fn wait(&self, timeout: Duration) -> Result<(), BusError> {
         let waited = contained(|| self.wake.timed_wait(|_| {}, timeout))?;
-        waited.map(|_| ()).map_err(|error| topic_error(super::WAKE_SERVICE, &error))
+        match waited {
+            Ok(_) | Err(ListenerWaitError::InterruptSignal) => Ok(()),
+            Err(error) => Err(topic_error(super::WAKE_SERVICE, &error)),
+        }
     }
 
     /// An error as soon as memory of the bus has been lost: samples may have parts of others, or none, from then on.

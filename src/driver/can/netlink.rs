@@ -3,6 +3,12 @@
 //! An interface is up with a bit rate that only its administrator may set. `rapid artifacts --install`
 //! puts a rule in place by which udev does it at each plug; who may do so himself (root, or
 //! `CAP_NET_ADMIN`) has it done here.
+//!
+//! Invariant: an interface that was set down while this program used it stays down until it is set up again from outside:
+//! whoever works on the bus wants no frames on it.
+
+use std::collections::BTreeSet;
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use serde::Serialize;
 use socketcan::CanInterface;
@@ -38,6 +44,18 @@ enum Need {
     Anew,
 }
 
+/// Interfaces that were set down while they were in use, by their index.
+static SET_DOWN: Mutex<BTreeSet<u32>> = Mutex::new(BTreeSet::new());
+
+/// The interface was set down while it was in use.
+pub(super) fn was_set_down(index: u32) {
+    set_down().insert(index);
+}
+
+fn set_down() -> MutexGuard<'static, BTreeSet<u32>> {
+    SET_DOWN.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
 /// Looks at the interface `name`.
 ///
 /// # Errors
@@ -68,8 +86,10 @@ pub(super) fn bring_up(name: &str, bitrate: u32) -> Result<Ready, LinkError> {
     let state = read(&details);
     match need(&state, bitrate) {
         Need::Nothing => {
+            set_down().remove(&details.index);
             return Ok(Ready { index: details.index, restarts: state.restart_ms.is_some_and(|ms| ms > 0) });
         }
+        Need::Up if set_down().contains(&details.index) => return Err(stays_down(name)),
         Need::Up => {}
         Need::Anew => {
             tracing::warn!(interface = name, ?state.bitrate, wished = bitrate, "the interface is set up anew");
@@ -120,6 +140,12 @@ fn read(details: &InterfaceDetails) -> Interface {
 fn by_hand(name: &str, bitrate: u32, up: bool) -> String {
     let down = if up { format!("sudo ip link set {name} down && ") } else { String::new() };
     format!("{down}sudo ip link set {name} up type can bitrate {bitrate}")
+}
+
+fn stays_down(name: &str) -> LinkError {
+    LinkError::Retry(format!(
+        "{name} was set down while it was in use: it is used again once it is up (`sudo ip link set {name} up`)"
+    ))
 }
 
 fn not_set(name: &str, bitrate: u32, state: &Interface, error: &socketcan::Error) -> LinkError {

@@ -99,7 +99,10 @@ impl Socket {
             Some(libc::ENODEV | libc::ENXIO) => Some(LinkError::Gone),
             // The interface went down: with its adapter, or by somebody's order.
             Some(libc::ENETDOWN) if netlink::index(&self.name) != Some(self.index) => Some(LinkError::Gone),
-            Some(libc::ENETDOWN) => Some(LinkError::Retry(format!("{} was set down", self.name))),
+            Some(libc::ENETDOWN) => {
+                netlink::was_set_down(self.index);
+                Some(LinkError::Retry(format!("{} was set down", self.name)))
+            }
             _ => Some(LinkError::Retry(format!("{what} {}: {error}", self.name))),
         }
     }

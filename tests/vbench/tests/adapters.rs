@@ -116,6 +116,35 @@ fn a_full_bus_is_recorded_and_disturbs_nobody() {
     assert!(outcome.emu.iter().any(|line| off(&line)), "the motor was not told to turn off");
 }
 
+#[test]
+fn an_interface_that_is_set_down_stays_down_until_it_is_set_up() {
+    let script = r#"
+rapid_start --headless --config /tmp/bench/devices.toml --json
+emu plug 0
+wait_for 30 test -e /sys/class/net/can0 || fail 'no interface'
+emu flood 0 50
+wait_for 60 states 1 bus streaming || fail 'it does not stream'
+ip link set can0 down
+await_rapid 20 'used again once it is up' || fail 'it is not reported'
+ip link show can0 >$out/down
+ip link set can0 up
+wait_for 60 states 2 bus streaming || fail 'it does not stream again'
+rapid_stop
+emu_quit
+exit 0
+"#;
+    let outcome = play(
+        Scenario::new("set-down")
+            .device(DeviceSpec::can(Protocol::GsUsb).serial("CAN1"))
+            .registry(&registry(&[can("bus", FULL, 0, "1d50:606f", "CAN1", "protocol = \"raw\"")]))
+            .script(script)
+            .limit(Duration::from_secs(120)),
+    );
+    ended(&outcome);
+    let down = outcome.file("down");
+    assert!(down.contains("can0") && !down.contains("UP"), "{down}");
+}
+
 /// What `rapid` says that a device has lost.
 fn lost(outcome: &Outcome, device: &str) -> u64 {
     let summary = outcome.rapid.iter().rev().find(|line| line["devices"].is_array()).expect("a summary");
