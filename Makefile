@@ -16,7 +16,8 @@ LINTED := RUSTC_WORKSPACE_WRAPPER=clippy-driver CLIPPY_ARGS=-Dwarnings__CLIPPY_H
 # What is built once, in a fresh clone, is built sooner and in half the room without the state of incremental builds. Where
 # there is some already, someone is at work, and changing the setting would build the workspace again.
 INCREMENTAL := $(if $(wildcard $(TARGET)/debug/incremental),,CARGO_INCREMENTAL=0)
-TESTS := env $(INCREMENTAL) RAPID_BIN='$(TARGET)/debug/rapid' RAPID_PYTHON='$(CACHE)/venv/bin/python' $(LINTED) cargo test --locked --workspace
+TESTED := env $(INCREMENTAL) RAPID_BIN='$(TARGET)/debug/rapid' RAPID_PYTHON='$(CACHE)/venv/bin/python' $(LINTED)
+TESTS := cargo test --locked --workspace
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1|/p' Makefile | while IFS='|' read -r name what; do printf 'make %-12s %s\n' "$$name" "$$what"; done
@@ -34,8 +35,8 @@ demo: setup-build ## build, then the simulated rig: the monitor on a terminal, o
 # `cargo test` builds the program as well, into this place: no build of its own goes before it.
 test: setup ## set up, format, lints, all tests, and a look at what they left behind
 	cargo fmt --all --check
-	$(TESTS) --no-run
-	scripts/leftovers.sh scripts/tests.sh $(TESTS)
+	$(TESTED) $(TESTS) --no-run
+	$(TESTED) scripts/leftovers.sh scripts/tests.sh $(TESTS)
 
 lint: ## format and clippy
 	cargo fmt --all --check

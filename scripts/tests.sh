@@ -30,10 +30,14 @@ set -m
 bench >"$output" 2>&1 &
 readonly job=$!
 set +m
-trap 'kill -- "-$job" 2>/dev/null || true; rm -f "$output"' EXIT
+finish() {
+    kill -- "-$job" 2>/dev/null && wait "$job" || true
+    cat "$output"
+    rm -f "$output"
+}
+trap finish EXIT
 code=0
 "$@" --no-fail-fast --exclude vbench || code=1
 echo "     Waiting for the virtual bench"
 wait "$job" || code=1
-cat "$output"
 exit "$code"

@@ -114,7 +114,7 @@ pub(crate) struct Walked {
 
 impl Walked {
     /// Of a walk that begins.
-    pub(super) fn nothing() -> Self {
+    pub(crate) fn nothing() -> Self {
         Self {
             end: FileEnd::Unfinished,
             bytes: 0,

@@ -110,8 +110,14 @@ pub fn give(instance: Option<&str>, order: Order) -> Result<(), GiveError> {
         let others = sockets.lines().filter_map(|line| other_of(line, instance)).collect();
         return Err(GiveError::NoRun { instance: instance.map(str::to_owned), others });
     }
-    if matches!(order, Order::Arm | Order::ArmBack) && runs.len() > 1 {
-        return Err(GiveError::Several(runs.iter().map(|run| run.process).collect()));
+    if matches!(order, Order::Arm | Order::ArmBack) {
+        if runs.len() > 1 {
+            return Err(GiveError::Several(runs.iter().map(|run| run.process).collect()));
+        }
+        // Nor is one of several armed because the other cannot be reached.
+        if let Some(error) = unreached {
+            return Err(error);
+        }
     }
     let sent: Vec<_> = runs.into_iter().map(|run| (run.process, run.send(order, given))).collect();
     // Each has its order before the first is waited for.

@@ -60,7 +60,9 @@ impl MotorBus {
     /// being armed, and that cannot be driven is a fault.
     pub fn feed_brakes(&mut self, brakes: Brakes, now: Stamp) {
         for (index, motor) in self.motors.iter_mut().enumerate() {
-            motor.take_brake(brakes.of(index), now);
+            // One that is to be released may be on its way: its line counts as engaged from when that is wanted.
+            let is = brakes.of(index);
+            motor.take_brake(if is == BrakeIs::Engaged && motor.releases() { BrakeIs::Moving } else { is }, now);
             if motor.misses_brake() {
                 self.notices.tell(Notice::NotBraked { motor: index });
             }

@@ -74,6 +74,11 @@ impl Shared {
         Ok(shared)
     }
 
+    /// Is the brake of these motors to be released? Only if all want that.
+    fn releases(&self, motors: u16) -> bool {
+        !self.ends.load(Ordering::SeqCst) && self.wanted.load(Ordering::SeqCst) & motors == motors
+    }
+
     fn wake(&self) {
         // Room for a number is always there.
         let _ = rustix::io::write(&self.wake, &1_u64.to_ne_bytes());
@@ -184,8 +189,7 @@ impl Tender {
         loop {
             self.shared.busy.store(Stamp::now().0.max(1), Ordering::SeqCst);
             let ends = self.shared.ends.load(Ordering::SeqCst);
-            let wanted = if ends { 0 } else { self.shared.wanted.load(Ordering::SeqCst) };
-            self.tend(wanted);
+            self.tend();
             self.shared.busy.store(0, Ordering::SeqCst);
             if ends {
                 return;
@@ -198,16 +202,19 @@ impl Tender {
         }
     }
 
-    /// Sets every line. What one is, is published before it is set otherwise and right after that, not once all are.
-    fn tend(&mut self, wanted: u16) {
+    /// Sets every line. What one is, is published before it is set otherwise and right after that, not once all are; and
+    /// what it is to be is asked anew for each, because the one before may have taken seconds. Those come first that are
+    /// open and to be engaged.
+    fn tend(&mut self) {
         let Self { lines, shared, state, guard, .. } = self;
+        lines.sort_by_cached_key(|line| (line.output.is_none(), shared.releases(line.motors)));
         for line in lines {
             let bits = line.motors;
-            let releases = wanted & bits == bits;
-            if releases != (state.released & bits == bits) {
+            if shared.releases(bits) != (state.released & bits == bits) {
                 state.moving |= bits;
                 shared.publish(*state);
             }
+            let releases = shared.releases(bits);
             let tended = line.tend(releases, guard.as_ref());
             let put = |all: &mut u16, is_so: bool| *all = if is_so { *all | bits } else { *all & !bits };
             put(&mut state.released, releases && tended.is_ok());

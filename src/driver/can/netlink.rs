@@ -7,8 +7,7 @@
 //! Invariant: an interface that was set down while this program used it stays down until it is set up again from outside:
 //! whoever works on the bus wants no frames on it.
 
-use std::collections::BTreeSet;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::atomic::{AtomicU32, Ordering};
 
 use serde::Serialize;
 use socketcan::CanInterface;
@@ -44,16 +43,26 @@ enum Need {
     Anew,
 }
 
-/// Interfaces that were set down while they were in use, by their index.
-static SET_DOWN: Mutex<BTreeSet<u32>> = Mutex::new(BTreeSet::new());
+/// Interfaces that were set down while they were in use, by their index; 0 is none. One that finds no room is brought up
+/// again as if it had just been plugged in.
+static SET_DOWN: [AtomicU32; 16] = [const { AtomicU32::new(0) }; 16];
 
 /// The interface was set down while it was in use.
 pub(super) fn was_set_down(index: u32) {
-    set_down().insert(index);
+    if !stays_down(index) {
+        replace(0, index);
+    }
 }
 
-fn set_down() -> MutexGuard<'static, BTreeSet<u32>> {
-    SET_DOWN.lock().unwrap_or_else(PoisonError::into_inner)
+/// Was it set down while it was in use, and not set up again since?
+fn stays_down(index: u32) -> bool {
+    SET_DOWN.iter().any(|place| place.load(Ordering::SeqCst) == index)
+}
+
+/// Replaces the first of these numbers that is there.
+fn replace(index: u32, by: u32) {
+    let is_replaced = |place: &AtomicU32| place.compare_exchange(index, by, Ordering::SeqCst, Ordering::SeqCst).is_ok();
+    let _ = SET_DOWN.iter().any(is_replaced);
 }
 
 /// Looks at the interface `name`.
@@ -84,12 +93,14 @@ pub(super) fn bring_up(name: &str, bitrate: u32) -> Result<Ready, LinkError> {
     let interface = CanInterface::open(name).map_err(|error| refusal(name, &error))?;
     let details = interface.details().map_err(|error| refusal(name, &error))?;
     let state = read(&details);
+    if state.up {
+        replace(details.index, 0);
+    }
     match need(&state, bitrate) {
         Need::Nothing => {
-            set_down().remove(&details.index);
             return Ok(Ready { index: details.index, restarts: state.restart_ms.is_some_and(|ms| ms > 0) });
         }
-        Need::Up if set_down().contains(&details.index) => return Err(stays_down(name)),
+        Need::Up if stays_down(details.index) => return Err(set_down(name)),
         Need::Up => {}
         Need::Anew => {
             tracing::warn!(interface = name, ?state.bitrate, wished = bitrate, "the interface is set up anew");
@@ -142,7 +153,7 @@ fn by_hand(name: &str, bitrate: u32, up: bool) -> String {
     format!("{down}sudo ip link set {name} up type can bitrate {bitrate}")
 }
 
-fn stays_down(name: &str) -> LinkError {
+fn set_down(name: &str) -> LinkError {
     LinkError::Retry(format!(
         "{name} was set down while it was in use: it is used again once it is up (`sudo ip link set {name} up`)"
     ))
@@ -220,6 +231,21 @@ mod tests {
         ] {
             assert_eq!(need(&state, 500_000), expected, "{state:?}");
         }
+    }
+
+    #[test]
+    fn an_interface_that_was_set_down_is_remembered_until_it_is_up() {
+        let index = u32::MAX;
+        assert!(!stays_down(index));
+        for _ in 0..100 {
+            was_set_down(index);
+        }
+        was_set_down(index - 1);
+        assert!(stays_down(index) && stays_down(index - 1));
+        replace(index, 0);
+        assert!(!stays_down(index) && stays_down(index - 1));
+        replace(index - 1, 0);
+        assert!(!stays_down(index - 1));
     }
 
     #[test]

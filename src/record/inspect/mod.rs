@@ -28,7 +28,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use super::quality::{Quality, Spread};
-use super::walk::walk;
+use super::walk::{Walked, walk};
 use crate::episode_format::{self, Failed, OpenError, ReadAt};
 use crate::status::Verdict;
 use crate::text;
@@ -237,5 +237,7 @@ fn inspect_from(file: impl ReadAt, size: u64, path: &Path, boot: Option<String>)
     let recorded = failed.as_ref().map_or(size, |failed| failed.at);
     let mut collected = Collected::default();
     let walked = walk(file, recorded, boot, &mut |opcode, record| collected.record(opcode, record))?;
+    // The recorder's own mark shows that it was an episode, of which nothing is left.
+    let walked = walked.or_else(|| failed.is_some().then(Walked::nothing));
     Ok(walked.map(|walked| collected.report(path, size, walked, failed)))
 }

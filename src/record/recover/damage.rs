@@ -238,7 +238,7 @@ async fn damage_before_the_first_chunk_is_not_emptiness() {
         let said = recover(&path, &mut go_on).unwrap();
         let kept = match said.outcome {
             Outcome::Repaired(repaired) if name == "b" => repaired.original.unwrap(),
-            Outcome::Unreadable { kept } if name == "c" => kept,
+            Outcome::Unreadable { kept, .. } if name == "c" => kept,
             other => panic!("{other:?}"),
         };
         assert_eq!((fs::read(&kept).unwrap(), kept.extension().unwrap().to_str()), (partial, Some("damaged")));

@@ -100,6 +100,9 @@ pub enum Outcome {
         /// What it is called now.
         #[serde(serialize_with = "text::lossy")]
         kept: PathBuf,
+        /// Why its recorder called it BAD.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        failed: Option<String>,
     },
 }
 
@@ -206,7 +209,7 @@ impl Source<'_> {
             return Ok(Outcome::AlreadyRepaired { to, kept });
         }
         let Some(copied) = self.copy(&names.recovering, sha256, watch)? else {
-            return Ok(Outcome::Unreadable { kept: aside("damaged")? });
+            return Ok(self.unreadable(aside("damaged")?));
         };
         let is_all = copied.damage.is_lossless();
         if copied.summary.is_empty() && (is_all || copied.summary.messages == 0) {
@@ -214,7 +217,7 @@ impl Source<'_> {
             // Damage before the first message is not emptiness.
             let ending = if is_all { "empty" } else { "damaged" };
             let kept = aside(ending)?;
-            return Ok(if is_all { Outcome::Empty { kept: Some(kept) } } else { Outcome::Unreadable { kept } });
+            return Ok(if is_all { Outcome::Empty { kept: Some(kept) } } else { self.unreadable(kept) });
         }
         let to = self.publish(names)?;
         // Removed only where nothing is lost by it: what follows a torn end is less than one record.
@@ -227,6 +230,10 @@ impl Source<'_> {
             Some(aside("damaged")?)
         };
         Ok(Outcome::Repaired(Box::new(copied.repaired(to, original))))
+    }
+
+    fn unreadable(&self, kept: PathBuf) -> Outcome {
+        Outcome::Unreadable { kept, failed: self.failed.as_ref().map(|failed| failed.why.clone()) }
     }
 
     fn finished(&mut self, names: &Names, watch: &mut Watch<'_>) -> Result<Outcome, RecoverError> {

@@ -98,8 +98,9 @@ impl Recovered {
             Outcome::Empty { kept: Some(kept) } => {
                 (Level::Info, format!("nothing was recorded in it; set aside as {}", name(kept)))
             }
-            Outcome::Unreadable { kept } => {
-                (Level::Warn, format!("no message in it can be read; set aside as {}", name(kept)))
+            Outcome::Unreadable { kept, failed } => {
+                let why = failed.as_ref().map(|why| format!("; BAD: {why}")).unwrap_or_default();
+                (Level::Warn, format!("no message in it can be read{why}; set aside as {}", name(kept)))
             }
         };
         (level, format!("{}: {text}", self.file.display()))

@@ -196,7 +196,7 @@ async fn files_with_nothing_in_them_are_said_and_nothing_is_lost() {
     assert_eq!(recover(&empty, &mut go_on).unwrap().outcome, Outcome::Empty { kept: None });
     let noise = put(&folder, "a_002.mcap.partial", b"no MCAP file");
     let kept = folder.path().join("a_002.mcap.damaged");
-    assert_eq!(recover(&noise, &mut go_on).unwrap().outcome, Outcome::Unreadable { kept: kept.clone() });
+    assert_eq!(recover(&noise, &mut go_on).unwrap().outcome, Outcome::Unreadable { kept: kept.clone(), failed: None });
     assert_eq!(fs::read(kept).unwrap(), b"no MCAP file");
     // Header, metadata and channels, as they are on the disk when an episode has just begun.
     let mut bare = bytes.clone();
