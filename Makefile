@@ -3,24 +3,28 @@ SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup setup-build demo test lint check bench fuzz train train-test ablation texture lerobot-test clean
+.PHONY: help setup setup-build demo picture quick one test features lint check bench fuzz train train-test ablation texture lerobot-test clean
 
 # A toolchain just installed by rustup is not on the PATH of a shell that was open before.
 export PATH := $(PATH):$(HOME)/.cargo/bin
 TARGET := $(or $(CARGO_TARGET_DIR),$(CURDIR)/target)
 CACHE := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/rapid
 DEMO_DIR := demo-episodes
-# Clippy's compiler builds what is tested: it makes the programs that rustc makes, and no dependency is compiled for the
-# lints alone. Both commands of `test` need the same environment: with another wrapper cargo builds the workspace again.
+# Clippy's compiler builds the tests: it makes the programs that rustc makes, and no dependency is compiled for lints alone. Both commands of `test` need the same environment: with another wrapper cargo builds the workspace again.
 LINTED := RUSTC_WORKSPACE_WRAPPER=clippy-driver CLIPPY_ARGS=-Dwarnings__CLIPPY_HACKERY__
-# What is built once, in a fresh clone, is built sooner and in half the room without the state of incremental builds. Where
-# there is some already, someone is at work, and changing the setting would build the workspace again.
+# A fresh clone builds faster and in half the space without the state of incremental builds. Where there is such state,
+# someone is at work, and changing the setting would rebuild the workspace.
 INCREMENTAL := $(if $(wildcard $(TARGET)/debug/incremental),,CARGO_INCREMENTAL=0)
-TESTED := env $(INCREMENTAL) RAPID_BIN='$(TARGET)/debug/rapid' RAPID_PYTHON='$(CACHE)/venv/bin/python' $(LINTED)
+# Most tests wait most of their time, for clocks and for programs: more of them than processors run side by side.
+TEST_THREADS := RUST_TEST_THREADS=$(shell echo $$((3 * $$(nproc))))
+TESTED := env $(INCREMENTAL) $(TEST_THREADS) RAPID_BIN='$(TARGET)/debug/rapid' RAPID_PYTHON='$(CACHE)/venv/bin/python' $(LINTED)
 TESTS := cargo test --locked --workspace
+# What `make quick` runs, and the tests of the program that it leaves out: those that wait for long, or need Python or C.
+QUICK := --lib --test layering --test library --test memory --test guard --test short
+SLOW := calibrate docs ends hooks infer kill lan many_devices nodes process python scenarios second_run shared_memory stops task verdict
 
 help: ## this list
-	@sed -n 's/^\([a-z-]*\):[^#]*## /\1|/p' Makefile | while IFS='|' read -r name what; do printf 'make %-12s %s\n' "$$name" "$$what"; done
+	@sed -n 's/^\([a-z-]*\):[^#]*## /\1|/p' Makefile | sed 's/[$$](SLOW)/$(SLOW)/' | while IFS='|' read -r name what; do printf 'make %-12s %s\n' "$$name" "$$what"; done
 
 setup: ## everything that building, running and testing need; a second run changes nothing
 	@scripts/setup.sh build test
@@ -28,15 +32,33 @@ setup: ## everything that building, running and testing need; a second run chang
 setup-build: ## only what building and running need
 	@scripts/setup.sh build
 
+# Built to be seen soon: in a profile of its own, and without what simulated devices do not need.
 demo: setup-build ## build, then the simulated rig: the monitor on a terminal, otherwise a 10 s episode
+	cargo build --locked --profile demo --no-default-features --bin rapid
+	@if [ -t 0 ] && [ -t 1 ]; then exec '$(TARGET)/demo/rapid' --sim; else scripts/demo.sh '$(TARGET)/demo/rapid' $(DEMO_DIR); fi
+
+# A test takes the picture again and compares its words and colours with the one in the repository.
+picture: setup-build ## take docs/monitor.svg again: the monitor of the program while a camera is unplugged
 	cargo build --release --locked
-	@if [ -t 0 ] && [ -t 1 ]; then exec '$(TARGET)/release/rapid' --sim; else scripts/demo.sh '$(TARGET)/release/rapid' $(DEMO_DIR); fi
+	scripts/picture.py '$(TARGET)/release/rapid' docs/monitor.svg
+
+quick: setup-build ## by habit: format, lints, unit tests, layering, registry, the fast tests of the program; leaves out $(SLOW)
+	cargo fmt --all --check
+	$(TESTED) $(TESTS) $(QUICK)
+	$(TESTED) $(TESTS) --test program -- $(SLOW:%=--skip=%::)
+
+one: ## run one test by its name, with its output: TEST=name (of a test or of a module, the virtual bench's too)
+	@$(TESTED) scripts/one.sh '$(TEST)' $(TESTS)
 
 # `cargo test` builds the program as well, into this place: no build of its own goes before it.
-test: setup ## set up, format, lints, all tests, and a look at what they left behind
+test: setup ## the whole truth: format, lints, all tests with the virtual bench, and a look at what they left behind
 	cargo fmt --all --check
+	$(TESTED) scripts/features.sh ''
 	$(TESTED) $(TESTS) --no-run
 	$(TESTED) scripts/leftovers.sh scripts/tests.sh $(TESTS)
+
+features: ## compile the program with no cargo feature, and with each alone
+	$(TESTED) scripts/features.sh '' lan motors policy
 
 lint: ## format and clippy
 	cargo fmt --all --check
@@ -52,7 +74,7 @@ bench: setup ## print figures beside their baselines (JSON=1; BENCH="--quick --o
 	RAPID_BIN='$(TARGET)/release/rapid' '$(TARGET)/release/rapid-bench' $(if $(JSON),--json) $(BENCH)
 
 # The compiler for C++ is for libFuzzer alone.
-fuzz: ## feed every reader of strangers' bytes with made-up ones, each for FUZZ_SECONDS=60
+fuzz: ## feed every reader of untrusted bytes with generated ones, each for FUZZ_SECONDS=60
 	@scripts/setup.sh build fuzz
 	scripts/fuzz.sh
 
@@ -61,7 +83,7 @@ train: setup-build ## record demonstrations, train on them, export models/tactil
 	cargo build --release --locked
 	scripts/train.sh policy '$(TARGET)/release/rapid'
 
-# Without a program that is built already the tests on its episodes say that they are left out.
+# Without a program that is built already the tests on its episodes report that they are skipped.
 train-test: ## tests of the Python under models/
 	RAPID_BIN='$(wildcard $(TARGET)/release/rapid)' scripts/train.sh test
 
@@ -69,7 +91,7 @@ ablation: setup-build ## train five configurations of the policy and run each: m
 	cargo build --release --locked
 	scripts/train.sh ablation '$(TARGET)/release/rapid'
 
-texture: ## what a tactile picture says of the texture: models/results/texture.md
+texture: ## what a tactile picture reveals of the texture: models/results/texture.md
 	scripts/train.sh texture
 
 # In a place of its own and no part of the other tests: LeRobot and PyTorch are gigabytes that nothing else here needs.

@@ -1,23 +1,10 @@
-//! Compiles each recorded schema to the `FileDescriptorSet` that MCAP wants beside the messages:
-//! the schema's file and everything it imports. Packs the libraries that policies need.
+//! Names the commit of a release, and packs the libraries that policies need.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use sha2::{Digest as _, Sha256};
-
-const PROTO: &str = "src/record/proto";
-const SCHEMAS: [&str; 8] = [
-    "foxglove/CompressedImage",
-    "foxglove/Log",
-    "foxglove/RawImage",
-    "rapid/Bytes",
-    "rapid/Event",
-    "rapid/Frame",
-    "rapid/Mask",
-    "rapid/Scalars",
-];
 
 /// The pinned files of onnxruntime, as `sha256sum` lists them: `<sum>  <arch>/<file>`.
 const PINNED: &str = "scripts/onnxruntime.sha256";
@@ -29,16 +16,14 @@ const LEVEL: i32 = 9;
 
 fn main() -> Result<(), Box<dyn Error>> {
     commit();
-    println!("cargo::rerun-if-changed={PROTO}");
     println!("cargo::rerun-if-changed=build.rs");
     let out = PathBuf::from(std::env::var("OUT_DIR")?);
-    onnxruntime(&out)?;
-    libstdcxx(&out)?;
-    for schema in SCHEMAS {
-        let mut compiler = protox::Compiler::new([PROTO])?;
-        compiler.include_imports(true).include_source_info(false).open_file(format!("{schema}.proto"))?;
-        let set = compiler.encode_file_descriptor_set();
-        std::fs::write(out.join(format!("{}.bin", schema.replace('/', "."))), set)?;
+    if std::env::var_os("CARGO_FEATURE_POLICY").is_some() {
+        onnxruntime(&out)?;
+        libstdcxx(&out)?;
+    } else {
+        println!("cargo::rustc-env=RAPID_BUILT_WITH=onnxruntime: none (built without `policy`)");
+        println!("cargo::rustc-env=RAPID_BUILT_WITH_CXX=libstdc++: none (built without `policy`)");
     }
     Ok(())
 }

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use rapid::headless::{self, HeadlessOptions};
-use rapid::mask::PhysicalMask;
+use rapid::mask::{PhysicalMask, SizedMask};
 use rapid::modality::ModalityId;
 use rapid::registry::{
     CameraSpec, DeviceSpec, IdentitySpec, NodeSpec, PixelFormat, Registry, RigSpec, UsbSpec, WhenStale,
@@ -143,7 +143,7 @@ async fn pretend(board: Arc<Board>, count: u8, mut commands: mpsc::Receiver<Comm
                     device: NAMES.get(index).copied().unwrap_or("sensor").to_owned(),
                     bit: id,
                     state,
-                    mask: board.snapshot().mask.hex(usize::from(count)),
+                    mask: SizedMask { mask: board.snapshot().mask, devices: usize::from(count) },
                     detail: detail(state).to_owned(),
                 });
                 let level = if state == SlotState::Failed { Level::Error } else { Level::Info };

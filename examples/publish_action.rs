@@ -34,6 +34,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     let name = ServiceName::new(ACTION_TOPIC)?;
     let actions = node.service_builder(&name).publish_subscribe::<[u8]>().user_header::<SampleHeader>().open()?;
     let publisher = actions.publisher_builder().initial_max_slice_len(8 * options.axes).create()?;
+    // Without a notification an action is found with the actuator's next cycle.
+    let wake = node.service_builder(&name).event().open()?.notifier_builder().create()?;
     println!("publishes {} numbers at {} Hz on {ACTION_TOPIC}", options.axes, options.rate);
 
     let begun = Instant::now();
@@ -52,6 +54,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             ..SampleHeader::default()
         };
         sample.write_from_slice(&payload).send()?;
+        wake.notify()?;
         let due = begun + Duration::from_secs_f64(f64::from(seq + 1) / options.rate);
         std::thread::sleep(due.saturating_duration_since(Instant::now()));
     }

@@ -30,7 +30,7 @@ const PLUGGED: Duration = Duration::from_millis(50);
 
 type Failure = Box<dyn std::error::Error>;
 
-/// Tells when a removal passes on its way to the rig.
+/// Reports when a removal passes on its way to the rig.
 struct Tap {
     script: Script,
     removals: Sender<Stamp>,
@@ -41,9 +41,9 @@ impl Stream for Tap {
 
     fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
         let polled = Pin::new(&mut self.script).poll_next(context);
-        if let Poll::Ready(Some(Ok(HotplugEvent::Removed { witnessed, .. }))) = &polled {
-            // Nobody listens any more when the last one has been measured.
-            let _ = self.removals.send(*witnessed);
+        if let Poll::Ready(Some(Ok(HotplugEvent::Removed { noticed, .. }))) = &polled {
+            // There is no receiver any more when the last one has been measured.
+            let _ = self.removals.send(*noticed);
         }
         polled
     }

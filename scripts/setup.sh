@@ -36,7 +36,7 @@ main() {
     flock 9
     rm -rf "$CACHE"/onnxruntime.partial.*
 
-    # The packages of all parts come first, in one go: whoever has to ask somebody for root asks once.
+    # The packages of all parts come first, in one go: whoever has to ask an administrator asks once.
     local wanted=() part
     for part in "$@"; do
         case "$part" in
@@ -139,7 +139,7 @@ onnxruntime() {
     checked "$partial" "$arch/$library" || die "$library is not the one that is pinned in scripts/onnxruntime.sha256"
     mkdir -p "$dir"
     mv "$partial/$library" "$dir/$library"
-    # A program that was built without it is built anew: cargo watches this file, not one that was not there.
+    # A program that was built without it is built again: cargo watches this file, not one that was not there.
     touch build.rs
     rm -rf "$partial"
     trap - EXIT

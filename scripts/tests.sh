@@ -13,13 +13,13 @@ messages=$("$@" --no-run --message-format=json)
 executables=$(sed -n "s|.*\"manifest_path\":\"[^\"]*/$package/Cargo.toml\".*\"profile\":{[^}]*\"test\":true}.*\"executable\":\"\([^\"]*\)\".*|\1|p" <<<"$messages")
 [[ -n $executables ]] || { echo "tests.sh: no tests in $package" >&2; exit 1; }
 
-# Each of them needs the machine's two cores: one after the other.
+# Each of them needs the machine's two cores: one after the other. While a guest runs, the next one is prepared.
 bench() {
     cd "$package"
     local code=0
     while IFS= read -r executable; do
         printf '     Running %s\n' "$executable"
-        "$executable" </dev/null || { code=1; printf 'error: %s failed\n' "$executable"; }
+        RUST_TEST_THREADS=2 "$executable" </dev/null || { code=1; printf 'error: %s failed\n' "$executable"; }
     done <<<"$executables"
     return "$code"
 }

@@ -3,12 +3,12 @@
 #
 #     train.sh policy [RAPID]      demonstrations, training, export to models/tactile-id
 #     train.sh ablation RAPID      what each input of the policy is worth: models/results/ablation.{json,md}
-#     train.sh texture             what a tactile picture says of the texture: models/results/texture.{json,md}
+#     train.sh texture             what a tactile picture tells about the texture: models/results/texture.{json,md}
 #     train.sh test                tests of the Python under models/
 #     train.sh python ARGS...      that Python, run in models/
 #
 # RAPID is the program, default target/release/rapid. RUNS=models/runs is where demonstrations and checkpoints go; what
-# is there already is used again: a training that was stopped goes on. EPISODES=72, SEED=1000 of the demonstrations,
+# is there already is used again: a training that was stopped continues. EPISODES=72, SEED=1000 of the demonstrations,
 # THREADS=2 and MINUTES of a training.
 #
 # Demonstrations and environment get their final names last: an interrupted run leaves nothing that looks whole.

@@ -4,17 +4,21 @@
 //! order of the actuator's `[device.NAME.action]` table, in its units. Its capture time is the tick of
 //! the control grid it is the action of.
 
+use std::os::fd::BorrowedFd;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU16, Ordering};
 
 use serde::Serialize;
+
+use crate::bell::Bell;
+use crate::time::Stamp;
 
 /// Topic of actions, on the bus and in recordings.
 pub const ACTION_TOPIC: &str = "/action";
 /// Numbers in an action, at most.
 pub const MAX_ACTION: usize = 64;
 
-/// May an actuator move? Told to whoever watches it.
+/// May an actuator move? For screens and recordings.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Arming {
@@ -75,12 +79,40 @@ impl Trip {
     }
 }
 
-/// Orders on their way to whoever carries them out.
+/// Why a sample on the topic of actions moves nothing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum NoAction {
+    /// It is no list of finite numbers.
+    #[error("an action is no list of 1 to {MAX_ACTION} finite 64-bit floats")]
+    NoNumbers,
+    /// A policy of this process drives the actuator.
+    #[error("another program publishes actions while a policy runs here: end one of them")]
+    Foreign,
+}
+
+/// Where an actuator finds the action that it is to carry out: the topic of actions.
+pub trait ActionSource: std::fmt::Debug + Send + Sync {
+    /// Readable when an action may have come since the last call of [`Self::newest`]. A program may publish without it:
+    /// who waits for it also looks by the clock.
+    fn bell(&self) -> Option<BorrowedFd<'_>>;
+
+    /// Writes the newest action that waits into `action` and forgets the older ones; gives it with the tick it
+    /// is the action of, or `None` if none waits.
+    ///
+    /// # Errors
+    /// When nothing but what is no action, or is not to be followed, waited.
+    fn newest<'a>(&self, action: &'a mut [f64; MAX_ACTION]) -> Result<Option<(&'a [f64], Stamp)>, NoAction>;
+}
+
+/// Orders on their way to the actuator that carries them out.
 ///
 /// Invariant: neither a disarm nor an emergency stop is lost, and no arm is left of before them. Of several emergency
 /// stops the first is named.
 #[derive(Debug, Default)]
-pub struct OrderSlot(AtomicU16);
+pub struct OrderSlot {
+    given: AtomicU16,
+    bell: Bell,
+}
 
 impl OrderSlot {
     const DISARM: u16 = 1;
@@ -107,13 +139,22 @@ impl OrderSlot {
             }
         };
         // It never refuses.
-        let _ = self.0.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |given| Some(left(given)));
+        let _ = self.given.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |given| Some(left(given)));
+        self.bell.ring();
+    }
+
+    /// Rings with every order, until the next [`Self::take`].
+    #[must_use]
+    pub const fn bell(&self) -> &Bell {
+        &self.bell
     }
 
     /// Takes what is there, in the order in which it is to be carried out. An emergency stop comes before a disarm,
     /// which turns off also what an emergency stop would hold.
     pub fn take(&self) -> impl Iterator<Item = Order> + use<> {
-        let given = self.0.swap(0, Ordering::SeqCst);
+        // First: an order that comes in between rings again, for nothing.
+        self.bell.silence();
+        let given = self.given.swap(0, Ordering::SeqCst);
         let [stop, _] = (given >> Self::STOP).to_le_bytes();
         let trip = Trip { stop, is_lost: given & Self::LOST != 0 };
         let orders = [
@@ -126,14 +167,14 @@ impl OrderSlot {
     }
 }
 
-/// What an actuator tells of itself beside its samples.
+/// What an actuator reports beside its samples.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ActuatorNotice {
     /// May it move now?
     pub arming: Arming,
     /// What happened, for people.
     pub text: String,
-    /// Somebody should look after it.
+    /// It needs attention.
     pub is_problem: bool,
 }
 

@@ -1,30 +1,25 @@
-//! The command line: what can be typed, and nothing of what it does.
+//! The command line: its grammar, help and examples, and nothing of what a command does.
+//!
+//! Invariant: a command shows and accepts only the options that have an effect on it.
 
 use std::ffi::OsString;
+use std::ops::RangeBounds;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::parser::ValueSource;
-use clap::{ArgAction, ArgMatches, Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueHint};
+use clap::{ArgAction, ArgMatches, Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum, ValueHint};
 
-mod ablation;
-mod calibrate;
-mod compare;
-mod policy;
-mod register;
+#[cfg(feature = "policy")]
+use crate::lockstep::evaluate::Condition;
 
-pub use ablation::{AblationArgs, Count};
-pub use calibrate::Calibration;
-pub use compare::CompareArgs;
-pub use policy::{EvalArgs, PolicyArgs};
-pub use register::{RegisterArgs, UnregisterArgs};
-
-/// Records robot demonstrations from sensors that come and go
+/// Record robot demonstrations with hot-plugged sensors
 #[derive(Debug, Parser)]
 #[command(
-    version, long_version = LONG_VERSION, max_term_width = 100, after_help = EXAMPLES, override_usage = "rapid [OPTIONS]\n       rapid <COMMAND> [OPTIONS]",
-    disable_help_flag = true, disable_version_flag = true
+    version, long_version = LONG_VERSION, max_term_width = 100, after_long_help = EXAMPLES,
+    override_usage = "rapid [OPTIONS]\n       rapid <COMMAND> [OPTIONS]", disable_help_flag = true,
+    disable_version_flag = true
 )]
 pub struct Cli {
     /// What to do instead of running the rig.
@@ -33,13 +28,13 @@ pub struct Cli {
     /// Options of a run.
     #[command(flatten)]
     pub run: RunArgs,
-    /// A policy at the controls.
+    /// Options of the simulated task.
+    #[command(flatten)]
+    pub task: TaskArgs,
+    /// Options of a policy.
     #[command(flatten)]
     pub policy: PolicyArgs,
-    /// Where devices come from.
-    #[command(flatten, next_help_heading = RUN)]
-    pub simulation: SimArgs,
-    /// Options that every command understands.
+    /// General options, of the commands in [`general_options`].
     #[command(flatten)]
     pub global: Global,
     /// Print version
@@ -47,185 +42,207 @@ pub struct Cli {
     version: Option<bool>,
 }
 
-/// `rapid --version`; `-V` says the first line alone.
+/// `rapid --version`; `-V` prints the first line alone.
 const LONG_VERSION: &str =
     concat!(env!("CARGO_PKG_VERSION"), "\n", env!("RAPID_BUILT_WITH"), "\n", env!("RAPID_BUILT_WITH_CXX"));
 
 const EXAMPLES: &str = "\
-Without a command, rapid runs the rig and shows the monitor: it finds the sensors that devices.toml \
-names, streams them, publishes the Physical Mask and records episodes (space starts and ends one).
+Without a command, rapid runs the rig and opens the monitor: it finds the sensors that devices.toml \
+declares, streams them, publishes the Physical Mask and records episodes (space starts and ends one).
 
 Examples:
-  rapid --sim                           look around, without any hardware
-  rapid devices                         what is plugged in, and which entry it is
+  rapid --sim                           a first look, without any hardware
+  rapid devices                         what is plugged in, and which entry it matches
   rapid                                 the monitor on the real rig
   rapid --headless --record --duration 30s --task \"place block\" --tag finger=soft
   rapid --infer --sim task --duration 20s         a policy sorts a simulated block
   rapid inspect episodes/20260101_place-block_001.mcap
-  rapid recover episodes                after a crash: makes the unfinished episodes whole
+  rapid recover episodes                after a crash: repairs unfinished episodes
 
-Exit codes: 0 done, 1 failed while running, 2 bad configuration or arguments,
-            3 a device that is needed is not there,
-            4 without a screen: an episode is BAD, 130 interrupted twice";
+Exit codes: 0 success, 1 failed while running, 2 invalid configuration or arguments,
+            3 a required device is missing,
+            4 without the monitor: an episode is BAD, 130 interrupted twice";
 
 const RECOVER: &str = "\
-A run that may record does this by itself, in the background, for what it finds in its --out folder.
+A run that may record does this by itself, in the background, for the files in its --out folder.
 
-X.mcap.partial becomes X.mcap, and is kept as X.mcap.damaged if anything of it was left out. \
-Of a cut or damaged X.mcap a whole X.recovered.mcap is made beside it. A file being written is left alone.
+X.mcap.partial becomes X.mcap, and is kept as X.mcap.damaged if any of its data had to be left out. \
+A truncated or damaged X.mcap is repaired into X.recovered.mcap beside it. A file that is being written \
+is left alone.
 
 Examples:
   rapid recover episodes
   rapid recover copied/20260101_place-block_001.mcap";
 
-const RUN: &str = "Options of a run";
+const RUN: &str = "Run options";
 const GENERAL: &str = "General options";
 
-/// Options that every command understands, before or after it.
+/// Options of several commands, accepted before or after the command.
 #[derive(Debug, Clone, Args)]
 #[command(next_help_heading = GENERAL)]
 pub struct Global {
-    /// Registry [default: devices.toml here, ~/.config/rapid/ or /etc/rapid/]
+    /// Simulate the registry, a scenario file, or `task`
+    ///
+    /// Without a value the devices of the registry are simulated; `task` is a robot that sorts blocks.
+    #[arg(long, global = true, value_name = "SCENARIO", num_args = 0..=1, value_hint = ValueHint::FilePath)]
+    pub sim: Option<Option<PathBuf>>,
+    /// Registry [default: devices.toml]
+    ///
+    /// The default is the first devices.toml in the working directory, ~/.config/rapid and /etc/rapid.
     #[arg(long, short, global = true, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub config: Option<PathBuf>,
-    /// JSON objects, one a line, instead of text
+    /// Print JSON objects, one per line
     #[arg(long, global = true)]
     pub json: bool,
-    /// Name of this rig, to run beside another one on the same machine
-    #[arg(long, global = true, value_name = "NAME", value_parser = instance)]
+    /// Name of this rig, if several run on one machine
+    #[arg(long, global = true, value_name = "NAME", value_parser = instance, hide_short_help = true,
+        env = "RAPID_INSTANCE", hide_env_values = true)]
     pub instance: Option<String>,
-    /// Print help
+    /// Print help; --help adds all options and examples
     #[arg(long, short, global = true, action = ArgAction::Help)]
     help: Option<bool>,
 }
 
-/// Where devices come from.
-#[derive(Debug, Clone, Args)]
-pub struct SimArgs {
-    /// Simulated devices: those of the registry, what a scenario file says, or `task`, a robot that sorts blocks
-    #[arg(long, value_name = "SCENARIO", num_args = 0..=1, value_hint = ValueHint::FilePath)]
-    pub sim: Option<Option<PathBuf>>,
+/// The general options that have an effect on a command; the others are hidden there, and refused.
+fn general_options(command: &str) -> &'static [&'static str] {
+    match command {
+        "devices" | "register" | "calibrate" => &["sim", "config", "json"],
+        "unregister" | "check" | "doctor" | "ablation" => &["config", "json"],
+        "artifacts" => &["config"],
+        "mask" | "replay" => &["json", "instance"],
+        "arm" | "disarm" => &["instance"],
+        "inspect" | "recover" | "eval" => &["json"],
+        _ => &[],
+    }
 }
 
 /// Options of a run.
 #[derive(Debug, Clone, Args)]
 #[command(next_help_heading = RUN)]
-#[expect(clippy::struct_excessive_bools, reason = "each is a switch of the command line")]
 pub struct RunArgs {
-    /// Lines instead of the monitor
+    /// Print events as plain text (no monitor)
     #[arg(long)]
     pub headless: bool,
     /// Record an episode from the start
     #[arg(long)]
     pub record: bool,
-    /// End after so much recording, or running if nothing is recorded: 30s, 5m
+    /// End after recording (or running) this long: 30s, 5m
     #[arg(long, value_name = "TIME", value_parser = duration)]
     pub duration: Option<Duration>,
     /// Folder for episodes
     #[arg(long, value_name = "DIR", default_value = "episodes", value_hint = ValueHint::DirPath)]
     pub out: PathBuf,
-    /// What is demonstrated; also in the file's name
+    /// Task, part of the file's name
     #[arg(long, value_name = "TEXT", default_value = "episode")]
     pub task: String,
-    /// Property of the episode, such as finger=soft; may be repeated
-    #[arg(long, value_name = "KEY=VALUE", value_parser = tag)]
+    /// Property of the episode, such as finger=soft; repeatable
+    #[arg(long, value_name = "KEY=VALUE", value_parser = tag, hide_short_help = true)]
     pub tag: Vec<(String, String)>,
-    /// Module that is mounted and has no sensor of its own; may be repeated
-    #[arg(long, value_name = "NAME")]
+    /// Module that is mounted and has no sensor of its own; repeatable
+    #[arg(long, value_name = "NAME", hide_short_help = true)]
     pub module: Vec<String>,
-    /// Observations a second [default: as the registry says]
-    #[arg(long, value_name = "HZ", value_parser = rate)]
+    /// Observations per second [default: from the registry]
+    #[arg(long, value_name = "HZ", value_parser = rate, hide_short_help = true)]
     pub rate: Option<f64>,
-    /// Number of the first trial of `--sim task`, and of the noise of a policy
-    #[arg(long, value_name = "N", default_value_t = 0)]
-    pub seed: u64,
-    /// With `--sim task --record`: a script that knows the task demonstrates it, faster than real time
-    #[arg(long, requires = "record")]
-    pub expert: bool,
-    /// Demonstrations to record, each of another trial
-    #[arg(long, value_name = "COUNT", default_value_t = 1, requires = "expert")]
-    pub episodes: usize,
-    /// Let the actuator move as soon as it is there; without this `rapid arm` or a key of the monitor does
-    #[arg(long)]
+    /// Enable the actuator as soon as it is connected, instead of by `rapid arm` or the monitor
+    #[arg(long, hide_short_help = true)]
     pub arm: bool,
-    /// Half width of an observation's window [default: as the registry says]
-    #[arg(long, value_name = "TIME", value_parser = window)]
+    /// Half width of the synchronisation window of an observation [default: from the registry]
+    #[arg(long, value_name = "TIME", value_parser = window, hide_short_help = true)]
     pub window: Option<Duration>,
+}
+
+/// Options of the simulated task.
+#[derive(Debug, Clone, Args)]
+#[command(next_help_heading = "Options of the simulated task")]
+pub struct TaskArgs {
+    /// Seed of the first trial of `--sim task`, and of the noise of a policy
+    #[arg(long, value_name = "N", default_value_t = 0, hide_short_help = true)]
+    pub seed: u64,
+    /// With `--sim task --record`: record demonstrations of a scripted expert, faster than real time
+    #[arg(long, requires = "record", conflicts_with_all = ["duration", "rate", "window"], hide_short_help = true)]
+    pub expert: bool,
+    /// Demonstrations to record, one trial each
+    #[arg(long, value_name = "COUNT", default_value_t = 1, requires = "expert", hide_short_help = true)]
+    pub episodes: usize,
 }
 
 /// What to do instead of running the rig.
 #[derive(Debug, Subcommand)]
 pub enum Command {
-    /// Lists what is plugged in, which entry of the registry it is, and if none, why not
-    #[command(after_help = "Examples:\n  rapid devices --formats        with what the cameras offer\n  \
+    /// List connected devices and the registry entries they match
+    #[command(after_long_help = "Examples:\n  rapid devices --formats        with the formats of the cameras\n  \
         rapid devices --sim            how the simulated rig is matched")]
     Devices {
         /// Also list formats and controls of cameras
         #[arg(long)]
         formats: bool,
-        /// Where devices come from.
-        #[command(flatten)]
-        simulation: SimArgs,
     },
-    /// Adds an entry to the registry for a device that is plugged in
-    #[command(after_help = register::REGISTER)]
+    /// Add an entry to the registry for a connected device
+    #[command(after_long_help = REGISTER)]
     Register(Box<RegisterArgs>),
-    /// Takes an entry out of the registry; everything else in it stays as it is
+    /// Remove an entry from the registry; the rest is kept unchanged
+    #[command(after_long_help = "Examples:\n  rapid unregister cam_left --dry-run\n  rapid unregister cam_left --yes")]
     Unregister(UnregisterArgs),
-    /// Checks the registry and says everything that is wrong with it
+    /// Check the registry and report every mistake in it
+    #[command(after_long_help = "Exit code: 0 if the registry is valid, otherwise 2.\n\nExamples:\n  rapid check\n  \
+        rapid check --config other.toml --json")]
     Check,
-    /// Looks for what on this machine stands in the way: bandwidth, permissions, rules, limits, disk
-    #[command(after_help = "Exit code: 0 if nothing is bad, otherwise 1.\n\nExamples:\n  rapid doctor\n  \
+    /// Diagnose this machine: bandwidth, permissions, limits, disk
+    #[command(after_long_help = "Exit code: 0 if nothing is bad, otherwise 1.\n\nExamples:\n  rapid doctor\n  \
         rapid doctor --out /data/episodes      that disk\n  \
         rapid doctor --json | jq -r 'select(.level == \"bad\") | .fix'")]
     Doctor {
-        /// Folder for episodes, whose disk is tried
+        /// Folder for episodes, whose disk is tested
         #[arg(long, value_name = "DIR", default_value = "episodes", value_hint = ValueHint::DirPath)]
         out: PathBuf,
     },
-    /// Writes what follows from the registry: udev rules, descriptors, systemd unit
-    #[command(after_help = "Examples:\n  rapid artifacts                look at them first, in udev/\n  \
-        sudo rapid artifacts --install")]
+    /// Write the udev rules and systemd unit derived from the registry
+    #[command(after_long_help = "Files: udev rules, one descriptor per entry, and a systemd unit.\n\nExamples:\n  \
+        rapid artifacts                to read them first, in udev/\n  sudo rapid artifacts --install")]
     Artifacts {
-        /// Copy them into /etc and make udev read them (needs root)
+        /// Install them below /etc and reload udev (needs root)
         #[arg(long, conflicts_with = "to")]
         install: bool,
-        /// Where to write them
+        /// Folder to write them to
         #[arg(long, value_name = "DIR", default_value = "udev", value_hint = ValueHint::DirPath)]
         to: PathBuf,
     },
-    /// Measures a property of a sensor
+    /// Measure a property of a sensor
+    #[command(after_long_help = "Examples:\n  rapid calibrate latency --device cam_wrist\n  \
+        rapid calibrate latency --help")]
     Calibrate {
         /// Which property.
         #[command(subcommand)]
         what: Calibration,
     },
-    /// Prints the Physical Mask that a running rapid publishes
+    /// Print the Physical Mask that a running rapid publishes
+    #[command(after_long_help = "Examples:\n  rapid mask\n  rapid mask --watch\n  \
+        rapid mask --json --instance left | jq .mask")]
     Mask {
         /// Print every change until interrupted
         #[arg(long)]
         watch: bool,
     },
-    /// Lets the actuator of a running rapid move: motors are enabled, and follow actions
+    /// Enable the actuator of a running rapid: motors follow actions
     #[command(
-        after_help = "An actuator that was unplugged, failed, was disarmed or got no actions for a while needs this again, and \
-        so does one that an emergency stop or an enabling switch has stopped. It is refused while one of these does not \
-        run.\n\nExamples:\n  \
-        rapid arm\n  rapid arm --instance left\n  rapid arm --drive-back"
+        after_long_help = "An actuator that was unplugged, failed, was disarmed or received no actions for a while must be \
+        armed again, and so must one that was stopped by an emergency stop or an enabling switch. It is refused until \
+        each of these permits motion.\n\nExamples:\n  rapid arm\n  rapid arm --instance left\n  rapid arm --drive-back"
     )]
     Arm {
-        /// Drive joints that are outside their limits back into them, slowly: without this the arm is refused. Stand clear
+        /// Drive joints slowly back inside their limits, if outside (else refused). Stand clear
         #[arg(long)]
         drive_back: bool,
     },
-    /// Stops the actuator of a running rapid: its motors are disabled
+    /// Disable the actuator of a running rapid: its motors stop
     #[command(
-        after_help = "It holds for the rest of the run, with or without an actuator, until the next arm, and needs neither \
-        disk nor shared memory.\n\nExamples:\n  rapid disarm\n  rapid disarm --instance left"
+        after_long_help = "It holds for the rest of the run, with or without an actuator, until the next arm, and needs \
+        neither disk nor shared memory.\n\nExamples:\n  rapid disarm\n  rapid disarm --instance left"
     )]
     Disarm,
-    /// Tells what an episode holds: verdict, rates, gaps, lateness, presence over time
-    #[command(after_help = "Of one file a report; of a folder or of several files one line each, GOOD, SUSPECT or \
+    /// Report on episodes: verdict, rates, gaps, latency, presence
+    #[command(after_long_help = "One file gives a report; a folder or several files one line each: GOOD, SUSPECT or \
         BAD.\n\nExamples:\n  rapid inspect episodes/20260101_place-block_001.mcap\n  rapid inspect episodes\n  \
         rapid inspect --json episodes | jq -r 'select(.verdict == \"GOOD\") | .file'")]
     Inspect {
@@ -233,150 +250,170 @@ pub enum Command {
         #[arg(value_hint = ValueHint::AnyPath, value_name = "FILE|DIR", required = true)]
         paths: Vec<PathBuf>,
     },
-    /// Makes whole episodes of those that were not finished: after a kill, a loss of power, a full disk
-    #[command(after_help = RECOVER)]
+    /// Repair unfinished episodes after a kill, power loss or full disk
+    #[command(after_long_help = RECOVER)]
     Recover {
-        /// Episodes, or folders: of a folder every .partial is repaired
+        /// Episodes, or folders: in a folder every .partial is repaired
         #[arg(required = true, value_name = "FILE|DIR", value_hint = ValueHint::AnyPath)]
         paths: Vec<PathBuf>,
     },
-    /// Plays an episode as if its devices were plugged in
-    #[command(after_help = compare::REPLAY)]
-    Replay {
-        /// Episode
-        #[arg(value_hint = ValueHint::FilePath)]
-        file: PathBuf,
-        /// Options of the run.
-        #[command(flatten)]
-        run: RunArgs,
-        /// Options of a comparison.
-        #[command(flatten)]
-        compare: CompareArgs,
-    },
-    /// Tries a policy on the simulated task, with a sensor that is pulled out
-    #[command(after_help = policy::EVAL)]
+    /// Replay an episode as if its devices were plugged in
+    #[command(after_long_help = REPLAY)]
+    Replay(ReplayArgs),
+    /// Evaluate a policy on the simulated task with sensors unplugged
+    #[cfg(feature = "policy")]
+    #[command(after_long_help = EVAL)]
     Eval(EvalArgs),
-    /// Lists the configurations of a comparison, the episodes recorded of each, and what is next
-    #[command(after_help = ablation::ABLATION)]
+    /// List the configurations of a comparison and what to record next
+    #[command(after_long_help = ABLATION)]
     Ablation(AblationArgs),
-    /// Prints a completion script: source <(rapid completions bash)
+    /// Print a shell completion script
+    #[command(after_long_help = "Examples:\n  source <(rapid completions bash)\n  \
+        rapid completions fish >~/.config/fish/completions/rapid.fish")]
     Completions {
         /// Shell
         shell: clap_complete::Shell,
     },
+    /// Write the manual pages, one per command
+    #[command(after_long_help = "Examples:\n  rapid man && man ./man/rapid-replay.1\n  \
+        sudo rapid man /usr/local/share/man/man1")]
+    Man {
+        /// Folder to write them to
+        #[arg(value_name = "DIR", default_value = "man", value_hint = ValueHint::DirPath)]
+        to: PathBuf,
+    },
 }
 
 impl Cli {
-    /// Reads what was typed, the name of the program first.
+    /// Parses a command line, the name of the program first.
     ///
     /// # Errors
-    /// When it makes no sense; help and version are such an "error" too.
+    /// When it is invalid; help and version are such an "error" too.
     pub fn read(typed: impl IntoIterator<Item = OsString>) -> Result<Self, clap::Error> {
-        let typed: Vec<_> = typed.into_iter().collect();
-        let mut command = Self::command();
-        if typed.get(1).is_some_and(|first| first == "-h") {
-            command = command.after_help("--help adds examples and exit codes");
-        }
+        let mut command = Self::grammar();
         let matches = command.try_get_matches_from_mut(typed).map_err(|error| explained(error, &mut command))?;
         let cli = Self::from_arg_matches(&matches)?;
-        if let Some((name, _)) = matches.subcommand()
-            && let Some(option) = stray(&matches, name)
-        {
-            let text = match name {
-                "replay" => {
-                    format!("--{option} stands before the command; write it after: rapid replay FILE --{option}")
-                }
-                _ => format!("--{option} is an option of a run, and `rapid {name}` runs nothing: leave it out"),
-            };
-            return Err(command.error(ErrorKind::ArgumentConflict, text));
+        match misplaced(&matches, &command).or_else(|| cli.contradiction(&command)) {
+            Some(text) => Err(command.error(ErrorKind::ArgumentConflict, text)),
+            None => Ok(cli),
         }
-        if let Some(("replay", typed)) = matches.subcommand()
-            && let Some(text) = compare::conflict(typed)
-        {
-            return Err(command.error(ErrorKind::ArgumentConflict, text));
-        }
-        let tags = match &cli.command {
-            Some(Command::Replay { run, .. }) => &run.tag,
-            _ => &cli.run.tag,
+    }
+
+    /// What is parsed, and what help, completions and manual pages are made of: without the general options
+    /// that have no effect on a command.
+    #[must_use]
+    pub fn grammar() -> clap::Command {
+        let command = Self::command();
+        let general: Vec<_> = command.get_arguments().filter(|option| option.is_global_set()).cloned().collect();
+        let command = command.mut_subcommands(|command| {
+            let known = general_options(command.get_name());
+            let hidden = general.iter().filter(|option| option.get_id() != "help");
+            let hidden: Vec<_> = hidden.filter(|option| !known.contains(&option.get_id().as_str())).collect();
+            command.args(hidden.into_iter().map(|option| option.clone().hide(true)))
+        });
+        // `rapid eval` has them too, without --infer.
+        let require = |command: clap::Command| {
+            let command = command.mut_arg("denoising_steps", |option| option.requires("infer").hide_short_help(true));
+            command.mut_arg("ort_lib", |option| option.requires("infer").hide_short_help(true))
+        };
+        require(command).mut_subcommand("replay", require)
+    }
+
+    /// What cannot be meant, and the fix.
+    fn contradiction(&self, command: &clap::Command) -> Option<String> {
+        let tags = match &self.command {
+            Some(Command::Replay(replay)) => &replay.run.tag,
+            _ => &self.run.tag,
         };
         if let Some(key) = repeated(tags) {
-            let text =
-                format!("--tag {key} is given more than once, and an episode has one value of each: leave one out");
-            return Err(command.error(ErrorKind::ArgumentConflict, text));
+            return Some(format!("--tag {key} is given twice, and an episode has one value per key: leave one out"));
         }
-        if let Some(Some(file)) = &cli.simulation.sim
-            && let Some(name) = file.to_str().filter(|name| command.find_subcommand(name).is_some())
-        {
-            let fix = match name {
-                "devices" => "write `rapid devices --sim`",
-                "register" => "write `rapid register --sim`",
-                "calibrate" => "write `rapid calibrate latency --sim`",
-                _ => "leave --sim out, or name a scenario file",
-            };
-            let text = format!("--sim takes {name:?} for the name of a scenario file: {fix}");
-            return Err(command.error(ErrorKind::ArgumentConflict, text));
-        }
-        Ok(cli)
+        let file = self.global.sim.as_ref()?.as_ref()?.to_str()?;
+        let name = command.find_subcommand(file)?.get_name();
+        let fix = match name {
+            "calibrate" => "write `rapid calibrate latency --sim`".to_owned(),
+            name if general_options(name).contains(&"sim") => format!("write `rapid {name} --sim`"),
+            _ => "leave --sim out, or name a scenario file".to_owned(),
+        };
+        Some(format!("--sim takes {name:?} for the name of a scenario file: {fix}"))
     }
 }
 
 /// A key with more than one value.
 fn repeated(tags: &[(String, String)]) -> Option<&str> {
-    let is_again =
-        |(place, (key, _)): &(usize, &(String, String))| tags.iter().take(*place).any(|(before, _)| before == key);
-    tags.iter().enumerate().find(is_again).map(|(_, (key, _))| key.as_str())
+    let mut keys = std::collections::BTreeSet::new();
+    tags.iter().map(|(key, _)| key.as_str()).find(|key| !keys.insert(*key))
 }
 
-/// An option of a run before a command that would not look at it.
-fn stray(matches: &ArgMatches, command: &str) -> Option<String> {
+/// An option that has no effect on the command it was given to, and the fix.
+fn misplaced(matches: &ArgMatches, command: &clap::Command) -> Option<String> {
+    let given = |matches: &ArgMatches, id: &str| matches.value_source(id) == Some(ValueSource::CommandLine);
+    let (name, of_command) = matches.subcommand()?;
+    let known = general_options(name);
+    let stray = |option: &&clap::Arg| !known.contains(&option.get_id().as_str());
+    if let Some(option) = command.get_arguments().filter(stray).find(|option| given(matches, option.get_id().as_str()))
+    {
+        let long = option.get_long()?;
+        return Some(match name {
+            _ if option.is_global_set() => format!("--{long} has no effect on `rapid {name}`: leave it out"),
+            "replay" => format!("--{long} stands before the command; write it after: rapid replay FILE --{long}"),
+            _ => format!("--{long} is an option of a run, and `rapid {name}` runs nothing: leave it out"),
+        });
+    }
+    if name != "replay" || !given(of_command, "infer") {
+        return None;
+    }
     let run = RunArgs::augment_args(clap::Command::new("run"));
-    let policy = PolicyArgs::augment_args(clap::Command::new("run"));
-    let simulation = SimArgs::augment_args(clap::Command::new("run"));
-    // `rapid --sim --json devices` is understood.
-    let known = run
-        .get_arguments()
-        .chain(policy.get_arguments())
-        .chain(simulation.get_arguments().filter(|_| !matches!(command, "devices" | "calibrate" | "register")));
-    let typed = |id: &str| matches.value_source(id) == Some(ValueSource::CommandLine);
-    known.map(|argument| argument.get_id().as_str()).find(|id| typed(id)).map(str::to_owned)
+    let option = run.get_arguments().find(|option| given(of_command, option.get_id().as_str()))?.get_long()?;
+    Some(format!("--{option} is an option of a run, and --infer compares without one: leave one of them out"))
 }
 
-/// A file where a command should stand: says where files stand.
+/// The error with its fix: where a file stands, and where an option of a run does.
 fn explained(error: clap::Error, command: &mut clap::Command) -> clap::Error {
-    let (ErrorKind::InvalidSubcommand, Some(ContextValue::String(word))) =
-        (error.kind(), error.get(ContextKind::InvalidSubcommand))
-    else {
+    let context = |kind| match error.get(kind) {
+        Some(ContextValue::String(word)) => Some(word.as_str()),
+        _ => None,
+    };
+    let text = if let Some(word) = context(ContextKind::InvalidSubcommand) {
+        match word.rsplit_once('.') {
+            Some((_, "toml")) => format!(
+                "{word:?} is no command; a scenario stands right after --sim (rapid --sim {word}), a registry after --config"
+            ),
+            Some((_, "mcap" | "partial")) => {
+                format!("{word:?} is no command; an episode stands after a command: rapid inspect {word}")
+            }
+            _ => return error,
+        }
+    } else if let Some(option) = context(ContextKind::InvalidArg).filter(|_| error.kind() == ErrorKind::UnknownArgument)
+        && command.get_arguments().any(|known| known.get_long() == option.strip_prefix("--"))
+    {
+        format!("{option} is an option of a run (`rapid {option}`) and has no effect on this command: leave it out")
+    } else {
         return error;
     };
-    let place = match word.rsplit_once('.') {
-        Some((_, "toml")) => {
-            format!("a scenario stands right after --sim (rapid --sim {word}), a registry after --config")
-        }
-        Some((_, "mcap" | "partial")) => format!("an episode stands after a command: rapid inspect {word}"),
-        _ => return error,
-    };
-    command.error(ErrorKind::InvalidSubcommand, format!("{word:?} is no command; {place}"))
+    command.error(error.kind(), text)
+}
+
+/// A time in `range`, or else `wrong`; `example` is how times are written.
+fn time(text: &str, range: impl RangeBounds<Duration>, wrong: &str, example: &str) -> Result<Duration, String> {
+    match humantime::parse_duration(text) {
+        Ok(time) if range.contains(&time) => Ok(time),
+        Ok(_) => Err(wrong.to_owned()),
+        Err(_) => Err(format!("write a number and a unit, for example {example}")),
+    }
 }
 
 fn duration(text: &str) -> Result<Duration, String> {
-    match humantime::parse_duration(text) {
-        Ok(Duration::ZERO) => Err("must be longer than nothing".to_owned()),
-        Ok(duration) => Ok(duration),
-        Err(_) => Err("write a number and a unit, for example 30s, 500ms or 2m".to_owned()),
-    }
+    time(text, Duration::from_nanos(1).., "must be longer than 0s", "30s, 500ms or 2m")
 }
 
 fn window(text: &str) -> Result<Duration, String> {
-    match humantime::parse_duration(text) {
-        Ok(window) if (Duration::from_millis(1)..=Duration::from_secs(10)).contains(&window) => Ok(window),
-        Ok(_) => Err("must lie between 1ms and 10s".to_owned()),
-        Err(_) => Err("write a number and a unit, for example 25ms".to_owned()),
-    }
+    time(text, Duration::from_millis(1)..=Duration::from_secs(10), "must be between 1ms and 10s", "25ms")
 }
 
 fn rate(text: &str) -> Result<f64, String> {
     let hertz: f64 = text.parse().map_err(|_| "write a number, for example 30".to_owned())?;
-    if (0.1..=1000.0).contains(&hertz) { Ok(hertz) } else { Err("must lie between 0.1 and 1000 Hz".to_owned()) }
+    if (0.1..=1000.0).contains(&hertz) { Ok(hertz) } else { Err("must be between 0.1 and 1000 Hz".to_owned()) }
 }
 
 fn tag(text: &str) -> Result<(String, String), String> {
@@ -389,6 +426,318 @@ fn tag(text: &str) -> Result<(String, String), String> {
 fn instance(text: &str) -> Result<String, String> {
     let plain = !text.is_empty() && text.len() <= 32 && text.chars().all(|c| c.is_ascii_alphanumeric() || c == '-');
     if plain { Ok(text.to_owned()) } else { Err("1 to 32 letters, digits and dashes".to_owned()) }
+}
+
+const ABLATION: &str = "\
+An episode belongs to a configuration by its tag finger=... (or that of a module) and by the sensors that \
+were present when it started. A word of --modality is an entry, a module with sensors, a part of the names \
+of entries (tactile for tactile_tip), or vision: cameras that are not in a fingertip.
+
+Examples:
+  rapid ablation --finger rigid,soft --modality vision,vision+tactile --episodes 20
+  rapid ablation plan.toml --in /data/episodes --json
+
+Keys of a plan: episodes = 20, fingers = [\"rigid\"], modalities = [\"vision\"], and optionally task = \"...\", \
+tag = \"finger\" and [words] vision = [\"cam_wrist\"].";
+
+/// Which configurations, and where their episodes are.
+#[derive(Debug, Clone, Args)]
+pub struct AblationArgs {
+    /// Plan [default: ablation.toml, if there is one]
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub plan: Option<PathBuf>,
+    /// Fingers: values of their tag
+    #[arg(long, value_name = "A,B", value_delimiter = ',')]
+    pub finger: Vec<String>,
+    /// Sets of modalities
+    #[arg(long, value_name = "X,X+Y", value_delimiter = ',')]
+    pub modality: Vec<String>,
+    /// Episodes per configuration [default: from the plan, or 10]
+    #[arg(long, value_name = "COUNT", value_parser = at_least_one)]
+    pub episodes: Option<usize>,
+    /// Only episodes of this task
+    #[arg(long, value_name = "TEXT")]
+    pub task: Option<String>,
+    /// Folder of the episodes
+    #[arg(long = "in", value_name = "DIR", default_value = "episodes", value_hint = ValueHint::DirPath)]
+    pub folder: PathBuf,
+    /// Worst verdict that counts: good, suspect or any
+    #[arg(long, value_name = "VERDICT", default_value = "suspect", hide_possible_values = true)]
+    pub count: Count,
+}
+
+/// The worst verdict with which an episode counts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Count {
+    /// GOOD.
+    Good,
+    /// GOOD or SUSPECT.
+    Suspect,
+    /// All of them.
+    Any,
+}
+
+fn at_least_one(text: &str) -> Result<usize, String> {
+    text.parse().ok().filter(|count| *count > 0).ok_or_else(|| "write a number from 1 on".to_owned())
+}
+
+const LATENCY: &str = "\
+How: stop a running rapid (the camera must be free), darken the room, and point the camera at this \
+terminal from nearby, so that the terminal fills most of the picture; use full screen and full brightness. \
+Then start this: the terminal flashes white and black in a pattern that matches at one delay only, up to \
+three times a second. The result is the line for the camera's entry. Switch automatic exposure off \
+(`controls` of the entry) if the pictures do not follow.
+
+The result includes the latency of the terminal and its screen, often 10 to 40 ms. That of an LED is \
+negligible: --led takes one of /sys/class/leds (needs permission to write there).
+
+Examples:
+  rapid calibrate latency --device cam_wrist
+  rapid calibrate latency --device cam_wrist --light-delay 15ms
+  sudo rapid calibrate latency --device cam_wrist --led ACT --duration 1m
+  rapid calibrate latency --sim --device cam_wrist          without a camera";
+
+/// What can be measured.
+#[derive(Debug, Subcommand)]
+pub enum Calibration {
+    /// Measure the latency of a camera by flashing a light in front of it
+    #[command(after_long_help = LATENCY)]
+    Latency(LatencyArgs),
+}
+
+/// How the latency of a camera is measured.
+#[derive(Debug, Clone, Args)]
+pub struct LatencyArgs {
+    /// Entry of the camera [default: the only one that is plugged in]
+    #[arg(long, value_name = "NAME")]
+    pub device: Option<String>,
+    /// How long to flash: 5s to 10m
+    #[arg(long, value_name = "TIME", default_value = "20s", value_parser = flashing)]
+    pub duration: Duration,
+    /// Flash an LED instead of this terminal: its name, or its folder
+    #[arg(long, value_name = "NAME|DIR", value_hint = ValueHint::DirPath)]
+    pub led: Option<PathBuf>,
+    /// Latency of the light itself, if known; subtracted from the result
+    #[arg(long, value_name = "TIME", default_value = "0ms", value_parser = light_delay)]
+    pub light_delay: Duration,
+}
+
+fn flashing(text: &str) -> Result<Duration, String> {
+    match duration(text)? {
+        length if (Duration::from_secs(5)..=Duration::from_mins(10)).contains(&length) => Ok(length),
+        _ => Err("must be between 5s and 10m".to_owned()),
+    }
+}
+
+fn light_delay(text: &str) -> Result<Duration, String> {
+    time(text, ..=Duration::from_secs(1), "must be 1s at most", "15ms")
+}
+
+const POLICY: &str = "Policy options";
+
+#[cfg(feature = "policy")]
+const EVAL: &str = "\
+Conditions: full (all sensors), no-tactile (without the tactile sensor), hot-unplug (it is unplugged while \
+the block is carried), hot-replug (it is unplugged on the way to the block, and plugged in again), no-wrist \
+(without the camera that shows where the block lies).
+
+The seed of a trial determines when each sensor captures (anywhere in its period of 100 ms) and how long \
+after that its sample is delivered (5 to 50 ms); the policy starts when the last of them was delivered. \
+Trials run faster than real time; the same seed gives the same trial.
+
+Examples:
+  rapid eval
+  rapid eval --trials 100 --json > result.jsonl
+  rapid eval --static-config --condition hot-unplug models/tactile-id";
+
+/// Options of a policy.
+#[derive(Debug, Clone, Args)]
+#[command(next_help_heading = POLICY)]
+#[expect(clippy::struct_excessive_bools, reason = "each is a switch of the command line")]
+pub struct PolicyArgs {
+    /// Run a policy, headless [default: the built-in one]
+    ///
+    /// The built-in policy is for `--sim task`.
+    #[arg(long, value_name = "BUNDLE", num_args = 0..=1, value_hint = ValueHint::DirPath, help_heading = RUN)]
+    pub infer: Option<Option<PathBuf>>,
+    /// Show and record its actions without moving anything
+    #[arg(long, requires = "infer", hide_short_help = true)]
+    pub dry_run: bool,
+    /// Wait until all sensors it requires are plugged in, instead of failing
+    #[arg(long, requires = "infer", hide_short_help = true)]
+    pub wait: bool,
+    /// Open the monitor
+    #[arg(long, requires = "infer", conflicts_with = "headless", hide_short_help = true)]
+    pub monitor: bool,
+    /// Continue when a sensor is missing that the policy was not trained to miss
+    #[arg(long, alias = "go-on", requires = "infer", hide_short_help = true)]
+    pub ignore_missing: bool,
+    /// How inference runs.
+    #[command(flatten, next_help_heading = POLICY)]
+    pub inference: InferenceArgs,
+}
+
+/// How inference runs.
+#[derive(Debug, Clone, Args)]
+pub struct InferenceArgs {
+    /// Denoising steps [default: from the policy]
+    #[arg(long, value_name = "COUNT")]
+    pub denoising_steps: Option<usize>,
+    /// onnxruntime library to use instead of the built-in one
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub ort_lib: Option<PathBuf>,
+}
+
+/// What `rapid eval` runs.
+#[cfg(feature = "policy")]
+#[derive(Debug, Clone, Args)]
+pub struct EvalArgs {
+    /// Folder of the policy [default: the one built into rapid]
+    #[arg(value_hint = ValueHint::DirPath)]
+    pub bundle: Option<PathBuf>,
+    /// Trials per condition
+    #[arg(long, value_name = "COUNT", default_value_t = 25, value_parser = trials)]
+    pub trials: usize,
+    /// Seed of the first trial; demonstrations start at 0 unless recorded with another --seed
+    #[arg(long, value_name = "N", default_value_t = 50_000)]
+    pub seed: u64,
+    /// Condition, see --help; repeatable [default: all]
+    #[arg(long, value_name = "NAME", value_parser = condition)]
+    pub condition: Vec<Condition>,
+    /// Baseline with a fixed set of sensors: losing one ends the run
+    #[arg(long)]
+    pub static_config: bool,
+    /// How inference runs.
+    #[command(flatten)]
+    pub inference: InferenceArgs,
+}
+
+#[cfg(feature = "policy")]
+fn trials(text: &str) -> Result<usize, String> {
+    let count = text.parse().map_err(|_| "write a number, for example 25".to_owned())?;
+    if count > 0 { Ok(count) } else { Err("must be at least 1".to_owned()) }
+}
+
+#[cfg(feature = "policy")]
+fn condition(text: &str) -> Result<Condition, String> {
+    let known = Condition::ALL.into_iter().find(|condition| condition.word() == text);
+    known.ok_or_else(|| format!("one of {}", Condition::ALL.map(Condition::word).join(", ")))
+}
+
+const REGISTER: &str = "\
+On a terminal it asks for missing values. Without --serial and --port the entry matches the connected unit \
+by its serial number, or by its port if it has no unique one and is not the only unit.
+
+Examples:
+  rapid register
+  rapid register --vid 046d --pid 0825 --name cam_left --node camera --set camera.width=1280
+  rapid register --import ~/.config/rapid_driver/registry.toml --dry-run
+  rapid register --sim scenario.toml          without a device";
+
+/// What to register.
+#[derive(Debug, Clone, Args)]
+pub struct RegisterArgs {
+    /// USB vendor id
+    #[arg(long, value_name = "HEX", value_parser = usb_id)]
+    pub vid: Option<u16>,
+    /// USB product id
+    #[arg(long, value_name = "HEX", value_parser = usb_id)]
+    pub pid: Option<u16>,
+    /// Serial number of the unit
+    #[arg(long, value_name = "TEXT")]
+    pub serial: Option<String>,
+    /// USB port instead of a serial number, such as 1-2.3
+    #[arg(long, value_name = "PORT")]
+    pub port: Option<String>,
+    /// Name of the entry, such as gripper
+    #[arg(long)]
+    pub name: Option<String>,
+    /// camera, serial, can, lan or a node program [default: from the device's interfaces]
+    #[arg(long)]
+    pub node: Option<String>,
+    /// Bit in the mask [default: the lowest free one]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(0..64))]
+    pub bit: Option<u8>,
+    /// Position of its module: front, tip, top or bottom
+    #[arg(long)]
+    pub slot: Option<String>,
+    /// Any other key of the entry, such as camera.width=1280; repeatable
+    #[arg(long, value_name = "KEY=VALUE", value_parser = tag)]
+    pub set: Vec<(String, String)>,
+    /// First read the device for up to 2 s and show its data
+    #[arg(long)]
+    pub test: bool,
+    /// Write without asking
+    #[arg(long, short)]
+    pub yes: bool,
+    /// Print the entry without writing it
+    #[arg(long)]
+    pub dry_run: bool,
+    /// Import the devices of a registry.toml of `rapid_driver`
+    #[arg(long, help = "Import the devices of a registry.toml of rapid_driver", value_name = "FILE", value_hint = ValueHint::FilePath, conflicts_with_all = ["vid", "pid", "serial", "port", "name", "bit", "slot", "set"])]
+    pub import: Option<PathBuf>,
+    /// Its `mask_layout.toml`, for the bits
+    #[arg(long, help = "Its mask_layout.toml, for the bits", value_name = "FILE", value_hint = ValueHint::FilePath, requires = "import")]
+    pub layout: Option<PathBuf>,
+}
+
+/// What to remove.
+#[derive(Debug, Clone, Args)]
+pub struct UnregisterArgs {
+    /// Name of the entry
+    pub name: String,
+    /// Write without asking
+    #[arg(long, short)]
+    pub yes: bool,
+    /// Print the new registry without writing it
+    #[arg(long)]
+    pub dry_run: bool,
+}
+
+fn usb_id(text: &str) -> Result<u16, String> {
+    let digits = text.strip_prefix("0x").unwrap_or(text);
+    let hex = (1..=4).contains(&digits.len()) && digits.bytes().all(|byte| byte.is_ascii_hexdigit());
+    let id = hex.then(|| u16::from_str_radix(digits, 16).ok()).flatten();
+    id.ok_or_else(|| "write the four hexadecimal digits that lsusb shows, for example 046d".to_owned())
+}
+
+const REPLAY: &str = "\
+The registry is the one recorded in the episode. With --infer nothing is run: the action chunks of an \
+episode recorded with the policy are computed again; with any other episode, the policy's actions are \
+compared with the recorded ones.
+
+Examples:
+  rapid replay episodes/20260101_place-block_001.mcap
+  rapid replay episodes/20260101_place-block_001.mcap --headless --record --out again
+  rapid replay episodes/20260101_place-block_001.mcap --infer models/tactile-id --tolerance 1e-4";
+
+/// Which episode, and how it is replayed.
+#[derive(Debug, Clone, Args)]
+pub struct ReplayArgs {
+    /// Episode
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub file: PathBuf,
+    /// Options of the run.
+    #[command(flatten)]
+    pub run: RunArgs,
+    /// Compare a policy with the episode [default: the one built into rapid]
+    #[arg(long, value_name = "BUNDLE", num_args = 0..=1, value_hint = ValueHint::DirPath, help_heading = COMPARISON)]
+    pub infer: Option<Option<PathBuf>>,
+    /// Largest accepted difference of actions computed again
+    #[arg(long, value_name = "DIFFERENCE", value_parser = tolerance, requires = "infer", help_heading = COMPARISON)]
+    pub tolerance: Option<f64>,
+    /// How inference runs.
+    #[command(flatten, next_help_heading = COMPARISON)]
+    pub inference: InferenceArgs,
+}
+
+const COMPARISON: &str = "Comparison options";
+
+fn tolerance(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(difference) if (0.0..f64::INFINITY).contains(&difference) => Ok(difference),
+        _ => Err("write a number from 0 on, for example 1e-4".to_owned()),
+    }
 }
 
 #[cfg(test)]

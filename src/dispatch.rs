@@ -1,11 +1,9 @@
-//! From what was typed to what is run, and from how that ended to the exit code.
+//! From the command line to the command, and from its result to the exit code.
 //!
 //! Invariant: every error is printed here, once.
 
-mod failure;
-mod places;
+#[cfg_attr(not(feature = "policy"), path = "dispatch/policy_absent.rs")]
 mod policy;
-mod register;
 
 use std::io::{self, IsTerminal, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -15,89 +13,82 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use clap::CommandFactory;
 use tokio_util::sync::CancellationToken;
 
-use self::failure::Failure;
-use self::places::{find_registry, load, registry_or_builtin, registry_path};
 use crate::action::Order;
 use crate::app::{self, AppError, Devices, Options, Screen, mask_path};
-use crate::cli::{Calibration, Cli, Command, Global, PolicyArgs, RunArgs, SimArgs};
-use crate::commands::calibrate::LatencyOptions;
+use crate::cli::{Calibration, Cli, Command, Global, PolicyArgs, RegisterArgs, RunArgs, UnregisterArgs};
 use crate::commands::devices::{Entries, Formats};
-use crate::commands::{self, Format, Outcome, mask::MaskOptions};
-use crate::driver::replay;
+use crate::commands::inspect::InspectFailure;
+use crate::commands::mask::MaskOptions;
+use crate::commands::register::{self, Dialogue, Target};
+use crate::commands::{self, Format, Outcome};
+use crate::driver::{DriverError, replay};
 use crate::headless::style::{ColourChoice, Palette, Terminal};
 use crate::hotplug::udev;
-use crate::outlet;
-use crate::record::inspect;
-use crate::record::{self, EpisodeRequest, RecordError};
+use crate::record::inspect::ReadError;
+use crate::record::{self, EpisodeRequest, RecordError, inspect};
 use crate::registry::scenario::Scenario;
-use crate::registry::{Attachment, Registry};
-use crate::rig::presence::{json_path, read_mask};
-use crate::text;
+use crate::registry::{Attachment, Registry, RegistryErrors};
+use crate::rig::presence::{PresenceError, json_path, read_mask};
+use crate::{outlet, text};
 
-/// Tasks that are left at the end have this long to go.
-const LAST_TASKS: Duration = Duration::from_millis(500);
-/// The reader of standard error has this long to take why a command failed: it may never read.
-const LAST_WORDS: Duration = Duration::from_secs(2);
-/// The mask's JSON file holds 64 devices at most; anything larger is not it.
+#[cfg(feature = "policy")]
+use crate::commands::compare::CompareFailure;
+#[cfg(feature = "policy")]
+use crate::commands::eval::EvalError;
+#[cfg(feature = "policy")]
+use crate::compare::CompareError;
+#[cfg(feature = "policy")]
+use crate::policy::bundle::BundleErrors;
+
+/// Tasks that are still running at the end have this long to finish.
+const TASKS_TIMEOUT: Duration = Duration::from_millis(500);
+/// The reader of standard error has this long to accept an error message: it may never read.
+const STDERR_TIMEOUT: Duration = Duration::from_secs(2);
+/// The mask's JSON file lists 64 devices at most; a larger file is another one.
 const LARGEST_JSON: u64 = 1 << 20;
 
-/// Runs what was typed.
+/// Runs a command line.
 #[must_use]
 pub fn dispatch(cli: Cli) -> ExitCode {
-    let outcome = match cli.command {
-        None => run(&cli.global, &cli.run, Source::of(cli.simulation), Some(cli.policy)),
-        Some(Command::Replay { file, run: ref args, compare }) => match compare.compare_with.clone() {
-            Some(bundle) => policy::compare(&cli.global, file, bundle, compare),
-            None => run(&cli.global, args, Source::Episode(file), None),
-        },
-        Some(command) => print(&cli.global, cli.simulation, command),
-    };
-    match outcome {
+    match execute(cli) {
         Ok(()) => ExitCode::SUCCESS,
-        // Whoever read the output has read enough of it.
+        // The reader of the output has closed it.
         Err(Failure::Output(error)) if error.kind() == io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
         Err(failure) => {
-            // Paths and what a library says of a file are text of strangers.
-            let said = failure::with_cause(failure.to_string());
-            let text: Vec<_> = said.lines().map(|line| text::plain(line).into_owned()).collect();
-            let text = text.join("\n");
-            if !text.is_empty() {
-                let said = format!("{} {text}\n", stderr_palette().bad("error:"));
-                outlet::write_within(io::stderr(), said, LAST_WORDS);
+            // Paths, and errors of libraries about files, are untrusted text.
+            let message = with_cause(failure.to_string());
+            let lines: Vec<_> = message.lines().map(|line| text::plain(line).into_owned()).collect();
+            if !message.is_empty() {
+                let message = format!("{} {}\n", stderr_palette().bad("error:"), lines.join("\n"));
+                outlet::write_within(io::stderr(), message, STDERR_TIMEOUT);
             }
             ExitCode::from(failure.code())
         }
     }
 }
 
-/// Everything that prints and ends.
-fn print(global: &Global, before: SimArgs, command: Command) -> Result<(), Failure> {
+fn execute(cli: Cli) -> Result<(), Failure> {
     // Not locked: a command may write from another thread.
     let out = &mut io::stdout();
+    let global = &cli.global;
     let format = if global.json { Format::Json } else { Format::Text };
+    let Some(command) = cli.command else {
+        if cli.task.expert {
+            return policy::demonstrate(global, &cli.run, &cli.task, format);
+        }
+        let rig = rig(global, cli.task.seed)?;
+        return run(global, &cli.run, rig, cli.task.seed, Some(cli.policy));
+    };
     match command {
-        Command::Check => {
-            let path = registry_path(global)?;
-            match commands::check::check(&path, format, out)? {
-                Outcome::Done => Ok(()),
-                Outcome::BadConfiguration => Err(Failure::Told),
-            }
-        }
-        Command::Devices { formats, simulation } => {
+        Command::Check => reported(commands::check::check(&registry_path(global)?, format, out)?),
+        Command::Devices { formats } => {
             let formats = if formats { Formats::Ask } else { Formats::Skip };
-            devices(
-                global,
-                Source::of(if simulation.sim.is_some() { simulation } else { before }),
-                formats,
-                format,
-                out,
-            )
+            devices(global, formats, format, out)
         }
-        Command::Register(args) => register::register(global, before, &args, format, out),
-        Command::Unregister(args) => register::unregister(global, &args, format, out),
+        Command::Register(args) => register(global, &args, format, out),
+        Command::Unregister(args) => unregister(global, &args, format, out),
         Command::Doctor { out: episodes } => {
             let registry = registry_path(global).and_then(|path| load(&path)).map_err(|failure| failure.to_string());
             let registry = registry.as_ref().map_err(String::as_str);
@@ -116,95 +107,94 @@ fn print(global: &Global, before: SimArgs, command: Command) -> Result<(), Failu
             Ok(commands::arm::order(global.instance.as_deref(), order, out)?)
         }
         Command::Disarm => Ok(commands::arm::order(global.instance.as_deref(), Order::Disarm, out)?),
-        Command::Calibrate { what: Calibration::Latency { device, duration, led, light_delay, simulation } } => {
-            let source = Source::of(if simulation.sim.is_some() { simulation } else { before });
-            let (registry, attached) = plugged(global, source)?;
-            let options = LatencyOptions { device, duration, led, light_delay };
-            Ok(block_on(commands::calibrate::latency(&registry, &attached, &options, format, out))??)
+        Command::Calibrate { what: Calibration::Latency(args) } => {
+            let (registry, attached) = connected(global)?;
+            Ok(block_on(commands::calibrate::latency(&registry, &attached, &args, format, out))??)
         }
-        Command::Inspect { paths } => match commands::inspect::inspect(&paths, format, columns(), paint(), out)? {
-            Outcome::Done => Ok(()),
-            Outcome::BadConfiguration => Err(Failure::Told),
-        },
-        Command::Recover { paths } => recover(&paths, format),
-        Command::Ablation(args) => Ok(commands::ablation::ablation(
-            &registry_or_builtin(global)?,
-            global.config.as_deref(),
-            &args,
-            format,
-            out,
-        )?),
+        Command::Inspect { paths } => {
+            let columns = crate::tui::columns().unwrap_or(100);
+            let paint = if palette() == Palette::Ansi { inspect::Paint::Ansi } else { inspect::Paint::Plain };
+            reported(commands::inspect::inspect(&paths, format, columns, paint, out)?)
+        }
+        Command::Recover { paths } => recover(paths, format),
+        Command::Ablation(args) => {
+            let registry = registry_or_builtin(global)?;
+            Ok(commands::ablation::ablation(&registry, global.config.as_deref(), &args, format, out)?)
+        }
+        #[cfg(feature = "policy")]
         Command::Eval(args) => policy::eval(args, format),
-        Command::Completions { shell } => Ok(commands::completions::completions(&mut Cli::command(), shell, out)?),
-        Command::Replay { .. } => Ok(()),
-    }
-}
-
-/// Where devices come from.
-enum Source {
-    /// This machine.
-    Machine,
-    /// A scenario: the demonstration, or that of a file.
-    Scenario(Option<PathBuf>),
-    /// The simulated task.
-    Task,
-    /// A recorded episode.
-    Episode(PathBuf),
-}
-
-impl Source {
-    fn of(simulation: SimArgs) -> Self {
-        match simulation.sim {
-            None => Self::Machine,
-            // A file of that name is ./task.
-            Some(Some(file)) if file.as_os_str() == "task" => Self::Task,
-            Some(file) => Self::Scenario(file),
+        Command::Replay(args) if args.infer.is_some() => policy::compare(args, format),
+        Command::Replay(args) => {
+            let replay::Replayed { registry, scenario, length } =
+                replay::scenario(&args.file).map_err(Failure::Replay)?;
+            let mut options = args.run;
+            // Without a monitor, a replay ends where the episode does.
+            if options.headless {
+                options.duration.get_or_insert(length);
+            }
+            run(global, &options, (registry, Devices::Simulated(scenario)), 0, None)
         }
+        Command::Completions { shell } => Ok(commands::completions::completions(&mut Cli::grammar(), shell, out)?),
+        Command::Man { to } => Ok(commands::completions::man(Cli::grammar(), &to, out)?),
     }
 }
 
-/// What is plugged in is worth knowing even while the registry is wrong: it is told first.
-fn devices(
-    global: &Global,
-    source: Source,
-    formats: Formats,
-    format: Format,
-    out: &mut dyn Write,
-) -> Result<(), Failure> {
-    if let Source::Scenario(_) | Source::Task = source {
-        let (registry, attached) = plugged(global, source)?;
-        let plugged = commands::devices::list(Entries::Of(&registry), &attached, formats);
-        return Ok(commands::devices::print(&plugged, Some(&registry), format, out)?);
+fn reported(outcome: Outcome) -> Result<(), Failure> {
+    match outcome {
+        Outcome::Done => Ok(()),
+        Outcome::BadConfiguration => Err(Failure::Reported),
     }
-    let (entries, wrong) = match find_registry(global).map(|path| load(&path)) {
-        None => (None, None),
-        Some(Ok(registry)) => (Some(registry), None),
-        Some(Err(wrong)) => (None, Some(wrong)),
-    };
-    let known = match (&entries, &wrong) {
-        (Some(registry), _) => Entries::Of(registry),
-        (None, Some(_)) => Entries::Wrong,
-        (None, None) => Entries::NoFile,
-    };
-    let plugged = commands::devices::list(known, &udev::enumerate()?, formats);
-    commands::devices::print(&plugged, entries.as_ref(), format, out)?;
-    wrong.map_or(Ok(()), Err)
 }
 
-/// A registry that can be used, and what is plugged in.
-fn plugged(global: &Global, source: Source) -> Result<(Registry, Vec<Attachment>), Failure> {
-    let file = match source {
-        Source::Scenario(file) => file,
-        Source::Task => {
-            let registry = Registry::task();
-            let attached = crate::hotplug::script::attached(&Scenario::task(&registry, 0));
-            return Ok((registry, attached));
-        }
-        Source::Machine | Source::Episode(_) => return Ok((load(&registry_path(global)?)?, udev::enumerate()?)),
+/// The registry and the devices of this machine or, with `--sim`, of a scenario.
+fn rig(global: &Global, seed: u64) -> Result<(Registry, Devices), Failure> {
+    let Some(scenario) = &global.sim else {
+        return Ok((load(&registry_path(global)?)?, Devices::Machine));
     };
+    if is_task(global) {
+        let registry = Registry::task();
+        let scenario = Scenario::task(&registry, seed);
+        return Ok((registry, Devices::Simulated(scenario)));
+    }
     let registry = registry_or_builtin(global)?;
-    let attached = crate::hotplug::script::attached(&scenario(file.as_deref(), &registry)?);
+    let scenario = match scenario {
+        Some(file) => Scenario::load(file, &registry)?,
+        None => Scenario::demo(&registry),
+    };
+    Ok((registry, Devices::Simulated(scenario)))
+}
+
+/// `--sim task`, the simulated task; a scenario file of that name is ./task.
+fn is_task(global: &Global) -> bool {
+    global.sim.as_ref().is_some_and(|scenario| scenario.as_deref() == Some(Path::new("task")))
+}
+
+/// The registry, and the devices that are connected.
+fn connected(global: &Global) -> Result<(Registry, Vec<Attachment>), Failure> {
+    let (registry, devices) = rig(global, 0)?;
+    let attached = match devices {
+        Devices::Machine => udev::enumerate()?,
+        Devices::Simulated(scenario) => crate::hotplug::script::attached(&scenario),
+    };
     Ok((registry, attached))
+}
+
+/// Lists connected devices first, even if the registry is invalid.
+fn devices(global: &Global, formats: Formats, format: Format, out: &mut dyn Write) -> Result<(), Failure> {
+    if global.sim.is_some() {
+        let (registry, attached) = connected(global)?;
+        let listed = commands::devices::list(Entries::Of(&registry), &attached, formats);
+        return Ok(commands::devices::print(&listed, Some(&registry), format, out)?);
+    }
+    let registry = find_registry(global).map(|path| load(&path)).transpose();
+    let known = match &registry {
+        Ok(Some(registry)) => Entries::Of(registry),
+        Ok(None) => Entries::NoFile,
+        Err(_) => Entries::Wrong,
+    };
+    let listed = commands::devices::list(known, &udev::enumerate()?, formats);
+    commands::devices::print(&listed, registry.as_ref().ok().and_then(Option::as_ref), format, out)?;
+    registry.map(drop)
 }
 
 fn mask(global: &Global, watch: bool) -> Result<(), Failure> {
@@ -225,12 +215,11 @@ fn mask(global: &Global, watch: bool) -> Result<(), Failure> {
     })?
 }
 
-fn recover(paths: &[PathBuf], format: Format) -> Result<(), Failure> {
+fn recover(paths: Vec<PathBuf>, format: Format) -> Result<(), Failure> {
     let progress = io::stderr().is_terminal() && format == Format::Text;
     let stop = Arc::new(AtomicBool::new(false));
     let asked = Arc::clone(&stop);
-    let paths = paths.to_owned();
-    let told = block_on(async move {
+    let ended = block_on(async move {
         let mut work = tokio::task::spawn_blocking(move || {
             commands::recover::run(&paths, format, progress, &asked, &mut io::stdout(), &mut io::stderr())
         });
@@ -242,105 +231,75 @@ fn recover(paths: &[PathBuf], format: Format) -> Result<(), Failure> {
         stop.store(true, Ordering::Relaxed);
         tokio::select! {
             done = &mut work => Ok(done),
-            // The disk may take its time; what was repaired is repaired.
+            // The disk may be slow; files that are already repaired stay repaired.
             _ = tokio::signal::ctrl_c() => Err(Failure::App(AppError::InterruptedTwice)),
         }
     })??;
-    let (outcome, written) = told.map_err(|_| Failure::App(AppError::Panicked("the repair")))?;
+    let (outcome, written) = ended.map_err(|_| Failure::App(AppError::Panicked("the repair")))?;
     if outcome.is_done() { Ok(written?) } else { Err(Failure::Recover(outcome)) }
 }
 
-/// The rig: on this machine, simulated, or played from an episode.
-fn run(global: &Global, args: &RunArgs, source: Source, policy: Option<PolicyArgs>) -> Result<(), Failure> {
-    if args.expert {
-        return policy::demonstrate(global, args, &source);
-    }
-    let mut duration = args.duration;
-    let (mut registry, devices) = match source {
-        Source::Episode(file) => {
-            let replay::Replayed { registry, scenario, length } = replay::scenario(&file).map_err(Failure::Replay)?;
-            // Without anybody at the screen, a replay ends where the episode does.
-            if args.headless && duration.is_none() {
-                duration = Some(length);
-            }
-            (registry, Devices::Simulated(scenario))
-        }
-        Source::Scenario(file) => {
-            let registry = registry_or_builtin(global)?;
-            let scenario = scenario(file.as_deref(), &registry)?;
-            (registry, Devices::Simulated(scenario))
-        }
-        Source::Task => {
-            let registry = Registry::task();
-            let scenario = Scenario::task(&registry, args.seed);
-            (registry, Devices::Simulated(scenario))
-        }
-        Source::Machine => (load(&registry_path(global)?)?, Devices::Machine),
-    };
-    if let Some(rate) = args.rate {
-        registry.rig.observation_hz = rate;
-    }
-    if let Some(window) = args.window {
-        registry.rig.sync_window = window;
-    }
-    let modules = modules(&registry, args)?;
+/// Runs the rig of a registry, `(registry, devices)`.
+fn run(
+    global: &Global,
+    args: &RunArgs,
+    (mut registry, devices): (Registry, Devices),
+    seed: u64,
+    policy: Option<PolicyArgs>,
+) -> Result<(), Failure> {
+    registry.rig.observation_hz = args.rate.unwrap_or(registry.rig.observation_hz);
+    registry.rig.sync_window = args.window.unwrap_or(registry.rig.sync_window);
+    let episode = request(args, &registry)?;
     if args.record {
-        prepare(&args.out).map_err(Failure::Folder)?;
+        check_writable(&args.out).map_err(Failure::Folder)?;
     }
-    let monitor = policy.as_ref().is_none_or(|policy| policy.infer.is_none() || policy.monitor);
-    let screen = match (args.headless || !monitor || !io::stdout().is_terminal(), global.json) {
+    let monitor = !args.headless && policy.as_ref().is_none_or(|policy| policy.infer.is_none() || policy.monitor);
+    let screen = match (monitor && io::stdout().is_terminal(), global.json) {
         (_, true) => Screen::Json,
-        (true, false) => Screen::Lines,
-        (false, false) => Screen::Monitor,
+        (false, false) => Screen::Lines,
+        (true, false) => Screen::Monitor,
     };
-    let policy = policy.map(|policy| policy::at_the_controls(policy, args.seed, &registry)).transpose()?.flatten();
+    let policy = policy.map(|policy| policy::policy_of(policy, seed, &registry)).transpose()?.flatten();
     let options = Options {
         policy,
         registry,
         devices,
         screen,
-        episode: EpisodeRequest {
-            out: args.out.clone(),
-            task: args.task.clone(),
-            tags: args.tag.clone(),
-            modules,
-            duration,
-        },
+        episode,
         record: args.record,
         arm: args.arm,
-        duration,
+        duration: args.duration,
         instance: global.instance.clone(),
     };
     Ok(block_on(app::run(options))??)
 }
 
-/// The modules that were said to be mounted, if the registry knows them.
-fn modules(registry: &Registry, args: &RunArgs) -> Result<Vec<String>, Failure> {
+/// The episodes to record, if the registry knows the modules that were named.
+fn request(args: &RunArgs, registry: &Registry) -> Result<EpisodeRequest, Failure> {
     let mounted = crate::registry::mounted(&registry.modules, &args.module)?;
-    Ok(mounted.into_iter().map(|module| module.name.clone()).collect())
+    Ok(EpisodeRequest {
+        out: args.out.clone(),
+        task: args.task.clone(),
+        tags: args.tag.clone(),
+        modules: mounted.into_iter().map(|module| module.name.clone()).collect(),
+        duration: args.duration,
+    })
 }
 
-/// The folder an episode is to be written to at once: better refused before the devices are started.
-fn prepare(out: &Path) -> Result<(), RecordError> {
-    let refused = |source| RecordError::Io { path: out.to_owned(), source };
+/// Refuses a folder that cannot be written to, before any device is started.
+fn check_writable(out: &Path) -> Result<(), RecordError> {
     record::open_folder(out)?;
     let enter_and_write = rustix::fs::Access::WRITE_OK | rustix::fs::Access::EXEC_OK;
-    rustix::fs::access(out, enter_and_write).map_err(|error| refused(error.into()))
+    rustix::fs::access(out, enter_and_write)
+        .map_err(|error| RecordError::Io { path: out.to_owned(), source: error.into() })
 }
 
-fn scenario(file: Option<&Path>, registry: &Registry) -> Result<Scenario, Failure> {
-    match file {
-        Some(file) => Ok(Scenario::load(file, registry)?),
-        None => Ok(Scenario::demo(registry)),
-    }
-}
-
-/// Runs `work` on a runtime of its own. When it is done nothing is waited for: a thread that is
-/// still opening a device that does not answer would hold up the end for as long as the kernel likes.
+/// Runs `work` on its own runtime, and then waits for nothing else: a thread that is still opening an
+/// unresponsive device would delay the exit for as long as the kernel blocks it.
 fn block_on<T>(work: impl Future<Output = T>) -> Result<T, Failure> {
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().thread_name("worker").build()?;
     let done = catch_unwind(AssertUnwindSafe(|| runtime.block_on(work)));
-    runtime.shutdown_timeout(LAST_TASKS);
+    runtime.shutdown_timeout(TASKS_TIMEOUT);
     done.map_err(|_| Failure::Panicked)
 }
 
@@ -352,12 +311,212 @@ fn stderr_palette() -> Palette {
     ColourChoice::Auto.resolve(Terminal::of(&io::stderr()), |name| std::env::var(name).ok())
 }
 
-fn paint() -> inspect::Paint {
-    if palette() == Palette::Ansi { inspect::Paint::Ansi } else { inspect::Paint::Plain }
+fn registry_or_builtin(global: &Global) -> Result<Registry, Failure> {
+    find_registry(global).map_or_else(|| Ok(Registry::builtin()), |path| load(&path))
 }
 
-fn columns() -> usize {
-    crate::tui::columns().unwrap_or(100)
+/// Reads a registry; its warnings go to standard error.
+fn load(path: &Path) -> Result<Registry, Failure> {
+    let loaded = Registry::load(path)?;
+    for warning in &loaded.warnings {
+        let _ = writeln!(io::stderr(), "{} {warning}", stderr_palette().warn("warning:"));
+    }
+    Ok(loaded.registry)
+}
+
+fn registry_path(global: &Global) -> Result<PathBuf, Failure> {
+    find_registry(global).ok_or_else(|| Failure::NoRegistry(usual_places()))
+}
+
+/// The registry named, or the first of the usual places where there is one.
+fn find_registry(global: &Global) -> Option<PathBuf> {
+    if let Some(path) = &global.config {
+        return Some(path.clone());
+    }
+    usual_places().into_iter().find(|path| path.exists())
+}
+
+fn usual_places() -> Vec<PathBuf> {
+    let home = || std::env::var_os("HOME").map(|home| PathBuf::from(home).join(".config"));
+    let config = std::env::var_os("XDG_CONFIG_HOME").map(PathBuf::from).filter(|path| path.is_absolute());
+    let mut places = vec![PathBuf::from("devices.toml")];
+    places.extend(config.or_else(home).map(|folder| folder.join("rapid/devices.toml")));
+    places.push(PathBuf::from("/etc/rapid/devices.toml"));
+    places
+}
+
+/// Adds an entry.
+fn register(global: &Global, args: &RegisterArgs, format: Format, out: &mut dyn Write) -> Result<(), Failure> {
+    let target = Target::read(find_registry(global).unwrap_or_else(|| PathBuf::from("devices.toml")))?;
+    let attached = match udev::enumerate() {
+        _ if global.sim.is_some() => connected(global)?.1,
+        // An entry for a device that is not plugged in can be made on any machine.
+        Err(_) if args.vid.is_some() => Vec::new(),
+        attached => attached?,
+    };
+    let (input, output) = (&mut io::stdin().lock(), &mut io::stdout());
+    let talk = is_interactive(format).then_some(Dialogue { input, out: output });
+    Ok(block_on(register::register(&target, &attached, args, talk, format, out))??)
+}
+
+/// Removes an entry.
+fn unregister(global: &Global, args: &UnregisterArgs, format: Format, out: &mut dyn Write) -> Result<(), Failure> {
+    let target = Target::read(registry_path(global)?)?;
+    let (input, output) = (&mut io::stdin().lock(), &mut io::stdout());
+    let talk = is_interactive(format).then_some(Dialogue { input, out: output });
+    Ok(register::unregister(&target, args, talk, format, out)?)
+}
+
+fn is_interactive(format: Format) -> bool {
+    format == Format::Text && io::stdin().is_terminal() && io::stdout().is_terminal()
+}
+
+/// Why a command failed.
+#[derive(Debug, thiserror::Error)]
+enum Failure {
+    #[error(transparent)]
+    App(#[from] AppError),
+    /// The registry is invalid.
+    #[error("{0}")]
+    Registry(#[from] RegistryErrors),
+    /// There is no registry.
+    #[error(
+        "no devices.toml: looked for {}\n    fix: write one (`rapid devices` lists connected devices), name one with --config, \
+         or try `rapid --sim`", .0.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ")
+    )]
+    NoRegistry(Vec<PathBuf>),
+    #[error(transparent)]
+    Presence(#[from] PresenceError),
+    #[error(transparent)]
+    Hotplug(#[from] crate::hotplug::HotplugError),
+    #[error(transparent)]
+    Inspect(#[from] ReadError),
+    #[error(transparent)]
+    Artifacts(#[from] commands::artifacts::ArtifactsError),
+    #[error(transparent)]
+    Register(#[from] commands::register::RegisterError),
+    #[error(transparent)]
+    Order(#[from] commands::arm::OrderError),
+    #[error(transparent)]
+    Mask(#[from] commands::mask::MaskError),
+    #[error(transparent)]
+    Calibrate(#[from] commands::calibrate::CalibrateError),
+    /// Not every file was repaired; which, and why, has been printed.
+    #[error("")]
+    Recover(commands::recover::Outcome),
+    /// The file to replay is not an episode.
+    #[error(transparent)]
+    Replay(DriverError),
+    /// The folder for episodes cannot be written to.
+    #[error(transparent)]
+    Folder(RecordError),
+    #[cfg(feature = "policy")]
+    #[error(transparent)]
+    Eval(#[from] commands::eval::EvalError),
+    #[cfg(feature = "policy")]
+    /// The policy is invalid, or not for this rig.
+    #[error(transparent)]
+    Bundle(BundleErrors),
+    #[cfg(feature = "policy")]
+    /// The policy built into the program, on another rig than its own.
+    #[error(
+        "{0}\nThe policy built into rapid is for the simulated task only: rapid --infer --sim task\n    fix: name the folder \
+         of a policy that was trained on this rig: rapid --infer FOLDER (models/README.md describes how to make one)"
+    )]
+    OtherRig(BundleErrors),
+    #[cfg(feature = "policy")]
+    #[error(transparent)]
+    Compare(#[from] CompareFailure),
+    #[cfg(feature = "policy")]
+    #[error(transparent)]
+    Demonstrate(#[from] commands::demonstrate::DemonstrateError),
+    #[error(transparent)]
+    Module(#[from] crate::registry::ModuleError),
+    #[error(transparent)]
+    Ablation(#[from] commands::ablation::AblationError),
+    /// The arguments contradict each other.
+    #[error("{0}")]
+    Arguments(&'static str),
+    /// The mistakes have been printed.
+    #[error("")]
+    Reported,
+    /// The diagnosis found a problem, and printed it.
+    #[error("")]
+    Found,
+    #[error("output: {0}")]
+    Output(#[from] io::Error),
+    /// Devices and files have been released while unwinding.
+    #[error("rapid panicked; please report this")]
+    Panicked,
+}
+
+impl From<InspectFailure> for Failure {
+    fn from(failure: InspectFailure) -> Self {
+        match failure {
+            InspectFailure::Episode(error) => Self::Inspect(error),
+            InspectFailure::Output(error) => Self::Output(error),
+        }
+    }
+}
+
+impl Failure {
+    /// Exit codes: 1 failed while running, 2 invalid configuration or arguments, 3 a required device is missing, 4 a
+    /// BAD episode, 130 interrupted twice.
+    fn code(&self) -> u8 {
+        match self {
+            Self::App(AppError::InterruptedTwice) => 130,
+            Self::App(AppError::Logging(_))
+            | Self::Registry(_)
+            | Self::NoRegistry(_)
+            | Self::Replay(_)
+            | Self::Folder(_)
+            | Self::Inspect(ReadError::NotMcap(_))
+            | Self::Arguments(_)
+            | Self::Module(_)
+            | Self::Reported => 2,
+            #[cfg(feature = "policy")]
+            Self::Bundle(_)
+            | Self::OtherRig(_)
+            | Self::Eval(EvalError::Bundle(_))
+            | Self::Compare(
+                CompareFailure::Bundle(_)
+                | CompareFailure::Compare(
+                    CompareError::File(_)
+                    | CompareError::Registry { .. }
+                    | CompareError::Unsuited { .. }
+                    | CompareError::Nothing(_),
+                ),
+            ) => 2,
+            Self::Inspect(ReadError::Io { source, .. })
+                if matches!(source.kind(), io::ErrorKind::NotFound | io::ErrorKind::IsADirectory) =>
+            {
+                2
+            }
+            Self::Calibrate(error) if error.is_bad_argument() => 2,
+            Self::Ablation(error) if error.is_bad_argument() => 2,
+            Self::Register(error) if error.is_bad_argument() => 2,
+            Self::Recover(outcome) if outcome.is_bad_argument() => 2,
+            Self::App(AppError::Bad { .. }) => 4,
+            Self::App(AppError::Required(_)) | Self::Order(commands::arm::OrderError::Give(_)) => 3,
+            _ => 1,
+        }
+    }
+}
+
+/// The failure's text, or its cause where that is the limit of open files: the file that could not be opened then is
+/// not at fault.
+fn with_cause(text: String) -> String {
+    // EMFILE and ENFILE, in the words of the standard library.
+    if text.contains("(os error 24)") {
+        let limit = rustix::process::getrlimit(rustix::process::Resource::Nofile).current;
+        let limit = limit.map_or_else(String::new, |limit| format!(" of {limit} open files"));
+        return format!("the limit{limit} is reached: raise it (`ulimit -n 4096`, or LimitNOFILE= in the unit)");
+    }
+    if text.contains("(os error 23)") {
+        return "this machine has too many files open (sysctl fs.file-max): end the programs that opened them, or raise the limit"
+            .to_owned();
+    }
+    text
 }
 
 #[cfg(test)]
@@ -365,19 +524,39 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_thread_stuck_in_a_device_does_not_hold_up_the_end() {
+    fn a_thread_blocked_in_a_device_does_not_delay_the_exit() {
         let (release, stuck) = std::sync::mpsc::channel::<()>();
         let done = block_on(async move {
-            let (tell, begun) = tokio::sync::oneshot::channel();
+            let (started, wait) = tokio::sync::oneshot::channel();
             tokio::task::spawn_blocking(move || {
-                let _ = tell.send(());
+                let _ = started.send(());
                 stuck.recv()
             });
-            begun.await.expect("begun");
+            wait.await.expect("started");
             7
         });
         assert_eq!(done.expect("runtime"), 7);
-        // Only now may the device answer: a runtime that waited for it would not have come here.
+        // The device answers only now: a runtime that waited for it would not have reached this line.
         drop(release);
+    }
+}
+
+#[cfg(test)]
+mod failure_tests {
+    use super::*;
+    use crate::folder::FolderError;
+
+    #[test]
+    fn at_the_limit_of_open_files_the_limit_is_named_and_not_the_file() {
+        let of = |code| {
+            let error = io::Error::from_raw_os_error(code);
+            let folder = FolderError::Io { path: PathBuf::from("out"), error };
+            with_cause(Failure::Folder(RecordError::Folder(folder)).to_string())
+        };
+        let said = of(24);
+        assert!(said.contains("open files is reached") && said.contains("ulimit -n"), "{said}");
+        assert!(said.contains("LimitNOFILE=") && !said.contains("--out"), "{said}");
+        assert!(of(23).contains("fs.file-max"), "{}", of(23));
+        assert!(of(13).contains("--out") && of(13).contains("Permission denied"), "{}", of(13));
     }
 }

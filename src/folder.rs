@@ -1,8 +1,8 @@
 //! A folder held open: files in it are made, replaced and removed by name, wherever its path leads
 //! meanwhile.
 //!
-//! For folders that others may write to as well (/dev/shm, /tmp, a shared disk): what somebody
-//! planted there under a name we are about to use is never followed, opened or written to.
+//! For folders that others may write to as well (/dev/shm, /tmp, a shared disk): a file or link
+//! that another user planted under a name we are about to use is never followed, opened or written to.
 //!
 //! Invariant: the last part of a name is never followed if it is a symbolic link; on the way to a
 //! folder only links of root and of this user are, as root none if so asked.
@@ -11,18 +11,18 @@
 use std::ffi::{OsStr, OsString};
 use std::fs::File;
 use std::io::{self, Read, Write};
-use std::os::fd::OwnedFd;
+use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::ffi::OsStringExt;
 use std::path::{Component, Path, PathBuf};
 
-use rustix::fs::{AtFlags, FileType, Mode, OFlags, RenameFlags};
+use rustix::fs::{AtFlags, CWD, FileType, Mode, OFlags, RenameFlags, Stat};
 use rustix::io::Errno;
 
 use crate::time::realtime_ns;
 
 /// Links on one way before it is taken for a circle; as in Linux, see `path_resolution(7)`.
 const MOST_LINKS: usize = 40;
-/// Names tried for a temporary file, should somebody take them before us.
+/// Names tried for a temporary file, should another program take them first.
 const TRIES: u32 = 8;
 
 /// Which symbolic links on the way to a folder are followed.
@@ -80,7 +80,7 @@ impl From<FolderError> for io::Error {
 }
 
 /// Where this program keeps what should survive a restart: systemd.exec(5), XDG Base Directory
-/// Specification 0.8. `None` where nothing says.
+/// Specification 0.8. `None` without any of them.
 #[must_use]
 pub fn state_directory() -> Option<PathBuf> {
     let absolute = |name| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
@@ -108,8 +108,18 @@ impl Folder {
     /// # Errors
     /// When it is not there and may not be made, or lies behind a link that is not followed.
     pub fn open(path: &Path, links: Links, missing: Missing) -> Result<Self, FolderError> {
-        let mut walk = Walk { links, missing, shown: PathBuf::new(), followed: 0 };
-        let open = walk.enter(path)?;
+        let mut check = |link: &Path, stat: &Stat| {
+            let is_link = FileType::from_raw_mode(stat.st_mode) == FileType::Symlink;
+            if is_link && (links == Links::Refused || !is_trusted(stat.st_uid)) {
+                return Err(FolderError::Link { path: link.to_owned(), owner: stat.st_uid });
+            }
+            Ok(())
+        };
+        let mut walk = Walk::new(missing, &mut check);
+        let at = walk.to(path)?;
+        // A folder on the way need not be readable, this one must be.
+        let flags = OFlags::DIRECTORY | OFlags::CLOEXEC;
+        let open = walk.shown_error(rustix::fs::openat(&at, ".", flags, Mode::empty()))?;
         Ok(Self { open, path: path.to_owned() })
     }
 
@@ -148,7 +158,7 @@ impl Folder {
         Ok(file)
     }
 
-    /// Gives `name` these contents and this mode, whole: a reader sees what was there before, or all of it.
+    /// Gives `name` these contents and this mode, whole: a reader sees the old contents or all of the new.
     ///
     /// # Errors
     /// When the disk does not take it, or the name belongs to something that cannot be replaced.
@@ -162,7 +172,7 @@ impl Folder {
             .and_then(|()| if sync == Sync::Wait { file.sync_all() } else { Ok(()) })
             .and_then(|()| Ok(rustix::fs::renameat(&self.open, &temporary, &self.open, name)?));
         if written.is_err() {
-            // What was begun is of no use to anyone; the first error is the one to tell.
+            // The unfinished file is of no use; the first error is the one to report.
             let _ = self.remove(&temporary);
         }
         written
@@ -248,80 +258,97 @@ pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
     Ok(text)
 }
 
-/// The way to a folder, one part at a time: each is opened in the one before, so that nothing on the
-/// way can be exchanged between a look and a step.
-struct Walk {
-    links: Links,
+/// The way along a path, one part at a time: each is opened in the one before, so that nothing on the way can be
+/// exchanged between a look and a step. Links are followed.
+pub(crate) struct Walk<'a> {
     missing: Missing,
+    /// Asked about each folder, link and file on the way before it is entered or followed.
+    check: &'a mut dyn FnMut(&Path, &Stat) -> Result<(), FolderError>,
     /// As far as it has gone.
     shown: PathBuf,
     followed: usize,
 }
 
-impl Walk {
-    fn enter(&mut self, path: &Path) -> Result<OwnedFd, FolderError> {
-        let start = if path.is_absolute() { "/" } else { "." };
-        let mut at = self.told(rustix::fs::open(start, FOLDER, Mode::empty()))?;
+impl<'a> Walk<'a> {
+    /// Makes what is `missing`, and goes as far as `check` allows.
+    pub(crate) fn new(missing: Missing, check: &'a mut dyn FnMut(&Path, &Stat) -> Result<(), FolderError>) -> Self {
+        Self { missing, check, shown: PathBuf::new(), followed: 0 }
+    }
+
+    /// What `path` leads to, opened only to be named (`O_PATH`).
+    ///
+    /// # Errors
+    /// When it is not there, or not allowed.
+    pub(crate) fn to(&mut self, path: &Path) -> Result<OwnedFd, FolderError> {
+        let start = Path::new(if path.is_absolute() { "/" } else { "." });
+        let (mut at, _) = self.enter(CWD, start)?;
         // Still to go, the next part last.
         let mut rest = parts(path);
         self.shown = PathBuf::from(if path.is_absolute() { "/" } else { "" });
         while let Some(name) = rest.pop() {
             let before = self.shown.clone();
-            self.shown.push(&name);
-            at = match rustix::fs::openat(&at, &name, FOLDER | OFlags::NOFOLLOW, Mode::empty()) {
-                Err(Errno::NOENT) if self.makes(rest.is_empty()) => self.make(&at, &name)?,
-                // O_DIRECTORY with O_NOFOLLOW answers a link with either.
-                Err(error @ (Errno::LOOP | Errno::NOTDIR)) => {
-                    let Some(target) = self.target(&at, &name)? else { return Err(self.io(error)) };
+            if name == ".." && self.shown.file_name().is_some() {
+                self.shown.pop();
+            } else {
+                self.shown.push(&name);
+            }
+            let (next, kind) = match self.enter(&at, Path::new(&name)) {
+                Err(FolderError::Io { error, .. })
+                    if error.kind() == io::ErrorKind::NotFound && self.makes(rest.is_empty()) =>
+                {
+                    self.make(&at, &name)?;
+                    self.enter(&at, Path::new(&name))?
+                }
+                entered => entered?,
+            };
+            at = match kind {
+                FileType::Symlink => {
+                    // An empty name: the link that was opened, not what has its name by now.
+                    let target = self.shown_error(rustix::fs::readlinkat(&next, "", Vec::new()))?;
+                    let target = PathBuf::from(OsString::from_vec(target.into_bytes()));
+                    self.followed += 1;
+                    if self.followed > MOST_LINKS {
+                        return Err(self.io(Errno::LOOP));
+                    }
                     rest.extend(parts(&target));
                     self.shown = before;
-                    if !target.is_absolute() {
-                        continue;
+                    if target.is_absolute() {
+                        self.shown = PathBuf::from("/");
+                        self.enter(CWD, Path::new("/"))?.0
+                    } else {
+                        at
                     }
-                    self.shown = PathBuf::from("/");
-                    self.told(rustix::fs::open("/", FOLDER, Mode::empty()))?
                 }
-                opened => self.told(opened)?,
+                FileType::Directory => next,
+                _ if rest.is_empty() => next,
+                _ => return Err(FolderError::NoFolder(self.shown.clone())),
             };
         }
-        // A folder on the way need not be readable, this one must be.
-        self.told(rustix::fs::openat(&at, ".", FOLDER.difference(OFlags::PATH), Mode::empty()))
+        Ok(at)
+    }
+
+    /// Opens `name`, a link itself and not what it leads to, and checks it.
+    fn enter(&mut self, at: impl AsFd, name: &Path) -> Result<(OwnedFd, FileType), FolderError> {
+        let flags = OFlags::PATH | OFlags::NOFOLLOW | OFlags::CLOEXEC;
+        let next = self.shown_error(rustix::fs::openat(at, name, flags, Mode::empty()))?;
+        let stat = self.shown_error(rustix::fs::fstat(&next))?;
+        let shown = if self.shown.as_os_str().is_empty() { name } else { &self.shown };
+        (self.check)(shown, &stat)?;
+        Ok((next, FileType::from_raw_mode(stat.st_mode)))
     }
 
     fn makes(&self, is_last: bool) -> bool {
         self.missing == Missing::All || (self.missing == Missing::Last && is_last)
     }
 
-    fn make(&self, at: &OwnedFd, name: &OsStr) -> Result<OwnedFd, FolderError> {
+    fn make(&self, at: &OwnedFd, name: &OsStr) -> Result<(), FolderError> {
         match rustix::fs::mkdirat(at, name, Mode::from_raw_mode(0o755)) {
-            Ok(()) | Err(Errno::EXIST) => {}
-            Err(error) => return Err(self.io(error)),
+            Ok(()) | Err(Errno::EXIST) => Ok(()),
+            Err(error) => Err(self.io(error)),
         }
-        self.told(rustix::fs::openat(at, name, FOLDER | OFlags::NOFOLLOW, Mode::empty()))
     }
 
-    /// Where the link `name` leads, if it is one and is followed.
-    fn target(&mut self, at: &OwnedFd, name: &OsStr) -> Result<Option<PathBuf>, FolderError> {
-        let link = rustix::fs::openat(at, name, OFlags::PATH | OFlags::NOFOLLOW | OFlags::CLOEXEC, Mode::empty());
-        let link = self.told(link)?;
-        let stat = self.told(rustix::fs::fstat(&link))?;
-        if FileType::from_raw_mode(stat.st_mode) != FileType::Symlink {
-            return Ok(None);
-        }
-        let trusted = stat.st_uid == 0 || stat.st_uid == rustix::process::geteuid().as_raw();
-        if self.links == Links::Refused || !trusted {
-            return Err(FolderError::Link { path: self.shown.clone(), owner: stat.st_uid });
-        }
-        self.followed += 1;
-        if self.followed > MOST_LINKS {
-            return Err(self.io(Errno::LOOP));
-        }
-        // An empty name: the link that was opened, not what has its name by now.
-        let target = self.told(rustix::fs::readlinkat(&link, "", Vec::new()))?;
-        Ok(Some(PathBuf::from(OsString::from_vec(target.into_bytes()))))
-    }
-
-    fn told<T>(&self, result: Result<T, Errno>) -> Result<T, FolderError> {
+    fn shown_error<T>(&self, result: Result<T, Errno>) -> Result<T, FolderError> {
         result.map_err(|error| self.io(error))
     }
 
@@ -333,7 +360,11 @@ impl Walk {
     }
 }
 
-const FOLDER: OFlags = OFlags::PATH.union(OFlags::DIRECTORY).union(OFlags::CLOEXEC);
+/// May `owner` change what is ours? Root and this user may.
+#[must_use]
+pub fn is_trusted(owner: u32) -> bool {
+    owner == 0 || owner == rustix::process::geteuid().as_raw()
+}
 
 /// The names of a path, the last first.
 fn parts(path: &Path) -> Vec<OsString> {

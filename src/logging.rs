@@ -8,7 +8,7 @@
 //! says, and standard error only warnings and errors: state changes are printed as events already.
 //! Messages of panics are logged whatever it says.
 //!
-//! Invariant: who logs never waits for standard error: a reader that is behind loses lines, and is told.
+//! Invariant: who logs never waits for standard error: a reader that is behind loses lines, and is told how many.
 //! Invariant: a line has no control characters and no line breaks, and at most [`LONGEST`] characters.
 
 use std::fmt::{Debug, Write as _};
@@ -98,7 +98,7 @@ fn spawn_writer(mut out: impl Write + Send + 'static) -> io::Result<SyncSender<P
     let (sender, pieces) = mpsc::sync_channel(DEPTH);
     std::thread::Builder::new().name("stderr".to_owned()).spawn(move || {
         for piece in pieces {
-            // There is nowhere left to report that the reader is gone, nor that nobody waits.
+            // There is nowhere left to report that the reader is gone, nor that none waits.
             let _ = match piece {
                 Piece::Line(line) => out.write_all(line.as_bytes()),
                 Piece::Flush(done) => done.send(()).map_err(io::Error::other),

@@ -1,11 +1,15 @@
-//! Entry point: becomes the guard of a bus of motors if it was started as one; otherwise parses the command line, runs the command, prints an error, sets the exit code.
+//! Entry point: the guard of a bus of motors if it was started as one; otherwise parses the command line, runs the
+//! command, prints an error and sets the exit code.
 
 use std::process::ExitCode;
 
+#[cfg(feature = "motors")]
 use rapid::driver::can::guard;
 
 fn main() -> ExitCode {
+    #[cfg(feature = "motors")]
     let mut args = std::env::args_os();
+    #[cfg(feature = "motors")]
     if args.next().is_some_and(|name| name == guard::NAME) {
         return guard::run(args);
     }
@@ -14,7 +18,7 @@ fn main() -> ExitCode {
         Err(error) => {
             // Help and version go to standard output and are no error.
             let code = if error.use_stderr() { 2 } else { 0 };
-            // Nothing can be said when even this cannot be written.
+            // No error can be shown where even this cannot be written.
             let _ = error.print();
             ExitCode::from(code)
         }

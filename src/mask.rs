@@ -63,6 +63,28 @@ impl PhysicalMask {
     }
 }
 
+/// A mask with the number of devices it stands for, which decides how many digits its text has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct SizedMask {
+    /// The mask.
+    pub mask: PhysicalMask,
+    /// Number of registered modalities.
+    pub devices: usize,
+}
+
+impl std::fmt::Display for SizedMask {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(&self.mask.hex(self.devices))
+    }
+}
+
+impl Serialize for SizedMask {
+    /// As hexadecimal text: `0x05`.
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
 fn digits(mask: PhysicalMask, device_count: usize) -> usize {
     let highest = 64 - mask.0.leading_zeros() as usize;
     device_count.max(highest).max(1).div_ceil(8) * 8

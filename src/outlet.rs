@@ -30,7 +30,7 @@ impl Outlet {
                     break;
                 }
             }
-            // Nobody may be left who wants to know.
+            // The receiver may be gone.
             let _ = tell.send(outcome);
         })?;
         Ok(Self { sender, ended })
@@ -67,7 +67,7 @@ impl Outlet {
     /// Waits until everything is written, at most `within`.
     ///
     /// # Errors
-    /// What the writer said when it ended early; `TimedOut` when the reader takes too long.
+    /// The writer's error when it ended early; `TimedOut` when the reader takes too long.
     pub async fn finish(self, within: Duration) -> io::Result<()> {
         drop(self.sender);
         match tokio::time::timeout(within, self.ended).await {
@@ -113,7 +113,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_broken_pipe_is_told_and_nobody_waits_for_it() {
+    async fn a_broken_pipe_is_reported_without_blocking() {
         let outlet = Outlet::new("test", 1, Broken).unwrap();
         assert!(outlet.send(b"x".to_vec()).await);
         outlet.closed().await;

@@ -1,8 +1,8 @@
 //! Panics: where their messages go while the rig runs.
 //!
 //! The hook that Rust brings writes to standard error and waits for its reader, before anything is
-//! unwound: with a pipe that nobody reads, the thread would stand still and nobody would learn that it
-//! has panicked. So messages go to the log, which waits for nobody. While a screen has the terminal
+//! unwound: with a pipe that has no reader, the thread would block and its panic would go unnoticed.
+//! So messages go to the log, which waits for no reader. While a screen has the terminal
 //! they are kept as well, to be printed once it is given back.
 //!
 //! Invariant: only this module sets the hook; it stays for the life of the process, as a hook cannot
@@ -16,7 +16,7 @@ use std::sync::{Mutex, MutexGuard, Once, PoisonError};
 pub const TARGET: &str = "rapid::panics";
 
 /// Name of the thread that moves motors. Its panics have no backtrace: that is made before anything is
-/// unwound, takes a good part of a second, and so long the motors would go on.
+/// unwound, takes a good part of a second, and for that long the motors would continue.
 pub const CONTROL_THREAD: &str = "control";
 
 /// Where messages go.
@@ -81,7 +81,7 @@ fn tell(info: &PanicHookInfo<'_>) {
     }
 }
 
-/// A poisoned lock here guards whole values: go on with them.
+/// A poisoned lock here guards whole values: continue with them.
 fn goes() -> MutexGuard<'static, Goes> {
     GOES.lock().unwrap_or_else(PoisonError::into_inner)
 }

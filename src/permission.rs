@@ -15,6 +15,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::time::Duration;
 
 use crate::action::{Order, OrderSlot};
+use crate::bell::Bell;
 use crate::interlock::{Blocked, InputState, Interlocks};
 use crate::time::Stamp;
 
@@ -181,6 +182,12 @@ impl Attended {
         if self.0.disarmed.load(Ordering::SeqCst) != 0 {
             self.0.at_first_plug.store(false, Ordering::SeqCst);
         }
+    }
+
+    /// Rings with every order, until the next [`Self::take`].
+    #[must_use]
+    pub fn bell(&self) -> &Bell {
+        self.0.slot.bell()
     }
 
     /// Takes what it was ordered since the last call, in the order in which it is to be carried out.

@@ -19,6 +19,45 @@ pub struct KernelDriver {
     pub version: Option<String>,
 }
 
+/// What noticed first that a device was unplugged.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum UnplugSource {
+    /// The stream that read the device.
+    Stream,
+    /// The kernel's own uevent.
+    Kernel,
+    /// udev's processed event.
+    Udev,
+    /// The device was missing when all devices were enumerated again.
+    Enumeration,
+    /// A device on the network announced its end.
+    Goodbye,
+    /// A device on the network was not heard for its lease, or refused a connection.
+    Lease,
+    /// The link to a device on the network is down.
+    Link,
+    /// A scenario.
+    Script,
+}
+
+impl UnplugSource {
+    /// The word for it, as in JSON.
+    #[must_use]
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::Stream => "stream",
+            Self::Kernel => "kernel",
+            Self::Udev => "udev",
+            Self::Enumeration => "enumeration",
+            Self::Goodbye => "goodbye",
+            Self::Lease => "lease",
+            Self::Link => "link",
+            Self::Script => "script",
+        }
+    }
+}
+
 /// What was agreed with a device when it was opened.
 #[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct Negotiated {

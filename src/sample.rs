@@ -54,7 +54,7 @@ impl Encoding {
     }
 }
 
-/// Header flag: the device or driver said that this payload is damaged.
+/// Header flag: the device or driver reported that this payload is damaged.
 pub const FLAG_ERROR: u32 = 1;
 /// Header flag: the capture time comes from the kernel or the device, not from the moment of arrival.
 pub const FLAG_DEVICE_TIME: u32 = 2;

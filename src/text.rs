@@ -209,6 +209,13 @@ pub fn counted(number: u64, what: &str) -> String {
     format!("{} {what}{}", count(number), if number == 1 { "" } else { "s" })
 }
 
+/// Bytes as hexadecimal digits, two each.
+#[must_use]
+pub fn hexadecimal(bytes: &[u8]) -> String {
+    let digit = |nibble: u8| char::from_digit(nibble.into(), 16).unwrap_or_default();
+    bytes.iter().flat_map(|byte| [digit(byte >> 4), digit(byte & 0xf)]).collect()
+}
+
 /// Samples per second, with one decimal below 1000.
 #[must_use]
 pub fn hertz(hz: f64) -> String {
@@ -233,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_a_device_says_moves_the_cursor() {
+    fn device_strings_cannot_move_the_cursor() {
         assert_eq!(plain("a\x1b[2Jb\r\nc\u{202e}d\u{9b}e"), "a [2Jb  c d e");
         assert!(matches!(plain("streaming ü 相机"), Cow::Borrowed(_)));
         assert_eq!(ascii("µm 相"), "?m ?");

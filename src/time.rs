@@ -192,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn a_step_is_told_once_and_a_slew_never() {
+    fn a_clock_step_is_reported_once_and_a_slew_never() {
         const SECOND: i128 = 1_000_000_000;
         let mut watch = ClockWatch::new(WallClock::with_offset(1_700 * SECOND));
         let mut look = |offset| watch.look(WallClock::with_offset(offset));
@@ -201,7 +201,7 @@ mod tests {
         assert_eq!(look(5_300 * SECOND), Some(3_600_000_000_000));
         assert_eq!(look(5_300 * SECOND), None);
         assert_eq!(look(5_299 * SECOND), Some(-1_000_000_000));
-        // What is set in small steps is told once they come to one.
+        // What is set in small steps is reported once they add up to one.
         assert_eq!(
             [4, 8, 12, 16].map(|ms| look(5_299 * SECOND + ms * 1_000_000)),
             [None, None, Some(12_000_000), None]

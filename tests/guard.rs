@@ -11,10 +11,11 @@ mod motors;
 use std::ffi::OsString;
 use std::io::{BufRead, BufReader};
 use std::process::{Child, ChildStdout, Command, ExitCode, Stdio};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use motors::{Adapter, PATIENCE, spec};
-use rapid::action::Order;
+use motors::{Adapter, Hand, PATIENCE, spec};
+use rapid::action::{ActionSource, Order};
 use rapid::driver::can::guard;
 use rapid::driver::can::motors::Motors;
 use rapid::registry::{CanAdapter, CanProtocol, CanSpec, DamiaoSpec, DeviceNode, Stop};
@@ -83,6 +84,9 @@ fn drive(adapter: &str, path: &str, stop: &str) -> ExitCode {
     });
     runtime.block_on(async {
         let mut driven = Motors::open(&can, &motors, &DeviceNode::Tty(path.into())).await.expect("motors");
+        let hand = Arc::<Hand>::default();
+        driven.follow(Arc::clone(&hand) as Arc<dyn ActionSource>);
+        let mut notices = driven.notices().expect("the first call");
         let mut ticks = tokio::time::interval(Duration::from_millis(50));
         let mut is_armed = false;
         loop {
@@ -90,10 +94,10 @@ fn drive(adapter: &str, path: &str, stop: &str) -> ExitCode {
                 _ = &mut ends => break,
                 reading = driven.read() => drop(reading.expect("a sample")),
                 _ = ticks.tick() => {
-                    driven.command(&[0.3, -0.3], Stamp::now()).expect("it listens");
+                    hand.point(&[0.3, -0.3]);
                 }
             }
-            while let Some(notice) = driven.take_notice() {
+            while let Ok(notice) = notices.try_recv() {
                 println!("{:?} {}", notice.arming, notice.text);
             }
             // Once all have answered.
@@ -171,10 +175,10 @@ impl Driven {
 
     /// Waits until both motors were disabled by an order, and none gave up by its own limit. Prints how long it took.
     fn expect_off(&self, what: &str, since: Stamp) {
-        until(|| BOTH.iter().all(|motor| self.adapter.told_at(*motor, "motor_disabled", since).is_some()));
-        assert_eq!(self.adapter.count("motor_timeout"), 0, "{what}: {:?}", self.adapter.told());
+        until(|| BOTH.iter().all(|motor| self.adapter.reported_at(*motor, "motor_disabled", since).is_some()));
+        assert_eq!(self.adapter.count("motor_timeout"), 0, "{what}: {:?}", self.adapter.reported());
         for motor in BOTH {
-            let off = self.adapter.told_at(motor, "motor_disabled", since).expect("it was");
+            let off = self.adapter.reported_at(motor, "motor_disabled", since).expect("it was");
             println!("{what}: motor {motor} off after {:.1} ms", off.since(since).as_secs_f64() * 1e3);
         }
     }
@@ -233,7 +237,7 @@ fn stopped() {
     driven.signal(Signal::CONT);
     let text = driven.wait_for("Faulted");
     assert!(text.contains("rapid was held up: no motor was commanded for"), "{text}");
-    assert_eq!(driven.adapter.count("motor_enabled"), enabled, "{:?}", driven.adapter.told());
+    assert_eq!(driven.adapter.count("motor_enabled"), enabled, "{:?}", driven.adapter.reported());
 }
 
 fn damped() {
@@ -243,7 +247,7 @@ fn damped() {
     driven.expect_off("SIGKILL, damped", at);
     for motor in BOTH {
         // Commands came until then, or the motor would have given up; none was followed by another order.
-        let off = driven.adapter.told_at(motor, "motor_disabled", at).expect("it was");
+        let off = driven.adapter.reported_at(motor, "motor_disabled", at).expect("it was");
         assert!(off.since(at) >= guard::KEEP_FOR, "it was disabled {:?} after the death", off.since(at));
     }
 }
@@ -265,5 +269,5 @@ fn unguarded() {
     // The second line.
     let at = Stamp::now();
     driven.signal(Signal::KILL);
-    until(|| BOTH.iter().all(|motor| driven.adapter.told_at(*motor, "motor_timeout", at).is_some()));
+    until(|| BOTH.iter().all(|motor| driven.adapter.reported_at(*motor, "motor_timeout", at).is_some()));
 }

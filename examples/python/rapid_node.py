@@ -12,7 +12,7 @@ import iceoryx2 as iox2
 
 # What a payload holds.
 BYTES, MJPEG, YUYV, GREY, F64 = range(5)
-# What every actuator is told, little-endian 64-bit floats, one an axis.
+# Actions: little-endian 64-bit floats, one per axis.
 ACTIONS = "/action"
 # As many axes as an action may have.
 MOST_AXES = 64
@@ -41,12 +41,13 @@ class SampleHeader(ctypes.Structure):
 
 
 class Bus:
-    """The bus of the `rapid` that started this program, or of the one whose prefix is given."""
+    """The bus of the `rapid` that started this program, or of the one whose --instance is RAPID_INSTANCE."""
 
-    def __init__(self, prefix=None):
+    def __init__(self):
         iox2.set_log_level(iox2.LogLevel.Error)
         config = iox2.config.default()
-        prefix = prefix or os.environ.get("RAPID_BUS_PREFIX")
+        instance = os.environ.get("RAPID_INSTANCE")
+        prefix = os.environ.get("RAPID_BUS_PREFIX") or (f"iox2_{instance}_" if instance else None)
         if prefix:
             config.global_cfg.prefix = iox2.FileName.new(prefix)
         # SIGTERM ends this program as it ends any other.
@@ -58,30 +59,39 @@ class Bus:
         return builder.publish_subscribe(iox2.Slice[ctypes.c_uint8]).user_header(SampleHeader).open()
 
     def publisher(self, topic, max_bytes):
-        """Publishes payloads of at most this many bytes."""
-        ports = self._topic(topic).publisher_builder().initial_max_slice_len(max_bytes).create()
-        return Publisher(ports)
+        """Publishes payloads of at most this many bytes, on the topic of a device of this program or of actions."""
+        port = self._topic(topic).publisher_builder().initial_max_slice_len(max_bytes).create()
+        wake = self._node.service_builder(iox2.ServiceName.new(topic)).event().open()
+        return Publisher(port, wake.notifier_builder().create())
 
     def node(self, max_bytes):
         """Publishes the samples of the device this program was started for."""
         topic = os.environ["RAPID_TOPIC"]
         publisher = self.publisher(topic, max_bytes)
-        wake = self._node.service_builder(iox2.ServiceName.new(topic)).event().open()
-        publisher._wake = wake.notifier_builder().create()
         publisher._header = {"id": int(os.environ["RAPID_BIT"]), "epoch": int(os.environ["RAPID_EPOCH"])}
         return publisher
 
+    def subscriber(self, topic):
+        """Yields the header and the payload of every sample of a topic as it arrives; never ends."""
+        port = self._topic(topic).subscriber_builder().create()
+        while True:
+            while (sample := port.receive()) is not None:
+                # Copies: the sample's memory is returned to the publisher when it is dropped.
+                header = SampleHeader.from_buffer_copy(sample.user_header().contents)
+                yield header, bytes(sample.payload().as_memory_view())
+            self._node.wait(iox2.Duration.from_millis(2))
+
     def actions(self):
-        """Receives what the actuator is told."""
+        """Receives actions."""
         return Actions(self._topic(ACTIONS).subscriber_builder().create())
 
 
 class Publisher:
     """Publishes on one topic."""
 
-    def __init__(self, port):
+    def __init__(self, port, wake):
         self._port = port
-        self._wake = None
+        self._wake = wake
         self._header = {}
         self._seq = 0
 
@@ -94,8 +104,7 @@ class Publisher:
         sample.assume_init().send()
         self._seq += 1
         # Without a notification a sample is found a little later.
-        if self._wake:
-            self._wake.notify()
+        self._wake.notify()
 
     def send_numbers(self, numbers, **header):
         """Publishes numbers, which is what `kind = "scalars"` means."""

@@ -1,8 +1,8 @@
-//! The conductor: does what the user, the command line and the clock ask for, until one of them asks
-//! for the end.
+//! The conductor: carries out what the user, the command line and the clock request, until one of them requests the end.
 //!
-//! Invariant: whether an episode is in progress is known to the recorder alone, and asked of it.
+//! Invariant: the recorder alone knows whether an episode is in progress; the conductor asks it.
 
+use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::pin::pin;
 use std::sync::Arc;
@@ -11,22 +11,22 @@ use std::time::Duration;
 use tokio::sync::broadcast;
 use tokio::sync::broadcast::error::{RecvError, TryRecvError};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until, timeout};
-use tokio_util::sync::CancellationToken;
 
-use super::{AppError, Asked, Running, Screen, policy_ended, screen};
+use super::stage::{Stage, join};
+use super::{AppError, Request, Running, Screen};
 use crate::bus;
 use crate::fault;
-use crate::record::{EpisodeRequest, RecordError, Recorder};
+use crate::record::{EpisodeRequest, RecordError, Recorder, RecorderConfig, Source};
 use crate::sample::Epoch;
 use crate::status::{Board, DeviceStatus, EpisodeEnd, Event, Level, SlotState, What};
 use crate::time::Stamp;
 
-/// An episode asked for at the start begins when every attached device delivers, at the latest
+/// An episode requested at the start begins when every attached device delivers, at the latest
 /// after this time.
 const SETTLE_LIMIT: Duration = Duration::from_secs(3);
 /// Devices that are attached at the start are known after this time.
 const SETTLE_LEAST: Duration = Duration::from_millis(100);
-/// How often it is looked whether they deliver.
+/// How often that is checked.
 const SETTLE_LOOK: Duration = Duration::from_millis(20);
 
 /// That no device is plugged in is reported after this time.
@@ -34,12 +34,11 @@ const NONE_AFTER: Duration = Duration::from_secs(3);
 /// The last samples of an episode have this long to arrive: the longest `latency` of a device is a second.
 const LAST_SAMPLES: Duration = Duration::from_secs(2);
 
-/// Does what the user asks for, from the first sample to the order to end.
+/// Carries out requests, from the first sample to the request to end.
 pub(super) struct Conductor {
     pub(super) board: Arc<Board>,
     pub(super) events: broadcast::Receiver<Event>,
     pub(super) recorder: Recorder,
-    pub(super) writer_ended: CancellationToken,
     pub(super) episode: EpisodeRequest,
     pub(super) record: bool,
     pub(super) duration: Option<Duration>,
@@ -57,48 +56,42 @@ impl Conductor {
             (false, Some(duration)) => Some(begun + duration),
             _ => None,
         };
-        let mut looked = false;
-        // Nobody reads the output any more, and how that came.
+        let mut has_looked = false;
+        // How the output ended, once it has no reader any more.
         let mut output = Ok(());
         let mut bus_lost = pin!(bus::lost());
         loop {
             tokio::select! {
                 biased;
                 () = running.signals.next() => return output,
-                // Its outcome is taken when everything is taken down.
-                () = running.rig_ending.cancelled() => return output,
-                () = running.rig_ended.cancelled() => return output,
+                // The outcome is taken when everything is taken down.
+                () = running.streaming.ending.cancelled() => return output,
+                () = running.streaming.closed.cancelled() => return output,
                 error = &mut bus_lost => return Err(error.into()),
                 () = running.mask_ended.cancelled() => return Err(AppError::Panicked("thread `mask`")),
-                // It ends by itself only when it cannot go on.
-                outcome = policy_ended(&mut running.autopilot) => return outcome,
-                outcome = screen::ended(&mut running.screen) => match outcome {
+                // It ends by itself only when it cannot continue.
+                outcome = policy_ended(&mut running.inference) => return outcome,
+                outcome = running.screen.outcome() => match outcome {
                     Err(panicked @ AppError::Panicked(_)) => return Err(panicked),
-                    // An episode is worth more than its log lines, and goes on without.
+                    // An episode is worth more than its log lines, and continues without.
                     outcome if self.record && running.kind != Screen::Monitor => output = outcome,
                     outcome => return outcome,
                 },
-                // Before what is asked: how the last episode ended comes before the next one.
+                // Before requests: how the last episode ended comes before the next one.
                 event = self.events.recv() => {
                     if self.episode_ended(event)? { return output; }
                 }
-                Some(asked) = running.asked.recv() => match asked {
-                    // A slow disk takes its time to close a file: a signal does not wait for it. What was asked of
-                    // the recorder is done all the same, and its end is taken when everything is taken down.
-                    Asked::ToggleRecording(at) => tokio::select! {
+                Some(request) = running.requests.recv() => {
+                    // A slow disk takes its time to close a file: a signal does not wait for it. The recorder carries
+                    // the request out all the same, and its end is taken when everything is taken down.
+                    tokio::select! {
                         biased;
                         () = running.signals.next() => return output,
-                        done = self.toggle(at) => done?,
-                    },
-                    Asked::DropEpisode(file) => tokio::select! {
-                        biased;
-                        () = running.signals.next() => return output,
-                        () = self.drop_episode(file) => {}
-                    },
-                    Asked::Quit => return output,
-                },
-                // After the events: what became of its episode says more.
-                () = self.writer_ended.cancelled() => return Err(AppError::Panicked("thread `writer`")),
+                        carried_out = self.carry_out(request) => if carried_out?.is_break() { return output },
+                    }
+                }
+                // After the events: what became of its episode explains more.
+                outcome = running.recording.outcome() => return outcome.and(Err(AppError::Panicked("the recorder"))),
                 never = fault::strike("main") => never,
                 _ = look.tick(), if self.begin_episode => {
                     if self.has_settled(begun) {
@@ -107,17 +100,25 @@ impl Conductor {
                     }
                 }
                 () = sleep_until(end.unwrap_or(begun)), if end.is_some() => return output,
-                () = sleep_until(begun + NONE_AFTER), if !looked => {
-                    looked = true;
-                    self.say_if_none();
+                () = sleep_until(begun + NONE_AFTER), if !has_looked => {
+                    has_looked = true;
+                    self.warn_if_none();
                 }
             }
         }
     }
 
-    /// A run that waits for its first device looks like one that works. Of one whose devices were unplugged the events
-    /// tell.
-    fn say_if_none(&self) {
+    async fn carry_out(&mut self, request: Request) -> Result<ControlFlow<()>, AppError> {
+        match request {
+            Request::ToggleRecording(at) => self.toggle(at).await?,
+            Request::DropEpisode(file) => self.drop_episode(file).await,
+            Request::Quit => return Ok(ControlFlow::Break(())),
+        }
+        Ok(ControlFlow::Continue(()))
+    }
+
+    /// A run that waits for its first device looks like one that works. Events report devices that were unplugged.
+    fn warn_if_none(&self) {
         let devices = self.board.snapshot().devices;
         let never = |device: &DeviceStatus| device.state == SlotState::Absent && device.epoch == Epoch::default();
         if !devices.is_empty() && devices.iter().all(never) {
@@ -133,20 +134,19 @@ impl Conductor {
         waited >= SETTLE_LIMIT || (waited >= SETTLE_LEAST && !opening)
     }
 
-    /// Ends the episode in progress at the moment `at`, or begins one: also that which is to begin when all deliver.
+    /// Ends the episode in progress at the moment `at`, or begins one: also the one that waits for all to deliver.
     async fn toggle(&mut self, at: Stamp) -> Result<(), AppError> {
         self.begin_episode = false;
-        // What became of an episode is announced as an event and shown by the screen.
+        // How an episode ended is announced as an event and shown by the screen.
         let Err(RecordError::Idle) = self.recorder.stop_at(at).await else { return Ok(()) };
         if let Err(error) = self.recorder.start(self.episode.clone()).await {
-            // In the monitor, a full disk is no reason to leave: it is said and can be mended.
+            // In the monitor, a full disk is no reason to leave: it is reported and can be fixed.
             tracing::error!(%error, "the episode was not begun");
         }
         Ok(())
     }
 
-    /// Removes the file of the last episode, if the recorder still offers that: not when another has begun, or is
-    /// to begin.
+    /// Removes the file of the last episode if the recorder still offers that: not once another has begun.
     async fn drop_episode(&self, file: PathBuf) {
         if let Err(error) = self.recorder.drop_short(file).await {
             tracing::warn!(%error, "the episode was not dropped");
@@ -170,7 +170,7 @@ impl Conductor {
                 None => Ok(()),
             };
         }
-        // It may have ended by itself while the run did: how, is among the events that nobody took.
+        // It may have ended by itself while the run did: how, is among the events not yet taken.
         loop {
             let event = match self.events.try_recv() {
                 Ok(event) => Ok(event),
@@ -193,7 +193,7 @@ impl Conductor {
         }
     }
 
-    /// The end of an episode that this event tells of, or that events which were missed may have.
+    /// The end of an episode in this event, or in events that were missed.
     fn end_in(&self, event: Result<Event, RecvError>) -> Option<EpisodeEnd> {
         match event {
             Ok(Event { what: What::Episode { file, error, .. }, .. }) => Some(EpisodeEnd { file, error }),
@@ -201,6 +201,31 @@ impl Conductor {
             Ok(_) | Err(RecvError::Closed) => None,
         }
     }
+}
+
+/// Waits for the end of the policy, if there is one, and takes its outcome.
+async fn policy_ended(inference: &mut Option<Stage>) -> Result<(), AppError> {
+    match inference {
+        Some(inference) => inference.outcome().await,
+        None => std::future::pending().await,
+    }
+}
+
+/// Starts stage recording: the thread that writes episodes. It ends when the recorder is dropped.
+///
+/// # Errors
+/// When the system provides no thread.
+pub(super) fn record(source: impl Source + 'static, config: RecorderConfig) -> Result<(Stage, Recorder), AppError> {
+    let mut recorder = Recorder::spawn(source, config)?;
+    let (ended, thread) = (recorder.ended(), recorder.hand_over());
+    let stage = Stage::start("the recorder", |_| async move {
+        ended.cancelled().await;
+        match thread {
+            Some(thread) => join(thread, "thread `writer`").await,
+            None => Ok(()),
+        }
+    });
+    Ok((stage, recorder))
 }
 
 #[cfg(test)]

@@ -4,7 +4,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use super::LAST_CHUNK;
-use super::autopilot::LoadError;
+use super::inference::LoadError;
 use crate::bus::BusError;
 use crate::hotplug::HotplugError;
 use crate::logging::LoggingError;
@@ -41,7 +41,7 @@ pub enum AppError {
     #[error("output: {0}")]
     Output(io::Error),
     /// A thread or signal handler.
-    #[error("the system refuses: {0}")]
+    #[error("system call failed: {0}")]
     System(#[from] io::Error),
     /// The policy.
     #[error(transparent)]

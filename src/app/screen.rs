@@ -4,9 +4,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::sync::mpsc;
-use tokio::task::JoinHandle;
-use tokio_util::sync::CancellationToken;
 
+use super::stage::Stage;
 use super::{AppError, Screen};
 use crate::fault;
 use crate::headless::style::ColourChoice;
@@ -15,20 +14,17 @@ use crate::permission::Permission;
 use crate::status::{Board, Command};
 use crate::tui::{self, TuiError};
 
-pub(super) type ScreenTask = JoinHandle<Result<(), AppError>>;
-
 /// Starts the screen that was asked for.
 pub(super) fn start(
     screen: Screen,
     board: &Arc<Board>,
     commands: mpsc::Sender<Command>,
     permission: &Arc<Permission>,
-    stop: CancellationToken,
     duration: Option<Duration>,
-) -> ScreenTask {
+) -> Stage {
     let (board, permission) = (Arc::clone(board), Arc::clone(permission));
     if screen == Screen::Monitor {
-        return tokio::spawn(async move {
+        return Stage::start("the screen", |stop| async move {
             tokio::select! {
                 outcome = tui::run(board, commands, permission, stop) => match outcome {
                     // As good as SIGHUP, which comes with it or a little later.
@@ -48,21 +44,15 @@ pub(super) fn start(
         progress: screen == Screen::Lines,
         duration,
     };
-    let run = headless::run(board, stop, options, std::io::stdout());
-    tokio::spawn(async move {
-        // Lines cannot ask for anything.
-        drop(commands);
-        tokio::select! {
-            outcome = run => outcome.map_err(AppError::Output),
-            never = fault::strike("screen") => never,
+    Stage::start("the screen", |stop| {
+        let run = headless::run(board, stop, options, std::io::stdout());
+        async move {
+            // Lines cannot ask for anything.
+            drop(commands);
+            tokio::select! {
+                outcome = run => outcome.map_err(AppError::Output),
+                never = fault::strike("screen") => never,
+            }
         }
     })
-}
-
-/// Waits for the end of the screen, whose outcome is taken; for ever if it was taken before.
-pub(super) async fn ended(screen: &mut Option<ScreenTask>) -> Result<(), AppError> {
-    let Some(task) = screen else { return std::future::pending().await };
-    let outcome = task.await;
-    *screen = None;
-    outcome.unwrap_or(Err(AppError::Panicked("the screen")))
 }

@@ -1,40 +1,45 @@
-//! Where the actuator is to go: the topic of actions, for the one stream that reads the device.
+//! Where the actuator is to go: the topic of actions, for the thread or task that drives the actuator.
+//!
+//! An event service of the topic's name wakes it; an action of a program that does not notify is found by the clock.
 //!
 //! Invariant: once this process, which runs a policy, has published an action, those of other programs move nothing.
 //! Invariant: what is no list of at most [`MAX_ACTION`] finite numbers is no action, whoever published it.
 
+use std::os::fd::{BorrowedFd, OwnedFd};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use iceoryx2::identifiers::UniquePublisherId;
+use iceoryx2::port::listener::Listener;
 use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::prelude::*;
+use tokio::io::Interest;
+use tokio::io::unix::AsyncFd;
 
 use super::error::topic_error;
 use super::guard::{Guarded, contained};
-use super::{BusError, Service, TopicFactory, TopicSpec, Writer, sigbus};
-use crate::action::MAX_ACTION;
+use super::{BusError, EventFactory, Service, TopicFactory, TopicSpec, Writer, sigbus};
+use crate::action::{ActionSource, MAX_ACTION, NoAction};
 use crate::sample::{Encoding, SampleHeader};
 use crate::time::Stamp;
+
+/// A bell for a task to wait for; `None` where the system cannot watch it, and who waits looks by the clock alone.
+#[must_use]
+pub fn watch(bell: BorrowedFd<'_>) -> Option<AsyncFd<OwnedFd>> {
+    let bell = bell.try_clone_to_owned().ok()?;
+    // SAFETY: what is registered owns one descriptor all its life.
+    unsafe { AsyncFd::register_with_interest(bell, Interest::READABLE) }.ok()
+}
 
 /// The consumer of actions.
 pub struct Actions {
     topic: String,
     depth: usize,
     subscriber: Guarded<Subscriber<Service, [u8], SampleHeader>>,
+    listener: Guarded<Listener<Service>>,
     /// The one of this process.
     writer: UniquePublisherId,
     /// It has published.
     is_written: AtomicBool,
-}
-
-/// Why what was published moves nothing.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub enum NoAction {
-    /// It is no list of finite numbers.
-    #[error("an action is no list of 1 to {MAX_ACTION} finite 64-bit floats")]
-    NoNumbers,
-    /// A policy of this process drives the actuator.
-    #[error("another program publishes actions while a policy runs here: end one of them")]
-    Foreign,
 }
 
 impl std::fmt::Debug for Actions {
@@ -44,14 +49,21 @@ impl std::fmt::Debug for Actions {
 }
 
 impl Actions {
-    pub(super) fn open(spec: &TopicSpec, factory: &TopicFactory, writer: &Writer) -> Result<Self, BusError> {
+    pub(super) fn open(
+        spec: &TopicSpec,
+        factory: &TopicFactory,
+        wake: &EventFactory<Service>,
+        writer: &Writer,
+    ) -> Result<Self, BusError> {
         let subscriber = factory.subscriber_builder().buffer_size(spec.depth).create();
-        let subscriber = subscriber.map_err(|error| topic_error(&spec.name, &error))?;
-        let subscriber = Guarded::new(subscriber);
+        let subscriber = Guarded::new(subscriber.map_err(|error| topic_error(&spec.name, &error))?);
+        let listener = wake.listener_builder().create();
+        let listener = Guarded::new(listener.map_err(|error| topic_error(&spec.name, &error))?);
         Ok(Self {
             topic: spec.name.clone(),
             depth: spec.depth,
             subscriber,
+            listener,
             writer: writer.id(),
             is_written: AtomicBool::new(false),
         })
@@ -61,13 +73,18 @@ impl Actions {
     pub fn discard(&self) {
         let _ = self.newest(&mut [0.0; MAX_ACTION]);
     }
+}
 
-    /// Writes the newest action that waits into `action` and forgets the older ones; gives it with the tick it
-    /// is the action of, or `None` if none waits.
-    ///
-    /// # Errors
-    /// When nothing but what is no action, or is not to be followed, waited.
-    pub fn newest<'a>(&self, action: &'a mut [f64; MAX_ACTION]) -> Result<Option<(&'a [f64], Stamp)>, NoAction> {
+impl ActionSource for Actions {
+    fn bell(&self) -> Option<BorrowedFd<'_>> {
+        // SAFETY: the descriptor belongs to the listener, which lives as long as `self` and neither closes nor exchanges
+        // it before.
+        Some(unsafe { BorrowedFd::borrow_raw(self.listener.file_descriptor().native_handle()) })
+    }
+
+    fn newest<'a>(&self, action: &'a mut [f64; MAX_ACTION]) -> Result<Option<(&'a [f64], Stamp)>, NoAction> {
+        // First: what was announced is received below.
+        let _ = contained(|| self.listener.try_wait(|_| {}));
         let (mut newest, mut refused) = (None, None);
         for _ in 0..self.depth {
             let Ok(Ok(Some(sample))) = contained(|| self.subscriber.receive()) else { break };

@@ -105,7 +105,7 @@ impl Inbox {
     }
 
     /// Blocks until a modality was published or `timeout` passed, whichever is first, or the process was continued after
-    /// it was stopped. The mask alone wakes nobody.
+    /// it was stopped. The mask alone wakes no inbox.
     ///
     /// # Errors
     /// When the event service is broken.

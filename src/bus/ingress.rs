@@ -1,7 +1,7 @@
 //! An ingress: the topic on which a program of the rig publishes for one modality.
 //!
 //! It stands beside the modality's own topic and never reaches a consumer: what comes here is judged
-//! by the rig and published anew by the topic's one writer. An event service of the same name wakes
+//! by the rig and republished by the topic's one writer. An event service of the same name wakes
 //! the rig; a program that does not notify is looked after every [`LOOK`].
 //!
 //! Invariant: at most [`Ingress::depth`] samples wait; the oldest give way.
@@ -26,7 +26,7 @@ use crate::sample::SampleHeader;
 
 /// Begins the name of an ingress; the modality's topic follows.
 const PREFIX: &str = "/rapid/ingress";
-/// The longest that a sample of which nobody was notified waits.
+/// The longest that a sample without a notification waits.
 const LOOK: Duration = Duration::from_millis(10);
 /// A successor may come while the place of a program that died is not yet given back.
 const PUBLISHERS: usize = 4;

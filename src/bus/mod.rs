@@ -3,13 +3,13 @@
 //! One iceoryx2 node; all topics are opened once from the registry, so that a plug or unplug re-wires
 //! nothing. The payload is what the driver gave, the user header a [`SampleHeader`]; any process with
 //! an iceoryx2 binding can subscribe. One event service wakes consumers: the event's id is the
-//! modality's bit.
+//! modality's bit. The topic of actions has one of its own, which wakes nothing but the actuator.
 //!
 //! Invariant: a writer never waits for a reader. A reader that falls `depth` samples behind loses
 //! the oldest, and sees the hole in `SampleHeader::seq`.
 //! Invariant: payloads lie in pools that are reserved when a topic is opened, and the handle of a
 //! loan in memory that is used again (`shared`): once a thread has published a sample, no sample
-//! allocates (`tests/stream_alloc.rs`). The locks of a topic's port are its stream's alone.
+//! allocates (`tests/memory/stream_alloc.rs`). The locks of a topic's port are its stream's alone.
 //! Invariant: every segment of this program has all its memory from when it is made (`room`); what others made and is
 //! gone ends the run in order (`sigbus`). Nothing of the bus is writable by others, and none of it outlives the
 //! processes that use it (`leftovers`).
@@ -46,7 +46,7 @@ use guard::{Guarded, contained};
 use home::Home;
 use service::Service;
 
-pub use actions::{Actions, NoAction};
+pub use actions::{Actions, watch};
 pub use error::BusError;
 pub use inbox::{Foreign, Inbox};
 pub use ingress::{Given, Ingress, Watch};
@@ -128,19 +128,15 @@ impl Bus {
     ) -> Result<Self, BusError> {
         let node = home.node();
         let topics = specs.into_iter().map(|spec| open_topic(node, spec)).collect::<Result<Vec<_>, _>>()?;
-        let wake = Guarded::new(
-            node.service_builder(&service_name(WAKE_SERVICE)?)
-                .event()
-                .max_notifiers(crate::modality::MAX_MODALITIES + 1 + MAX_NODES)
-                .max_listeners(MAX_NODES)
-                .max_nodes(MAX_NODES)
-                .event_id_max_value(255)
-                .open_or_create()
-                .map_err(|error| topic_error(WAKE_SERVICE, &error))?,
-        );
+        let wake = open_wake(node, WAKE_SERVICE, crate::modality::MAX_MODALITIES + 1 + MAX_NODES)?;
+        let action = topics.iter().find(|(spec, _)| spec.id == TopicId::Action);
+        let action = action.map(|topic| Ok((topic, open_wake(node, &topic.0.name, MAX_NODES)?))).transpose()?;
         let writers = topics
             .iter()
-            .map(|(spec, factory)| Ok((spec.id, Arc::new(Writer::open(spec, factory, &wake)?))))
+            .map(|(spec, factory)| {
+                let own = action.as_ref().filter(|(topic, _)| topic.0.id == spec.id).map(|(_, wake)| &**wake);
+                Ok((spec.id, Arc::new(Writer::open(spec, factory, &wake, own)?)))
+            })
             .collect::<Result<Vec<_>, BusError>>()?;
         let ingresses = registry
             .devices
@@ -148,9 +144,11 @@ impl Bus {
             .filter(|device| matches!(device.node, NodeSpec::Process(_)))
             .map(|device| Ok((device.id, Arc::new(Ingress::open(node, device)?))))
             .collect::<Result<Vec<_>, BusError>>()?;
-        let actions = topics.iter().zip(&writers).find(|((spec, _), _)| spec.id == TopicId::Action);
-        let actions = actions.map(|((spec, factory), (_, writer))| Actions::open(spec, factory, writer).map(Arc::new));
-        let actions = actions.transpose()?;
+        let writer = writers.iter().find(|(id, _)| *id == TopicId::Action);
+        let actions = action
+            .zip(writer)
+            .map(|(((spec, factory), wake), (_, writer))| Actions::open(spec, factory, &wake, writer).map(Arc::new))
+            .transpose()?;
         let instance = instance.map(str::to_owned);
         Ok(Self { writers, actions, topics, wake, ingresses, instance, home: Arc::clone(home) })
     }
@@ -187,7 +185,7 @@ impl Bus {
         contained(|| Inbox::open(&self.topics, self.writers.iter().map(|(_, writer)| writer.as_ref()), &self.wake))?
     }
 
-    /// What the actuator is told; `None` without an actuator in the registry.
+    /// Actions for the actuator; `None` without an actuator in the registry.
     #[must_use]
     pub fn actions(&self) -> Option<Arc<Actions>> {
         self.actions.clone()
@@ -267,6 +265,19 @@ fn open_topic(node: &Node<Service>, spec: TopicSpec) -> Result<(TopicSpec, Guard
         .open_or_create()
         .map_err(|error| topic_error(&spec.name, &error))?;
     Ok((spec, Guarded::new(factory)))
+}
+
+/// An event service of that name.
+fn open_wake(node: &Node<Service>, name: &str, notifiers: usize) -> Result<Guarded<EventFactory<Service>>, BusError> {
+    let service = node
+        .service_builder(&service_name(name)?)
+        .event()
+        .max_notifiers(notifiers)
+        .max_listeners(MAX_NODES)
+        .max_nodes(MAX_NODES)
+        .event_id_max_value(255)
+        .open_or_create();
+    service.map(Guarded::new).map_err(|error| topic_error(name, &error))
 }
 
 fn service_name(name: &str) -> Result<ServiceName, BusError> {

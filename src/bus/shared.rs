@@ -41,7 +41,7 @@ impl<T> Shared<T> {
 
     fn with(value: T) -> Self {
         let memory = spare::take(Self::LAYOUT).cast::<Inner<T>>();
-        // SAFETY: the memory has the layout of `Inner<T>` and belongs to nobody else.
+        // SAFETY: the memory has the layout of `Inner<T>` and has no other owner.
         unsafe { memory.write(Inner { handles: AtomicUsize::new(1), value: ReentrantMutex::new(value) }) };
         Self(memory, PhantomData)
     }
@@ -159,7 +159,7 @@ mod spare {
     /// Keeps or frees memory.
     ///
     /// # Safety
-    /// It was allocated with `layout`, and nobody uses it any more.
+    /// It was allocated with `layout`, and has no user left.
     pub(super) unsafe fn give(memory: NonNull<u8>, layout: Layout) {
         let kept = layout.size() <= SPARE_BYTES
             && PIECES.try_with(|pieces| match pieces.borrow_mut().0.iter_mut().find(|piece| piece.is_none()) {

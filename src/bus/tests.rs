@@ -1,5 +1,5 @@
 use super::*;
-use crate::action::MAX_ACTION;
+use crate::action::{ActionSource, MAX_ACTION, NoAction};
 use crate::modality::ModalityId;
 use crate::registry::{DeviceSpec, IdentitySpec, NodeSpec, Parse, RigSpec, SerialSpec, UsbSpec, WhenStale};
 use crate::sample::Encoding;

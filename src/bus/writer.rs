@@ -24,7 +24,8 @@ pub struct Writer {
     publisher: Guarded<Publisher<Service, [u8], SampleHeader>>,
     /// Of the publisher, to look at its head.
     pool: Option<File>,
-    wake: Option<Guarded<Notifier<Service>>>,
+    /// Of the actuator first, which has no time to lose, then of all consumers.
+    wakes: Vec<Guarded<Notifier<Service>>>,
 }
 
 impl std::fmt::Debug for Writer {
@@ -34,10 +35,12 @@ impl std::fmt::Debug for Writer {
 }
 
 impl Writer {
+    /// `own` is the event service of this topic alone, if it has one.
     pub(super) fn open(
         spec: &TopicSpec,
         factory: &TopicFactory,
         wake: &EventFactory<Service>,
+        own: Option<&EventFactory<Service>>,
     ) -> Result<Self, BusError> {
         // A topic that another program kept open from an earlier run may have deeper queues than asked.
         let samples = TopicSpec::pool_for(factory.static_config().subscriber_max_buffer_size().max(spec.depth));
@@ -57,17 +60,16 @@ impl Writer {
             TopicId::Mask => None,
             TopicId::Action => Some(MAX_MODALITIES),
         };
-        let wake = event
-            .map(|event| {
-                wake.notifier_builder()
-                    .default_event_id(EventId::new(event))
-                    .create()
-                    .map_err(|error| topic_error(&spec.name, &error))
+        let notifiers = own.map(|own| (own, 0)).into_iter().chain(event.map(|event| (wake, event)));
+        let wakes = notifiers
+            .map(|(service, event)| {
+                let notifier = service.notifier_builder().default_event_id(EventId::new(event)).create();
+                notifier.map(Guarded::new).map_err(|error| topic_error(&spec.name, &error))
             })
-            .transpose()?;
-        let (publisher, wake) = (Guarded::new(publisher), wake.map(Guarded::new));
+            .collect::<Result<_, _>>()?;
+        let publisher = Guarded::new(publisher);
         let pool = pool(publisher.id());
-        Ok(Self { topic: spec.name.clone(), max_bytes: spec.max_bytes, publisher, pool, wake })
+        Ok(Self { topic: spec.name.clone(), max_bytes: spec.max_bytes, publisher, pool, wakes })
     }
 
     /// Names this writer in every sample it publishes.
@@ -99,7 +101,7 @@ impl Writer {
             self.publisher.loan_slice_uninit(payload.len()).map_err(|error| self.transfer(&describe(error)))?;
         *sample.user_header_mut() = header;
         sample.write_from_slice(payload).send().map_err(|error| self.transfer(&format!("{error:?}")))?;
-        if let Some(wake) = &self.wake {
+        for wake in &self.wakes {
             // A consumer that cannot be woken looks by itself soon after; the sample is not lost.
             let _ = wake.notify();
         }

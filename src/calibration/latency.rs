@@ -15,7 +15,7 @@ use crate::time::Stamp;
 /// Latencies looked at, seconds. Below zero: a stamp taken before the exposure.
 const EARLIEST: f64 = -0.1;
 const LATEST: f64 = 1.0;
-/// With fewer pictures or flips nothing is said.
+/// With fewer pictures or flips there is no result.
 const LEAST_PICTURES: usize = 30;
 const LEAST_FLIPS: usize = 8;
 /// Least difference between dark and lit, of 255, that is no noise.
@@ -68,7 +68,7 @@ pub struct Estimate {
     pub flips: usize,
 }
 
-/// Why no latency can be told.
+/// Why no latency can be determined.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum Refusal {
     /// There is not enough to compare.
@@ -274,7 +274,7 @@ impl Scene {
         let deviation = (square - mean * mean).max(0.0).sqrt();
         Estimate {
             latency_ms: (near + mean) * 1e3,
-            // Latencies within a step of one another are not told apart.
+            // Latencies within a step of one another are not distinguished.
             uncertainty_ms: (1.96 * deviation + step) * 1e3,
             correlation: best.correlation.min(1.0),
             contrast: best.contrast,

@@ -1,66 +1,119 @@
-//! What is printed for what is typed.
+//! Help texts, and errors of the command line.
 
 use insta::assert_snapshot;
 
 use super::*;
 
-/// What is printed for `rapid WORDS`, at the width of a usual terminal.
+fn read(words: &str) -> Result<Cli, clap::Error> {
+    Cli::read(std::iter::once("rapid").chain(words.split_whitespace()).map(OsString::from))
+}
+
+/// What is printed for `rapid WORDS`, which is help or an error.
 fn printed(words: &str) -> String {
-    let typed = std::iter::once("rapid").chain(words.split_whitespace()).map(OsString::from);
-    match Cli::read(typed) {
-        Ok(cli) => panic!("understood: {cli:?}"),
+    match read(words) {
+        Ok(cli) => panic!("accepted: {cli:?}"),
         Err(error) => error.to_string(),
     }
 }
 
+/// Each command, with the words that call it.
+fn commands(words: &str, command: clap::Command) -> Vec<(String, clap::Command)> {
+    let subcommands = command.get_subcommands().filter(|command| command.get_name() != "help");
+    let of = |sub: &clap::Command| commands(&format!("{words} {}", sub.get_name()), sub.clone());
+    let mut all: Vec<_> = subcommands.flat_map(of).collect();
+    all.push((words.trim().to_owned(), command));
+    all
+}
+
 #[test]
-fn help() {
-    for words in ["-h", "--help"] {
-        assert_snapshot!(format!("help_{}", words.trim_matches('-')), printed(words));
+fn help_is_short_by_h_and_has_examples_by_help() {
+    let mut grammar = Cli::grammar();
+    grammar.build();
+    for (words, command) in commands("", grammar) {
+        let name = format!("rapid {words}").trim().replace(' ', "-");
+        let (short, long) = (printed(&format!("{words} -h")), printed(&format!("{words} --help")));
+        let narrow = command.term_width(80).render_help().to_string();
+        assert!(short.lines().count() <= 40 && narrow.lines().count() <= 40, "{words}:\n{narrow}");
+        assert!(long.contains("Examples:"), "{words}: {long}");
+        assert_snapshot!(format!("{name}-short"), short);
+        assert_snapshot!(format!("{name}-long"), long);
     }
-    let commands: Vec<_> = Cli::command().get_subcommands().map(|command| command.get_name().to_owned()).collect();
-    for command in commands {
-        // What it measures is said one word further.
-        let words = if command == "calibrate" { "calibrate latency" } else { command.as_str() };
+}
+
+#[test]
+fn a_general_option_is_shown_exactly_where_it_is_accepted_and_has_an_effect() {
+    let general = [("sim", "--sim=task"), ("config", "--config=x"), ("json", "--json"), ("instance", "--instance=x")];
+    let mut grammar = Cli::grammar();
+    grammar.build();
+    for (words, command) in commands("", grammar).into_iter().filter(|(words, _)| !words.is_empty()) {
+        let name = words.split(' ').next().unwrap();
         let help = printed(&format!("{words} --help"));
-        assert!(help.lines().count() <= 40, "{help}");
-        assert_snapshot!(format!("help_of_{command}"), help);
+        let positional: String =
+            command.get_positionals().filter(|value| value.is_required_set()).map(|_| " bash").collect();
+        for (option, argument) in general {
+            let known = general_options(name).contains(&option);
+            assert_eq!(help.contains(&format!("--{option}")), known, "{words} --{option}");
+            if words == "calibrate" {
+                continue;
+            }
+            for words in [format!("{argument} {words}{positional}"), format!("{words}{positional} {argument}")] {
+                match read(&words) {
+                    Ok(_) => assert!(known, "accepted: {words}"),
+                    Err(error) => {
+                        assert!(!known && error.exit_code() == 2, "{words}: {error}");
+                        let fix = format!("--{option} has no effect on `rapid {name}`: leave it out");
+                        assert!(error.to_string().contains(&fix), "{words}: {error}");
+                    }
+                }
+            }
+        }
     }
+}
+
+#[test]
+fn a_renamed_option_is_still_accepted_by_its_old_name() {
+    for option in ["--ignore-missing", "--go-on"] {
+        assert!(read(&format!("--infer --sim task {option}")).unwrap().policy.ignore_missing);
+        assert!(printed(option).contains("--infer"), "{option} needs --infer");
+    }
+    assert!(!printed("--help").contains("go-on"));
 }
 
 #[test]
 fn the_command_is_well_formed() {
-    Cli::command().debug_assert();
+    Cli::grammar().debug_assert();
 }
 
 #[test]
-fn options_stand_before_or_after_a_command_or_it_is_said_where() {
-    let read = |words: &str| Cli::read(words.split_whitespace().map(OsString::from)).unwrap();
-    assert!(read("rapid --json check").global.json && read("rapid check --json").global.json);
-    assert!(read("rapid --sim --json devices").simulation.sim.is_some());
-    let Some(Command::Devices { simulation, .. }) = read("rapid devices --sim x.toml").command else { panic!() };
-    assert_eq!(simulation.sim, Some(Some("x.toml".into())));
+fn options_before_or_after_a_command_parse_or_the_error_names_the_position() {
+    let global = |words: &str| read(words).unwrap().global;
+    assert!(global("--json check").json && global("check --json").json);
+    assert!(global("--sim --json devices").sim.is_some());
+    assert_eq!(global("devices --sim x.toml").sim, Some(Some("x.toml".into())));
+    assert_eq!(global("calibrate latency --sim").sim, Some(None));
     for (words, expected) in [
         ("--headless replay a.mcap", "write it after: rapid replay FILE --headless"),
         ("replay a.mcap --infer --record", "--record is an option of a run, and --infer compares"),
         ("replay a.mcap --tolerance 1", "--infer"),
         ("--record inspect a.mcap", "`rapid inspect` runs nothing"),
+        ("inspect a.mcap --record", "--record is an option of a run"),
+        ("--sim task --expert --record --duration 3s", "--duration"),
         ("--sim devices", "write `rapid devices --sim`"),
         ("--sim mask", "leave --sim out"),
         ("--sim --headless play.toml", "right after --sim (rapid --sim play.toml)"),
         ("a.mcap", "rapid inspect a.mcap"),
         ("devces", "'devices'"),
     ] {
-        let said = printed(words);
-        assert!(said.contains(expected), "{words}: {said}");
+        let message = printed(words);
+        assert!(message.contains(expected), "{words}: {message}");
     }
 }
 
 #[test]
-fn quantities_say_how_they_are_written() {
+fn an_error_in_a_quantity_shows_how_it_is_written() {
     for (words, expected) in [
         ("--duration 30", "a number and a unit, for example 30s"),
-        ("--duration 0s", "longer than nothing"),
+        ("--duration 0s", "longer than 0s"),
         ("--window 1h", "between 1ms and 10s"),
         ("--window 25", "25ms"),
         ("--rate abc", "a number, for example 30"),
@@ -70,11 +123,11 @@ fn quantities_say_how_they_are_written() {
         ("replay a.mcap --infer --tolerance NaN", "a number from 0 on"),
         ("eval --trials 0", "at least 1"),
         ("artifacts --install --to x", "cannot be used with '--to"),
-        ("--tag a=1 --tag b=1 --tag a=2", "--tag a is given more than once"),
-        ("replay x.mcap --record --tag a=1 --tag a=1", "--tag a is given more than once"),
+        ("--tag a=1 --tag b=1 --tag a=2", "--tag a is given twice"),
+        ("replay x.mcap --record --tag a=1 --tag a=1", "--tag a is given twice"),
         ("--instance a/b", "letters, digits and dashes"),
     ] {
-        let said = printed(words);
-        assert!(said.contains(expected), "{words}: {said}");
+        let message = printed(words);
+        assert!(message.contains(expected), "{words}: {message}");
     }
 }

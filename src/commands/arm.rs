@@ -1,4 +1,4 @@
-//! `rapid arm` and `rapid disarm`: leave for the actuator of a running `rapid` to move.
+//! `rapid arm` and `rapid disarm`: enable or disable the actuator of a running `rapid`.
 
 use std::io::{self, Write};
 
@@ -8,7 +8,7 @@ use crate::orders::give::{GiveError, give};
 /// Why an order was not carried out.
 #[derive(Debug, thiserror::Error)]
 pub enum OrderError {
-    /// The run.
+    /// The run does not answer, or refuses.
     #[error(transparent)]
     Give(#[from] GiveError),
     /// The output.
@@ -16,15 +16,15 @@ pub enum OrderError {
     Output(#[from] io::Error),
 }
 
-/// Gives an order. What becomes of it, the run says.
+/// Gives an order; its result is in the log of the run.
 ///
 /// # Errors
-/// When no run is there to take it, or it is refused.
+/// When no run accepts orders, or it is refused.
 pub fn order(instance: Option<&str>, order: Order, out: &mut dyn Write) -> Result<(), OrderError> {
     give(instance, order)?;
     let what = match order {
-        Order::Arm | Order::ArmBack => "the actuator is being armed: what came of it is in the log of the run",
-        Order::Disarm | Order::Emergency(_) => "the actuator is disarmed, and stays so until it is armed again",
+        Order::Arm | Order::ArmBack => "the actuator is being armed: the result is in the log of the run",
+        Order::Disarm | Order::Emergency(_) => "the actuator is disarmed until it is armed again",
     };
     Ok(writeln!(out, "{what}")?)
 }

@@ -1,14 +1,13 @@
-//! `rapid artifacts`: writes the files that follow from the registry, and installs them.
+//! `rapid artifacts`: writes the files derived from the registry, and installs them.
 //!
-//! Invariant: as root no symbolic link is followed on the way to a file, and a file is replaced
-//! whole, by rename.
+//! Invariant: as root no symbolic link is followed on the way to a file, and files are replaced
+//! atomically, by rename.
 //! Invariant: other programs are started with argument vectors, never through a shell.
 
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use super::Format;
 use crate::folder::{Folder, FolderError, Links, Missing, Sync};
 use crate::registry::Registry;
 use crate::registry::artifacts::{Artifact, ArtifactKind, DESCRIPTORS, HEADER, SYSTEM_REGISTRY, artifacts};
@@ -30,7 +29,7 @@ pub enum ArtifactsError {
         /// Why.
         error: io::Error,
     },
-    /// udev did not take the rules.
+    /// udev did not accept the rules.
     #[error("the files are installed, but `{command}` failed ({error}): run it by hand, or restart the machine")]
     Reload {
         /// What was run.
@@ -43,43 +42,20 @@ pub enum ArtifactsError {
     Output(#[from] io::Error),
 }
 
-/// Writes the artifacts' names and texts to `out`, and nothing else.
-///
-/// # Errors
-/// When `out` cannot be written to.
-pub fn list(registry: &Registry, format: Format, out: &mut dyn Write) -> io::Result<()> {
-    for artifact in artifacts(registry) {
-        if format == Format::Json {
-            let path = artifact.path.to_string_lossy();
-            let line = serde_json::json!({ "kind": "artifact", "path": path, "contents": artifact.contents });
-            writeln!(out, "{line}")?;
-            continue;
-        }
-        writeln!(out, "--- {}", artifact.path.display())?;
-        out.write_all(artifact.contents.as_bytes())?;
-    }
-    Ok(())
-}
-
-/// Writes the artifacts below `folder` (`udev` by default) and removes descriptors of entries that
-/// are gone.
+/// Writes the artifacts below `folder` (`udev` by default) and deletes descriptors of entries that no longer
+/// exist.
 ///
 /// # Errors
 /// When a file cannot be written.
 pub fn write(registry: &Registry, folder: &Path, out: &mut dyn Write) -> Result<(), ArtifactsError> {
-    let links = links_for_this_user();
-    let all = artifacts(registry);
-    for artifact in &all {
-        write_file(&folder.join(&artifact.path), artifact, links)?;
-        writeln!(out, "wrote {}", folder.join(&artifact.path).display())?;
-    }
-    remove_stale(&folder.join(DESCRIPTORS), &all, links, out)
+    let place = |artifact: &Artifact| folder.join(&artifact.path);
+    put(registry, place, &folder.join(DESCRIPTORS), links_for_this_user(), "wrote", out)
 }
 
 /// Installs the artifacts where udev and systemd read them, and makes udev apply the rules.
 ///
 /// # Errors
-/// When not root, or when a file cannot be written, or when udev does not take the rules.
+/// When not root, or when a file cannot be written, or when udev does not accept the rules.
 pub fn install(registry: &Registry, out: &mut dyn Write) -> Result<(), ArtifactsError> {
     if !rustix::process::geteuid().is_root() {
         return Err(ArtifactsError::NotRoot);
@@ -88,7 +64,7 @@ pub fn install(registry: &Registry, out: &mut dyn Write) -> Result<(), Artifacts
     for arguments in [
         ["control", "--reload"].as_slice(),
         &["trigger", "--action=change", "--subsystem-match=video4linux", "--subsystem-match=tty"],
-        // CAN interfaces alone: others are none of ours.
+        // Only CAN interfaces: no others are ours.
         &["trigger", "--action=add", "--subsystem-match=net", "--attr-match=type=280"],
     ] {
         run("udevadm", arguments)?;
@@ -104,34 +80,49 @@ pub fn install(registry: &Registry, out: &mut dyn Write) -> Result<(), Artifacts
 
 /// Installs below `root`, which is `/` except in tests.
 fn install_below(registry: &Registry, root: &Path, out: &mut dyn Write) -> Result<(), ArtifactsError> {
-    let all = artifacts(registry);
     let descriptors = root.join("etc/rapid").join(DESCRIPTORS);
-    for artifact in &all {
+    let place = |artifact: &Artifact| {
         let folder = match artifact.kind {
             ArtifactKind::Rules => root.join("etc/udev/rules.d"),
             ArtifactKind::Unit => root.join("etc/systemd/system"),
             ArtifactKind::Descriptor => descriptors.clone(),
         };
-        let path = folder.join(artifact.path.file_name().unwrap_or_default());
-        write_file(&path, artifact, Links::Refused)?;
-        writeln!(out, "installed {}", path.display())?;
-    }
-    remove_stale(&descriptors, &all, Links::Refused, out)
+        folder.join(artifact.path.file_name().unwrap_or_default())
+    };
+    put(registry, place, &descriptors, Links::Refused, "installed", out)
 }
 
-/// A link planted in a folder others may write to would lead root's writing elsewhere.
-fn links_for_this_user() -> Links {
+/// Writes each artifact to its place, and deletes descriptors of entries that no longer exist.
+fn put(
+    registry: &Registry,
+    place: impl Fn(&Artifact) -> PathBuf,
+    descriptors: &Path,
+    links: Links,
+    done: &str,
+    out: &mut dyn Write,
+) -> Result<(), ArtifactsError> {
+    let all = artifacts(registry);
+    for artifact in &all {
+        let path = place(artifact);
+        write_file(&path, artifact.contents.as_bytes(), artifact.mode, links)?;
+        writeln!(out, "{done} {}", path.display())?;
+    }
+    remove_stale(descriptors, &all, links, out)
+}
+
+/// A link planted in a folder that others may write to would redirect the writes of root.
+pub(super) fn links_for_this_user() -> Links {
     if rustix::process::geteuid().is_root() { Links::Refused } else { Links::Own }
 }
 
-fn write_file(path: &Path, artifact: &Artifact, links: Links) -> Result<(), ArtifactsError> {
+pub(super) fn write_file(path: &Path, contents: &[u8], mode: u32, links: Links) -> Result<(), ArtifactsError> {
     let folder = Folder::open(path.parent().unwrap_or(Path::new(".")), links, Missing::All)?;
     let name = path.file_name().unwrap_or_default();
-    let written = folder.replace(name, artifact.contents.as_bytes(), artifact.mode, Sync::Wait);
+    let written = folder.replace(name, contents, mode, Sync::Wait);
     written.map_err(|error| ArtifactsError::Write { path: path.to_path_buf(), error })
 }
 
-/// Removes descriptors that we wrote for entries that are no more.
+/// Deletes descriptors written for entries that no longer exist.
 fn remove_stale(path: &Path, all: &[Artifact], links: Links, out: &mut dyn Write) -> Result<(), ArtifactsError> {
     let explain = |error: io::Error| ArtifactsError::Write { path: path.to_path_buf(), error };
     let folder = Folder::open(path, links, Missing::All)?;
@@ -147,7 +138,7 @@ fn remove_stale(path: &Path, all: &[Artifact], links: Links, out: &mut dyn Write
             continue;
         }
         folder.remove(&name).map_err(explain)?;
-        writeln!(out, "removed {}: no such entry any more", path.join(name.escape_debug().to_string()).display())?;
+        writeln!(out, "removed {}: the entry no longer exists", path.join(name.escape_debug().to_string()).display())?;
     }
     Ok(())
 }
@@ -164,8 +155,8 @@ fn run(program: &str, arguments: &[&str]) -> Result<(), ArtifactsError> {
     match Command::new(program).args(arguments).output() {
         Ok(output) if output.status.success() => Ok(()),
         Ok(output) => {
-            let said = String::from_utf8_lossy(&output.stderr).trim().to_owned();
-            Err(ArtifactsError::Reload { command, error: format!("{}: {said}", output.status) })
+            let stderr = String::from_utf8_lossy(&output.stderr).trim().to_owned();
+            Err(ArtifactsError::Reload { command, error: format!("{}: {stderr}", output.status) })
         }
         Err(error) => Err(ArtifactsError::Reload { command, error: error.to_string() }),
     }

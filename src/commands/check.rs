@@ -1,4 +1,4 @@
-//! `rapid check`: what the registry says, or everything that is wrong with it.
+//! `rapid check`: the entries of the registry, or all of its mistakes.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -18,59 +18,44 @@ use crate::text;
 /// # Errors
 /// When `out` cannot be written to.
 pub fn check(path: &Path, format: Format, out: &mut dyn Write) -> io::Result<Outcome> {
-    match (Registry::load(path), format) {
-        (Ok(loaded), Format::Text) => {
-            table(&loaded, out)?;
-            for module in &loaded.registry.modules {
-                writeln!(out, "{}", module_line(module))?;
-            }
-            for motor in motors(&loaded.registry) {
-                writeln!(out, "{}", text::plain(&motor.to_string()))?;
-            }
-            for stop in &loaded.registry.stops {
-                writeln!(out, "{}", stop_line(stop))?;
-            }
-            let count = loaded.registry.devices.len();
-            let devices = if count == 1 { "device" } else { "devices" };
-            writeln!(out, "{}: {count} {devices}, ok", text::plain(&path.display().to_string()))?;
-            Ok(Outcome::Done)
+    let loaded = Registry::load(path);
+    let (lines, outcome) = match &loaded {
+        Ok(loaded) => (lines(loaded), Outcome::Done),
+        Err(errors) => (errors.diagnostics.iter().map(Line::Error).collect(), Outcome::BadConfiguration),
+    };
+    if format == Format::Json {
+        lines.iter().try_for_each(|line| writeln!(out, "{}", text::json(line)?))?;
+        return Ok(outcome);
+    }
+    let counted = match &loaded {
+        Ok(loaded) => {
+            table(loaded, out)?;
+            format!("{}, ok", text::counted(loaded.registry.devices.len() as u64, "device"))
         }
-        (Ok(loaded), Format::Json) => {
-            for device in &loaded.registry.devices {
-                line(out, &Line::Device(row(device)))?;
-            }
-            for module in &loaded.registry.modules {
-                line(out, &Line::Module(module))?;
-            }
-            for motor in motors(&loaded.registry) {
-                line(out, &Line::Motor(motor))?;
-            }
-            for stop in &loaded.registry.stops {
-                line(out, &Line::Stop(StopRow::of(stop)))?;
-            }
-            for warning in &loaded.warnings {
-                line(out, &Line::Warning(warning))?;
-            }
-            Ok(Outcome::Done)
-        }
-        (Err(errors), Format::Text) => {
-            writeln!(out, "{errors}")?;
-            let count = errors.diagnostics.len();
-            writeln!(
-                out,
-                "{}: {count} {}",
-                text::plain(&path.display().to_string()),
-                if count == 1 { "problem" } else { "problems" }
-            )?;
-            Ok(Outcome::BadConfiguration)
-        }
-        (Err(errors), Format::Json) => {
-            for error in &errors.diagnostics {
-                line(out, &Line::Error(error))?;
-            }
-            Ok(Outcome::BadConfiguration)
+        Err(errors) => text::counted(errors.diagnostics.len() as u64, "problem"),
+    };
+    for line in lines {
+        match line {
+            // They are in the table.
+            Line::Device(_) | Line::Warning(_) => {}
+            Line::Module(module) => writeln!(out, "{}", module_line(module))?,
+            Line::Motor(motor) => writeln!(out, "{}", text::plain(&motor.to_string()))?,
+            Line::Stop(stop) => writeln!(out, "{}", stop_line(&stop))?,
+            Line::Error(error) => writeln!(out, "{error}")?,
         }
     }
+    writeln!(out, "{}: {counted}", text::plain(&path.display().to_string()))?;
+    Ok(outcome)
+}
+
+fn lines(loaded: &Loaded) -> Vec<Line<'_>> {
+    let Loaded { registry, warnings } = loaded;
+    let mut lines: Vec<_> = registry.devices.iter().map(|device| Line::Device(row(device))).collect();
+    lines.extend(registry.modules.iter().map(Line::Module));
+    lines.extend(motors(registry).map(Line::Motor));
+    lines.extend(registry.stops.iter().map(|stop| Line::Stop(StopRow::of(stop))));
+    lines.extend(warnings.iter().map(Line::Warning));
+    lines
 }
 
 /// One line of JSON.
@@ -85,7 +70,7 @@ enum Line<'a> {
     Error(&'a Diagnostic),
 }
 
-/// How a joint stops.
+/// The stop behaviour of a joint.
 #[derive(Serialize)]
 struct MotorRow<'a> {
     name: &'a str,
@@ -124,14 +109,14 @@ impl std::fmt::Display for MotorRow<'_> {
         let Self { name, device, own_fault, other_fault, emergency, brake } = self;
         write!(
             f,
-            "motor {name} of {device}: {own_fault} at a fault of its own, {other_fault} at another's, {emergency} at an \
-             emergency stop"
+            "motor {name} of {device}: {own_fault} on its own fault, {other_fault} on another's, {emergency} on an emergency \
+             stop"
         )?;
         brake.iter().try_for_each(|brake| write!(f, "; brake on {brake}"))
     }
 }
 
-/// `kind` of a line is what the line is of.
+/// Named `stops_as` because `kind` is the type of the line.
 #[derive(Serialize)]
 struct StopRow<'a> {
     name: &'a str,
@@ -194,14 +179,10 @@ fn module_line(module: &ModuleSpec) -> String {
     text::plain(&line).into_owned()
 }
 
-fn stop_line(stop: &InterlockSpec) -> String {
+fn stop_line(stop: &StopRow<'_>) -> String {
     let what = if stop.actuators.is_empty() { "nothing".to_owned() } else { stop.actuators.join(" ") };
-    let line = format!("{} {}: {}; stops {what}", stop.kind.label(), stop.name, stop.input);
+    let line = format!("{} {}: {}; stops {what}", stop.stops_as.label(), stop.name, stop.input);
     text::plain(&line).into_owned()
-}
-
-fn line(out: &mut dyn Write, line: &Line<'_>) -> io::Result<()> {
-    writeln!(out, "{}", text::json(line)?)
 }
 
 fn table(loaded: &Loaded, out: &mut dyn Write) -> io::Result<()> {
@@ -257,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn warnings_and_problems_are_told_and_problems_are_bad_configuration() {
+    fn warnings_and_problems_are_listed_and_problems_fail_the_check() {
         let (outcome, text) = checked("[device.a]\nvid = \"1\"\npid = \"2\"\nnode = \"camera\"\n", Format::Text);
         assert_eq!(outcome, Outcome::Done);
         assert!(text.contains("warning: devices.toml:1:9: [device.a] no bit given, it gets bit 0"), "{text}");
@@ -272,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn how_each_joint_stops_is_listed() {
+    fn the_stop_behaviour_of_each_joint_is_listed() {
         let motors = "[device.arm]\nvid = \"2e88\"\npid = \"4603\"\nnode = \"can\"\nbit = 0\n[device.arm.can]\n\
                       adapter = \"damiao\"\nprotocol = \"damiao\"\nmotors = [\n\
                       { name = \"lift\", slave = 1, type = \"DM4310\", kp = 20, kd = 1, position = [0, 1], \
@@ -281,9 +262,9 @@ mod tests {
         let (outcome, text) = checked(motors, Format::Text);
         assert_eq!(outcome, Outcome::Done, "{text}");
         for line in [
-            "motor lift of arm: limp at a fault of its own, brake at another's, limp at an emergency stop; brake on line 4 \
-             of /dev/brakes\n",
-            "motor wheel of arm: limp at a fault of its own, hold at another's, limp at an emergency stop\n",
+            "motor lift of arm: limp on its own fault, brake on another's, limp on an emergency stop; brake on line 4 of \
+             /dev/brakes\n",
+            "motor wheel of arm: limp on its own fault, hold on another's, limp on an emergency stop\n",
         ] {
             assert!(text.contains(line), "{text}");
         }
@@ -318,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn json_is_one_object_a_line() {
+    fn json_is_one_object_per_line() {
         let (_, text) = checked(crate::registry::BUILTIN, Format::Json);
         let rows: Vec<serde_json::Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
         assert_eq!(rows.len(), 3);

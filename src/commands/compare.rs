@@ -1,34 +1,20 @@
-//! `rapid replay FILE --infer`: a policy beside a recorded episode.
+//! `rapid replay FILE --infer`: a policy compared with a recorded episode.
 
 use std::io::{self, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use super::Format;
 use super::progress::Bar;
+use crate::cli::ReplayArgs;
 use crate::compare::{self, Again, Beside, CompareError, Compared, Comparison, Difference, Spread, Watcher};
 use crate::policy::bundle::{Bundle, BundleErrors};
 use crate::policy::library::{Environment, LibraryError};
 use crate::text;
 
-/// Differences up to this come from the machine: the order in which it adds.
+/// Differences up to this come from the order of floating-point additions, which depends on the machine.
 const USUAL_TOLERANCE: f64 = 1e-4;
 
-/// What is compared.
-#[derive(Debug, Clone)]
-pub struct CompareOptions {
-    /// The episode.
-    pub file: PathBuf,
-    /// Folder of the policy.
-    pub bundle: Option<PathBuf>,
-    /// A larger difference of a policy's own episode is a failure.
-    pub tolerance: Option<f64>,
-    /// Steps of denoising instead of the bundle's own.
-    pub denoising_steps: Option<usize>,
-    /// Library of onnxruntime instead of the one inside.
-    pub library: Option<PathBuf>,
-}
-
-/// Why there is no comparison, or what it showed.
+/// Why there is no comparison, or why it failed.
 #[derive(Debug, thiserror::Error)]
 pub enum CompareFailure {
     /// The bundle.
@@ -50,8 +36,8 @@ pub enum CompareFailure {
         /// What was allowed.
         tolerance: f64,
     },
-    /// A tolerance, and nothing that it could be about.
-    #[error("{file}: {why}, so there is no difference to hold against --tolerance")]
+    /// A tolerance, and no difference to compare it with.
+    #[error("{file}: {why}, so there is no difference to compare with --tolerance")]
     Incomparable {
         /// The episode.
         file: String,
@@ -63,13 +49,13 @@ pub enum CompareFailure {
     Output(#[from] io::Error),
 }
 
-struct Progress<'a> {
+struct ProgressBar<'a> {
     bar: Option<Bar>,
     wanted: bool,
     stop: &'a dyn Fn() -> bool,
 }
 
-impl Watcher for Progress<'_> {
+impl Watcher for ProgressBar<'_> {
     fn at(&mut self, done: usize, total: usize) -> bool {
         let wanted = self.wanted;
         self.bar.get_or_insert_with(|| Bar::new("comparing", total, wanted)).at(done);
@@ -77,31 +63,31 @@ impl Watcher for Progress<'_> {
     }
 }
 
-/// Compares, and prints what came of it. Ends early when `stop` says so, and prints what there is.
+/// Compares, and prints the result. Ends early when `stop` returns true, and prints the result so far.
 ///
 /// # Errors
 /// When the policy or the file cannot be used, or the difference is larger than allowed.
 pub fn run(
-    options: &CompareOptions,
+    args: &ReplayArgs,
     format: Format,
     stop: &dyn Fn() -> bool,
     out: &mut dyn Write,
 ) -> Result<(), CompareFailure> {
-    let bundle = Bundle::open(options.bundle.as_deref())?;
-    let environment = Environment::open(options.library.as_deref())?;
-    let mut progress = Progress { bar: None, wanted: format == Format::Text, stop };
-    let compared = compare::compare(&options.file, &bundle, &environment, options.denoising_steps, &mut progress)?;
+    let bundle = Bundle::open(args.infer.as_ref().and_then(Option::as_deref))?;
+    let environment = Environment::open(args.inference.ort_lib.as_deref())?;
+    let mut progress = ProgressBar { bar: None, wanted: format == Format::Text, stop };
+    let compared = compare::compare(&args.file, &bundle, &environment, args.inference.denoising_steps, &mut progress)?;
     drop(progress);
     match format {
-        Format::Json => writeln!(out, "{}", json(&compared, &bundle, options)?)?,
-        Format::Text => print(&compared, &bundle, &options.file, options.tolerance, out)?,
+        Format::Json => writeln!(out, "{}", json(&compared, &bundle, args)?)?,
+        Format::Text => print(&compared, &bundle, &args.file, args.tolerance, out)?,
     }
-    judge(&compared, options)
+    judge(&compared, args)
 }
 
-fn judge(compared: &Compared, options: &CompareOptions) -> Result<(), CompareFailure> {
-    let Some(tolerance) = options.tolerance else { return Ok(()) };
-    let file = options.file.display().to_string();
+fn judge(compared: &Compared, args: &ReplayArgs) -> Result<(), CompareFailure> {
+    let Some(tolerance) = args.tolerance else { return Ok(()) };
+    let file = args.file.display().to_string();
     let Comparison::Again(again) = &compared.comparison else {
         return Err(CompareFailure::Incomparable { file, why: "no policy recorded it" });
     };
@@ -112,13 +98,13 @@ fn judge(compared: &Compared, options: &CompareOptions) -> Result<(), CompareFai
     }
 }
 
-fn json(compared: &Compared, bundle: &Bundle, options: &CompareOptions) -> Result<String, io::Error> {
+fn json(compared: &Compared, bundle: &Bundle, args: &ReplayArgs) -> Result<String, io::Error> {
     let mut value = serde_json::to_value(compared)?;
     value["event"] = "comparison".into();
-    value["file"] = options.file.display().to_string().into();
+    value["file"] = args.file.display().to_string().into();
     (value["policy"], value["policy_hash"]) = (bundle.name.clone().into(), bundle.hash.clone().into());
     if let Comparison::Again(again) = &compared.comparison {
-        let tolerance = options.tolerance.unwrap_or(USUAL_TOLERANCE);
+        let tolerance = args.tolerance.unwrap_or(USUAL_TOLERANCE);
         value["tolerance"] = tolerance.into();
         value["within"] = again.largest().map(|largest| largest <= tolerance).into();
     }
@@ -139,12 +125,12 @@ fn print(
             let by = compared.recorded_policy.as_deref().unwrap_or("a policy");
             writeln!(out, "{file}: recorded by {}, computed again by {name}\n", text::plain(by))?;
             if compared.recorded_policy_hash.as_ref().is_some_and(|hash| *hash != bundle.hash) {
-                writeln!(out, "not the same policy: the bundle is another one than that of the recording\n")?;
+                writeln!(out, "another policy: the bundle differs from that of the recording\n")?;
             }
             print_again(again, tolerance.unwrap_or(USUAL_TOLERANCE), out)?;
         }
         Comparison::Beside(beside) => {
-            writeln!(out, "{file}: a demonstration, beside {name}\n")?;
+            writeln!(out, "{file}: a demonstration, compared with {name}\n")?;
             print_beside(beside, bundle, out)?;
         }
     }
@@ -152,7 +138,7 @@ fn print(
         writeln!(out, "\n{}", text::plain(damage))?;
     }
     if compared.interrupted {
-        writeln!(out, "\ninterrupted: what is above is a part of the episode")?;
+        writeln!(out, "\ninterrupted: the above covers a part of the episode")?;
     }
     Ok(())
 }
@@ -160,15 +146,15 @@ fn print(
 fn print_again(again: &Again, tolerance: f64, out: &mut dyn Write) -> io::Result<()> {
     writeln!(out, "{} chunks, {} computed again", again.chunks, again.compared)?;
     let others = [
-        (again.samples_missing, "not: their samples are not all in the file (captured before it began, or lost)"),
+        (again.samples_missing, "not: some of their samples are not in the file (captured before it started, or lost)"),
         (
             again.reference_unknown,
-            "not: the recording began after the policy, and the first picture, which it compares all others with, is \
-             not in the file",
+            "not: the recording started after the policy, and the first picture, the reference for all others, is not \
+             in the file",
         ),
-        (again.unlike, "not: of other observations or another length than this policy's"),
+        (again.unlike, "not: their observations or length differ from this policy's"),
         (again.unreadable, "not: their events cannot be read"),
-        (again.failed, "not: the policy has no answer"),
+        (again.failed, "not: the policy failed"),
     ];
     print_others(&others, again.failure.as_deref(), out)?;
     if again.compared > 0 {
@@ -176,8 +162,8 @@ fn print_again(again: &Again, tolerance: f64, out: &mut dyn Write) -> io::Result
     }
     let actions = &again.actions;
     if actions.recorded > 0 {
-        writeln!(out, "\n{} actions, {} beside those of the chunks", actions.recorded, actions.compared)?;
-        print_others(&[(actions.without_chunk, "not: no chunk in the file speaks of their tick")], None, out)?;
+        writeln!(out, "\n{} actions, {} compared with those of the chunks", actions.recorded, actions.compared)?;
+        print_others(&[(actions.without_chunk, "not: no chunk in the file covers their tick")], None, out)?;
         if actions.compared > 0 {
             table(&actions.difference, out)?;
         }
@@ -197,7 +183,7 @@ fn print_beside(beside: &Beside, bundle: &Bundle, out: &mut dyn Write) -> io::Re
         text::hertz(bundle.control_hz),
         counts.chunks
     )?;
-    print_others(&[(beside.without_recorded, "not: no action was recorded there")], None, out)?;
+    print_others(&[(beside.without_recorded, "not: no action was recorded then")], None, out)?;
     for (reason, held) in &beside.held {
         writeln!(out, "  {held} not: {reason}")?;
     }
@@ -226,7 +212,7 @@ fn table(difference: &Difference, out: &mut dyn Write) -> io::Result<()> {
     line("all", "", &difference.all)
 }
 
-/// Short, whatever its size.
+/// A value in few characters, whatever its magnitude.
 fn number(value: f64) -> String {
     if value == 0.0 {
         "0".to_owned()

@@ -1,5 +1,5 @@
-//! `rapid --sim task --expert --record`: demonstrations of the simulated task, recorded faster than they
-//! would take.
+//! `rapid --sim task --expert --record`: demonstrations of the simulated task, recorded faster than real
+//! time.
 
 use std::io::{self, Write};
 use std::sync::Arc;
@@ -11,19 +11,20 @@ use super::Format;
 use super::progress::Bar;
 use crate::driver::sim::task::Texture;
 use crate::lockstep::STEP;
-use crate::lockstep::collect::{self, CollectError};
+use crate::lockstep::TrialError;
+use crate::lockstep::collect;
 use crate::record::EpisodeRequest;
 use crate::registry::Registry;
 use crate::status::{Board, Grade};
 use crate::text;
 
-/// Why not all of them were recorded.
+/// Why not all demonstrations were recorded.
 #[derive(Debug, thiserror::Error)]
 pub enum DemonstrateError {
     /// A demonstration.
     #[error(transparent)]
-    Collect(#[from] CollectError),
-    /// An episode's file is not whole.
+    Collect(#[from] TrialError),
+    /// An episode's file is incomplete.
     #[error("{0}")]
     Episode(String),
     /// The output.
@@ -31,11 +32,11 @@ pub enum DemonstrateError {
     Output(#[from] io::Error),
 }
 
-/// Records `count` demonstrations from seed `first` on, half of them of each texture, and says what they
-/// are. Stops between two of them when `stop` says so.
+/// Records `count` demonstrations from seed `first` on, half of them of each texture, and lists them.
+/// Stops between two of them when `stop` returns true.
 ///
 /// # Errors
-/// When one cannot be recorded; those before it are whole.
+/// When one cannot be recorded; those before it are complete.
 pub fn run(
     request: &EpisodeRequest,
     first: u64,
@@ -65,9 +66,9 @@ pub fn run(
         if format == Format::Json {
             let report = &demonstration.report;
             let texture = if demonstration.texture == Texture::Triangular { "triangular" } else { "hexagonal" };
-            let said = json!({"event": "demonstration", "seed": seed, "texture": texture,
+            let line = json!({"event": "demonstration", "seed": seed, "texture": texture,
                 "steps": demonstration.steps, "file": report.file.to_string_lossy(), "verdict": report.verdict.grade});
-            writeln!(out, "{said}")?;
+            writeln!(out, "{line}")?;
         }
     }
     bar.clear();
@@ -78,7 +79,7 @@ pub fn run(
         writeln!(
             out,
             "{done} demonstrations in {folder}: {triangular} triangular, {} hexagonal, {good} GOOD; {steps} steps, {} of \
-             robot time in {:.1} s ({times:.0} times as fast)",
+             robot time in {:.1} s ({times:.0} times real time)",
             done - triangular,
             text::clock(recorded),
             taken.as_secs_f64(),

@@ -1,4 +1,4 @@
-//! `rapid devices`: what is plugged in, which entry of the registry it is, and if none, why not.
+//! `rapid devices`: the devices that are plugged in, and the registry entry each matches, or why none.
 
 use std::io::{self, Write};
 
@@ -16,38 +16,38 @@ use crate::text;
 pub struct Plugged {
     /// Node, for example `/dev/video0`.
     pub node: String,
-    /// What its device says it is.
+    /// Its device, in the device's own words.
     #[serde(flatten)]
     pub unit: Unit,
-    /// The entry it is, if any.
+    /// The entry it matches, if any.
     pub entry: Option<String>,
-    /// Why it is that entry, or none.
+    /// Why it matches that entry, or none.
     pub reasons: Vec<String>,
-    /// Formats and controls, if asked for and it is a camera.
+    /// Formats and controls of a camera, if requested.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub camera: Option<CameraInfo>,
-    /// Why the camera does not tell them.
+    /// Why they cannot be read.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub camera_error: Option<String>,
 }
 
-/// What to tell of cameras.
+/// Whether to query cameras.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Formats {
-    /// Open them and ask for formats and controls.
+    /// Open them and query formats and controls.
     Ask,
-    /// Leave them alone.
+    /// Do not open them.
     Skip,
 }
 
-/// What there is to match against.
+/// The entries to match against.
 #[derive(Debug, Clone, Copy)]
 pub enum Entries<'a> {
     /// The entries of a registry.
     Of(&'a Registry),
-    /// Nothing: there is no registry.
+    /// None: there is no registry.
     NoFile,
-    /// Nothing: the registry cannot be used.
+    /// None: the registry is invalid.
     Wrong,
 }
 
@@ -61,9 +61,7 @@ pub fn list(entries: Entries<'_>, attached: &[Attachment], formats: Formats) -> 
     let plugged = |attachment: &Attachment| {
         let (entry, reasons) = match (&mut assigner, entries) {
             (Some((assigner, registry)), _) => explain(assigner, registry, attachment),
-            (None, Entries::Wrong) => {
-                (None, vec!["the registry cannot be used; what is wrong is said below".to_owned()])
-            }
+            (None, Entries::Wrong) => (None, vec!["the registry is invalid; its mistakes are listed below".to_owned()]),
             (None, _) => (None, vec!["there is no registry; write a devices.toml".to_owned()]),
         };
         let (camera, camera_error) = match (&attachment.node, formats) {
@@ -75,11 +73,11 @@ pub fn list(entries: Entries<'_>, attached: &[Attachment], formats: Formats) -> 
         };
         Plugged { node: attachment.node.label(), unit: attachment.unit.clone(), entry, reasons, camera, camera_error }
     };
-    attached.iter().filter(|attachment| is_worth_a_line(entries, attachment)).map(plugged).collect()
+    attached.iter().filter(|attachment| is_listed(entries, attachment)).map(plugged).collect()
 }
 
-/// Every hub and mouse is a USB device: only those that an entry means are listed as such.
-fn is_worth_a_line(entries: Entries<'_>, attachment: &Attachment) -> bool {
+/// Every hub and mouse is a USB device: only those that an entry matches are listed as such.
+fn is_listed(entries: Entries<'_>, attachment: &Attachment) -> bool {
     match (&attachment.node, entries) {
         (DeviceNode::Usb(_), Entries::Of(registry)) => !Assigner::new(registry).explain(attachment).fits.is_empty(),
         (DeviceNode::Usb(_), Entries::NoFile | Entries::Wrong) => false,
@@ -91,7 +89,7 @@ fn explain(assigner: &mut Assigner, registry: &Registry, attachment: &Attachment
     let mut why = assigner.explain(attachment).reasons;
     match assigner.attach(attachment) {
         Assignment::Entry(id) => (registry.device(id).map(|device| device.name.clone()), why),
-        // It fits, and something stands in the way.
+        // It matches, and something prevents its use.
         Assignment::Waiting { reason } | Assignment::WrongNode { reason } => {
             why.push(reason);
             (None, why)
@@ -100,7 +98,7 @@ fn explain(assigner: &mut Assigner, registry: &Registry, attachment: &Attachment
     }
 }
 
-/// Prints the list, and the entries of which nothing is plugged in.
+/// Prints the list, and the entries without a connected device.
 ///
 /// # Errors
 /// When `out` cannot be written.
@@ -122,7 +120,7 @@ struct Line<T> {
     what: T,
 }
 
-/// An entry of which nothing is plugged in.
+/// An entry without a connected device.
 #[derive(Serialize)]
 struct Missing<'a> {
     entry: &'a str,
@@ -178,7 +176,7 @@ fn print_text(plugged: &[Plugged], missing: &[&DeviceSpec], out: &mut dyn Write)
     }
     for entry in missing {
         let Some(UsbSpec { vid, pid, serial, port }) = entry.identity.usb() else {
-            // It is looked for while `rapid` runs.
+            // It is searched for while `rapid` runs.
             writeln!(out, "[device.{}] is on the network", entry.name)?;
             continue;
         };

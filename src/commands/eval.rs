@@ -1,41 +1,23 @@
-//! `rapid eval`: closed-loop trials of a policy on the simulated task, as the paper's table of hot-plug
-//! robustness has them.
+//! `rapid eval`: closed-loop trials of a policy on the simulated task, as in the paper's table of hot-plug
+//! robustness.
 
 use std::io::{self, Write};
-use std::path::PathBuf;
 use std::time::Instant;
 
 use serde_json::json;
 
 use super::Format;
 use super::progress::Bar;
+use crate::cli::EvalArgs;
 use crate::driver::sim::task::Outcome;
-use crate::lockstep::evaluate::{Bench, Condition, Configuration, Status, Trial, TrialError, robot_time, wilson};
+use crate::lockstep::TrialError;
+use crate::lockstep::evaluate::{Bench, Condition, Configuration, Status, Trial, robot_time, wilson};
 use crate::policy::bundle::{Bundle, BundleErrors};
 use crate::policy::library::{Environment, LibraryError};
 use crate::policy::model::Model;
 use crate::policy::sampler::PolicyError;
 use crate::registry::Registry;
 use crate::text;
-
-/// What is evaluated.
-#[derive(Debug, Clone)]
-pub struct EvalOptions {
-    /// Folder of the policy; without one that inside the program.
-    pub bundle: Option<PathBuf>,
-    /// Trials a condition.
-    pub trials: usize,
-    /// Number of the first trial.
-    pub seed: u64,
-    /// Which conditions.
-    pub conditions: Vec<Condition>,
-    /// Which sensors a run expects.
-    pub configuration: Configuration,
-    /// Steps of denoising instead of the bundle's own.
-    pub denoising_steps: Option<usize>,
-    /// Library of onnxruntime instead of the one inside.
-    pub library: Option<PathBuf>,
-}
 
 /// Why there is no result.
 #[derive(Debug, thiserror::Error)]
@@ -57,7 +39,7 @@ pub enum EvalError {
     Output(#[from] io::Error),
 }
 
-/// What a condition came to.
+/// The result of a condition.
 struct Row {
     condition: Condition,
     trials: Vec<Trial>,
@@ -76,34 +58,30 @@ const fn paper(condition: Condition, configuration: Configuration) -> (Option<f6
     }
 }
 
-/// Runs the trials and prints what came of them. Stops between two trials when `stop` says so, and prints
-/// what there is.
+/// Runs the trials and prints the results. Stops between two trials when `stop` returns true, and prints
+/// the results so far.
 ///
 /// # Errors
 /// When the policy cannot be loaded or run.
-pub fn run(
-    options: &EvalOptions,
-    format: Format,
-    stop: &dyn Fn() -> bool,
-    out: &mut dyn Write,
-) -> Result<(), EvalError> {
-    let bundle = Bundle::open(options.bundle.as_deref())?;
+pub fn run(args: &EvalArgs, format: Format, stop: &dyn Fn() -> bool, out: &mut dyn Write) -> Result<(), EvalError> {
+    let bundle = Bundle::open(args.bundle.as_deref())?;
     let registry = Registry::task();
     bundle.check_registry(&registry)?;
     let actuators: Vec<_> =
         registry.actuator().into_iter().map(|(device, action)| (device.name.as_str(), action.names.len())).collect();
     bundle.check_actuators(&actuators)?;
-    let environment = Environment::open(options.library.as_deref())?;
-    let mut model = Model::load(&bundle, &environment, options.denoising_steps)?;
-    let configuration = options.configuration;
+    let environment = Environment::open(args.inference.ort_lib.as_deref())?;
+    let mut model = Model::load(&bundle, &environment, args.inference.denoising_steps)?;
+    let conditions = if args.condition.is_empty() { &Condition::ALL[..] } else { &args.condition };
+    let configuration = if args.static_config { Configuration::Static } else { Configuration::Dynamic };
     let mut bench = Bench { bundle: &bundle, registry: &registry, model: &mut model, configuration };
     let begun = Instant::now();
-    let mut bar = Bar::new("trials", options.trials * options.conditions.len(), format == Format::Text);
+    let mut bar = Bar::new("trials", args.trials * conditions.len(), format == Format::Text);
     let mut rows: Vec<Row> = Vec::new();
     let mut done = 0;
-    'all: for condition in &options.conditions {
+    'all: for condition in conditions {
         rows.push(Row { condition: *condition, trials: Vec::new() });
-        for seed in (options.seed..).take(options.trials) {
+        for seed in (args.seed..).take(args.trials) {
             if stop() {
                 break 'all;
             }
@@ -126,7 +104,7 @@ pub fn run(
                 writeln!(out, "{}", tagged("condition", &row.json(&bundle, configuration)))?;
             }
         }
-        Format::Text => table(&rows, &bundle, options, begun.elapsed().as_secs_f64(), out)?,
+        Format::Text => table(&rows, &bundle, args, configuration, begun.elapsed().as_secs_f64(), out)?,
     }
     Ok(())
 }
@@ -146,7 +124,7 @@ impl Row {
         self.trials.iter().filter(|trial| trial.status == Status::Crash).count()
     }
 
-    /// The worst that happened; a sensor that came back is as one that was there.
+    /// The worst status; a sensor that came back counts as present.
     fn status(&self) -> Status {
         let worst = self.trials.iter().map(|trial| trial.status).max().unwrap_or(Status::Normal);
         if worst == Status::Degraded && self.condition == Condition::HotReplug { Status::Normal } else { worst }
@@ -169,26 +147,27 @@ impl Row {
 fn table(
     rows: &[Row],
     bundle: &Bundle,
-    options: &EvalOptions,
+    args: &EvalArgs,
+    configuration: Configuration,
     taken: f64,
     out: &mut dyn Write,
 ) -> Result<(), io::Error> {
-    let kind = match options.configuration {
-        Configuration::Dynamic => "the mask decides",
+    let kind = match configuration {
+        Configuration::Dynamic => "dynamic configuration",
         Configuration::Static => "static configuration: a missing sensor is fatal",
     };
     writeln!(
         out,
-        "{}  {} trials a condition from seed {}; {kind}\n",
+        "{}  {} trials per condition from seed {}; {kind}\n",
         text::plain(&bundle.name),
-        options.trials,
-        options.seed
+        args.trials,
+        args.seed
     )?;
     writeln!(out, "condition     score  95 %          success  wrong bin  incomplete  crash  status    paper")?;
     for row in rows {
         let (total, successes) = (row.trials.len(), row.count(Outcome::Success));
         let (low, high) = wilson(successes, total);
-        let (paper, paper_status) = paper(row.condition, options.configuration);
+        let (paper, paper_status) = paper(row.condition, configuration);
         let paper = paper.map_or_else(|| "-   ".to_owned(), |score| format!("{score:.2}"));
         writeln!(
             out,
@@ -205,7 +184,7 @@ fn table(
     let robot = robot_time(steps);
     writeln!(
         out,
-        "\n{} of robot time in {taken:.1} s ({:.0} times as fast)",
+        "\n{} of robot time in {taken:.1} s ({:.0} times real time)",
         text::clock(robot),
         robot.as_secs_f64() / taken.max(1e-9)
     )?;

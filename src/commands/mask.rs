@@ -1,7 +1,7 @@
 //! `rapid mask`: the published mask, once or at each change.
 //!
-//! Invariant: it only reads what is published, so it works beside a `rapid` that is running, and
-//! says so when none is.
+//! Invariant: it only reads published data, so it works beside a running `rapid`, and reports when none
+//! is running.
 
 use std::io::{self, Write};
 use std::time::Duration;
@@ -14,9 +14,9 @@ use crate::headless::style::Palette;
 use crate::mask::{MaskRecord, PhysicalMask};
 use crate::text;
 
-/// A record older than this comes from a publisher that is gone: a living one publishes every 2 ms.
+/// A record older than this is stale: a running publisher publishes every 2 ms.
 pub const STALE_AFTER: Duration = Duration::from_secs(1);
-/// How often `--watch` looks: as often as the mask is published.
+/// Polling period of `--watch`: that of the publisher.
 const POLL: Duration = Duration::from_millis(2);
 
 /// Names of bits.
@@ -25,7 +25,7 @@ pub type Layout = [(u8, String)];
 /// What to print.
 #[derive(Debug, Clone, Copy)]
 pub struct MaskOptions {
-    /// Go on, with a line for each change.
+    /// Continue with a line per change.
     pub watch: bool,
     /// JSON objects instead of text.
     pub json: bool,
@@ -36,7 +36,7 @@ pub struct MaskOptions {
 /// Why the mask cannot be shown.
 #[derive(Debug, thiserror::Error)]
 pub enum MaskError {
-    /// There is no record that can be read.
+    /// No record can be read.
     #[error("{0}")]
     Unreadable(String),
     /// The output cannot be written.
@@ -60,7 +60,7 @@ pub fn layout(json: &str) -> Option<Vec<(u8, String)>> {
     Some(file.devices.into_iter().map(|device| (device.bit, device.name)).collect())
 }
 
-/// The record for people: the mask, its age, and a line a modality. `now_ns` is the wall time now.
+/// The record for people: the mask, its age, and one line per modality. `now_ns` is the current wall time.
 #[must_use]
 pub fn render(record: &MaskRecord, layout: Option<&Layout>, now_ns: u64, palette: Palette) -> String {
     let count = usize::from(record.device_count);
@@ -80,13 +80,13 @@ pub fn render(record: &MaskRecord, layout: Option<&Layout>, now_ns: u64, palette
     std::iter::once(head).chain(bits(record, layout).into_iter().map(line)).collect()
 }
 
-/// Registered bits in ascending order: those with names, or as many as the record says there are.
+/// Registered bits in ascending order: those with names, or as many as the record counts.
 fn bits(record: &MaskRecord, layout: Option<&Layout>) -> Vec<u8> {
     let mut bits: Vec<u8> = match layout {
         Some(layout) => layout.iter().map(|(bit, _)| *bit).filter(|bit| *bit < 64).collect(),
         None => (0..record.device_count.min(64)).collect(),
     };
-    // A set bit is shown even when nobody can name it.
+    // A set bit is shown even without a name.
     bits.extend((0..64).filter(|bit| record.mask.0 >> bit & 1 == 1));
     bits.sort_unstable();
     bits.dedup();
@@ -136,7 +136,7 @@ struct ObjectDevice<'a> {
 /// The record as one JSON object, without a line end.
 ///
 /// # Errors
-/// Never in practice: every part of it has a form in JSON.
+/// Never in practice: every part can be serialised.
 pub fn render_json(record: &MaskRecord, layout: Option<&Layout>, now_ns: u64) -> serde_json::Result<String> {
     let count = usize::from(record.device_count);
     let online = |bit: u8| bit < 64 && record.mask.0 >> bit & 1 == 1;
@@ -157,26 +157,12 @@ pub fn render_json(record: &MaskRecord, layout: Option<&Layout>, now_ns: u64) ->
 
 /// Prints the record, and with `watch` each change of the mask until `stop`.
 ///
-/// `read` gives the record now, `names` the layout, `now` the wall time in ns. While watching, a
-/// publisher that goes and comes back is told; before, none is an error.
+/// `read` returns the current record, `names` the layout, `now` the wall time in ns. While watching, a
+/// publisher that stops or returns is reported; at the start, a missing one is an error.
 ///
 /// # Errors
-/// When there is no record to begin with, or the output cannot be written. A closed pipe is a clean end.
+/// When there is no record at the start, or the output cannot be written. A closed pipe is no error.
 pub async fn run(
-    read: impl FnMut() -> Result<MaskRecord, String>,
-    names: impl Fn() -> Option<Vec<(u8, String)>>,
-    now: impl Fn() -> u64,
-    options: MaskOptions,
-    stop: CancellationToken,
-    out: impl Write,
-) -> Result<(), MaskError> {
-    match show(read, names, now, options, stop, out).await {
-        Err(MaskError::Output(error)) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
-        outcome => outcome,
-    }
-}
-
-async fn show(
     mut read: impl FnMut() -> Result<MaskRecord, String>,
     names: impl Fn() -> Option<Vec<(u8, String)>>,
     now: impl Fn() -> u64,
@@ -184,42 +170,49 @@ async fn show(
     stop: CancellationToken,
     mut out: impl Write,
 ) -> Result<(), MaskError> {
-    let first = read().map_err(MaskError::Unreadable)?;
-    let layout = names();
-    let text = if options.json {
-        render_json(&first, layout.as_deref(), now()).map_err(io::Error::from)? + "\n"
-    } else {
-        render(&first, layout.as_deref(), now(), options.palette)
-    };
-    out.write_all(text.as_bytes())?;
-    out.flush()?;
-    if !options.watch {
-        return Ok(());
-    }
-    let mut seen = Seen { mask: first.mask, sequence: first.sequence, alive: age(&first, now()) <= STALE_AFTER };
-    let mut poll = tokio::time::interval(POLL);
-    poll.set_missed_tick_behavior(MissedTickBehavior::Delay);
-    loop {
-        tokio::select! {
-            biased;
-            () = stop.cancelled() => return Ok(()),
-            _ = poll.tick() => {}
-        }
-        let Some(change) = seen.look(read(), now()) else { continue };
-        let line = change.line(&names, now(), options)?;
-        out.write_all(line.as_bytes())?;
+    let show = async {
+        let first = read().map_err(MaskError::Unreadable)?;
+        let layout = names();
+        let text = if options.json {
+            render_json(&first, layout.as_deref(), now()).map_err(io::Error::from)? + "\n"
+        } else {
+            render(&first, layout.as_deref(), now(), options.palette)
+        };
+        out.write_all(text.as_bytes())?;
         out.flush()?;
+        if !options.watch {
+            return Ok(());
+        }
+        let mut last =
+            LastMask { mask: first.mask, sequence: first.sequence, alive: age(&first, now()) <= STALE_AFTER };
+        let mut poll = tokio::time::interval(POLL);
+        poll.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        loop {
+            tokio::select! {
+                biased;
+                () = stop.cancelled() => return Ok(()),
+                _ = poll.tick() => {}
+            }
+            let Some(change) = last.update(read(), now()) else { continue };
+            let line = change.line(&names, now(), options)?;
+            out.write_all(line.as_bytes())?;
+            out.flush()?;
+        }
+    };
+    match show.await {
+        Err(MaskError::Output(error)) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
+        outcome => outcome,
     }
 }
 
-/// What the watcher knows.
-struct Seen {
+/// The last published state that was read.
+struct LastMask {
     mask: PhysicalMask,
     sequence: u64,
     alive: bool,
 }
 
-/// What there is to say.
+/// A change to print.
 #[derive(Debug)]
 enum Change {
     Mask { record: MaskRecord, before: PhysicalMask },
@@ -227,8 +220,8 @@ enum Change {
     Gone(String),
 }
 
-impl Seen {
-    fn look(&mut self, record: Result<MaskRecord, String>, now_ns: u64) -> Option<Change> {
+impl LastMask {
+    fn update(&mut self, record: Result<MaskRecord, String>, now_ns: u64) -> Option<Change> {
         let record = match record {
             Ok(record) if age(&record, now_ns) <= STALE_AFTER => record,
             Ok(_) => return self.gone("no publication for 1 s"),

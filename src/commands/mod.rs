@@ -1,16 +1,18 @@
-//! Subcommands that need no rig: each writes to a given stream and says how it ended.
+//! Subcommands that run without a rig: each writes to a given stream and returns its outcome.
 
 pub mod ablation;
 pub mod arm;
 pub mod artifacts;
 pub mod calibrate;
 pub mod check;
+#[cfg(feature = "policy")]
 pub mod compare;
 pub mod completions;
+#[cfg(feature = "policy")]
 pub mod demonstrate;
 pub mod devices;
 pub mod doctor;
-mod episodes;
+#[cfg(feature = "policy")]
 pub mod eval;
 pub mod inspect;
 pub mod mask;
@@ -24,15 +26,15 @@ pub enum Format {
     /// For people.
     #[default]
     Text,
-    /// One JSON object a line.
+    /// One JSON object per line.
     Json,
 }
 
-/// How a command ended; the caller turns it into an exit code.
+/// The outcome of a command; the caller turns it into an exit code.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Outcome {
-    /// It did what was asked.
+    /// Success.
     Done,
-    /// The configuration is wrong; what is wrong has been written.
+    /// The configuration is invalid; its mistakes have been written.
     BadConfiguration,
 }

@@ -1,6 +1,13 @@
-//! A progress line on standard error, for work that takes longer than one likes to wait in the dark.
+//! Work that takes long: a progress line on standard error, and many episodes judged in parallel, on all processors.
+//!
+//! Every file is read completely, whatever its recorder wrote about it, so later changes are found.
 
+use std::collections::BTreeMap;
 use std::io::{IsTerminal, Write, stderr};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::mpsc;
+use std::thread;
 use std::time::{Duration, Instant};
 
 use crate::text;
@@ -8,7 +15,7 @@ use crate::text;
 const EVERY: Duration = Duration::from_millis(100);
 const BLOCKS: usize = 20;
 
-/// `label ██████·········· 12/72  0:07 left`, drawn over itself; nothing where nobody looks.
+/// `label ██████·········· 12/72  0:07 left`, drawn over itself; only on a terminal.
 #[derive(Debug)]
 pub struct Bar {
     label: &'static str,
@@ -19,13 +26,13 @@ pub struct Bar {
 }
 
 impl Bar {
-    /// A line for `total` pieces of work, if `wanted` and standard error is a terminal.
+    /// A line for `total` units of work, if `wanted` and standard error is a terminal.
     #[must_use]
     pub fn new(label: &'static str, total: usize, wanted: bool) -> Self {
         Self { label, total, begun: Instant::now(), drawn: None, shown: wanted && stderr().is_terminal() }
     }
 
-    /// `done` pieces are done.
+    /// Reports that `done` units are done.
     pub fn at(&mut self, done: usize) {
         if !self.shown || self.drawn.is_some_and(|drawn| drawn.elapsed() < EVERY) {
             return;
@@ -57,16 +64,82 @@ fn line(label: &str, done: usize, total: usize, elapsed: Duration) -> String {
     format!("{label} {bar} {done}/{total}{left}")
 }
 
+/// Applies `read` to every file and passes the results to `take`, in the order of the files, each as soon as
+/// possible. On a terminal a line on standard error shows the progress.
+///
+/// # Errors
+/// The first of `take`; the remaining files are then not read.
+pub(super) fn each<T: Send, E>(
+    files: &[PathBuf],
+    read: impl Fn(&Path) -> T + Sync,
+    mut take: impl FnMut(&Path, T) -> Result<(), E>,
+) -> Result<(), E> {
+    let workers = thread::available_parallelism().map_or(1, usize::from).min(files.len());
+    let mut bar = Bar::new("episodes", files.len(), files.len() > 1);
+    let next = AtomicUsize::new(0);
+    thread::scope(|scope| {
+        let (done, results) = mpsc::sync_channel(2 * workers);
+        for _ in 0..workers {
+            let (done, next, read) = (done.clone(), &next, &read);
+            scope.spawn(move || {
+                loop {
+                    let index = next.fetch_add(1, Ordering::Relaxed);
+                    // After an error the receiver is dropped.
+                    let Some(file) = files.get(index) else { break };
+                    if done.send((index, read(file))).is_err() {
+                        break;
+                    }
+                }
+            });
+        }
+        drop(done);
+        let mut early = BTreeMap::new();
+        let mut index = 0;
+        for (done, result) in results {
+            early.insert(done, result);
+            while let Some((file, result)) = files.get(index).zip(early.remove(&index)) {
+                index += 1;
+                bar.clear();
+                take(file, result)?;
+            }
+            bar.at(index);
+        }
+        Ok(())
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn the_line_says_how_far_and_how_long() {
+    fn the_line_shows_progress_and_time_left() {
         let bar = |done, total| line("trials", done, total, Duration::from_secs(30));
         assert_eq!(bar(0, 4), "trials ···················· 0/4");
         assert_eq!(bar(1, 4), "trials █████··············· 1/4  01:30 left");
         assert_eq!(bar(4, 4), "trials ████████████████████ 4/4  00:00 left");
         assert_eq!(bar(0, 0), "trials ████████████████████ 0/0");
+    }
+}
+
+#[cfg(test)]
+mod episodes_tests {
+    use super::*;
+
+    #[test]
+    fn results_come_in_the_order_of_the_files_until_an_error() {
+        let files: Vec<PathBuf> = (0..500).map(|number| PathBuf::from(number.to_string())).collect();
+        let number = |file: &Path| file.to_str().unwrap().parse::<usize>().unwrap();
+        let mut taken = Vec::new();
+        each(&files, number, |file, read| {
+            assert_eq!(file, files[read]);
+            taken.push(read);
+            Ok::<_, ()>(())
+        })
+        .unwrap();
+        assert_eq!(taken, (0..500).collect::<Vec<_>>());
+        let stopped = each(&files, number, |_, read| if read == 7 { Err(read) } else { Ok(()) });
+        assert_eq!(stopped, Err(7));
+        assert_eq!(each(&[], number, |_, read| Err(read)), Ok(()));
     }
 }

@@ -1,4 +1,4 @@
-//! `rapid recover`: repairs files and folders, and says of each what is there and what is lost.
+//! `rapid recover`: repairs files and folders, and reports what was kept and lost of each.
 
 use std::io::{self, Write};
 use std::ops::ControlFlow;
@@ -9,10 +9,10 @@ use serde::Serialize;
 use serde_json::json;
 
 use super::Format;
-use crate::record::recover::{RecoverError, Recovered, Watch, finished, is_damaged, left_behind, recover};
+use crate::episode::recover::{RecoverError, Recovered, Watch, finished, is_damaged, left_behind, recover};
 use crate::text;
 
-/// How it went, of all files together.
+/// The outcome of all files together.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Outcome {
     failed: usize,
@@ -20,25 +20,23 @@ pub struct Outcome {
 }
 
 impl Outcome {
-    /// Is everything whole that can be?
+    /// Whether everything was repaired that can be.
     #[must_use]
     pub const fn is_done(self) -> bool {
         self.failed == 0 && self.bad_arguments == 0
     }
 
-    /// Was something named that is no episode, and nothing worse?
+    /// Whether some argument was no episode, and nothing worse happened.
     #[must_use]
     pub const fn is_bad_argument(self) -> bool {
         self.failed == 0 && self.bad_arguments > 0
     }
 }
 
-/// Repairs every file of `paths` and every unfinished one of a folder among them; what became of them
-/// goes to `out`, what failed and, if wanted, the progress to `err`. `stop` interrupts the file in work
-/// and leaves out the rest.
+/// Repairs every file of `paths` and every unfinished one of a folder among them. Results go to `out`, errors
+/// and, if wanted, the progress to `err`. `stop` interrupts the current file and skips the rest.
 ///
-/// A reader that has gone is no reason to leave a file unrepaired: beside the outcome, whether all that
-/// was to be said could be written to `out`.
+/// A closed output leaves no file unrepaired, so its error is returned beside the outcome.
 pub fn run(
     paths: &[PathBuf],
     format: Format,
@@ -47,58 +45,47 @@ pub fn run(
     out: &mut impl Write,
     err: &mut impl Write,
 ) -> (Outcome, io::Result<()>) {
-    let mut teller = Teller { outcome: Outcome::default(), format, out, written: Ok(()), err };
+    let mut report = Report { outcome: Outcome::default(), format, out, written: Ok(()), err };
     for path in paths {
-        let work = match Work::of(path) {
+        let (unfinished, finished) = match work_of(path) {
             Ok(work) => work,
             Err(source) => {
-                teller.failed(path, &RecoverError::Io { path: path.clone(), source });
+                report.failed(path, &RecoverError::Io { path: path.clone(), source });
                 continue;
             }
         };
-        let is_idle = work.unfinished.is_empty();
-        for file in work.unfinished {
-            match teller.watched(&file, progress, stop, recover) {
-                Ok(recovered) => teller.done(&recovered),
-                Err(error) => teller.failed(&file, &error),
+        let is_idle = unfinished.is_empty();
+        for file in unfinished {
+            match report.with_progress(&file, progress, stop, recover) {
+                Ok(recovered) => report.done(&recovered),
+                Err(error) => report.failed(&file, &error),
             }
         }
         let mut is_sound = true;
-        for file in work.finished {
-            let damaged = teller.watched(&file, progress, stop, is_damaged);
+        for file in finished {
+            let damaged = report.with_progress(&file, progress, stop, is_damaged);
             is_sound &= matches!(damaged, Ok(false));
             match damaged {
                 Ok(false) => {}
-                Ok(true) => teller.damaged(&file),
-                Err(error) => teller.failed(&file, &error),
+                Ok(true) => report.damaged(&file),
+                Err(error) => report.failed(&file, &error),
             }
         }
         if is_idle && is_sound && format == Format::Text {
-            teller.line(&format!("{}: nothing to repair", path.display()));
+            report.line(&format!("{}: nothing to repair", path.display()));
         }
     }
-    teller.end()
+    report.end()
 }
 
-/// What of a path is to be repaired, and of a folder what is only looked at: a finished file is repaired where it is
-/// named itself.
-struct Work {
-    unfinished: Vec<PathBuf>,
-    finished: Vec<PathBuf>,
+/// The files of a path to repair, and those only to check: a finished file is repaired only if it is named itself.
+fn work_of(path: &Path) -> io::Result<(Vec<PathBuf>, Vec<PathBuf>)> {
+    // Listed before anything is repaired: repaired files need no check.
+    if path.is_dir() { Ok((left_behind(path)?, finished(path)?)) } else { Ok((vec![path.to_owned()], Vec::new())) }
 }
 
-impl Work {
-    fn of(path: &Path) -> io::Result<Self> {
-        if !path.is_dir() {
-            return Ok(Self { unfinished: vec![path.to_owned()], finished: Vec::new() });
-        }
-        // Before anything is repaired: what that makes is whole.
-        Ok(Self { unfinished: left_behind(path)?, finished: finished(path)? })
-    }
-}
-
-/// What is said of each file, and how it went so far.
-struct Teller<'a, O, E> {
+/// Writes a line per file, and keeps the outcome so far.
+struct Report<'a, O, E> {
     outcome: Outcome,
     format: Format,
     out: &'a mut O,
@@ -107,9 +94,9 @@ struct Teller<'a, O, E> {
     err: &'a mut E,
 }
 
-impl<O: Write, E: Write> Teller<'_, O, E> {
-    /// Does `work` on a file, with its progress shown if that is wanted, until `stop` interrupts it.
-    fn watched<T>(
+impl<O: Write, E: Write> Report<'_, O, E> {
+    /// Does `work` on a file, showing its progress if wanted, until `stop` interrupts it.
+    fn with_progress<T>(
         &mut self,
         file: &Path,
         progress: bool,
@@ -119,7 +106,7 @@ impl<O: Write, E: Write> Teller<'_, O, E> {
         if stop.load(Ordering::Relaxed) {
             return Err(RecoverError::Interrupted(file.to_owned()));
         }
-        let mut bar = Progress { file, shown: None };
+        let mut bar = PercentLine { file, shown: None };
         let mut watch = |done, size| {
             if progress {
                 bar.show(done, size, self.err);
@@ -131,13 +118,13 @@ impl<O: Write, E: Write> Teller<'_, O, E> {
         done
     }
 
-    /// A finished file that is damaged: it stays as it is unless it is named itself.
+    /// Reports a damaged finished file: it is kept as it is unless it is named itself.
     fn damaged(&mut self, file: &Path) {
         let name = file.display();
         match self.format {
             Format::Json => self.json(&json!({"file": file.to_string_lossy(), "outcome": "damaged"})),
             Format::Text => self.line(&text::plain(&format!(
-                "{name}: damaged; `rapid recover {name}` makes a whole file of what can be read of it"
+                "{name}: damaged; `rapid recover {name}` saves its readable data to a new file"
             ))),
         }
     }
@@ -180,13 +167,13 @@ impl<O: Write, E: Write> Teller<'_, O, E> {
     }
 }
 
-/// One line that is written over, whenever the percentage changes.
-struct Progress<'a> {
+/// A line that is redrawn whenever the percentage changes.
+struct PercentLine<'a> {
     file: &'a Path,
     shown: Option<u64>,
 }
 
-impl Progress<'_> {
+impl PercentLine<'_> {
     fn show(&mut self, done: u64, size: u64, err: &mut impl Write) {
         let percent = u128::from(done) * 100 / u128::from(size.max(1));
         let percent = u64::try_from(percent).unwrap_or(100);
@@ -209,9 +196,9 @@ impl Progress<'_> {
 mod tests {
     use super::*;
 
-    struct Gone;
+    struct Closed;
 
-    impl Write for Gone {
+    impl Write for Closed {
         fn write(&mut self, _: &[u8]) -> io::Result<usize> {
             Err(io::ErrorKind::BrokenPipe.into())
         }
@@ -222,9 +209,9 @@ mod tests {
     }
 
     #[test]
-    fn a_finished_file_that_is_damaged_is_named_with_what_to_do() {
-        let bytes = crate::episode_format::testing::episode(crate::episode_format::testing::options());
-        let whole = crate::record::recover::recover_bytes(&bytes).expect("an episode");
+    fn a_damaged_finished_file_is_reported_with_the_fix() {
+        let bytes = crate::episode::testing::episode(crate::episode::testing::options());
+        let whole = crate::episode::recover::recover_bytes(&bytes).expect("an episode");
         // The check value of the summary, before the magic number: every message can still be read.
         let mut flipped = whole.clone();
         flipped[whole.len() - 10] ^= 1;
@@ -234,26 +221,26 @@ mod tests {
             let folder = tempfile::tempdir().expect("a folder");
             let file = folder.path().join("a_001.mcap");
             std::fs::write(&file, bytes).expect("a file");
-            let said = |path: &Path, format| {
+            let reported = |path: &Path, format| {
                 let (mut out, mut err) = (Vec::new(), Vec::new());
                 let (outcome, _) = run(&[path.to_owned()], format, false, &AtomicBool::new(false), &mut out, &mut err);
                 let err = String::from_utf8_lossy(&err);
                 assert!(outcome.is_done() && err.is_empty(), "{what}: {outcome:?} {err}");
                 String::from_utf8(out).expect("text")
             };
-            let text = said(folder.path(), Format::Text);
+            let text = reported(folder.path(), Format::Text);
             let command = format!("`rapid recover {}`", file.display());
             assert_eq!((text.contains(&command), text.contains("nothing to repair")), (is_named, !is_named), "{text}");
-            assert_eq!(said(folder.path(), Format::Json).contains("\"damaged\""), is_named, "{what}");
+            assert_eq!(reported(folder.path(), Format::Json).contains("\"damaged\""), is_named, "{what}");
             assert_eq!(std::fs::read(&file).expect("the file"), bytes, "{what}");
-            // Once that is done there is nothing left to do.
-            said(&file, Format::Text);
-            assert!(said(folder.path(), Format::Text).contains("nothing to repair"), "{what}");
+            // After the repair nothing is left to do.
+            reported(&file, Format::Text);
+            assert!(reported(folder.path(), Format::Text).contains("nothing to repair"), "{what}");
         }
     }
 
     #[test]
-    fn a_reader_that_has_gone_leaves_no_file_unrepaired() {
+    fn a_closed_output_leaves_no_file_unrepaired() {
         let folder = tempfile::tempdir().expect("a folder");
         let file = |name: &str| folder.path().join(name);
         for name in ["a_001.mcap.partial", "b_001.mcap.partial", "c_001.mcap.partial"] {
@@ -262,9 +249,9 @@ mod tests {
         let paths = [file("none.mcap"), folder.path().to_owned()];
         let (stop, mut err) = (AtomicBool::new(false), Vec::new());
         for format in [Format::Text, Format::Json] {
-            let (outcome, written) = run(&paths, format, false, &stop, &mut Gone, &mut err);
+            let (outcome, written) = run(&paths, format, false, &stop, &mut Closed, &mut err);
             assert!(outcome.is_bad_argument(), "{outcome:?}");
-            assert_eq!(written.expect_err("nobody reads").kind(), io::ErrorKind::BrokenPipe);
+            assert_eq!(written.expect_err("closed").kind(), io::ErrorKind::BrokenPipe);
             assert_eq!(std::fs::read_dir(folder.path()).expect("a folder").count(), 0);
         }
     }

@@ -1,4 +1,4 @@
-//! The chunks of a recorded policy, computed once more from the samples that their events name.
+//! The chunks of a recorded policy, computed again from the samples that their events name.
 //!
 //! Chunks are taken in the order in which the policy gave them, so that a picture that later ones are
 //! compared with is the same. A request that had no answer left no event: had it been the first with a
@@ -10,18 +10,18 @@ use std::path::Path;
 use serde::Serialize;
 
 use super::difference::{Difference, distance};
-use super::reference::Reference;
-use super::survey::{RecordedAction, RecordedChunk, SEQUENCE_BITS, Survey};
+use super::survey::{RecordedAction, RecordedChunk, RecordedSamples, SEQUENCE_BITS, Survey, header};
 use super::{CompareError, Ended};
-use crate::driver::replay::tape::{Content, Tape};
-use crate::policy::bundle::Bundle;
+use crate::episode::decode::{Content, Scratch};
+use crate::episode::reader::{Item, Reader};
+use crate::policy::bundle::{Bundle, ObservationInput, ObservationSpec, Operation};
 use crate::policy::model::Model;
 use crate::policy::request::Request;
 use crate::registry::Registry;
-use crate::sample::{Encoding, SampleHeader};
+use crate::sample::SampleHeader;
 
-/// What came of it.
-#[derive(Debug, Clone, Serialize)]
+/// The result.
+#[derive(Debug, Clone, Default, Serialize)]
 pub struct Again {
     /// Chunks in the file.
     pub chunks: u64,
@@ -46,7 +46,7 @@ pub struct Again {
 }
 
 /// The published actions beside those of the chunks, brought within the limits.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Default, Serialize)]
 pub struct Actions {
     /// Actions in the file.
     pub recorded: u64,
@@ -70,14 +70,6 @@ impl Again {
 /// A sample: position of its device in the registry, and the number that the message holds.
 type Key = (usize, u64);
 
-#[derive(Debug)]
-struct Kept {
-    encoding: Encoding,
-    width: u32,
-    height: u32,
-    bytes: Vec<u8>,
-}
-
 /// What is being computed.
 struct Work<'a> {
     bundle: &'a Bundle,
@@ -86,7 +78,7 @@ struct Work<'a> {
     /// Position in the registry of each observation's device.
     devices: Vec<Option<usize>>,
     references: Vec<Reference>,
-    samples: BTreeMap<Key, Kept>,
+    samples: BTreeMap<Key, (SampleHeader, Vec<u8>)>,
     /// How many of the chunks still to come are made of a sample that is in the file.
     uses: BTreeMap<Key, u32>,
     chunk: Vec<f32>,
@@ -104,18 +96,12 @@ pub(super) fn compare(
     let device = |name: &str| registry.devices.iter().position(|device| device.name == name);
     let topics: BTreeMap<&str, usize> =
         registry.devices.iter().enumerate().map(|(at, device)| (device.topic.as_str(), at)).collect();
-    let difference = || Difference::new(&bundle.action);
     let again = Again {
         chunks: survey.chunks.len() as u64 + survey.unreadable,
-        compared: 0,
-        samples_missing: 0,
-        reference_unknown: 0,
-        unlike: 0,
         unreadable: survey.unreadable,
-        failed: 0,
-        failure: None,
-        difference: difference(),
+        difference: Difference::new(&bundle.action),
         actions: actions(survey, bundle),
+        ..Again::default()
     };
     let mut work = Work {
         bundle,
@@ -143,7 +129,7 @@ pub(super) fn compare(
         }
     }
     let total = waiting.len();
-    let mut tape = Tape::open(file)?;
+    let (mut reader, mut scratch) = (Reader::open(file)?, Scratch::default());
     loop {
         while let Some(chunk) = waiting.front().copied().filter(|chunk| work.is_ready(chunk)) {
             if !ended.goes_on(total - waiting.len(), total) {
@@ -155,12 +141,17 @@ pub(super) fn compare(
         if waiting.is_empty() {
             return Ok(work.again);
         }
-        let Some(taped) = tape.next_message()? else { break };
-        let Content::Sample { encoding, width, height, bytes } = taped.content else { continue };
-        let Some(device) = topics.get(taped.topic) else { continue };
-        let key = (*device, u64::from(taped.sequence));
-        if work.uses.contains_key(&key) {
-            work.samples.entry(key).or_insert_with(|| Kept { encoding, width, height, bytes: bytes.to_vec() });
+        if !reader.advance()? {
+            break;
+        }
+        let Item::Message(message) = reader.item() else { continue };
+        let Some(device) = topics.get(message.channel.topic.as_str()) else { continue };
+        let key = (*device, u64::from(message.sequence));
+        if !work.uses.contains_key(&key) || work.samples.contains_key(&key) {
+            continue;
+        }
+        if let Some(Content::Sample(sample)) = message.content(&mut scratch) {
+            work.samples.insert(key, (header(&message, &sample), sample.payload.to_vec()));
         }
     }
     // The file has changed since it was looked through.
@@ -172,8 +163,7 @@ impl Work<'_> {
     /// Is it of observations and of a length as this policy's?
     fn is_like(&self, chunk: &RecordedChunk) -> bool {
         let (observations, steps) = (&self.bundle.observations, self.bundle.n_obs_steps);
-        let same = |(samples, observation): (&super::survey::RecordedSamples, _)| {
-            let observation: &crate::policy::bundle::ObservationSpec = observation;
+        let same = |(samples, observation): (&RecordedSamples, &ObservationSpec)| {
             samples.modality == observation.modality && [0, steps].contains(&samples.seqs.len())
         };
         chunk.samples.len() == observations.len()
@@ -183,7 +173,7 @@ impl Work<'_> {
 
     /// The samples it is made of.
     fn keys(&self, chunk: &RecordedChunk) -> Vec<Key> {
-        let of = |(samples, device): (&super::survey::RecordedSamples, &Option<usize>)| {
+        let of = |(samples, device): (&RecordedSamples, &Option<usize>)| {
             let device = *device;
             let key = move |number: &u64| Some((device?, number & SEQUENCE_BITS));
             samples.seqs.iter().filter_map(key).collect::<Vec<_>>()
@@ -242,18 +232,11 @@ impl Work<'_> {
             self.request.set_present(at, !samples.seqs.is_empty());
             for (step, number) in samples.seqs.iter().enumerate() {
                 let kept = device.and_then(|device| self.samples.get(&(device, number & SEQUENCE_BITS)));
-                let (Some(kept), Some(cell)) = (kept, self.request.cell_mut(at, step)) else {
+                let (Some((header, bytes)), Some(cell)) = (kept, self.request.cell_mut(at, step)) else {
                     whole = false;
                     continue;
                 };
-                let header = SampleHeader {
-                    seq: *number,
-                    encoding: kept.encoding as u32,
-                    width: kept.width,
-                    height: kept.height,
-                    ..SampleHeader::default()
-                };
-                cell.set(&header, 0, &kept.bytes);
+                cell.set(&SampleHeader { seq: *number, ..*header }, bytes);
             }
         }
         whole
@@ -311,8 +294,7 @@ impl Work<'_> {
 
 /// The recorded actions beside the recorded chunks.
 fn actions(survey: &Survey, bundle: &Bundle) -> Actions {
-    let mut actions =
-        Actions { recorded: 0, compared: 0, without_chunk: 0, difference: Difference::new(&bundle.action) };
+    let mut actions = Actions { difference: Difference::new(&bundle.action), ..Actions::default() };
     let chunks: BTreeMap<u64, &RecordedChunk> =
         survey.chunks.iter().map(|chunk| (chunk.tick & SEQUENCE_BITS, chunk)).collect();
     for action in &survey.actions {
@@ -334,7 +316,7 @@ fn actions(survey: &Survey, bundle: &Bundle) -> Actions {
     actions
 }
 
-/// What `chunk` says of the tick of `action`, within the limits.
+/// The action of `chunk` for the tick of `action`, within the limits.
 fn planned(chunk: &RecordedChunk, action: &RecordedAction, bundle: &Bundle) -> Option<Vec<f64>> {
     let age = u64::from(action.sequence).checked_sub(chunk.tick & SEQUENCE_BITS)?;
     let index = usize::try_from(age).ok()?.checked_add(bundle.action_start)?;
@@ -349,4 +331,50 @@ fn planned(chunk: &RecordedChunk, action: &RecordedAction, bundle: &Bundle) -> O
         None => f64::NAN,
     });
     Some(clamped.collect())
+}
+
+/// Is the picture of an observation known with which the policy compared all later ones? It is the first one that the
+/// policy used. A recording may have begun later than that; then what it computed from is unknown, though every sample
+/// of the chunk is there.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Reference {
+    /// There is none: its pictures are looked at as they are, or it has none.
+    None,
+    /// The next picture is it.
+    Next,
+    /// It was read.
+    Known,
+    /// It is not in the file.
+    Lost,
+}
+
+impl Reference {
+    /// At the first chunk of the file, of every observation.
+    fn all(survey: &Survey, bundle: &Bundle, registry: &Registry) -> Vec<Self> {
+        let whole = holds_every_chunk(survey, bundle);
+        let of = |observation: &ObservationSpec| {
+            let ObservationInput::Image(image) = &observation.input else { return Self::None };
+            if image.operation != Some(Operation::DiffToReference) {
+                return Self::None;
+            }
+            // With the very first sample of the run in the file, none can have been used before.
+            let device = registry.named(&observation.modality);
+            let first = || device.is_some_and(|device| survey.holds(&device.topic, 0));
+            if whole || first() { Self::Next } else { Self::Lost }
+        };
+        bundle.observations.iter().map(of).collect()
+    }
+}
+
+/// Was the recording there before the policy's first chunk?
+fn holds_every_chunk(survey: &Survey, bundle: &Bundle) -> bool {
+    let Some(chunk) = survey.chunks.first() else { return true };
+    // Told when the policy is loaded.
+    if survey.policy.is_some() || chunk.tick == 0 {
+        return true;
+    }
+    let begun = chunk.observed_ns as f64 - chunk.tick as f64 * 1e9 / bundle.control_hz;
+    // Half a tick is more than what is lost in these numbers, and less than a chunk takes.
+    let slack = 0.5e9 / bundle.control_hz;
+    survey.begin_monotonic_ns.is_some_and(|begin| begun + slack >= begin as f64)
 }

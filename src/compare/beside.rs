@@ -1,9 +1,9 @@
-//! A policy that watches an episode in which somebody else acted: what it would have done at each tick, beside
+//! A policy that watches an episode in which a person or another program acted: what it would have done at each tick, beside
 //! what was done.
 //!
 //! It is asked when a policy at the controls is asked, every `n_action_steps` ticks and when a modality comes
 //! or goes, its answer is there at once, and its actions are kept within the limits. It sees what the other one
-//! did, not what would have come of its own actions.
+//! did, not the result of its own actions.
 //!
 //! The control grid begins with the episode. The action of a tick is the one captured nearest to it, at most
 //! half a tick away.
@@ -14,8 +14,7 @@ use std::path::Path;
 use serde::Serialize;
 
 use super::difference::Difference;
-use super::ordered::{Ordered, Received};
-use super::survey::Survey;
+use super::survey::{Ordered, Received, Survey};
 use super::{CompareError, Ended};
 use crate::modality::MAX_MODALITIES;
 use crate::policy::bundle::Bundle;
@@ -24,15 +23,15 @@ use crate::policy::model::Model;
 use crate::policy::pilot::Pilot;
 use crate::policy::request::Request;
 use crate::registry::Registry;
-use crate::sample::Epoch;
+use crate::sample::{Epoch, SampleHeader};
 use crate::sync::Grid;
 use crate::time::Stamp;
 
 /// Of the policy's noise.
 const SEED: u64 = 0;
 
-/// What came of it.
-#[derive(Debug, Clone, Serialize)]
+/// The result.
+#[derive(Debug, Clone, Default, Serialize)]
 pub struct Beside {
     /// Ticks of the control grid within the episode.
     pub ticks: u64,
@@ -82,14 +81,9 @@ pub(super) fn compare(
         model,
         recorded: by_tick(survey, grid, bundle.control_hz),
         beside: Beside {
-            ticks: 0,
-            compared: 0,
-            without_recorded: 0,
-            held: BTreeMap::new(),
             recorded: survey.actions.len() as u64,
-            counts: Counts::default(),
-            failure: None,
             difference: Difference::new(&bundle.action),
+            ..Beside::default()
         },
     };
     // After so many ticks without anything received no action is left.
@@ -111,9 +105,9 @@ pub(super) fn compare(
         match what {
             Received::Sample { id, header, payload } => {
                 let epoch = epochs.get(id.index()).copied().unwrap_or_default().0;
-                watch.pilot.sample(id, &crate::sample::SampleHeader { epoch, ..header }, &payload);
+                watch.pilot.observer.push(id, &SampleHeader { epoch, ..header }, &payload);
             }
-            Received::Mask(mask) => watch.pilot.mask(mask),
+            Received::Mask(mask) => watch.pilot.mask = mask,
             Received::Opened { id, epoch } => {
                 if let Some(place) = epochs.get_mut(id.index()) {
                     *place = epoch;
@@ -121,7 +115,7 @@ pub(super) fn compare(
             }
         }
     }
-    // The moment of the end is a tick too if somebody acted at it.
+    // The moment of the end is a tick too if there is an action at it.
     if last.is_some_and(|last| grid.tick(watch.tick) == Stamp(last)) && watch.recorded.contains_key(&watch.tick) {
         watch.tick();
     }
@@ -136,9 +130,9 @@ impl Watch<'_> {
         if self.pilot.look(number, stamp, stamp) {
             self.pilot.fill(number, stamp, &mut self.request);
             let refused = match self.model.answer(&self.request, &mut self.chunk) {
-                Ok(()) => self.pilot.answer(number, &self.chunk).err().map(|refused| refused.to_string()),
+                Ok(()) => self.pilot.queue.take(number, &self.chunk).err().map(|refused| refused.to_string()),
                 Err(error) => {
-                    self.pilot.failed(number);
+                    self.pilot.queue.failed(number);
                     Some(error.to_string())
                 }
             };
@@ -162,7 +156,7 @@ impl Watch<'_> {
     }
 
     fn end(mut self) -> Beside {
-        self.beside.counts = self.pilot.counts();
+        self.beside.counts = self.pilot.queue.counts();
         self.beside
     }
 }

@@ -45,7 +45,7 @@ pub struct AxisDifference {
 }
 
 /// Distances between actions.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct Difference {
     /// Of all axes, whatever their units.
     #[serde(flatten)]
@@ -89,7 +89,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_mean_and_the_largest_are_told_with_its_tick() {
+    fn the_mean_and_the_largest_are_reported_with_its_tick() {
         let mut spread = Spread::default();
         for (tick, distance) in [(3, 1.0), (4, 4.0), (5, 1.0)] {
             spread.take(tick, distance);
@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_number_is_far_from_all_but_itself() {
+    fn nan_is_far_from_all_but_itself() {
         let (nan, far) = (f64::NAN, f64::INFINITY);
         for (one, other, expected) in [(1.0, 3.0, 2.0), (nan, nan, 0.0), (nan, 1.0, far), (far, far, 0.0)] {
             assert_eq!(distance(one, other).total_cmp(&expected), std::cmp::Ordering::Equal, "{one} {other}");

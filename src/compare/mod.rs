@@ -10,8 +10,6 @@
 pub mod again;
 pub mod beside;
 mod difference;
-mod ordered;
-mod reference;
 mod survey;
 #[cfg(test)]
 mod tests;
@@ -24,7 +22,7 @@ pub use self::again::Again;
 pub use self::beside::Beside;
 pub use self::difference::{AxisDifference, Difference, Spread};
 use self::survey::Survey;
-use crate::driver::DriverError;
+use crate::episode::ReadError;
 use crate::policy::bundle::{Bundle, BundleErrors};
 use crate::policy::library::Environment;
 use crate::policy::model::Model;
@@ -36,7 +34,7 @@ use crate::registry::Registry;
 pub enum CompareError {
     /// The file.
     #[error(transparent)]
-    File(#[from] DriverError),
+    File(#[from] ReadError),
     /// The file holds no registry that can be read.
     #[error("{file}: {why}")]
     Registry {
@@ -67,23 +65,23 @@ pub enum CompareError {
 pub enum Comparison {
     /// A policy recorded the episode, and its chunks were computed again.
     Again(Again),
-    /// Somebody or something else acted.
+    /// A person or another program acted.
     Beside(Beside),
 }
 
-/// Who wants to know how far it is.
+/// Receives progress.
 pub trait Watcher {
-    /// `done` of about `total` pieces are done. Returns whether to go on.
+    /// `done` of about `total` pieces are done. Returns whether to continue.
     fn at(&mut self, done: usize, total: usize) -> bool;
 }
 
 /// A comparison, and what is to be known of the file besides.
 #[derive(Debug, Clone, Serialize)]
 pub struct Compared {
-    /// What came of it.
+    /// The result.
     #[serde(flatten)]
     pub comparison: Comparison,
-    /// Name of the policy that the file says has recorded it.
+    /// Name of the policy that recorded it, by the file.
     pub recorded_policy: Option<String>,
     /// What names the contents of its bundle.
     pub recorded_policy_hash: Option<String>,

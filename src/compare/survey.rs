@@ -1,20 +1,28 @@
-//! A first look through an episode: what a comparison must know before it reads the samples.
+//! How a comparison reads an episode: once for what it must know before it reads the samples, and then these in order.
 
 use std::collections::BTreeMap;
+use std::fs::File;
 use std::path::Path;
 
 use serde::Deserialize;
 
 use crate::action::ACTION_TOPIC;
-use crate::driver::DriverError;
-use crate::driver::replay::tape::{Content, Tape};
+use crate::episode::ReadError;
+use crate::episode::decode::{Content, Sample, Scratch};
+use crate::episode::encode::EventText;
+use crate::episode::reader::{Item, Message, Reader};
 use crate::mask::PhysicalMask;
-use crate::sample::Encoding;
+use crate::modality::ModalityId;
+use crate::registry::Registry;
+use crate::sample::{Encoding, Epoch, SampleHeader};
 
 /// What of a sample's number a recorded message holds.
 pub(super) const SEQUENCE_BITS: u64 = 0xffff_ffff;
+/// By how much the order of the file may be another one: far more than the recorder takes from topic to
+/// topic.
+const SPAN_NS: u64 = 1_000_000_000;
 
-/// See the module's comment.
+/// A first look through an episode.
 #[derive(Debug, Default)]
 pub(super) struct Survey {
     /// Text of the registry it was recorded with.
@@ -86,44 +94,47 @@ struct PolicyEvent {
 
 impl Survey {
     /// Reads the whole file.
-    pub(super) fn read(file: &Path) -> Result<Self, DriverError> {
-        let mut tape = Tape::open(file)?;
+    pub(super) fn read(file: &Path) -> Result<Self, ReadError> {
+        let (mut reader, mut scratch) = (Reader::open(file)?, Scratch::default());
         let mut survey = Self::default();
         let mut first = None;
-        while let Some(taped) = tape.next_message()? {
-            match taped.content {
-                Content::Sample { encoding: Encoding::F64, bytes, .. } if taped.topic == ACTION_TOPIC => {
-                    let values = bytes.as_chunks().0.iter().map(|number| f64::from_le_bytes(*number)).collect();
-                    let (sequence, at_ns) = (taped.sequence, taped.log_time);
+        while reader.advance()? {
+            let Item::Message(message) = reader.item() else { continue };
+            let Some(content) = message.content(&mut scratch) else { continue };
+            let topic = &message.channel.topic;
+            match content {
+                Content::Sample(Sample { encoding: Encoding::F64, payload, .. }) if topic == ACTION_TOPIC => {
+                    let values = payload.as_chunks().0.iter().map(|number| f64::from_le_bytes(*number)).collect();
+                    let (sequence, at_ns) = (message.sequence, message.log_time);
                     survey.actions.push(RecordedAction { sequence, at_ns, values });
                 }
-                Content::Sample { .. } => {
-                    first = first.or(Some(taped.log_time));
-                    match survey.samples.get_mut(taped.topic) {
-                        Some(numbers) => numbers.push(taped.sequence),
-                        None => drop(survey.samples.insert(taped.topic.to_owned(), vec![taped.sequence])),
+                Content::Sample(_) => {
+                    first = first.or(Some(message.log_time));
+                    match survey.samples.get_mut(topic) {
+                        Some(numbers) => numbers.push(message.sequence),
+                        None => drop(survey.samples.insert(topic.clone(), vec![message.sequence])),
                     }
                 }
-                Content::Event { kind: "chunk", json } => match serde_json::from_str(json) {
+                Content::Event(EventText { kind: "chunk", json, .. }) => match serde_json::from_str(json) {
                     Ok(chunk) => survey.chunks.push(chunk),
                     Err(_) => survey.unreadable += 1,
                 },
-                Content::Event { kind: "policy", json } => {
+                Content::Event(EventText { kind: "policy", json, .. }) => {
                     if let Ok(PolicyEvent { policy, hash }) = serde_json::from_str(json) {
                         survey.policy.get_or_insert((policy, hash));
                     }
                 }
-                Content::Event { .. } | Content::Mask(_) => {}
+                Content::Event(_) | Content::Mask(_) | Content::Frame(_) | Content::Other => {}
             }
         }
         for numbers in survey.samples.values_mut() {
             numbers.sort_unstable();
         }
-        let number = |key| tape.about(key).and_then(|text| text.parse().ok());
-        survey.registry = tape.about("registry").map(str::to_owned);
+        let number = |key| reader.about(key).and_then(|text| text.parse().ok());
+        survey.registry = reader.about("registry").map(str::to_owned);
         survey.begin_ns = number("begin_wall_ns").or(first).unwrap_or_default();
         survey.begin_monotonic_ns = number("begin_monotonic_ns");
-        survey.damage = tape.damage();
+        survey.damage = reader.integrity().damage();
         Ok(survey)
     }
 
@@ -136,5 +147,88 @@ impl Survey {
     pub(super) fn holds(&self, topic: &str, number: u64) -> bool {
         let sequence = u32::try_from(number & SEQUENCE_BITS).unwrap_or_default();
         self.samples.get(topic).is_some_and(|numbers| numbers.binary_search(&sequence).is_ok())
+    }
+}
+
+/// What was received.
+#[derive(Debug)]
+pub(super) enum Received {
+    Sample { id: ModalityId, header: SampleHeader, payload: Vec<u8> },
+    Mask(PhysicalMask),
+    Opened { id: ModalityId, epoch: Epoch },
+}
+
+/// The samples and masks of an episode in the order in which they were received. A file has them in the order in which
+/// they were written, which within a topic is that order, and between topics is nearly it.
+#[derive(Debug)]
+pub(super) struct Ordered<'a> {
+    reader: Reader<File>,
+    scratch: Scratch,
+    registry: &'a Registry,
+    /// By the time of receipt, then by the order of the file.
+    held: BTreeMap<(u64, u64), Received>,
+    read: u64,
+    newest: u64,
+    ended: bool,
+}
+
+/// A device was opened: its samples are of this epoch from now on.
+#[derive(Deserialize)]
+struct Opened {
+    device: String,
+    epoch: Epoch,
+}
+
+impl<'a> Ordered<'a> {
+    pub(super) fn open(file: &Path, registry: &'a Registry) -> Result<Self, ReadError> {
+        let (reader, scratch) = (Reader::open(file)?, Scratch::default());
+        Ok(Self { reader, scratch, registry, held: BTreeMap::new(), read: 0, newest: 0, ended: false })
+    }
+
+    /// What was received next, and when, wall time; `None` at the end.
+    pub(super) fn next(&mut self) -> Result<Option<(u64, Received)>, ReadError> {
+        loop {
+            let oldest = self.held.first_key_value().map(|((at, _), _)| *at);
+            if self.ended || oldest.is_some_and(|oldest| self.newest.saturating_sub(oldest) > SPAN_NS) {
+                return Ok(self.held.pop_first().map(|((at, _), received)| (at, received)));
+            }
+            self.ended = !self.reader.advance()?;
+            let Item::Message(message) = self.reader.item() else { continue };
+            let at = message.publish_time;
+            if let Some(received) = received(&message, self.registry, &mut self.scratch) {
+                self.newest = self.newest.max(at);
+                self.held.insert((at, self.read), received);
+                self.read += 1;
+            }
+        }
+    }
+}
+
+fn received(message: &Message<'_>, registry: &Registry, scratch: &mut Scratch) -> Option<Received> {
+    match message.content(scratch)? {
+        Content::Mask(mask) => Some(Received::Mask(mask)),
+        Content::Event(EventText { kind: "opened", json, .. }) => {
+            let opened: Opened = serde_json::from_str(json).ok()?;
+            Some(Received::Opened { id: registry.named(&opened.device)?.id, epoch: opened.epoch })
+        }
+        Content::Event(_) | Content::Frame(_) | Content::Other => None,
+        Content::Sample(sample) => {
+            let id = registry.devices.iter().find(|device| device.topic == message.channel.topic)?.id;
+            let header = SampleHeader { id: id.bit().into(), ..header(message, &sample) };
+            Some(Received::Sample { id, header, payload: sample.payload.to_vec() })
+        }
+    }
+}
+
+/// The header that a recorded sample had on the bus, as far as its message holds it.
+pub(super) fn header(message: &Message<'_>, sample: &Sample<'_>) -> SampleHeader {
+    SampleHeader {
+        seq: message.sequence.into(),
+        capture_ns: message.log_time,
+        recv_ns: message.publish_time,
+        encoding: sample.encoding as u32,
+        width: sample.width,
+        height: sample.height,
+        ..SampleHeader::default()
     }
 }

@@ -12,8 +12,8 @@ use serde_json::Value;
 
 use super::*;
 use crate::action::ACTION_TOPIC;
-use crate::episode_format::wire::protobuf;
-use crate::episode_format::{ABOUT, EVENT_TOPIC};
+use crate::episode::decode::{self, Content, Kind, Scratch};
+use crate::episode::{ABOUT, EVENT_TOPIC};
 use crate::lockstep::evaluate::{Bench, Condition, Configuration, Recording, Trial};
 use crate::record::EpisodeRequest;
 use crate::record::stepped::Stepped;
@@ -53,8 +53,9 @@ struct Message {
 impl Message {
     /// The event in it.
     fn event(&self) -> Option<Value> {
-        let json = protobuf(&self.data).find(|(field, _)| *field == 5)?.1.text();
-        (self.topic == EVENT_TOPIC).then(|| serde_json::from_str(&json).unwrap())
+        let mut scratch = Scratch::default();
+        let Some(Content::Event(event)) = decode::content(Kind::Event, &self.data, &mut scratch) else { return None };
+        (self.topic == EVENT_TOPIC).then(|| serde_json::from_str(event.json).unwrap())
     }
 
     fn is_chunk(&self) -> bool {
@@ -84,7 +85,7 @@ impl Recorded {
         let out = folder.path().to_owned();
         let request =
             EpisodeRequest { out, task: "sort".into(), tags: Vec::new(), modules: Vec::new(), duration: None };
-        let library = &environment.origin().to_string();
+        let library = &environment.origin.to_string();
         let recording = Recording { recorder: &mut recorder, request: &request, library, begun: Stamp(9_000_000_000) };
         let (trial, report) = bench.record(Condition::HotReplug, SEED, recording).unwrap();
         assert!(trial.failure.is_none() && trial.counts.chunks > 5, "{trial:?}");
@@ -92,7 +93,7 @@ impl Recorded {
         Self { folder, bundle, environment, bytes, trial }
     }
 
-    /// The file with its messages changed by `edit`, which says which of them are kept, and its metadata by `about`.
+    /// The file with its messages changed by `edit`, which decides which of them are kept, and its metadata by `about`.
     fn edited(
         &self,
         mut edit: impl FnMut(&mut Message) -> bool,
@@ -165,7 +166,7 @@ impl Recorded {
 }
 
 #[test]
-fn what_a_policy_recorded_is_computed_again_and_changes_are_found() {
+fn recorded_chunks_are_computed_again_and_changes_are_found() {
     let recorded = Recorded::new();
     let chunks = recorded.chunks();
     assert_eq!(chunks.len() as u64, recorded.trial.counts.chunks);
@@ -255,7 +256,7 @@ fn the_picture_that_others_are_compared_with_is_the_first_one_or_unknown() {
 }
 
 #[test]
-fn a_policy_that_looks_on_does_what_it_would_have_done() {
+fn a_watching_policy_does_what_it_would_have_done() {
     let recorded = Recorded::new();
     // Its own actions without its chunks; those of the ticks at which it was asked came from the chunk before.
     let asked: Vec<u64> = recorded.chunks().iter().map(|chunk| chunk["tick"].as_u64().unwrap()).collect();
@@ -296,7 +297,7 @@ fn a_policy_that_looks_on_does_what_it_would_have_done() {
 }
 
 #[test]
-fn a_damaged_file_is_compared_as_far_as_it_goes_and_a_foreign_one_refused_by_name() {
+fn a_damaged_file_is_compared_up_to_the_damage_and_a_foreign_one_rejected_by_name() {
     let recorded = Recorded::new();
     let cut = recorded.compared(&recorded.bytes[..recorded.bytes.len() * 2 / 3]).unwrap();
     assert!(cut.damage.as_ref().is_some_and(|damage| damage.contains("ends within a record")), "{cut:?}");

@@ -9,7 +9,7 @@ pub struct CanFrame {
     pub extended: bool,
     /// A request for a frame, without data.
     pub remote: bool,
-    /// What the controller tells of the bus; no frame of the bus itself.
+    /// A report of the controller about the bus; no frame of the bus itself.
     pub error: bool,
     /// Bytes of data, `0..=8`.
     pub len: u8,

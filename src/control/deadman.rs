@@ -23,7 +23,7 @@ const WAY: Duration = Duration::from_millis(20);
 #[derive(Debug, Clone, Copy)]
 pub struct Deadman {
     hold_after: Option<Duration>,
-    /// Patience that nobody configured is no shorter.
+    /// The default is no shorter.
     least: Duration,
     disable_after: Option<Duration>,
     /// Of the newest action, if any came since arming.
@@ -34,7 +34,7 @@ pub struct Deadman {
 /// What to do.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Verdict {
-    /// Go on.
+    /// Continue.
     Follow,
     /// Stay where the last command was.
     Hold,

@@ -1,6 +1,6 @@
 //! From targets, ten a second or so, to the commands between them, hundreds a second.
 //!
-//! A target is reached on a straight line from the command at its arrival, in the time between two
+//! A target is reached on a straight line from the command in force at its arrival, in the time between two
 //! targets: then the next one is due. After that the target is held. The time between two targets is the
 //! shorter one of the last two: a pause is none, and who is slow is known by the second.
 //!
@@ -61,8 +61,8 @@ impl Interpolator {
         self.takes = Duration::ZERO;
     }
 
-    /// Heads for `target`, the one of `tick`, from `command`, the one of now.
-    pub fn head_for(&mut self, target: &[f64], tick: Stamp, command: &[f64], now: Stamp) {
+    /// Heads for `target`, the one of `tick`, from `command`, the one of `begin`.
+    pub fn head_for(&mut self, target: &[f64], tick: Stamp, command: &[f64], begin: Stamp) {
         if let Some(apart) = self.tick.map(|last| tick.since(last)).filter(|apart| *apart <= LONGEST) {
             let gap = apart.max(SHORTEST);
             self.period = gap.min(self.gap);
@@ -73,7 +73,7 @@ impl Interpolator {
             *from = *command;
             *to = *target;
         }
-        self.begin = now;
+        self.begin = begin;
         self.takes = self.period;
     }
 

@@ -13,4 +13,5 @@ pub mod deadman;
 pub mod interpolate;
 pub mod limits;
 pub mod motors;
+pub mod pace;
 pub mod ramp;

@@ -7,15 +7,15 @@
 //! | Arming    | read, cleared, enabled         | Holding, when all are enabled; Faulted, when not |
 //! | Following | go where actions say           | Holding, without a fresh action                  |
 //! | Holding   | stay                           | Following; Disabling, after a while              |
-//! | Disabling | told to turn off               | Disarmed, when all have said so                  |
-//! | Faulted   | told to turn off, damped, or hold | Arming, when asked; Disabling, when asked     |
-//! | Stopped   | told to turn off, by the caller |                                                 |
+//! | Disabling | ordered to turn off            | Disarmed, when all have confirmed it             |
+//! | Faulted   | ordered off, damped, or hold   | Arming, when asked; Disabling, when asked        |
+//! | Stopped   | ordered off by the caller      |                                                  |
 //!
 //! A cycle is: [`MotorBus::feed`] every frame that came, [`MotorBus::target`] the newest action,
 //! [`MotorBus::step`], and send what that gives. Who polls motors knows their positions without
 //! enabling them: that is what happens in all states but the last.
 //!
-//! Every arm reads the parameters anew: a motor that lost its power has forgotten its mode and its time
+//! Every arm reads the parameters again: a motor that lost its power has forgotten its mode and its time
 //! limit, by which it stops on its own when this program was killed.
 //!
 //! Invariant: no command before an arm was asked for, nor after a disarm or a stop until one is asked for again; after a
@@ -129,7 +129,7 @@ pub struct Counts {
     pub clamped: u64,
     /// Times that all motors were disabled by a fault.
     pub faults: u64,
-    /// Notices that nobody took in time.
+    /// Notices that were not read in time.
     pub lost_notices: u64,
 }
 
@@ -273,7 +273,9 @@ impl MotorBus {
                 *slot = clamped.value;
             }
         }
-        self.line.head_for(&self.targets, tick, &self.commands, now);
+        // The command in force is that of the last step: the line begins there, so that already the next step moves.
+        let begin = self.stepped.map_or(now, |last| last.max(now.before(self.cycle * LATE_CYCLES)));
+        self.line.head_for(&self.targets, tick, &self.commands, begin);
         self.deadman.feed(tick.min(now));
         self.counts.actions += 1;
         if self.state == BusState::Holding {
@@ -330,8 +332,8 @@ impl MotorBus {
         })
     }
 
-    /// Names of the motors that were told to turn on, or said that they are on, and have not said since they
-    /// were told to turn off that they are off.
+    /// Names of the motors that were ordered to turn on, or reported that they are on, and have not reported since they
+    /// were ordered to turn off that they are off.
     pub fn still_on(&self) -> impl Iterator<Item = &str> {
         self.motors.iter().filter(|motor| motor.may_be_on).map(|motor| motor.spec.name.as_str())
     }

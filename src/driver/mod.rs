@@ -7,9 +7,13 @@
 //! Invariant: no driver blocks: what may block while opening runs on tokio's blocking pool.
 //! Invariant: no bytes from a device make a driver panic.
 
+#[cfg(not(all(feature = "lan", feature = "motors")))]
+mod absent;
 mod arrival;
 pub mod camera;
+#[cfg(feature = "motors")]
 pub mod can;
+#[cfg(feature = "lan")]
 pub mod lan;
 pub mod process;
 pub mod replay;
@@ -18,7 +22,9 @@ pub mod sim;
 
 use std::sync::Arc;
 
-use crate::action::{ActuatorNotice, Order};
+use tokio::sync::mpsc;
+
+use crate::action::{ActionSource, ActuatorNotice, Order};
 use crate::permission::Attended;
 use crate::provenance::Negotiated;
 use crate::registry::scenario::{SimDevice, SimSource};
@@ -26,6 +32,14 @@ use crate::registry::{CanProtocol, DeviceNode, DeviceSpec, NodeSpec};
 use crate::sample::Encoding;
 use crate::status::Episode;
 use crate::time::Stamp;
+#[cfg(not(feature = "lan"))]
+use absent::Absent as Lan;
+#[cfg(not(feature = "motors"))]
+use absent::{Absent as Motors, Absent as RawCan};
+#[cfg(feature = "motors")]
+use can::{motors::Motors, raw::Raw as RawCan};
+#[cfg(feature = "lan")]
+use lan::Lan;
 
 /// One sample as the device gave it, borrowed until the next read.
 #[derive(Debug)]
@@ -71,11 +85,11 @@ pub enum Driver {
     /// A serial line.
     Serial(Box<serial::Serial>),
     /// Motors behind a CAN adapter.
-    Motors(Box<can::motors::Motors>),
+    Motors(Box<Motors>),
     /// The frames of a CAN bus.
-    Can(Box<can::raw::Raw>),
+    Can(Box<RawCan>),
     /// A device on the network.
-    Lan(Box<lan::Lan>),
+    Lan(Box<Lan>),
     /// A device that exists only in a scenario.
     Sim(Box<sim::Sim>),
     /// One topic of a recorded episode.
@@ -87,7 +101,7 @@ impl Driver {
     /// is out, opening again and again leads nowhere.
     #[must_use]
     pub fn unlinked(spec: &DeviceSpec, node: &DeviceNode) -> Option<impl Future<Output = ()> + Send + use<>> {
-        if matches!(spec.node, NodeSpec::Lan(_)) { lan::Lan::unlinked(node) } else { None }
+        if matches!(spec.node, NodeSpec::Lan(_)) { Lan::unlinked(node) } else { None }
     }
 
     /// Opens the node of `spec` and starts it.
@@ -102,18 +116,22 @@ impl Driver {
             (NodeSpec::Serial(serial), DeviceNode::Tty(path)) => {
                 Ok(Self::Serial(Box::new(serial::Serial::open(serial, path, spec.max_bytes).await?)))
             }
+            #[cfg(not(feature = "motors"))]
+            (NodeSpec::Can(_), DeviceNode::Net(_) | DeviceNode::Tty(_)) => Err(absent::not_built("motors")),
+            #[cfg(feature = "motors")]
             (NodeSpec::Can(can), DeviceNode::Net(_) | DeviceNode::Tty(_)) => match &can.protocol {
-                CanProtocol::Damiao(motors) => {
-                    Ok(Self::Motors(Box::new(can::motors::Motors::open(can, motors, node).await?)))
-                }
-                CanProtocol::Raw => Ok(Self::Can(Box::new(can::raw::Raw::open(can, node).await?))),
+                CanProtocol::Damiao(motors) => Ok(Self::Motors(Box::new(Motors::open(can, motors, node).await?))),
+                CanProtocol::Raw => Ok(Self::Can(Box::new(RawCan::open(can, node).await?))),
             },
             (_, DeviceNode::Sim(device)) => Self::open_sim(spec, device).await,
             (NodeSpec::Camera(_), node) => Err(wrong_kind(spec, "camera", node)),
             (NodeSpec::Serial(_), node) => Err(wrong_kind(spec, "serial line", node)),
             (NodeSpec::Can(_), node) => Err(wrong_kind(spec, "CAN adapter", node)),
+            #[cfg(not(feature = "lan"))]
+            (NodeSpec::Lan(_), DeviceNode::Net(_) | DeviceNode::Lan { .. }) => Err(absent::not_built("lan")),
+            #[cfg(feature = "lan")]
             (NodeSpec::Lan(settings), node @ (DeviceNode::Net(_) | DeviceNode::Lan { .. })) => {
-                Ok(Self::Lan(Box::new(lan::Lan::open(spec, settings, node).await?)))
+                Ok(Self::Lan(Box::new(Lan::open(spec, settings, node).await?)))
             }
             (NodeSpec::Lan(_), node) => Err(wrong_kind(spec, "network device", node)),
             // The rig supervises programs itself: `process` only starts and ends them.
@@ -146,20 +164,20 @@ impl Driver {
         }
     }
 
-    /// Tells an actuator where to go: a target an axis, in the order and the units of its table of actions, as of
-    /// `tick` of the control grid.
+    /// Commands an actuator that does not follow actions itself ([`Self::attend`]): a target for each axis, in the order
+    /// and the units of its table of actions.
     ///
     /// # Errors
     /// When the device takes no actions, or others.
-    pub fn command(&mut self, target: &[f64], tick: Stamp) -> Result<(), DriverError> {
+    pub fn command(&mut self, target: &[f64]) -> Result<(), DriverError> {
         match self {
-            Self::Motors(driver) => driver.command(target, tick),
+            Self::Motors(_) => Ok(()),
             Self::Sim(driver) => driver.command(target),
             _ => Err(DriverError::Fatal("of real devices, motors behind a CAN adapter alone take actions".to_owned())),
         }
     }
 
-    /// Lets an actuator move, or stops it. One that needs no leave takes it for said.
+    /// Lets an actuator move, or stops it. A device that needs no permission accepts the order and does nothing.
     ///
     /// # Errors
     /// When it does not take orders now.
@@ -174,12 +192,13 @@ impl Driver {
         }
     }
 
-    /// Has it carry out these orders from now on. Says whether it takes them itself; otherwise they are to be passed on to
-    /// [`Self::order`].
-    pub fn attend(&mut self, orders: &Arc<Attended>) -> bool {
+    /// Has it carry out these orders and actions from now on. Says whether it takes them itself; otherwise they are to be
+    /// passed on to [`Self::order`] and [`Self::command`].
+    pub fn attend(&mut self, orders: &Arc<Attended>, actions: &Arc<dyn ActionSource>) -> bool {
         match self {
             Self::Motors(driver) => {
                 driver.attend(orders);
+                driver.follow(Arc::clone(actions));
                 return true;
             }
             Self::Sim(driver) => driver.joints.name_stops(orders.stops()),
@@ -188,16 +207,16 @@ impl Driver {
         false
     }
 
-    /// What an actuator has to tell, oldest first.
-    pub fn take_notice(&mut self) -> Option<ActuatorNotice> {
+    /// What happens to an actuator, at the first call.
+    pub fn notices(&mut self) -> Option<mpsc::Receiver<ActuatorNotice>> {
         match self {
-            Self::Motors(driver) => driver.take_notice(),
-            Self::Sim(driver) => driver.joints.take_notice(),
+            Self::Motors(driver) => driver.notices(),
+            Self::Sim(driver) => Some(driver.joints.notices()),
             _ => None,
         }
     }
 
-    /// Tells a device that records by itself of the episode in progress, or with `None` that there is
+    /// Notifies a device that records by itself of the episode in progress, or with `None` that there is
     /// none: when one begins or ends, and of one in progress when the device is opened. Returns at once:
     /// what takes time is done by [`Self::read`] or a task of the driver's own.
     ///
@@ -240,7 +259,7 @@ impl Driver {
     }
 
     /// What was agreed with the device, for the recording. Of the driver only what the open node
-    /// tells: a serial line tells nothing.
+    /// reports: a serial line reports nothing.
     #[must_use]
     pub fn negotiated(&self) -> Negotiated {
         match self {

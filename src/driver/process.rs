@@ -6,7 +6,7 @@
 //! camera's node held open by an unknowing child would keep the camera busy.
 //!
 //! Invariant: no shell.
-//! Invariant: a group is signalled only before its leader is reaped, while nobody else can have got
+//! Invariant: a group is signalled only before its leader is reaped, while no other process can have got
 //! its number.
 //! Invariant: when we end, however that comes, the kernel kills the children. Not what they have started in
 //! turn: that ends with them only where we are still there to end the group. A script whose last command is
@@ -72,7 +72,7 @@ impl Spawner {
         let (orders, inbox) = mpsc::channel::<Order>();
         let serve = move || {
             for Order { launch, reply } in inbox {
-                // Whom nobody waits for any more is killed when it is dropped.
+                // A program that is no longer waited for is killed when it is dropped.
                 let _ = reply.send(start(&launch));
             }
         };

@@ -1,19 +1,17 @@
-//! Replay: one topic of a recorded episode, played as a device.
+//! Replay: a recorded episode as a scenario, its mask as plugs and unplugs, and one of its topics played as a device.
 //!
 //! The file is read a batch of messages ahead on the blocking pool; each is due at its recorded
 //! distance from the scenario's beginning. When the messages are used up the device stays silent, as one that
 //! hangs does.
 //!
-//! Invariant: the file is read chunk by chunk, never held whole.
+//! Invariant: the file is read from its beginning to its end, chunk by chunk, never held whole.
+//! Invariant: what lies in a damaged chunk is not played.
 //! Invariant: a damaged file ends the topic early or leaves out what is damaged; it never ends the
 //! program.
 
-mod episode;
-mod scenario;
-pub mod tape;
-mod wire;
-
+use std::collections::BTreeMap;
 use std::fs::File;
+use std::os::unix::fs::FileExt as _;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -22,15 +20,20 @@ use std::time::Duration;
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
-use self::episode::{Episode, Messages};
-pub use self::episode::{EpisodeDescription, TopicDescription, describe, read_bytes};
-pub use self::scenario::{Replayed, scenario};
-use self::wire::Shape;
 use super::sim::stamp_of;
 use super::{DriverError, Reading, unblock};
+use crate::episode::decode::{Content, Kind, Sample, Scratch};
+use crate::episode::reader::{Channel, Item, Reader};
+use crate::episode::record_iter::{FileEnd, MAGIC};
+use crate::episode::{self, ReadAt, ReadError};
+use crate::mask::PhysicalMask;
+use crate::modality::ModalityId;
 use crate::provenance::{KernelDriver, Negotiated};
-use crate::registry::scenario::{SimDevice, SimSource};
-use crate::sample::FLAG_DEVICE_TIME;
+use crate::registry::scenario::{
+    Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, SimDevice, SimFaults, SimSource,
+};
+use crate::registry::{DeviceSpec, LanIdentity, Registry, UsbIdentity};
+use crate::sample::{Encoding, FLAG_DEVICE_TIME};
 use crate::time::{Stamp, nanoseconds};
 
 /// Messages read at once: at 1 kHz this bridges the reading of a chunk.
@@ -42,6 +45,12 @@ const NOTICE: Duration = Duration::from_millis(10);
 /// The first time a device is opened, what was recorded while it was being opened is still played.
 const OPENING: Duration = Duration::from_secs(2);
 
+/// Changes of the mask that are played: a device that flaps at 500 Hz, the rate of the mask, reaches
+/// them after half an hour.
+const MAX_CHANGES: usize = 1_000_000;
+/// A device is attached before its first sample, with which its bit begins: by this much.
+const LEAD: Duration = Duration::from_millis(100);
+
 /// A topic being played.
 #[derive(Debug)]
 pub struct Replay {
@@ -51,6 +60,7 @@ pub struct Replay {
     next: usize,
     /// The batch after `playing`; `None` once the file is used up.
     reading: Option<JoinHandle<Batch>>,
+    begin_ns: u64,
     description: String,
 }
 
@@ -58,17 +68,10 @@ pub struct Replay {
 struct Message {
     /// Recorded capture time after the episode's beginning.
     after: Duration,
+    encoding: Encoding,
+    width: u32,
+    height: u32,
     payload: Vec<u8>,
-    shape: Shape,
-}
-
-/// The payload of one recorded message of the schema named so, with its width and height.
-#[doc(hidden)]
-#[must_use]
-pub fn decode(schema: &str, message: &[u8]) -> Option<(Vec<u8>, u32, u32)> {
-    let mut payload = Vec::new();
-    let shape = wire::payload(wire::Schema::named(schema)?, message, &mut payload)?;
-    Some((payload, shape.width, shape.height))
 }
 
 impl Replay {
@@ -85,10 +88,9 @@ impl Replay {
         let from = if is_first { elapsed.saturating_sub(OPENING) } else { elapsed };
         let from_ns = begin_ns.saturating_add(nanoseconds(from));
         let description = format!("replay of {topic} in {}", file.display());
-        let messages = unblock(move || Episode::open(&file)?.play(&topic, from_ns)).await?;
-        let reader = Reader { messages, begin_ns };
-        let reading = Some(tokio::task::spawn_blocking(move || reader.batch(Vec::new())));
-        Ok(Self { device, playing: Vec::new(), next: 0, reading, description })
+        let messages = unblock(move || play(&file, &topic, from_ns)).await?;
+        let reading = Some(tokio::task::spawn_blocking(move || batch(messages, begin_ns, Vec::new())));
+        Ok(Self { device, playing: Vec::new(), next: 0, reading, begin_ns, description })
     }
 
     /// The next recorded sample, when it is due.
@@ -99,11 +101,10 @@ impl Replay {
         let captured = self.wait_due().await?;
         // Nothing waits from here on: a future that is dropped has taken no sample.
         self.device.sequence.fetch_add(1, Ordering::AcqRel);
-        let Some(Message { payload, shape, .. }) = self.playing.get(self.next) else {
+        let Some(&Message { encoding, width, height, ref payload, .. }) = self.playing.get(self.next) else {
             return Err(DriverError::Gone);
         };
         self.next += 1;
-        let Shape { encoding, width, height } = *shape;
         Ok(Reading { bytes: payload, encoding, captured, flags: FLAG_DEVICE_TIME, width, height, lost: 0 })
     }
 
@@ -159,7 +160,8 @@ impl Replay {
         let Ok(Batch { messages, rest }) = read else { return };
         let used = std::mem::replace(&mut self.playing, messages);
         self.next = 0;
-        self.reading = rest.map(|reader| tokio::task::spawn_blocking(move || reader.batch(used)));
+        let begin_ns = self.begin_ns;
+        self.reading = rest.map(|rest| tokio::task::spawn_blocking(move || batch(rest, begin_ns, used)));
     }
 }
 
@@ -167,43 +169,333 @@ impl Replay {
 #[derive(Debug)]
 struct Batch {
     messages: Vec<Message>,
-    rest: Option<Reader>,
+    rest: Option<Messages<File>>,
 }
 
-/// Reads the file, on the blocking pool.
-#[derive(Debug)]
-struct Reader {
-    messages: Messages<File>,
-    begin_ns: u64,
-}
-
-impl Reader {
-    /// The next messages, in the memory of `used` ones. The file's end or its first damage is the end.
-    fn batch(mut self, used: Vec<Message>) -> Batch {
-        let mut spare = used.into_iter().map(|message| message.payload);
-        let (mut messages, mut bytes) = (Vec::with_capacity(BATCH), 0);
-        while messages.len() < BATCH && bytes < BATCH_BYTES {
-            let next = match self.messages.next() {
-                Ok(Some(next)) => next,
-                Ok(None) => return Batch { messages, rest: None },
-                Err(error) => {
-                    tracing::warn!(%error, "the recording ends early");
-                    return Batch { messages, rest: None };
-                }
-            };
-            let mut payload = spare.next().unwrap_or_default();
-            // A message that cannot be read was not recorded by us; it has no sample to play.
-            let Some(shape) = wire::payload(next.schema, next.data, &mut payload) else { continue };
-            let after = Duration::from_nanos(next.log_time.saturating_sub(self.begin_ns));
-            bytes += payload.len();
-            messages.push(Message { after, payload, shape });
+/// The next messages, in the memory of `used` ones; reads the file, on the blocking pool. The file's end or its first
+/// damage is the end.
+fn batch(mut recorded: Messages<File>, begin_ns: u64, used: Vec<Message>) -> Batch {
+    let mut spare = used.into_iter().map(|message| message.payload);
+    let (mut messages, mut bytes) = (Vec::with_capacity(BATCH), 0);
+    while messages.len() < BATCH && bytes < BATCH_BYTES {
+        match recorded.advance() {
+            Ok(true) => {}
+            Ok(false) => return Batch { messages, rest: None },
+            Err(error) => {
+                tracing::warn!(%error, "the recording ends early");
+                return Batch { messages, rest: None };
+            }
         }
-        Batch { messages, rest: Some(self) }
+        // A message that cannot be read was not recorded by us; it has no sample to play.
+        let Some((log_time, sample)) = recorded.sample() else { continue };
+        let mut payload = spare.next().unwrap_or_default();
+        payload.clear();
+        payload.extend_from_slice(sample.payload);
+        bytes += payload.len();
+        let after = Duration::from_nanos(log_time.saturating_sub(begin_ns));
+        let Sample { encoding, width, height, .. } = sample;
+        messages.push(Message { after, encoding, width, height, payload });
     }
+    Batch { messages, rest: Some(recorded) }
 }
 
 fn fatal(file: &Path, why: impl std::fmt::Display) -> DriverError {
     DriverError::Fatal(format!("{}: {why}", file.display()))
+}
+
+impl From<ReadError> for DriverError {
+    fn from(error: ReadError) -> Self {
+        Self::Fatal(error.to_string())
+    }
+}
+
+/// What an episode holds.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EpisodeDescription {
+    /// Wall time of the first message, ns since 1970.
+    pub begin_ns: u64,
+    /// Wall time of the last message, ns since 1970.
+    pub end_ns: u64,
+    /// Topics, by name.
+    pub topics: Vec<TopicDescription>,
+    /// Names and bits of the modalities, by bit.
+    pub layout: Vec<(String, ModalityId)>,
+    /// Text of the `devices.toml` it was recorded with.
+    pub registry: String,
+    /// The mask at its first record and after each change, with wall time in ns, ascending.
+    pub mask: Vec<(u64, PhysicalMask)>,
+}
+
+/// A topic of an episode.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TopicDescription {
+    /// Name.
+    pub topic: String,
+    /// Name of the schema, for example `foxglove.CompressedImage`.
+    pub schema: String,
+    /// Messages.
+    pub messages: u64,
+}
+
+/// What is in `file`. Reads the whole of it, a chunk at a time; blocks.
+///
+/// # Errors
+/// When the file cannot be read, or is damaged or was never closed.
+pub fn describe(file: &Path) -> Result<EpisodeDescription, DriverError> {
+    let collected = Collected::read(open(file)?)?;
+    if collected.mask.len() > MAX_CHANGES {
+        return Err(fatal(file, "the mask changes more than a million times"));
+    }
+    if collected.reader.integrity().end != FileEnd::Finished {
+        return Err(fatal(file, format!("is damaged; {}", fix(file))));
+    }
+    collected.description().map_err(|why| fatal(file, why))
+}
+
+/// Opens a file that ends as a finished one does.
+fn open(path: &Path) -> Result<Reader<File>, DriverError> {
+    let (file, size) = episode::open(path)?;
+    let not_mcap = || ReadError::NotMcap(path.to_owned());
+    let magic_at = |at| {
+        let mut read = [0; MAGIC.len()];
+        file.read_exact_at(&mut read, at).map_err(|error| fatal(path, error))?;
+        Ok::<_, DriverError>(read == MAGIC)
+    };
+    let end = size.checked_sub(MAGIC.len() as u64).ok_or_else(not_mcap)?;
+    let (is_mcap, is_closed) = (magic_at(0)?, magic_at(end)?);
+    if !is_mcap {
+        return Err(not_mcap().into());
+    }
+    if !is_closed {
+        return Err(fatal(path, format!("was not closed, and cannot be played; {}", fix(path))));
+    }
+    Ok(Reader::new(file, size, path, None)?)
+}
+
+/// The messages of `topic` in the file at `path` from `from_ns` on.
+fn play(path: &Path, topic: &str, from_ns: u64) -> Result<Messages<File>, DriverError> {
+    let mut messages = Messages::new(open(path)?, topic, from_ns);
+    if messages.seek()? {
+        return Ok(messages);
+    }
+    Err(fatal(path, messages.refusal()))
+}
+
+fn fix(path: &Path) -> String {
+    format!("`rapid recover {}` makes it whole, `rapid inspect` reads what is there", path.display())
+}
+
+/// Reads `bytes`, which may be any, as replay reads a file: what they hold and every message that a
+/// device could play.
+pub fn read_bytes(bytes: &[u8]) {
+    let reader = || Reader::new(bytes, bytes.len() as u64, Path::new("bytes.mcap"), None);
+    let Ok(Ok(described)) = reader().and_then(Collected::read).map(Collected::description) else { return };
+    for topic in described.topics {
+        let Ok(reader) = reader() else { return };
+        let mut messages = Messages::new(reader, &topic.topic, described.begin_ns);
+        while let Ok(true) = messages.advance() {
+            let _ = messages.sample();
+        }
+    }
+}
+
+/// What is gathered of the whole file.
+struct Collected<R> {
+    reader: Reader<R>,
+    /// Messages by channel.
+    messages: BTreeMap<u16, u64>,
+    times: Option<(u64, u64)>,
+    mask: Vec<(u64, PhysicalMask)>,
+}
+
+impl<R: ReadAt> Collected<R> {
+    /// Reads to the end, or until the mask has changed too often.
+    fn read(reader: Reader<R>) -> Result<Self, ReadError> {
+        let mut collected = Self { reader, messages: BTreeMap::new(), times: None, mask: Vec::new() };
+        let mut scratch = Scratch::default();
+        while collected.mask.len() <= MAX_CHANGES && collected.reader.advance()? {
+            let Item::Message(message) = collected.reader.item() else { continue };
+            let at = message.log_time;
+            *collected.messages.entry(message.channel.id).or_default() += 1;
+            let (first, last) = collected.times.unwrap_or((at, at));
+            collected.times = Some((first.min(at), last.max(at)));
+            if message.channel.kind == Kind::Mask
+                && let Some(Content::Mask(mask)) = message.content(&mut scratch)
+                && collected.mask.last().is_none_or(|(_, last)| *last != mask)
+            {
+                collected.mask.push((at, mask));
+            }
+        }
+        Ok(collected)
+    }
+
+    fn description(mut self) -> Result<EpisodeDescription, String> {
+        let mut topics: BTreeMap<String, TopicDescription> = BTreeMap::new();
+        for channel in self.reader.channels() {
+            let Channel { id, topic, schema, .. } = channel;
+            let described = || TopicDescription { topic: topic.clone(), schema: schema.clone(), messages: 0 };
+            let messages = self.messages.get(id).copied().unwrap_or_default();
+            topics.entry(topic.clone()).or_insert_with(described).messages += messages;
+        }
+        let layout = self.reader.about("layout").unwrap_or_default();
+        let layout: BTreeMap<String, u8> = if layout.is_empty() {
+            BTreeMap::new()
+        } else {
+            serde_json::from_str(layout).map_err(|error| format!("its metadata cannot be read: {error}"))?
+        };
+        let mut layout: Vec<_> =
+            layout.into_iter().filter_map(|(name, bit)| Some((name, ModalityId::new(bit)?))).collect();
+        layout.sort_by_key(|(_, id)| *id);
+        // Within a topic of ours times ascend; of another writer's file nothing is known.
+        self.mask.sort_by_key(|(at, _)| *at);
+        let (begin_ns, end_ns) = self.times.unwrap_or_default();
+        let registry = self.reader.about("registry").unwrap_or_default().to_owned();
+        Ok(EpisodeDescription {
+            begin_ns,
+            end_ns,
+            topics: topics.into_values().collect(),
+            layout,
+            registry,
+            mask: self.mask,
+        })
+    }
+}
+
+/// The messages of a topic that a device could play, in the order they were recorded.
+#[derive(Debug)]
+struct Messages<R> {
+    reader: Reader<R>,
+    scratch: Scratch,
+    topic: String,
+    from_ns: u64,
+}
+
+impl<R: ReadAt> Messages<R> {
+    fn new(reader: Reader<R>, topic: &str, from_ns: u64) -> Self {
+        Self { reader, scratch: Scratch::default(), topic: topic.to_owned(), from_ns }
+    }
+
+    fn is_playable(&self, channel: &Channel) -> bool {
+        channel.topic == self.topic && matches!(channel.kind, Kind::Sample(_))
+    }
+
+    /// Reads up to a channel of the topic that can be played; is there one?
+    fn seek(&mut self) -> Result<bool, ReadError> {
+        while self.reader.advance()? {
+            if matches!(self.reader.item(), Item::Channel(channel) if self.is_playable(channel)) {
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
+
+    /// Moves to the next message; `false` at the end.
+    fn advance(&mut self) -> Result<bool, ReadError> {
+        while self.reader.advance()? {
+            if let Item::Message(message) = self.reader.item()
+                && message.log_time >= self.from_ns
+                && self.is_playable(message.channel)
+            {
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
+
+    /// The message moved to, and its time; `None` if it cannot be read.
+    fn sample(&mut self) -> Option<(u64, Sample<'_>)> {
+        let Item::Message(message) = self.reader.item() else { return None };
+        let Some(Content::Sample(sample)) = message.content(&mut self.scratch) else { return None };
+        Some((message.log_time, sample))
+    }
+
+    /// Why the topic cannot be played.
+    fn refusal(&self) -> String {
+        let topic = &self.topic;
+        if let Some(channel) = self.reader.channels().find(|channel| channel.topic == *topic) {
+            return format!("{topic} holds {:?} messages, which no device sends", channel.schema);
+        }
+        let mut topics: Vec<&str> = self.reader.channels().map(|channel| channel.topic.as_str()).collect();
+        topics.sort_unstable();
+        topics.dedup();
+        format!("has no topic {topic}; it has {}", topics.join(", "))
+    }
+}
+
+/// A recorded episode, to be played.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Replayed {
+    /// The registry it was recorded with.
+    pub registry: Registry,
+    /// Each modality is a device that plays its topic and is plugged and unplugged as the recorded
+    /// mask shows.
+    pub scenario: Scenario,
+    /// From its first message to its last.
+    pub length: Duration,
+}
+
+/// Makes devices of a recorded episode; blocks.
+///
+/// # Errors
+/// When the file cannot be read, or does not hold the registry and the layout.
+pub fn scenario(file: &Path) -> Result<Replayed, DriverError> {
+    let episode = describe(file)?;
+    if episode.layout.is_empty() || episode.registry.is_empty() {
+        return Err(fatal(file, "holds no layout and registry: it was not recorded by rapid"));
+    }
+    let loaded = Registry::parse(&episode.registry, None)
+        .map_err(|errors| fatal(file, format!("the registry in it cannot be read: {errors}")))?;
+    let registry = loaded.registry;
+    let device = |spec: &DeviceSpec| ScenarioDevice {
+        name: spec.name.clone(),
+        usb: usb_identity(spec),
+        lan: lan_identity(spec),
+        source: SimSource::Replay { file: file.to_owned(), topic: spec.topic.clone(), begin_ns: episode.begin_ns },
+        plugged: episode.mask.first().is_some_and(|(_, mask)| mask.contains(spec.id)),
+        faults: SimFaults::default(),
+    };
+    let mut events: Vec<_> =
+        registry.devices.iter().flat_map(|spec| plug_events(&episode, &spec.name, spec.id)).collect();
+    events.sort_by_key(|event| event.at);
+    let devices = registry.devices.iter().map(device).collect();
+    let length = Duration::from_nanos(episode.end_ns.saturating_sub(episode.begin_ns));
+    Ok(Replayed { registry, scenario: Scenario { devices, events, repeat: None }, length })
+}
+
+/// Plugs and unplugs of one modality, from the changes of its bit.
+fn plug_events(episode: &EpisodeDescription, name: &str, id: ModalityId) -> Vec<ScenarioEvent> {
+    let mut events: Vec<ScenarioEvent> = Vec::new();
+    for pair in episode.mask.windows(2) {
+        let [(_, before), (time, after)] = pair else { continue };
+        let at = Duration::from_nanos(time.saturating_sub(episode.begin_ns));
+        let earliest = events.last().map_or(Duration::ZERO, |event| event.at);
+        let (at, action) = match (before.contains(id), after.contains(id)) {
+            (false, true) => (at.saturating_sub(LEAD).max(earliest), ScenarioAction::Plug { port: None }),
+            (true, false) => (at, ScenarioAction::Unplug),
+            _ => continue,
+        };
+        events.push(ScenarioEvent { at, device: name.to_owned(), action });
+    }
+    events
+}
+
+/// A device on the network is found by its entry.
+fn lan_identity(spec: &DeviceSpec) -> Option<LanIdentity> {
+    let found = || LanIdentity { entry: spec.name.clone(), address: String::from("replay"), instance: None };
+    spec.identity.usb().is_none().then(found)
+}
+
+/// The identity of the entry; a port is made up where it names none.
+fn usb_identity(spec: &DeviceSpec) -> UsbIdentity {
+    let identity = spec.identity.usb();
+    UsbIdentity {
+        vid: identity.map_or(0, |usb| usb.vid),
+        pid: identity.map_or(0, |usb| usb.pid),
+        serial: spec.identity.serial().map(str::to_owned),
+        port: identity.and_then(|usb| usb.port.clone()).unwrap_or_else(|| format!("9-{}", spec.id.bit() + 1)),
+        product: Some(String::from("replay")),
+        ..UsbIdentity::default()
+    }
 }
 
 #[cfg(test)]

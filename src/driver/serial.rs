@@ -5,21 +5,21 @@
 //! message boundary after opening is the tail of a message and dropped without being counted.
 //! `nan` and `inf` in a message are values like any other and are passed on as they are.
 //!
-//! Invariant: memory is bounded by the longest permitted message, whatever the device sends.
+//! Invariant: the messages depend on the bytes alone, not on how they were cut into reads.
+//! Invariant: memory is bounded by the longest permitted message, whatever the device sends; a longer one is never held.
+//! Invariant: nothing allocates for a message that is well formed.
 //! Invariant: a stamp is the moment the bytes that completed the message came into our hands; a
 //! serial line gives no earlier one. Of several messages in one read each is older than the next by the
 //! least time that its bytes take on a line (`arrival`): stamps always increase.
 
-mod framing;
-mod parse;
-
+use std::fmt;
 use std::os::fd::{FromRawFd as _, IntoRawFd as _, OwnedFd};
 use std::path::Path;
 
+use serde::de::{DeserializeSeed, Deserializer, Error as _, IgnoredAny, MapAccess, SeqAccess, Visitor};
 use tokio::io::AsyncReadExt as _;
 use tokio_serial::{ClearBuffer, SerialPort as _, SerialPortBuilder, SerialStream};
 
-use self::framing::{Cut, Framer};
 use super::{DriverError, Reading, arrival, unblock};
 use crate::provenance::{Format, Negotiated};
 use crate::registry::{Framing, Parse, SerialSpec};
@@ -190,7 +190,7 @@ impl Decoder {
         if self.parse == Parse::Raw {
             return true;
         }
-        if !parse::numbers(self.parse, self.framer.message(), &mut self.values) {
+        if !numbers(self.parse, self.framer.message(), &mut self.values) {
             return false;
         }
         self.output.clear();
@@ -270,7 +270,7 @@ fn line(path: &Path, baud: u32) -> Result<SerialPortBuilder, DriverError> {
 fn open_error(path: &Path, baud: u32, error: &tokio_serial::Error) -> DriverError {
     let shown = path.display();
     match error.kind() {
-        // serialport tells EBUSY, from TIOCEXCL or from its lock, as `NoDevice`.
+        // serialport reports EBUSY, from TIOCEXCL or from its lock, as `NoDevice`.
         tokio_serial::ErrorKind::NoDevice if path.exists() => {
             DriverError::Retry(format!("{shown} is held by another program: end it (`fuser {shown}` names it)"))
         }
@@ -281,7 +281,7 @@ fn open_error(path: &Path, baud: u32, error: &tokio_serial::Error) -> DriverErro
             "{shown} may not be opened: add the user to group dialout (`sudo usermod -aG dialout $USER`, then log in \
              again) or install the udev rules (`rapid artifacts --install`)"
         )),
-        // ENODEV, ENXIO and EIO arrive without their number; a node that is gone tells them apart.
+        // ENODEV, ENXIO and EIO arrive without their number; whether the node is gone distinguishes them.
         _ if !path.exists() => DriverError::Gone,
         _ => DriverError::Retry(format!("{shown} at {baud} baud: {error}")),
     }
@@ -296,5 +296,304 @@ fn read_error(error: &std::io::Error) -> DriverError {
     }
 }
 
+/// Reads exactly `values.len()` numbers from `message`; false if it holds anything else.
+fn numbers(parse: Parse, message: &[u8], values: &mut [f64]) -> bool {
+    match parse {
+        Parse::Csv => csv(message, values),
+        Parse::Json => json(message, values),
+        Parse::F32le => f32le(message, values),
+        Parse::Raw => false,
+    }
+}
+
+fn csv(message: &[u8], values: &mut [f64]) -> bool {
+    let mut fields = message.split(|&byte| byte == b',');
+    for value in values {
+        let Some(number) = fields.next().and_then(decimal) else { return false };
+        *value = number;
+    }
+    fields.next().is_none()
+}
+
+/// A number in decimal notation with blanks around it; `nan`, `inf` and `-inf` included.
+fn decimal(field: &[u8]) -> Option<f64> {
+    std::str::from_utf8(field.trim_ascii()).ok()?.parse().ok()
+}
+
+fn f32le(message: &[u8], values: &mut [f64]) -> bool {
+    if message.len() != values.len() * 4 {
+        return false;
+    }
+    for (value, bytes) in values.iter_mut().zip(message.chunks_exact(4)) {
+        let mut four = [0; 4];
+        four.copy_from_slice(bytes);
+        *value = f64::from(f32::from_le_bytes(four));
+    }
+    true
+}
+
+fn json(message: &[u8], values: &mut [f64]) -> bool {
+    let wished = values.len();
+    let mut sink = Sink { values, count: 0 };
+    let mut deserializer = serde_json::Deserializer::from_slice(message);
+    let read = deserializer.deserialize_any(Document(&mut sink)).and_then(|()| deserializer.end());
+    read.is_ok() && sink.count == wished
+}
+
+struct Sink<'a> {
+    values: &'a mut [f64],
+    count: usize,
+}
+
+impl Sink<'_> {
+    fn push(&mut self, number: f64) -> bool {
+        let Some(place) = self.values.get_mut(self.count) else { return false };
+        *place = number;
+        self.count += 1;
+        true
+    }
+}
+
+/// An array of numbers, or an object whose numeric values count in the order they stand in; its
+/// other values (names, units, nested objects) are passed over.
+struct Document<'a, 'b>(&'a mut Sink<'b>);
+
+impl<'de> Visitor<'de> for Document<'_, '_> {
+    type Value = ();
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("an array of numbers or an object")
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut array: A) -> Result<(), A::Error> {
+        while let Some(element) = array.next_element_seed(Element)? {
+            let Some(number) = element else { return Err(A::Error::custom("not a number")) };
+            if !self.0.push(number) {
+                return Err(A::Error::custom("too many numbers"));
+            }
+        }
+        Ok(())
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut object: A) -> Result<(), A::Error> {
+        while object.next_key::<IgnoredAny>()?.is_some() {
+            if let Some(number) = object.next_value_seed(Element)?
+                && !self.0.push(number)
+            {
+                return Err(A::Error::custom("too many numbers"));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Any value: `Some` if it is a number.
+struct Element;
+
+impl<'de> DeserializeSeed<'de> for Element {
+    type Value = Option<f64>;
+
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Self::Value, D::Error> {
+        deserializer.deserialize_any(self)
+    }
+}
+
+impl<'de> Visitor<'de> for Element {
+    type Value = Option<f64>;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("any value")
+    }
+
+    fn visit_f64<E>(self, number: f64) -> Result<Self::Value, E> {
+        Ok(Some(number))
+    }
+
+    fn visit_i64<E>(self, number: i64) -> Result<Self::Value, E> {
+        Ok(Some(number as f64))
+    }
+
+    fn visit_u64<E>(self, number: u64) -> Result<Self::Value, E> {
+        Ok(Some(number as f64))
+    }
+
+    fn visit_bool<E>(self, _: bool) -> Result<Self::Value, E> {
+        Ok(None)
+    }
+
+    fn visit_str<E>(self, _: &str) -> Result<Self::Value, E> {
+        Ok(None)
+    }
+
+    fn visit_unit<E>(self) -> Result<Self::Value, E> {
+        Ok(None)
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut array: A) -> Result<Self::Value, A::Error> {
+        while array.next_element::<IgnoredAny>()?.is_some() {}
+        Ok(None)
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut object: A) -> Result<Self::Value, A::Error> {
+        while object.next_entry::<IgnoredAny, IgnoredAny>()?.is_some() {}
+        Ok(None)
+    }
+}
+
+/// What feeding bytes led to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Cut {
+    /// The message is not complete.
+    Open,
+    /// `message` is complete; it stays until the next feed.
+    Message,
+    /// A message ended that was longer than the limit or wrongly stuffed.
+    Malformed,
+}
+
+/// Cuts a stream of bytes into messages.
+#[derive(Debug)]
+struct Framer {
+    framing: Framing,
+    limit: usize,
+    message: Vec<u8>,
+    /// A boundary was seen since the beginning.
+    aligned: bool,
+    /// The message so far is longer than the limit; its bytes are let go up to the boundary.
+    overlong: bool,
+    /// The message was handed out: the next byte begins a new one.
+    complete: bool,
+}
+
+impl Framer {
+    fn new(framing: Framing, limit: usize) -> Self {
+        // COBS adds one byte to each 254 and one more; a line may end in a carriage return.
+        let limit = match framing {
+            Framing::Line => limit.saturating_add(1),
+            Framing::Cobs => limit.saturating_add(limit / 254 + 1),
+            Framing::Fixed(length) => length.max(1),
+        };
+        // Raw messages may be permitted to be large; what they need is reserved as they come.
+        let message = Vec::with_capacity(limit.min(1 << 16));
+        let aligned = matches!(framing, Framing::Fixed(_));
+        Self { framing, limit, message, aligned, overlong: false, complete: false }
+    }
+
+    /// Consumes bytes up to the end of a message, and says how many.
+    fn feed(&mut self, bytes: &[u8]) -> (usize, Cut) {
+        if std::mem::take(&mut self.complete) {
+            self.message.clear();
+        }
+        let delimiter = match self.framing {
+            Framing::Fixed(_) => return self.fill(bytes),
+            Framing::Line => b'\n',
+            Framing::Cobs => 0,
+        };
+        let Some(end) = bytes.iter().position(|&byte| byte == delimiter) else {
+            self.take(bytes);
+            return (bytes.len(), Cut::Open);
+        };
+        self.take(&bytes[..end]);
+        (end + 1, self.finish())
+    }
+
+    /// The message that was completed last.
+    fn message(&self) -> &[u8] {
+        &self.message
+    }
+
+    /// Lets the first byte of a complete message go and keeps the rest as the beginning of the next:
+    /// how messages of fixed length find their boundary again. Says no for other framings, which
+    /// have boundaries of their own.
+    fn slip(&mut self) -> bool {
+        if !matches!(self.framing, Framing::Fixed(_)) || self.message.is_empty() {
+            return false;
+        }
+        self.message.remove(0);
+        self.complete = false;
+        true
+    }
+
+    fn description(&self) -> String {
+        match self.framing {
+            Framing::Line => String::from("lines"),
+            Framing::Cobs => String::from("COBS frames"),
+            Framing::Fixed(length) => format!("messages of {length} bytes"),
+        }
+    }
+
+    fn fill(&mut self, bytes: &[u8]) -> (usize, Cut) {
+        let count = bytes.len().min(self.limit.saturating_sub(self.message.len()));
+        self.message.extend_from_slice(&bytes[..count]);
+        self.complete = self.message.len() >= self.limit;
+        (count, if self.complete { Cut::Message } else { Cut::Open })
+    }
+
+    fn take(&mut self, bytes: &[u8]) {
+        if !self.aligned || self.overlong {
+            return;
+        }
+        if self.message.len() + bytes.len() > self.limit {
+            self.overlong = true;
+            self.message.clear();
+            return;
+        }
+        self.message.extend_from_slice(bytes);
+    }
+
+    /// At a boundary. An empty message is none: senders repeat boundaries to be sure of one.
+    fn finish(&mut self) -> Cut {
+        let aligned = std::mem::replace(&mut self.aligned, true);
+        let overlong = std::mem::take(&mut self.overlong);
+        if !aligned {
+            return Cut::Open;
+        }
+        if overlong {
+            return Cut::Malformed;
+        }
+        if self.framing == Framing::Line && self.message.last() == Some(&b'\r') {
+            self.message.pop();
+        }
+        if self.message.is_empty() {
+            return Cut::Open;
+        }
+        self.complete = true;
+        if self.framing == Framing::Cobs && !unstuff(&mut self.message) {
+            return Cut::Malformed;
+        }
+        Cut::Message
+    }
+}
+
+/// Undoes consistent overhead byte stuffing in place (Cheshire and Baker, 1999): a code byte `n` is
+/// followed by `n - 1` bytes and stands for a zero after them, except where `n` is 255 or the
+/// message ends. `message` holds no zero. False if a code points beyond the end.
+fn unstuff(message: &mut Vec<u8>) -> bool {
+    let (mut read, mut written) = (0, 0);
+    while let Some(&code) = message.get(read) {
+        let run = usize::from(code).saturating_sub(1);
+        let (from, to) = (read + 1, read + 1 + run);
+        if code == 0 || to > message.len() {
+            return false;
+        }
+        message.copy_within(from..to, written);
+        written += run;
+        read = to;
+        if code != u8::MAX && read < message.len() {
+            // `written` is below `read`: the code byte made room.
+            message[written] = 0;
+            written += 1;
+        }
+    }
+    message.truncate(written);
+    true
+}
+
 #[cfg(test)]
 mod tests;
+
+#[cfg(test)]
+mod parse_tests;
+
+#[cfg(test)]
+mod framing_tests;

@@ -4,12 +4,10 @@
 //! their bytes are a function of seed and sequence, so a test can say what a recording must hold.
 //! Time is tokio's: under a paused clock a scenario runs as fast as it is read.
 //!
-//! Invariant: the sequence goes on over a replug; a number that is skipped is told in `lost`.
+//! Invariant: the sequence continues over a replug; skipped numbers are counted in `lost`.
 
-mod grid;
 mod joints;
 mod pictures;
-mod records;
 pub mod task;
 
 use std::collections::BTreeMap;
@@ -20,16 +18,22 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
-use self::grid::Grid;
 use self::joints::Joints;
-use self::pictures::{PICTURES, Pictures, Scene, encode, fill, write_picture};
-use self::records::Records;
+use self::pictures::{PICTURES, Pictures, encode, fill, write_picture};
 use super::{DriverError, Reading, unblock};
+#[cfg(feature = "motors")]
+use crate::control::can::CanFrame;
+#[cfg(feature = "motors")]
+use crate::driver::can::{
+    link::{Arrival, Received},
+    raw,
+};
 use crate::modality::ModalityKind;
 use crate::provenance::{Format, Negotiated};
 use crate::registry::scenario::{self, SimDevice, SimSource, TaskPart};
 use crate::registry::{CAN_RECORD, DeviceSpec, MOTOR_CHANNELS, NodeSpec};
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
+use crate::sync::Grid;
 use crate::time::{Stamp, nanoseconds};
 
 /// Pictures a camera keeps for a reader that is late, as many as the real driver has buffers.
@@ -49,14 +53,14 @@ pub struct Sim {
     next: u64,
     backlog: u64,
     payload: Vec<u8>,
-    /// Losses not told yet.
+    /// Losses not reported yet.
     owed: u64,
     /// The sample in `payload` is to be sent once more, with this stamp.
     again: Option<Stamp>,
     controls: BTreeMap<String, i64>,
     /// Its motors, if it has some.
     pub(super) joints: Joints,
-    /// It was told to record.
+    /// It was ordered to record.
     records: bool,
 }
 
@@ -76,8 +80,8 @@ impl Sim {
     pub async fn open(device: Arc<SimDevice>) -> Result<Self, DriverError> {
         let (content, rate, backlog) = match device.source {
             SimSource::Camera { width, height, fps, seed, bytes } => {
-                let scene = if device.light.is_there() { Scene::Light } else { Scene::Usual };
-                let pictures = unblock(move || Pictures::new(width, height, seed, bytes, scene)).await?;
+                let has_light = device.light.is_there();
+                let pictures = unblock(move || Pictures::new(width, height, seed, bytes, has_light)).await?;
                 (Content::Pictures(pictures), fps, CAMERA_BACKLOG)
             }
             SimSource::Serial { channels, hz, seed } => {
@@ -97,8 +101,8 @@ impl Sim {
             Content::Records { .. } => CAN_RECORD,
             Content::Task { .. } => task::SIDE * task::SIDE * 3,
         };
-        let grid = Grid { begun: device.begun, rate: u64::from(rate.max(1)) };
-        let next = grid.first_after(stamp_of(Instant::now()));
+        let grid = Grid::new(device.begun, rate.max(1).into());
+        let next = first_after(grid, stamp_of(Instant::now()));
         let (payload, controls) = (Vec::with_capacity(capacity), BTreeMap::new());
         Ok(Self {
             device,
@@ -116,7 +120,7 @@ impl Sim {
     }
 
     /// As `spec` has it. With the controls that it sets: a simulated camera has those and no others. With its
-    /// motors, which are where they are told to be. With bytes where it sends those.
+    /// motors, which are at their targets. With bytes where it sends those.
     #[must_use]
     pub(super) fn with_node(mut self, spec: &NodeSpec) -> Self {
         if let (Some(records), Content::Values { seed, .. }) = (Records::of(spec), &self.content) {
@@ -132,7 +136,7 @@ impl Sim {
         self
     }
 
-    /// Tells the arm of the simulated task where to go: as many numbers as it has axes.
+    /// Sets the action of the arm of the simulated task: as many numbers as it has axes.
     ///
     /// # Errors
     /// When the device is no actuator, or takes another count of numbers.
@@ -151,7 +155,7 @@ impl Sim {
         Ok(())
     }
 
-    /// Tells the device to record, or to end that.
+    /// Orders the device to record, or to stop recording.
     pub(super) fn record(&mut self, record: bool) {
         if self.records != record {
             self.records = record;
@@ -187,7 +191,7 @@ impl Sim {
         let (lost, point) = (std::mem::take(&mut self.owed), self.next);
         let skipped = u32::try_from(lost).unwrap_or(u32::MAX);
         let sequence = self.device.sequence.fetch_add(skipped.wrapping_add(1), Ordering::AcqRel).wrapping_add(skipped);
-        let captured = self.grid.stamp(point);
+        let captured = self.grid.tick(point);
         self.next += 1;
         let elapsed = captured.since(self.device.begun);
         if self.payload.is_empty() || faults.freeze_at.is_none_or(|freeze| elapsed < freeze) {
@@ -228,8 +232,8 @@ impl Sim {
         Reading { bytes: &self.payload, encoding, captured, flags: FLAG_DEVICE_TIME, width, height, lost }
     }
 
-    /// Waits until the next sample is due; tells how many the device had to drop before it because
-    /// nobody read them.
+    /// Waits until the next sample is due; returns how many the device had to drop before it because
+    /// they were not read.
     async fn next_due(&mut self) -> Result<u64, DriverError> {
         loop {
             // Before the look at the cable: what is stamped now was sent while it was plugged.
@@ -239,15 +243,15 @@ impl Sim {
             }
             if self.device.is_silent() {
                 // A silent device makes no samples: its sequence stands still, nothing is lost.
-                self.next = self.next.max(self.grid.first_after(stamp_of(now)));
-                tokio::time::sleep_until(now + NOTICE.min(self.grid.period())).await;
+                self.next = self.next.max(first_after(self.grid, stamp_of(now)));
+                tokio::time::sleep_until(now + NOTICE.min(self.grid.tick(1).since(self.grid.tick(0)))).await;
                 continue;
             }
-            let due = self.grid.stamp(self.next);
+            let due = self.grid.tick(self.next);
             // What is on its way for long is to be had as late.
             let now_stamp = stamp_of(now).before(self.device.faults.delay);
             if due <= now_stamp {
-                let newest = self.grid.first_after(now_stamp).saturating_sub(1);
+                let newest = first_after(self.grid, now_stamp).saturating_sub(1);
                 let lost = newest.saturating_sub(self.next).saturating_sub(self.backlog);
                 self.next += lost;
                 return Ok(lost);
@@ -303,6 +307,61 @@ impl Sim {
     }
 }
 
+/// Identifier of every frame.
+#[cfg(feature = "motors")]
+const ID: u16 = 0x123;
+
+/// What a simulated device sends whose samples are bytes as they come: frames of a bus, packets, messages.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Records {
+    /// One frame a sample, laid out as those of a real bus are.
+    #[cfg(feature = "motors")]
+    Frames,
+    /// A packet, or a message.
+    Packets,
+}
+
+impl Records {
+    /// What a device of this kind sends; `None` where it sends pictures or numbers.
+    fn of(node: &NodeSpec) -> Option<Self> {
+        match node {
+            _ if node.modality_kind() != ModalityKind::Bytes => None,
+            #[cfg(feature = "motors")]
+            NodeSpec::Can(_) => Some(Self::Frames),
+            _ => Some(Self::Packets),
+        }
+    }
+
+    /// Number `sequence`, taken at `captured`: it begins with the number, or a frame's data does.
+    fn write(self, seed: u64, sequence: u32, captured: Stamp, payload: &mut Vec<u8>) {
+        payload.clear();
+        // The lower half of the seed behind the number: little-endian, as all numbers here.
+        let data = (u64::from(sequence) | seed << 32).to_le_bytes();
+        match self {
+            #[cfg(feature = "motors")]
+            Self::Frames => {
+                let arrival = Arrival { at: captured, from_kernel: true };
+                raw::write(&Received { frame: CanFrame::standard(ID, data), arrival }, payload);
+            }
+            Self::Packets => payload.extend_from_slice(&data),
+        }
+    }
+
+    /// For people.
+    const fn describe(self) -> &'static str {
+        match self {
+            #[cfg(feature = "motors")]
+            Self::Frames => "simulated bus, frames",
+            Self::Packets => "simulated device, packets",
+        }
+    }
+}
+
+/// The first tick later than `now`.
+fn first_after(grid: Grid, now: Stamp) -> u64 {
+    grid.ticks_before(Stamp(now.0.saturating_add(1)))
+}
+
 /// Does the scenario's device send what the registry says?
 ///
 /// # Errors
@@ -344,7 +403,7 @@ pub(super) fn check(spec: &DeviceSpec, device: &SimDevice) -> Result<(), DriverE
     )))
 }
 
-/// The bytes a simulated device sends as number `sequence`, made anew; `None` for a recording
+/// The bytes a simulated device sends as number `sequence`; `None` for a recording
 /// or a program.
 #[must_use]
 pub fn frame(source: &SimSource, sequence: u32) -> Option<Vec<u8>> {

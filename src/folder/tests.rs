@@ -1,8 +1,6 @@
 use std::fs;
 use std::os::unix::fs::{PermissionsExt, lchown, symlink};
 
-use rustix::fs::CWD;
-
 use super::*;
 
 const OTHER: u32 = 12_345;
@@ -11,7 +9,7 @@ fn open(path: &Path) -> Result<Folder, FolderError> {
     Folder::open(path, Links::Own, Missing::Refused)
 }
 
-/// Everything somebody can plant under a name, each with a target that must not change.
+/// Everything that can be planted under a name, each with a target that must not change.
 fn plant(folder: &Path, name: &str) -> Vec<(&'static str, PathBuf)> {
     let victim = folder.join("victim");
     fs::write(&victim, "precious").unwrap();
@@ -40,7 +38,7 @@ fn plant(folder: &Path, name: &str) -> Vec<(&'static str, PathBuf)> {
 }
 
 #[test]
-fn what_is_planted_is_neither_opened_nor_written_to() {
+fn planted_files_are_neither_opened_nor_written_to() {
     let dir = tempfile::tempdir().unwrap();
     for (kind, place) in plant(dir.path(), "name") {
         let folder = open(&place).unwrap();
@@ -68,7 +66,7 @@ fn what_is_planted_is_neither_opened_nor_written_to() {
 }
 
 #[test]
-fn a_temporary_name_somebody_took_is_avoided() {
+fn a_taken_temporary_name_is_avoided() {
     let dir = tempfile::tempdir().unwrap();
     let folder = open(dir.path()).unwrap();
     let temporary = dir.path().join(format!(".name.{}.tmp", std::process::id()));

@@ -1,10 +1,9 @@
 //! Headless output: state changes as lines or JSON objects, progress, and a summary at the end.
 //!
 //! Invariant: it only reads the board; a reader at the other end that is slow or gone holds up
-//! nothing but this output, and what it missed is said.
+//! nothing but this output, and missed events are counted.
 
 mod line;
-mod policy;
 mod progress;
 pub mod style;
 mod tally;
@@ -61,8 +60,8 @@ enum Progress {
 /// already, and the summary.
 ///
 /// Events count from this call, not from the first poll. Cancel `shutdown` when everything else has
-/// ended, so that the last episode is in the summary. The future ends early, with `Ok`, when nobody
-/// reads the output any more (a closed pipe or terminal).
+/// ended, so that the last episode is in the summary. The future ends early, with `Ok`, when the reader of
+/// the output is gone (a closed pipe or terminal).
 ///
 /// # Errors
 /// When the output cannot be written.
@@ -107,7 +106,7 @@ struct Printer {
     began: Stamp,
     rates: Rates,
     tally: Tally,
-    /// A progress line stands on the terminal, without a line end.
+    /// The terminal shows a progress line, without a line end.
     pending: bool,
     last_line: Stamp,
 }
@@ -188,7 +187,7 @@ impl Printer {
         let wall_ns = self.wall.wall_ns(event.stamp);
         let line = match &event.what {
             _ if self.json => line::json(event, wall_ns)?,
-            // They come all the time, and progress says how fast.
+            // They come all the time, and progress shows how fast.
             What::Chunk(chunk) if chunk.skipped == 0 => return Ok(String::new()),
             _ => self.columns.line(event, wall_ns),
         };
@@ -241,14 +240,14 @@ impl Printer {
         Ok(self.whole_line(&text))
     }
 
-    /// `line` with its end, in place of the progress line if one stands there.
+    /// `line` with its end, in place of the progress line if there is one.
     fn whole_line(&mut self, line: &str) -> String {
         let erase = if std::mem::take(&mut self.pending) { ERASE_LINE } else { "" };
         format!("{erase}{line}\n")
     }
 }
 
-/// Width of the terminal at standard output, 80 if it does not say.
+/// Width of the terminal at standard output, 80 if unknown.
 fn terminal_columns() -> usize {
     match rustix::termios::tcgetwinsize(io::stdout()) {
         Ok(size) if size.ws_col > 0 => usize::from(size.ws_col),

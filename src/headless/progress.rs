@@ -4,9 +4,8 @@ use std::time::Duration;
 
 use serde::Serialize;
 
-use super::policy::{self, PolicyProgress};
 use crate::status::rates::Rates;
-use crate::status::{SlotState, Snapshot};
+use crate::status::{PolicyStatus, SlotState, Snapshot};
 use crate::text;
 
 /// Progress as one line, without a line end: time, mask, policy, the episode, rates of what streams.
@@ -14,7 +13,7 @@ pub(super) fn line(snapshot: &Snapshot, rates: &Rates, elapsed: Duration, durati
     let of = duration.map(|duration| format!("/{}", text::clock(duration))).unwrap_or_default();
     let mut parts = vec![format!("{}{of}", text::clock(elapsed))];
     parts.push(format!("mask {}", snapshot.mask.hex(snapshot.devices.len())));
-    parts.extend(snapshot.policy.as_ref().map(policy::progress));
+    parts.extend(snapshot.policy.as_ref().map(progress));
     // The episode comes before the rates: with many devices it is the end that is cut off.
     if let Some(recording) = &snapshot.recording {
         parts.push(format!(
@@ -105,4 +104,48 @@ pub(super) fn json(
         }),
         policy: snapshot.policy.as_ref().map(|policy| PolicyProgress::of(policy, snapshot.devices.len())),
     })
+}
+
+/// What the policy does now, in a few words for the progress line.
+pub(super) fn progress(policy: &PolicyStatus) -> String {
+    let dry = if policy.dry_run { " dry" } else { "" };
+    let latency = policy.latency_ms.map(|ms| format!(" {ms:.0} ms")).unwrap_or_default();
+    match &policy.hold {
+        None => format!("policy{dry} acts{latency}"),
+        Some(reason) => format!("policy{dry} holds: {}", text::plain(&reason.to_string())),
+    }
+}
+
+/// The same as JSON.
+#[derive(Debug, Serialize)]
+pub(super) struct PolicyProgress<'a> {
+    policy: &'a str,
+    dry_run: bool,
+    /// What it saw last, `0x05`.
+    mask: String,
+    /// Why it does nothing; null while it acts.
+    hold: Option<String>,
+    latency_ms: Option<f64>,
+    chunk_age: Option<u64>,
+    actions: u64,
+    held: u64,
+    chunks: u64,
+    unused: u64,
+}
+
+impl<'a> PolicyProgress<'a> {
+    pub(super) fn of(policy: &'a PolicyStatus, devices: usize) -> Self {
+        Self {
+            policy: &policy.name,
+            dry_run: policy.dry_run,
+            mask: policy.mask.hex(devices),
+            hold: policy.hold.as_ref().map(ToString::to_string),
+            latency_ms: policy.latency_ms,
+            chunk_age: policy.chunk_age,
+            actions: policy.actions,
+            held: policy.held,
+            chunks: policy.chunks,
+            unused: policy.unused,
+        }
+    }
 }

@@ -1,4 +1,4 @@
-//! The tally: what a run comes to, for the summary at its end.
+//! The tally: the totals of a run, for the summary at its end.
 //!
 //! Invariant: pure; built from events and snapshots.
 
@@ -7,10 +7,9 @@ use std::time::Duration;
 
 use serde::Serialize;
 
-use super::policy::PolicySum;
 use super::style::Palette;
 use crate::modality::MAX_MODALITIES;
-use crate::status::{DeviceStatus, Event, SlotState, Snapshot, Verdict, What};
+use crate::status::{DeviceStatus, Event, PolicyEnd, SlotState, Snapshot, Verdict, What};
 use crate::text;
 use crate::time::Stamp;
 
@@ -24,7 +23,7 @@ pub(super) struct Tally {
     episodes: Vec<Episode>,
     /// What the policy calls itself, and whether nothing moves.
     policy: Option<(String, bool)>,
-    policy_end: Option<PolicySum>,
+    policy_end: Option<PolicyEnd>,
     missed: u64,
 }
 
@@ -68,7 +67,7 @@ impl Presence {
         if self.stalled || newest <= since || newest >= until || samples < 2 {
             return present;
         }
-        // The newest stands for the time until the next.
+        // The newest sample counts for the time until the next.
         let sent = present.saturating_sub(until.since(newest)).as_secs_f64();
         present.min(Duration::from_secs_f64(sent * samples as f64 / (samples - 1) as f64))
     }
@@ -102,16 +101,16 @@ pub(super) struct Summary {
     missed_events: u64,
 }
 
-/// What the policy came to.
+/// The totals of the policy.
 #[derive(Debug, Serialize)]
 struct PolicyRow {
     policy: String,
     dry_run: bool,
     #[serde(flatten)]
-    sum: PolicySum,
+    sum: PolicyEnd,
 }
 
-/// What one modality came to.
+/// The totals of one modality.
 #[derive(Debug, Serialize)]
 struct Row {
     device: String,
@@ -170,7 +169,7 @@ impl Tally {
                 verdict: verdict.clone(),
             }),
             What::Policy { policy, dry_run, .. } => self.policy = Some((policy.clone(), *dry_run)),
-            What::PolicyEnd { .. } => self.policy_end = PolicySum::of(&event.what),
+            What::PolicyEnd(end) => self.policy_end = Some(*end),
             _ => {}
         }
     }
@@ -206,7 +205,7 @@ impl Tally {
     }
 }
 
-/// To three decimals, which is all a mean over seconds can say.
+/// To three decimals, the precision of a mean over seconds.
 fn round(value: f64) -> f64 {
     (value * 1000.0).round() / 1000.0
 }
@@ -247,14 +246,14 @@ impl Summary {
                 text::size(episode.bytes),
                 text::plain(&episode.verdict.sensors())
             ));
-            // Where an error has made a reason, that says it.
+            // Where an error has made a reason, it includes the error.
             let reasons = &episode.verdict.reasons;
-            let said = if reasons.is_empty() { episode.error.as_slice() } else { reasons };
-            lines.extend(said.iter().map(|reason| format!("         {}", text::plain(reason))));
+            let why = if reasons.is_empty() { episode.error.as_slice() } else { reasons };
+            lines.extend(why.iter().map(|reason| format!("         {}", text::plain(reason))));
         }
         if let Some(PolicyRow { policy, dry_run, sum }) = &self.policy {
             let dry = if *dry_run { format!("  {}", palette.warn("dry run")) } else { String::new() };
-            lines.push(format!("policy   {}{dry}  {}", palette.bold(&text::plain(policy)), sum.counts()));
+            lines.push(format!("policy   {}{dry}  {}", palette.bold(&text::plain(policy)), sum));
         }
         if self.missed_events > 0 {
             let text = format!("{} events are missing above: this output was behind", self.missed_events);

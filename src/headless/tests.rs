@@ -4,12 +4,14 @@ use serde_json::Value;
 
 use super::*;
 use crate::interlock::{InputState, StopKind};
-use crate::provenance::{KernelDriver, Negotiated};
+use crate::mask::{PhysicalMask, SizedMask};
+use crate::provenance::{KernelDriver, Negotiated, UnplugSource};
 use crate::registry::UsbIdentity;
 use crate::sample::Epoch;
 use crate::status::literal::{TAKEN, WALL_NS, board, every_state, id, policy, recording, three_streaming};
 use crate::status::{
-    Chunk, Grade, Level, PolicyStatus, Provenance, RecordingStatus, Sensors, SlotState, StopStatus, Verdict, What,
+    Chunk, Grade, Hold, Level, PolicyEnd, PolicyStatus, Provenance, RecordingStatus, Sensors, SlotState, StopStatus,
+    Verdict, What,
 };
 
 /// An output that keeps what it is given.
@@ -38,7 +40,13 @@ fn event(what: What) -> Event {
 }
 
 fn state(device: &str, bit: u8, state: SlotState, detail: &str) -> What {
-    What::State { device: device.to_owned(), bit: id(bit), state, mask: "0x05".to_owned(), detail: detail.to_owned() }
+    What::State {
+        device: device.to_owned(),
+        bit: id(bit),
+        state,
+        mask: SizedMask { mask: PhysicalMask(5), devices: 3 },
+        detail: detail.to_owned(),
+    }
 }
 
 fn episode(dropped: u64, error: Option<&str>) -> What {
@@ -79,7 +87,7 @@ fn chunk(skipped: u64) -> What {
     What::Chunk(Box::new(Chunk {
         tick: 40,
         observed_ns: 0,
-        mask: "0x05".to_owned(),
+        mask: SizedMask { mask: PhysicalMask(5), devices: 3 },
         seed: 7,
         latency_ms: 34.52,
         used: true,
@@ -90,7 +98,7 @@ fn chunk(skipped: u64) -> What {
 }
 
 fn hold(device: &str, reason: &str) -> What {
-    What::Hold { device: device.to_owned(), reason: reason.to_owned() }
+    What::Hold(Hold { device: (!device.is_empty()).then(|| device.to_owned()), reason: reason.to_owned() })
 }
 
 fn loaded(dry_run: bool) -> What {
@@ -105,7 +113,14 @@ fn loaded(dry_run: bool) -> What {
 }
 
 fn policy_end(chunks: u64) -> What {
-    What::PolicyEnd { actions: 812, held: 14, chunks, unused: 0, latency_p50_ms: 34.52, latency_p99_ms: 48.0 }
+    What::PolicyEnd(PolicyEnd {
+        actions: 812,
+        held: 14,
+        chunks,
+        unused: 0,
+        latency_p50_ms: 34.52,
+        latency_p99_ms: 48.0,
+    })
 }
 
 fn stop(kind: StopKind, state: InputState, detail: &str) -> What {
@@ -137,7 +152,7 @@ fn all_events() -> Vec<What> {
             }),
         },
         state("cam_wrist", 0, SlotState::Streaming, "/dev/video0 MJPG 640x480@30"),
-        What::Detach { device: "tof".to_owned(), bit: id(12), witness: "kernel".to_owned() },
+        What::Detach { device: "tof".to_owned(), bit: id(12), source: UnplugSource::Kernel },
         state("tof", 12, SlotState::Absent, ""),
         What::Unregistered { device: "046d:0825 \nX".to_owned(), reason: "no entry has this serial".to_owned() },
         What::Recording { file: "out/a.mcap".into() },
@@ -170,30 +185,30 @@ fn lines_for_people_have_their_columns() {
     let columns = line::Columns { name: 9, palette: Palette::Plain };
     let lines: Vec<_> = all_events().into_iter().map(|what| columns.line(&event(what), WALL_NS)).collect();
     insta::assert_snapshot!(lines.join("\n"), @r#"
-    22:13:20.000Z  cam_wrist  bit 0   attached      /dev/video0 port 1-2.3 serial CAM [2J00
-    22:13:20.000Z  cam_wrist  bit 0   opened        epoch 3  firmware 4.18  driver uvcvideo 6.1.0
-    22:13:20.000Z  cam_wrist  bit 0   streaming     mask 0x05  /dev/video0 MJPG 640x480@30
-    22:13:20.000Z  tof        bit 12  detached      told by kernel
+    22:13:20.000Z  cam_wrist  bit 0   attached      /dev/video0, port 1-2.3, serial CAM [2J00
+    22:13:20.000Z  cam_wrist  bit 0   opened        epoch 3: unit CAM [2J00
+    22:13:20.000Z  cam_wrist  bit 0   streaming     mask 0x05: /dev/video0 MJPG 640x480@30
+    22:13:20.000Z  tof        bit 12  detached      reported by kernel
     22:13:20.000Z  tof        bit 12  absent        mask 0x05
-    22:13:20.000Z  usb                unregistered  046d:0825  X   no entry has this serial
+    22:13:20.000Z  device             unregistered  046d:0825  X not registered: no entry has this serial
     22:13:20.000Z  episode            recording     out/a.mcap
-    22:13:20.000Z  episode            GOOD          out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped  2 of 3 sensors, without tof
-    22:13:20.000Z  episode            SUSPECT       out/a.mcap  30.0 s  1234 messages  12.3 MB  3 dropped  2 of 3 sensors, without tof  cam_wrist: 3 of 900 samples dropped on the way to the file (limit 0 %)
-    22:13:20.000Z  episode            BAD           out/a.mcap.partial  30.0 s  1234 messages  12.3 MB  3 dropped  2 of 3 sensors, without tof  the file could not be written: disk full
-    22:13:20.000Z  episode            BAD           out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped  2 of 3 sensors, without tof  the file could not be written: disk nearly full
-    22:13:20.000Z  episode            dropped       out/a.mcap  0.2 s
+    22:13:20.000Z  episode            GOOD          out/a.mcap finished, 30.0 s, 1234 messages, 12.3 MB, 0 dropped, 2 of 3 sensors, without tof
+    22:13:20.000Z  episode            SUSPECT       out/a.mcap finished, 30.0 s, 1234 messages, 12.3 MB, 3 dropped, 2 of 3 sensors, without tof: cam_wrist: 3 of 900 samples dropped on the way to the file (limit 0 %)
+    22:13:20.000Z  episode            BAD           out/a.mcap.partial not whole, 30.0 s, 1234 messages, 12.3 MB, 3 dropped, 2 of 3 sensors, without tof: the file could not be written: disk full
+    22:13:20.000Z  episode            BAD           out/a.mcap cut short, 30.0 s, 1234 messages, 12.3 MB, 0 dropped, 2 of 3 sensors, without tof: the file could not be written: disk nearly full
+    22:13:20.000Z  episode            dropped       episode out/a.mcap dropped; it was 0.2 s long
     22:13:20.000Z  disk               warn          out: disk nearly full, 1.5 GB free: the episode will be closed in about 4 min
     22:13:20.000Z  clock              warn          the wall clock was set back by 3600.000 s; times of capture stay as they are
-    22:13:20.000Z  policy             loaded        tactile-id  10 Hz  hash 0123456789ab  onnxruntime 1.22.0
-    22:13:20.000Z  policy             dry run       tactile-id  10 Hz  hash 0123456789ab  onnxruntime 1.22.0  nothing moves
+    22:13:20.000Z  policy             loaded        tactile-id loaded: 10 Hz, hash 0123456789ab, onnxruntime 1.22.0
+    22:13:20.000Z  policy             dry run       tactile-id loaded: 10 Hz, hash 0123456789ab, onnxruntime 1.22.0, dry run: nothing moves
     22:13:20.000Z  policy             holds         the next actions are still being computed
     22:13:20.000Z  policy             acts          from tick 12
-    22:13:20.000Z  policy             chunk         tick 40  34.5 ms  mask 0x05
-    22:13:20.000Z  policy             late chunk    tick 40  34.5 ms  mask 0x05  1 action too late
-    22:13:20.000Z  policy             late chunk    tick 40  34.5 ms  mask 0x05  3 actions too late
+    22:13:20.000Z  policy             chunk         tick 40: 34.5 ms, mask 0x05
+    22:13:20.000Z  policy             late chunk    tick 40: 34.5 ms, 1 action too late, mask 0x05
+    22:13:20.000Z  policy             late chunk    tick 40: 34.5 ms, 3 actions too late, mask 0x05
     22:13:20.000Z  policy             holds         a modality that the policy requires is missing: a [2Jrm
-    22:13:20.000Z  policy             ended         812 actions  14 ticks held  104 chunks  0 unused  latency p50 34.5 ms  p99 48.0 ms
-    22:13:20.000Z  policy             ended         812 actions  14 ticks held  0 chunks  0 unused
+    22:13:20.000Z  policy             ended         812 actions, 14 ticks held, 104 chunks, 0 unused, latency p50 34.5 ms p99 48.0 ms
+    22:13:20.000Z  policy             ended         812 actions, 14 ticks held, 0 chunks, 0 unused
     22:13:20.000Z  pendant            pressed       emergency stop pendant pressed
     22:13:20.000Z  pendant            held          enabling switch pendant held: nothing moves before the next arm
     22:13:20.000Z  pendant            lost          enabling switch pendant lost (nothing was received for 200ms)
@@ -227,7 +242,7 @@ fn json_is_the_event_with_its_wall_time() {
 }
 
 #[test]
-fn a_run_begins_with_what_it_looks_for() {
+fn a_run_begins_with_its_modalities() {
     let snapshot = three_streaming();
     let columns = line::Columns { name: 9, palette: Palette::Plain };
     let line = columns.begin(&snapshot, WALL_NS);
@@ -259,7 +274,7 @@ fn progress_names_what_counts_first() {
 }
 
 #[test]
-fn progress_says_what_the_policy_does() {
+fn progress_shows_the_policy() {
     let mut snapshot = three_streaming();
     let line = |snapshot: &Snapshot| progress::line(snapshot, &Rates::default(), Duration::from_secs(12), None);
     let json = |snapshot: &Snapshot| -> Value {
@@ -274,7 +289,7 @@ fn progress_says_what_the_policy_does() {
         "actions": 812, "held": 14, "chunks": 104, "unused": 0,
     });
     assert_eq!(json(&snapshot), expected);
-    let hold = Some("a modality is missing: a\x1b[2Jrm".to_owned());
+    let hold = Some(Hold { device: Some("a\x1b[2Jrm".to_owned()), reason: "a modality is missing".to_owned() });
     snapshot.policy = Some(PolicyStatus { dry_run: true, hold, latency_ms: None, ..policy() });
     assert!(line(&snapshot).contains("  policy dry holds: a modality is missing: a [2Jrm  "), "{}", line(&snapshot));
     assert_eq!(
@@ -284,7 +299,7 @@ fn progress_says_what_the_policy_does() {
 }
 
 #[test]
-fn the_summary_says_what_the_policy_came_to() {
+fn the_summary_counts_the_policy() {
     let start = three_streaming();
     let summary = |events: &[What]| {
         let mut tally = Tally::new(&start);
@@ -301,8 +316,8 @@ fn the_summary_says_what_the_policy_came_to() {
     });
     assert_eq!(object["policy"], expected);
     let text = whole.text(9, Palette::Plain);
-    let said = "policy   tactile-id  dry run  812 actions  14 ticks held  104 chunks  0 unused  latency p50 34.5 ms  p99 48.0 ms";
-    assert!(text.lines().any(|line| line == said), "{text}");
+    let expected = "policy   tactile-id  dry run  812 actions, 14 ticks held, 104 chunks, 0 unused, latency p50 34.5 ms p99 48.0 ms";
+    assert!(text.lines().any(|line| line == expected), "{text}");
     for events in [&[][..], &[loaded(false)]] {
         assert_eq!(serde_json::to_value(summary(events)).unwrap().get("policy"), None);
     }
@@ -385,7 +400,7 @@ fn the_summary_counts_from_its_beginning_and_means_while_present() {
 }
 
 #[tokio::test]
-async fn what_is_announced_before_the_end_is_printed_and_summed_up() {
+async fn announcements_before_the_end_are_printed_and_summarized() {
     let board = Arc::new(board(&["cam_wrist", "tof"]));
     let shutdown = CancellationToken::new();
     let kept = Kept::default();
@@ -399,7 +414,7 @@ async fn what_is_announced_before_the_end_is_printed_and_summed_up() {
     shutdown.cancel();
     output.await.unwrap();
     let text = kept.text();
-    assert!(text.contains("cam_wrist  bit 0   streaming     mask 0x05  /dev/video0\n"), "{text}");
+    assert!(text.contains("cam_wrist  bit 0   streaming     mask 0x05: /dev/video0\n"), "{text}");
     assert!(
         text.contains("GOOD     out/a.mcap  30.0 s  1234 messages  12.3 MB  0 dropped  2 of 3 sensors, without tof\n"),
         "{text}"
@@ -408,7 +423,7 @@ async fn what_is_announced_before_the_end_is_printed_and_summed_up() {
 }
 
 #[tokio::test]
-async fn every_json_line_is_an_object_and_what_was_missed_is_said() {
+async fn every_json_line_is_an_object_and_missed_events_are_reported() {
     let board = Arc::new(board(&["cam_wrist"]));
     let shutdown = CancellationToken::new();
     let kept = Kept::default();

@@ -4,10 +4,10 @@
 //! nothing else on the network is. What was found is told as `Added` with the entry's name; it is told as
 //! `Removed`
 //!
-//! * at once when the link that leads to it is down ([`Witness::Link`]), and a second after it says goodbye
-//!   ([`Witness::Goodbye`]), in which another may say that it is there (RFC 6762, 10.1),
+//! * at once when the link that leads to it is down ([`UnplugSource::Link`]), and a second after it says goodbye
+//!   ([`UnplugSource::Goodbye`]), in which another may say that it is there (RFC 6762, 10.1),
 //! * otherwise when nothing of it was heard for the entry's lease, or its address says that nobody is there and its
-//!   driver did not hear it either ([`Witness::Lease`]).
+//!   driver did not hear it either ([`UnplugSource::Lease`]).
 //!
 //! What a driver hears counts: a device that sends is not asked, and one whose announcements are lost in the
 //! air while its pictures arrive is there.
@@ -15,8 +15,6 @@
 //! Invariant: what is found is bounded and told as it is; whoever shows it makes it harmless.
 //! Invariant: nothing here waits for a device without an end, and nothing waits for anything here.
 
-mod lease;
-mod link;
 mod mdns;
 mod probe;
 mod watch;
@@ -32,13 +30,12 @@ use tokio::task::JoinSet;
 use self::mdns::Browser;
 use self::watch::Watch;
 use super::{HotplugError, HotplugEvent};
-use crate::registry::{LanFind, LanSpec, NodeSpec, Probe, Registry};
+use crate::registry::{LanFind, NodeSpec, Probe, Registry};
 
 /// Events that may wait; the rig reads them at once.
 const DEPTH: usize = 64;
 
 /// See the module's comment.
-#[derive(Debug)]
 pub struct LanMonitor {
     events: mpsc::Receiver<HotplugEvent>,
     /// Ended with this.
@@ -54,7 +51,8 @@ impl LanMonitor {
         let mut tasks = JoinSet::new();
         let mut announced: Vec<(&str, Vec<mdns::Wanted>)> = Vec::new();
         let mut phones = Vec::new();
-        for (spec, lan) in registry.devices.iter().filter_map(|spec| Some((spec, lan(&spec.node)?))) {
+        for spec in &registry.devices {
+            let NodeSpec::Lan(lan) = &spec.node else { continue };
             let watch = || Watch::new(&spec.name, lan.lease, tell.clone());
             match &lan.find {
                 LanFind::Adapter { .. } => {}
@@ -69,7 +67,7 @@ impl LanMonitor {
                         Some((_, all)) => all.push(wanted),
                         None => announced.push((service, vec![wanted])),
                     }
-                    phones.extend(lan.phone_port());
+                    phones.extend(lan.own_port().and_then(|(is_udp, port)| (!is_udp).then_some(port)));
                 }
             }
         }
@@ -82,13 +80,6 @@ impl LanMonitor {
         }
         let is_nothing = tasks.is_empty();
         (!is_nothing).then_some(Self { events, _tasks: tasks, _browser: browser })
-    }
-}
-
-fn lan(node: &NodeSpec) -> Option<&LanSpec> {
-    match node {
-        NodeSpec::Lan(lan) => Some(lan),
-        _ => None,
     }
 }
 

@@ -6,7 +6,7 @@
 //! Invariant: what is attached when the stream begins is told as `Added` before anything else.
 //! Invariant: a node told twice as `Added` without a removal between is the same attachment.
 
-mod known;
+#[cfg(feature = "lan")]
 pub mod lan;
 pub mod script;
 pub mod udev;
@@ -16,6 +16,7 @@ use std::pin::Pin;
 
 use futures::Stream;
 
+use crate::provenance::UnplugSource;
 use crate::registry::Attachment;
 use crate::time::Stamp;
 
@@ -28,47 +29,11 @@ pub enum HotplugEvent {
     Removed {
         /// A node, its USB device, or a hub above it.
         syspath: PathBuf,
-        /// When the witness told us, for the log and the bench.
-        witnessed: Stamp,
-        /// Who told.
-        witness: Witness,
+        /// When the source reported it, for the log and the bench.
+        noticed: Stamp,
+        /// What reported it first.
+        source: UnplugSource,
     },
-}
-
-/// Who told of a removal.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Witness {
-    /// The kernel's own uevent.
-    Kernel,
-    /// udev's processed event.
-    Udev,
-    /// It was missing when the devices were enumerated again.
-    Enumeration,
-    /// A device on the network said so itself.
-    Goodbye,
-    /// Nothing was heard of a device on the network for its lease, or nobody is at its port any more.
-    Lease,
-    /// The link to a device on the network is down.
-    Link,
-    /// A scenario.
-    Script,
-}
-
-impl Witness {
-    /// The word for it, as in JSON.
-    #[must_use]
-    pub const fn word(self) -> &'static str {
-        match self {
-            Self::Kernel => "kernel",
-            Self::Udev => "udev",
-            Self::Enumeration => "enumeration",
-            Self::Goodbye => "goodbye",
-            Self::Lease => "lease",
-            Self::Link => "link",
-            Self::Script => "script",
-        }
-    }
 }
 
 /// Why plugging can no longer be watched.

@@ -11,7 +11,7 @@ use std::time::Duration;
 use futures::Stream;
 use tokio::time::{Instant, Sleep, sleep_until};
 
-use super::{HotplugError, HotplugEvent, Witness};
+use super::{HotplugError, HotplugEvent, UnplugSource};
 use crate::registry::scenario::{self, Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, SimDevice};
 use crate::registry::{Attachment, DeviceNode, Unit};
 use crate::time::Stamp;
@@ -112,7 +112,7 @@ impl Timeline {
         let Some((syspath, sim)) = self.plugged.remove(name) else { return };
         sim.unplug();
         self.sequences.insert(name.to_owned(), sim.sequence.load(Ordering::Relaxed));
-        self.queue.push_back(HotplugEvent::Removed { syspath, witnessed: now, witness: Witness::Script });
+        self.queue.push_back(HotplugEvent::Removed { syspath, noticed: now, source: UnplugSource::Script });
     }
 
     fn set_silent(&self, name: &str, silent: bool) {

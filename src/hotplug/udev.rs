@@ -1,13 +1,18 @@
 //! The machine itself: kernel uevents for removal, udev's processed events for the node to open.
 //!
 //! The monitors listen before the devices are enumerated, so that nothing plugged in between is
-//! missed. A removal is told by whichever witness is first (on the virtual bench the kernel's uevent
+//! missed. A removal is told by whichever source is first (on the virtual bench the kernel's uevent
 //! comes some 50 ms before udev's); an addition only by udev, once rules and permissions are in place.
 //!
+//! The kernel numbers its events. A node told by event N cannot be taken away by a removal before
+//! N, which only arrived late: kernel and udev speak on two sockets, and each has its own backlog (`Known`).
+//!
+//! Invariant: a node in `Known` has been told as `Added` and not since as `Removed`.
 //! Invariant: lost events are never silent: when a socket overflows, devices are enumerated again
 //! and the difference is told.
 
-use std::collections::VecDeque;
+use std::collections::{HashMap, VecDeque};
+use std::path::{Path, PathBuf};
 use std::pin::Pin;
 use std::task::{Context, Poll, ready};
 
@@ -16,8 +21,7 @@ use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 use udev::{Device, Enumerator, EventType, MonitorBuilder, MonitorSocket};
 
-use super::known::{Known, Look, Present};
-use super::{HotplugError, HotplugEvent, Witness};
+use super::{HotplugError, HotplugEvent, UnplugSource};
 use crate::provenance::KernelDriver;
 use crate::registry::{Attachment, DeviceNode, UsbIdentity};
 use crate::time::Stamp;
@@ -31,12 +35,6 @@ pub struct UdevMonitor {
     udev: AsyncFd<MonitorSocket>,
     known: Known,
     queue: VecDeque<HotplugEvent>,
-}
-
-impl std::fmt::Debug for UdevMonitor {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("UdevMonitor").field("known", &self.known).finish_non_exhaustive()
-    }
 }
 
 impl UdevMonitor {
@@ -63,17 +61,17 @@ impl UdevMonitor {
         Ok(())
     }
 
-    fn take(&mut self, event: &udev::Event, witness: Witness) -> Result<(), HotplugError> {
+    fn take(&mut self, event: &udev::Event, source: UnplugSource) -> Result<(), HotplugError> {
         let (sequence, now) = (event.sequence_number(), Stamp::now());
         match event.event_type() {
             EventType::Remove => {
-                let (gone, look) = self.known.removed(event.syspath(), sequence, witness, now);
+                let (gone, look) = self.known.removed(event.syspath(), sequence, source, now);
                 self.queue.extend(gone);
                 if look == Look::Again {
                     self.enumerate()?;
                 }
             }
-            EventType::Add | EventType::Change if witness == Witness::Udev => {
+            EventType::Add | EventType::Change if source == UnplugSource::Udev => {
                 if let Some(present) = present(event) {
                     self.queue.extend(self.known.added(present, sequence, now));
                 }
@@ -84,9 +82,9 @@ impl UdevMonitor {
     }
 
     /// Moves what waits on a socket into the queue. Ready when the socket is drained and will wake us.
-    fn poll_socket(&mut self, context: &mut Context<'_>, witness: Witness) -> Poll<Result<(), HotplugError>> {
+    fn poll_socket(&mut self, context: &mut Context<'_>, source: UnplugSource) -> Poll<Result<(), HotplugError>> {
         loop {
-            let socket = if witness == Witness::Kernel { &self.kernel } else { &self.udev };
+            let socket = if source == UnplugSource::Kernel { &self.kernel } else { &self.udev };
             let mut guard = ready!(socket.poll_read_ready(context))?;
             let Some(event) = socket.get_ref().iter().next() else {
                 // Set by the receive that just returned nothing; libudev keeps it.
@@ -100,7 +98,7 @@ impl UdevMonitor {
                 continue;
             };
             drop(guard);
-            self.take(&event, witness)?;
+            self.take(&event, source)?;
         }
     }
 }
@@ -111,8 +109,8 @@ impl Stream for UdevMonitor {
     fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
         if self.queue.is_empty() {
             // The kernel's socket first: its removals are the earlier ones.
-            for witness in [Witness::Kernel, Witness::Udev] {
-                if let Poll::Ready(Err(error)) = self.poll_socket(context, witness) {
+            for source in [UnplugSource::Kernel, UnplugSource::Udev] {
+                if let Poll::Ready(Err(error)) = self.poll_socket(context, source) {
                     return Poll::Ready(Some(Err(error)));
                 }
             }
@@ -228,6 +226,110 @@ fn captures(device: &Device) -> bool {
     }
 }
 
+/// A node that is there.
+#[derive(Debug, Clone)]
+pub(super) struct Present {
+    pub(super) attachment: Attachment,
+    /// Number the kernel gave the USB device; another after each plug.
+    pub(super) device_number: Option<String>,
+}
+
+/// Must the devices be enumerated?
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Look {
+    Settled,
+    /// The removal may be older than the enumeration that found the node.
+    Again,
+}
+
+#[derive(Debug)]
+struct Node {
+    device_number: Option<String>,
+    /// The event that told of it; 0 if an enumeration did.
+    since: u64,
+}
+
+/// What has been told as attached, and what an event or an enumeration changes of it. Pure.
+#[derive(Debug, Default)]
+struct Known {
+    nodes: HashMap<PathBuf, Node>,
+    /// The kernel's removal of a path whose udev events are still to come.
+    removals: HashMap<PathBuf, u64>,
+    /// The newest event before the last enumeration.
+    enumerated: u64,
+}
+
+impl Known {
+    /// Takes what an enumeration found that began after event `sequence`; tells the difference,
+    /// removals first.
+    pub(super) fn enumerated(&mut self, present: Vec<Present>, sequence: u64, now: Stamp) -> Vec<HotplugEvent> {
+        self.enumerated = sequence;
+        let is_there = |path: &Path, node: &Node| {
+            let same = |found: &Present| found.attachment.syspath == path && found.device_number == node.device_number;
+            present.iter().any(same)
+        };
+        let gone: Vec<_> =
+            self.nodes.iter().filter(|(path, node)| !is_there(path, node)).map(|(path, _)| path.clone()).collect();
+        let mut events = self.forget(gone, UnplugSource::Enumeration, now);
+        events.extend(present.into_iter().filter_map(|present| self.remember(present, 0)));
+        events
+    }
+
+    /// Takes udev's addition number `sequence`.
+    pub(super) fn added(&mut self, present: Present, sequence: u64, now: Stamp) -> Vec<HotplugEvent> {
+        let path = &present.attachment.syspath;
+        let removed_since = |(removed, number): (&PathBuf, &u64)| path.starts_with(removed) && *number > sequence;
+        if self.removals.iter().any(removed_since) {
+            return Vec::new();
+        }
+        let exchanged = self.nodes.get(path).is_some_and(|node| node.device_number != present.device_number);
+        let gone = if exchanged { vec![path.clone()] } else { Vec::new() };
+        let mut events = self.forget(gone, UnplugSource::Udev, now);
+        events.extend(self.remember(present, sequence));
+        events
+    }
+
+    /// Takes the removal number `sequence` of everything at or below `path`.
+    pub(super) fn removed(
+        &mut self,
+        path: &Path,
+        sequence: u64,
+        source: UnplugSource,
+        now: Stamp,
+    ) -> (Vec<HotplugEvent>, Look) {
+        if source == UnplugSource::Kernel {
+            self.removals.insert(path.to_owned(), sequence);
+        } else if self.removals.get(path).is_some_and(|kernel| *kernel <= sequence) {
+            self.removals.remove(path);
+        }
+        let taken = |(known, node): (&PathBuf, &Node)| {
+            (known.starts_with(path) && node.since <= sequence).then(|| known.clone())
+        };
+        let gone: Vec<_> = self.nodes.iter().filter_map(taken).collect();
+        let look = if !gone.is_empty() && sequence <= self.enumerated { Look::Again } else { Look::Settled };
+        (self.forget(gone, source, now), look)
+    }
+
+    fn forget(&mut self, mut gone: Vec<PathBuf>, source: UnplugSource, now: Stamp) -> Vec<HotplugEvent> {
+        gone.sort();
+        let tell = |syspath: PathBuf| {
+            self.nodes.remove(&syspath);
+            HotplugEvent::Removed { syspath, noticed: now, source }
+        };
+        gone.into_iter().map(tell).collect()
+    }
+
+    /// `None` when the node is known.
+    fn remember(&mut self, present: Present, since: u64) -> Option<HotplugEvent> {
+        let Present { attachment, device_number } = present;
+        if self.nodes.contains_key(&attachment.syspath) {
+            return None;
+        }
+        self.nodes.insert(attachment.syspath.clone(), Node { device_number, since });
+        Some(HotplugEvent::Added(attachment))
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -237,6 +339,101 @@ mod tests {
         for (digits, expected) in [("0418", "4.18"), ("1000", "10.00"), ("0000", "0.00"), ("1", "1"), ("äöü", "äöü")]
         {
             assert_eq!(release_number(digits), expected);
+        }
+    }
+}
+
+#[cfg(test)]
+mod known_tests {
+    use super::*;
+    use crate::registry::{DeviceNode, UsbIdentity};
+
+    /// A node `port/name` of the device with this number.
+    fn node(path: &str, number: u32) -> Present {
+        let port = path.split('/').next().unwrap_or_default();
+        let usb = UsbIdentity { vid: 1, pid: 2, serial: None, port: port.into(), ..UsbIdentity::default() };
+        let attachment =
+            Attachment { syspath: path.into(), node: DeviceNode::Tty(path.into()), unit: usb.into(), driver: None };
+        Present { attachment, device_number: Some(number.to_string()) }
+    }
+
+    enum Step {
+        /// What is there, after which event.
+        Found(&'static [(&'static str, u32)], u64),
+        Added(&'static str, u32, u64),
+        Kernel(&'static str, u64),
+        Udev(&'static str, u64),
+    }
+    use Step::{Added, Found, Kernel, Udev};
+
+    fn told(steps: &[Step]) -> Vec<String> {
+        let mut known = Known::default();
+        let now = Stamp(1);
+        let mut told = Vec::new();
+        for step in steps {
+            let (events, look) = match step {
+                Found(nodes, sequence) => {
+                    let present = nodes.iter().map(|(path, number)| node(path, *number)).collect();
+                    (known.enumerated(present, *sequence, now), Look::Settled)
+                }
+                Added(path, number, sequence) => (known.added(node(path, *number), *sequence, now), Look::Settled),
+                Kernel(path, sequence) => known.removed(Path::new(path), *sequence, UnplugSource::Kernel, now),
+                Udev(path, sequence) => known.removed(Path::new(path), *sequence, UnplugSource::Udev, now),
+            };
+            told.extend(events.iter().map(|event| match event {
+                HotplugEvent::Added(attachment) => format!("+{}", attachment.syspath.display()),
+                HotplugEvent::Removed { syspath, source, .. } => format!("-{} {}", syspath.display(), source.word()),
+            }));
+            if look == Look::Again {
+                told.push("look".into());
+            }
+        }
+        told
+    }
+
+    #[test]
+    fn each_change_is_told_once_whatever_order_it_comes_in() {
+        let table: &[(&str, &[Step], &[&str])] = &[
+            (
+                "the kernel first",
+                &[Found(&[("1/a", 1)], 5), Kernel("1/a", 6), Udev("1/a", 6)],
+                &["+1/a", "-1/a kernel"],
+            ),
+            ("udev first", &[Added("1/a", 1, 5), Udev("1/a", 6), Kernel("1/a", 6)], &["+1/a", "-1/a udev"]),
+            (
+                "the kernel's removal comes after the replug it precedes",
+                &[Added("1/a", 1, 5), Udev("1/a", 6), Added("1/a", 2, 7), Kernel("1/a", 6)],
+                &["+1/a", "-1/a udev", "+1/a"],
+            ),
+            (
+                "an addition comes after the removal that follows it",
+                &[Kernel("1", 9), Added("1/a", 1, 8), Udev("1", 9), Added("1/a", 2, 12)],
+                &["+1/a"],
+            ),
+            (
+                "a device takes its nodes along, and no other port's",
+                &[Found(&[("1/a", 1), ("1/b", 1), ("1.2/a", 2)], 5), Kernel("1", 6)],
+                &["+1/a", "+1/b", "+1.2/a", "-1/a kernel", "-1/b kernel"],
+            ),
+            (
+                "overflow: one gone, one exchanged at its path, one new, one as it was",
+                &[Found(&[("1/a", 1), ("2/a", 2), ("3/a", 3)], 5), Found(&[("2/a", 7), ("3/a", 3), ("4/a", 8)], 20)],
+                &["+1/a", "+2/a", "+3/a", "-1/a enumeration", "-2/a enumeration", "+2/a", "+4/a"],
+            ),
+            (
+                "overflow: an old removal waits behind it, the addition was lost",
+                &[Found(&[("1/a", 2)], 20), Kernel("1/a", 12), Found(&[("1/a", 2)], 21)],
+                &["+1/a", "-1/a kernel", "look", "+1/a"],
+            ),
+            (
+                "the removal was lost and the addition not",
+                &[Added("1/a", 1, 5), Added("1/a", 2, 9)],
+                &["+1/a", "-1/a udev", "+1/a"],
+            ),
+            ("told twice", &[Found(&[("1/a", 1)], 5), Added("1/a", 1, 5), Added("1/a", 1, 6)], &["+1/a"]),
+        ];
+        for (name, steps, expected) in table {
+            assert_eq!(told(steps), *expected, "{name}");
         }
     }
 }

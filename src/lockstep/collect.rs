@@ -2,16 +2,13 @@
 
 use std::sync::Arc;
 
-use super::{Lockstep, Taker};
-use crate::bus::TopicId;
-use crate::driver::DriverError;
+use super::{Lockstep, TrialError};
 use crate::driver::sim::task::{Expert, Outcome, Texture, World};
 use crate::record::stepped::Stepped;
 use crate::record::{EpisodeReport, EpisodeRequest, RecordError};
 use crate::registry::Registry;
 use crate::registry::scenario::Scenario;
-use crate::sample::SampleHeader;
-use crate::status::{Board, Event};
+use crate::status::Board;
 use crate::time::{Stamp, WallClock};
 
 /// By how much the gripper misses while it demonstrates, so that the demonstrations show how to correct.
@@ -20,17 +17,6 @@ const SHAKE: f64 = 0.006;
 const SETTLE: u32 = 3;
 /// Steps recorded after the block is in its bin: what to do then is part of the task.
 const TAIL: u32 = 8;
-
-/// Why no demonstration was recorded.
-#[derive(Debug, thiserror::Error)]
-pub enum CollectError {
-    /// The simulation.
-    #[error(transparent)]
-    Simulation(#[from] DriverError),
-    /// The recorder.
-    #[error(transparent)]
-    Record(#[from] RecordError),
-}
 
 /// A recorded demonstration.
 #[derive(Debug)]
@@ -77,7 +63,7 @@ pub fn demonstrate(
     board: &Arc<Board>,
     request: &EpisodeRequest,
     seed: u64,
-) -> Result<Demonstration, CollectError> {
+) -> Result<Demonstration, TrialError> {
     let begun = Stamp::now();
     let mut recorder = Stepped::new(Arc::clone(registry), Arc::clone(board), WallClock::now());
     let mut rig = Lockstep::new(registry, Scenario::task(registry, seed), begun, &[])?;
@@ -106,14 +92,4 @@ pub fn demonstrate(
     }
     let report = recorder.finish(rig.now()).ok_or(RecordError::Idle)?;
     Ok(Demonstration { seed, texture, steps, report })
-}
-
-impl Taker for Stepped {
-    fn take(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
-        Stepped::take(self, topic, header, payload);
-    }
-
-    fn event(&mut self, event: &Event) {
-        Stepped::event(self, event);
-    }
 }

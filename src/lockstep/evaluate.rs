@@ -8,9 +8,8 @@ use std::time::Duration;
 use serde::Serialize;
 
 use super::timing::Timing;
-use super::{Lockstep, STEP, Taker};
+use super::{Lockstep, STEP, Taker, TrialError};
 use crate::bus::TopicId;
-use crate::driver::DriverError;
 use crate::driver::sim::task::{AXES, Outcome, Texture};
 use crate::mask::PhysicalMask;
 use crate::policy::bundle::Bundle;
@@ -24,7 +23,7 @@ use crate::record::{EpisodeReport, EpisodeRequest, RecordError};
 use crate::registry::scenario::{Scenario, ScenarioAction, ScenarioEvent};
 use crate::registry::{Registry, task};
 use crate::sample::SampleHeader;
-use crate::status::{Chunk, Event, What};
+use crate::status::Event;
 use crate::time::Stamp;
 
 /// The stream of a trial's seed that decides when cables are pulled.
@@ -150,17 +149,6 @@ pub struct Trial {
     pub failure: Option<String>,
 }
 
-/// Why a trial cannot be run.
-#[derive(Debug, thiserror::Error)]
-pub enum TrialError {
-    /// The simulation.
-    #[error(transparent)]
-    Simulation(#[from] DriverError),
-    /// The recorder.
-    #[error(transparent)]
-    Record(#[from] RecordError),
-}
-
 /// Records what a policy does.
 #[derive(Debug)]
 pub struct Recording<'a> {
@@ -234,7 +222,7 @@ impl Bench<'_> {
         }
         if let (Some(recorder), Some((request, library))) = (&mut witness.recorder, told) {
             recorder.begin(request, rig.now())?;
-            recorder.event(&Event { stamp: rig.now(), what: self.begins(library) });
+            recorder.event(&Event { stamp: rig.now(), what: self.bundle.begins(library.to_owned(), false) });
         }
         let launched = rig.mask();
         let (mut status, mut failure) = (Status::Normal, None);
@@ -260,7 +248,9 @@ impl Bench<'_> {
             let skipped = take(answer, &mut witness.pilot, request.tick, &chunk, &mut failure);
             if let Some(recorder) = &mut witness.recorder {
                 if let Some(skipped) = skipped {
-                    recorder.event(&Event { stamp: rig.now(), what: self.gave(&request, &chunk, skipped) });
+                    let (devices, latency_ms) = (self.registry.devices.len(), STEP.as_secs_f64() * 1e3);
+                    let what = request.answered(self.bundle, devices, latency_ms, Ok(skipped), &chunk);
+                    recorder.event(&Event { stamp: rig.now(), what });
                 }
                 recorder.advance(rig.now());
             }
@@ -278,35 +268,10 @@ impl Bench<'_> {
             outcome: trial.world.outcome(),
             status,
             steps: trial.world.steps(),
-            counts: witness.pilot.counts(),
+            counts: witness.pilot.queue.counts(),
             failure,
         };
         Ok((trial, report))
-    }
-
-    fn begins(&self, library: &str) -> What {
-        What::Policy {
-            policy: self.bundle.name.clone(),
-            folder: self.bundle.folder.clone(),
-            hash: self.bundle.hash.clone(),
-            library: library.to_owned(),
-            hz: self.bundle.control_hz,
-            dry_run: false,
-        }
-    }
-
-    fn gave(&self, request: &Request, actions: &[f32], skipped: u64) -> What {
-        What::Chunk(Box::new(Chunk {
-            tick: request.tick,
-            observed_ns: request.stamp.0,
-            mask: request.mask.hex(self.registry.devices.len()),
-            seed: request.seed,
-            latency_ms: STEP.as_secs_f64() * 1e3,
-            used: true,
-            skipped,
-            samples: request.samples(self.bundle),
-            actions: actions.to_vec(),
-        }))
     }
 }
 
@@ -320,7 +285,7 @@ fn take(
 ) -> Option<u64> {
     match answer? {
         Ok(()) => {
-            let taken = pilot.answer(asked, chunk);
+            let taken = pilot.queue.take(asked, chunk);
             if let Err(refused) = &taken {
                 *failure = Some(refused.to_string());
             }
@@ -328,7 +293,7 @@ fn take(
             Some(taken.unwrap_or(0))
         }
         Err(error) => {
-            pilot.failed(asked);
+            pilot.queue.failed(asked);
             *failure = Some(error.to_string());
             None
         }
@@ -360,15 +325,7 @@ impl Taker for Seen<'_> {
         if let Some(recorder) = &mut self.recorder {
             recorder.take(topic, header, payload);
         }
-        match topic {
-            TopicId::Modality(id) => self.pilot.sample(id, header, payload),
-            TopicId::Mask => {
-                if let Some(mask) = payload.first_chunk() {
-                    self.pilot.mask(PhysicalMask(u64::from_le_bytes(*mask)));
-                }
-            }
-            TopicId::Action => {}
-        }
+        self.pilot.take(topic, header, payload);
     }
 
     fn event(&mut self, event: &Event) {
@@ -415,7 +372,7 @@ mod tests {
     }
 
     #[test]
-    fn cables_are_pulled_when_the_condition_says() {
+    fn cables_are_unplugged_when_the_condition_holds() {
         for seed in 0..500 {
             assert_eq!(Condition::Full.windows(seed), (None, None));
             let (out, back) = Condition::HotUnplug.windows(seed);

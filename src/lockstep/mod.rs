@@ -17,13 +17,14 @@ use crate::bus::TopicId;
 use crate::driver::DriverError;
 use crate::driver::sim::task::{self, AXES, AXIS_COUNT, STEP_HZ, Shared};
 use crate::hotplug::script::Timeline;
-use crate::hotplug::{HotplugEvent, Witness};
-use crate::mask::PhysicalMask;
+use crate::mask::{PhysicalMask, SizedMask};
 use crate::modality::ModalityId;
 use crate::provenance::Negotiated;
+use crate::record::RecordError;
+use crate::record::stepped::Taker;
 use crate::registry::scenario::{Scenario, SimSource, TaskPart};
-use crate::registry::{Assigner, Assignment, Attachment, DeviceNode, DeviceSpec, Registry};
-use crate::rig::slot::{Effects, Input, Slot};
+use crate::registry::{Attachment, DeviceNode, DeviceSpec, Registry};
+use crate::rig::core::{Core, DeviceEffect, Effect, Input, StreamEvent};
 use crate::sample::{Encoding, Epoch, FLAG_DEVICE_TIME, SampleHeader};
 use crate::status::{Event, Provenance, SlotState, What};
 use crate::time::{Stamp, nanoseconds};
@@ -34,22 +35,24 @@ const MASK_PERIOD: Duration = Duration::from_millis(2);
 /// One step of the task.
 pub const STEP: Duration = Duration::from_nanos(1_000_000_000 / STEP_HZ as u64);
 
-/// Who sees what a rig sends, in the order of time.
-pub trait Taker {
-    /// A sample, a publication of the mask, or an action.
-    fn take(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]);
-    /// An event.
-    fn event(&mut self, event: &Event);
+/// Why a trial cannot be run, or no demonstration was recorded.
+#[derive(Debug, thiserror::Error)]
+pub enum TrialError {
+    /// The simulation.
+    #[error(transparent)]
+    Simulation(#[from] DriverError),
+    /// The recorder.
+    #[error(transparent)]
+    Record(#[from] RecordError),
 }
 
 /// The rig of one trial.
 #[derive(Debug)]
 pub struct Lockstep {
     timeline: Timeline,
-    assigner: Assigner,
+    core: Core,
     lanes: Vec<Lane>,
     trial: Shared,
-    mask: PhysicalMask,
     mask_sequence: u64,
     now: Stamp,
     /// When the step in progress began; `None` until the first.
@@ -57,11 +60,10 @@ pub struct Lockstep {
     payload: Vec<u8>,
 }
 
-/// A modality: its slot, and the device that runs in it.
+/// A modality: the device that runs in its slot.
 #[derive(Debug)]
 struct Lane {
     spec: DeviceSpec,
-    slot: Slot<Attachment>,
     running: Option<(Epoch, TaskPart)>,
     sequence: u64,
     latency: Duration,
@@ -94,7 +96,6 @@ impl Lockstep {
         let timings = timings.iter().copied().chain(std::iter::repeat(Timing::LOCKED));
         let lane = |(spec, timing): (&DeviceSpec, Timing)| Lane {
             spec: spec.clone(),
-            slot: Slot::new(registry.rig.cooldown),
             running: None,
             sequence: 0,
             latency: timing.latency,
@@ -104,9 +105,8 @@ impl Lockstep {
         Ok(Self {
             trial: scene.unwrap_or_else(|| Err(DriverError::Fatal("a scenario without the simulated task".into())))?,
             timeline: Timeline::new(scenario, begun),
-            assigner: Assigner::new(registry),
+            core: Core::new(registry),
             lanes: registry.devices.iter().zip(timings).map(lane).collect(),
-            mask: PhysicalMask::EMPTY,
             mask_sequence: 0,
             now: begun,
             stepping: None,
@@ -129,7 +129,7 @@ impl Lockstep {
     /// The mask in force.
     #[must_use]
     pub const fn mask(&self) -> PhysicalMask {
-        self.mask
+        self.core.mask()
     }
 
     /// Lets a tenth of a second pass in which nothing moves, the mask is published, and cables are plugged and
@@ -196,10 +196,10 @@ impl Lockstep {
                 let Some(sample) = lane.seen_by(now) else { break };
                 let header = header(lane, &sample);
                 lane.sequence += 1;
-                let (id, opening) = (lane.spec.id, lane.slot.state() == SlotState::Opening);
+                let id = lane.spec.id;
                 taker.take(TopicId::Modality(id), &header, &sample.payload);
-                if opening {
-                    self.apply(id, Input::Started(sample.epoch), taker);
+                if self.core.state(id).0 == SlotState::Opening {
+                    self.apply(Input::Stream { id, epoch: sample.epoch, event: StreamEvent::Started }, taker);
                 }
             }
         }
@@ -223,90 +223,63 @@ impl Lockstep {
         taker.take(TopicId::Action, &header, &self.payload);
     }
 
-    /// What was plugged and pulled until now, and what slots waited for.
+    /// Takes what was plugged and pulled until now, and the deadlines that passed.
     fn plug(&mut self, taker: &mut dyn Taker) {
         while let Some(event) = self.timeline.next_by(self.now) {
-            match event {
-                HotplugEvent::Added(attachment) => {
-                    if let Assignment::Entry(id) = self.assigner.attach(&attachment) {
-                        self.attached(id, attachment, taker);
+            self.apply(Input::Hotplug(event), taker);
+        }
+        self.apply(Input::Timer, taker);
+    }
+
+    /// Takes one step of the core and carries out its effects.
+    fn apply(&mut self, input: Input, taker: &mut dyn Taker) {
+        let mut effects = Vec::new();
+        self.core.step(input, self.now, &mut effects);
+        for effect in effects {
+            match effect {
+                Effect::Publish(_) => self.publish(taker),
+                Effect::Device(id, effect) => {
+                    if let Some(what) = self.carry_out(id, effect) {
+                        taker.event(&Event { stamp: self.now, what });
                     }
                 }
-                HotplugEvent::Removed { syspath, .. } => {
-                    let detached = self.assigner.detach(&syspath);
-                    for id in detached.freed {
-                        let (device, witness) = (self.name(id), Witness::Script.word().to_owned());
-                        taker.event(&self.told(What::Detach { device, bit: id, witness }));
-                        self.apply(id, Input::Detached, taker);
-                    }
-                    for (id, attachment) in detached.assigned {
-                        self.attached(id, attachment, taker);
-                    }
-                }
+                Effect::Unused { .. } | Effect::WrongNode { .. } => {}
             }
         }
-        let now = self.now;
-        let due = |lane: &&Lane| lane.slot.deadline().is_some_and(|deadline| deadline <= now);
-        for id in self.lanes.iter().filter(due).map(|lane| lane.spec.id).collect::<Vec<_>>() {
-            self.apply(id, Input::Timer, taker);
-        }
     }
 
-    fn attached(&mut self, id: ModalityId, attachment: Attachment, taker: &mut dyn Taker) {
-        let what = What::Attach {
-            device: self.name(id),
-            bit: id,
-            node: attachment.node.label(),
-            unit: attachment.unit.clone(),
-            driver: attachment.driver.as_deref().cloned(),
-        };
-        taker.event(&self.told(what));
-        self.apply(id, Input::Attached(attachment), taker);
-    }
-
-    fn apply(&mut self, id: ModalityId, input: Input<Attachment>, taker: &mut dyn Taker) {
-        let now = self.now;
-        let Some(lane) = self.lanes.iter_mut().find(|lane| lane.spec.id == id) else { return };
-        let before = lane.slot.state();
-        let Effects { stop, start } = lane.slot.apply(input, now);
-        if stop.is_some() {
-            lane.running = None;
-            lane.transit.clear();
-        }
-        let opened = start.and_then(|(epoch, attachment)| {
-            let DeviceNode::Sim(device) = &attachment.node else { return None };
-            let SimSource::Task { part, .. } = device.source else { return None };
-            lane.running = Some((epoch, part));
-            let (driver, bus) = (attachment.driver.as_deref().cloned(), Some(format!("sim:{}", device.name)));
-            let provenance = Provenance {
-                epoch,
-                node: attachment.node.label(),
-                attached: now,
-                unit: attachment.unit.clone(),
-                negotiated: Negotiated { driver, bus, ..Negotiated::default() },
-                latency_ns: nanoseconds(lane.spec.latency),
-            };
-            Some(What::Opened { device: lane.spec.name.clone(), bit: id, provenance: Box::new(provenance) })
-        });
-        let (state, present, device) = (lane.slot.state(), lane.slot.is_present(), lane.spec.name.clone());
-        let mask = self.mask.with(id, present);
-        if mask != self.mask {
-            self.mask = mask;
-            self.publish(taker);
-        }
-        if let Some(opened) = opened {
-            taker.event(&self.told(opened));
-        }
-        if state != before {
-            let mask = self.mask.hex(self.lanes.len());
-            taker.event(&self.told(What::State { device, bit: id, state, mask, detail: String::new() }));
-        }
+    /// Carries out one effect and returns what is to be announced of it.
+    fn carry_out(&mut self, id: ModalityId, effect: DeviceEffect) -> Option<What> {
+        let devices = self.lanes.len();
+        let lane = self.lanes.iter_mut().find(|lane| lane.spec.id == id)?;
+        let (device, bit) = (lane.spec.name.clone(), id);
+        Some(match effect {
+            DeviceEffect::Stop => {
+                lane.running = None;
+                lane.transit.clear();
+                return None;
+            }
+            DeviceEffect::Start(epoch, attachment) => {
+                let provenance = Box::new(lane.start(epoch, &attachment, self.core.attached_at(id))?);
+                What::Opened { device, bit, provenance }
+            }
+            DeviceEffect::AnnounceAttach => {
+                let Attachment { node, unit, driver, .. } = self.core.attached(id)?;
+                What::Attach { device, bit, node: node.label(), unit: unit.clone(), driver: driver.as_deref().cloned() }
+            }
+            DeviceEffect::AnnounceDetach(source) => What::Detach { device, bit, source },
+            DeviceEffect::State(transition) => {
+                let mask = SizedMask { mask: self.core.mask(), devices };
+                What::State { device, bit, state: transition.to, mask, detail: String::new() }
+            }
+            DeviceEffect::Ended | DeviceEffect::Plugged | DeviceEffect::Unplugged => return None,
+        })
     }
 
     fn publish(&mut self, taker: &mut dyn Taker) {
         self.mask_sequence += 1;
         let mut payload = [0; 16];
-        payload[..8].copy_from_slice(&self.mask.0.to_le_bytes());
+        payload[..8].copy_from_slice(&self.core.mask().0.to_le_bytes());
         payload[8..].copy_from_slice(&self.mask_sequence.to_le_bytes());
         let header = SampleHeader {
             seq: self.mask_sequence,
@@ -317,17 +290,25 @@ impl Lockstep {
         };
         taker.take(TopicId::Mask, &header, &payload);
     }
-
-    fn told(&self, what: What) -> Event {
-        Event { stamp: self.now, what }
-    }
-
-    fn name(&self, id: ModalityId) -> String {
-        self.lanes.iter().find(|lane| lane.spec.id == id).map(|lane| lane.spec.name.clone()).unwrap_or_default()
-    }
 }
 
 impl Lane {
+    /// Opens the part of the simulated task that is attached; `None` for a device of another kind.
+    fn start(&mut self, epoch: Epoch, attachment: &Attachment, attached: Stamp) -> Option<Provenance> {
+        let DeviceNode::Sim(device) = &attachment.node else { return None };
+        let SimSource::Task { part, .. } = device.source else { return None };
+        self.running = Some((epoch, part));
+        let (driver, bus) = (attachment.driver.as_deref().cloned(), Some(format!("sim:{}", device.name)));
+        Some(Provenance {
+            epoch,
+            node: attachment.node.label(),
+            attached,
+            unit: attachment.unit.clone(),
+            negotiated: Negotiated { driver, bus, ..Negotiated::default() },
+            latency_ns: nanoseconds(self.spec.latency),
+        })
+    }
+
     /// When it captures next, and when what it has captured is seen.
     fn moments(&self) -> impl Iterator<Item = Stamp> {
         let seen = self.transit.front().map(|sample| sample.at.after(self.latency));

@@ -75,7 +75,7 @@ fn sink_to(form: Stderr, before: &'static str, out: impl Write + Send + 'static)
 }
 
 #[test]
-fn a_reader_that_does_not_read_holds_nobody_up_and_learns_what_it_missed() {
+fn a_stalled_reader_blocks_no_writer_and_learns_what_it_lost() {
     let (mut reader, writer) = io::pipe().unwrap();
     let sink = sink_to(Stderr::Text, "", writer);
     let line = |text: String| LogLine { wall_ns: 0, level: Level::Warn, text };

@@ -55,7 +55,7 @@ impl Drop for Orders {
     }
 }
 
-/// Somebody who is about to give an order.
+/// A program that is about to give an order.
 struct Waiting {
     stream: UnixStream,
     since: Stamp,

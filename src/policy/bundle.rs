@@ -6,34 +6,29 @@
 //! gives its prediction (f32 `[B, Tp, Da]`). `B` is 1 or left open. `To` is `n_obs_steps`, `Tp` is
 //! `horizon`, `Da` the number of values of an action, `M` the length of the mask's order.
 //!
-//! Text -> `read` (values with the names of their keys) -> `parse` -> [`Bundle`]. What the file says
-//! is then held against the registry ([`Bundle::check_registry`]) and against what the graphs say of
-//! themselves ([`Bundle::check_graphs`]).
+//! Text -> `read` (no key twice, serde, types of `file` and `spec`) -> `validate` -> [`Bundle`]. It
+//! is then compared with the registry ([`Bundle::check_registry`]) and with the inputs and outputs of the graphs
+//! ([`Bundle::check_graphs`]).
 //!
-//! Invariant: of every check all mistakes are told at once, each with the key and a fix.
+//! Invariant: every check reports all mistakes at once, each with the path of its key and a fix.
 //! Invariant: nothing downstream of a [`Bundle`] checks it again.
 
-mod action;
-mod devices;
 #[cfg(test)]
 pub(crate) mod example;
 mod external;
+mod file;
 mod files;
-mod graphs;
-mod inside;
-mod json;
-mod keys;
-mod observations;
-mod parse;
 mod read;
 mod spec;
+mod suits;
 #[cfg(test)]
 mod tests;
+mod validate;
 
 pub use files::{Graph, POLICY_FILE};
-pub use graphs::{Element, GraphShape, TensorShape};
 pub use spec::{
     BetaSchedule, Bundle, BundleAction, BundleErrors, ColorOrder, GraphFile, ImageSpec, MaskSpec, Normalization,
     ObservationInput, ObservationSpec, Operation, PredictionType, SchedulerKind, SchedulerSpec, SliceNormalization,
     TimestepSpacing, VectorSpec,
 };
+pub use suits::{Element, GraphShape, TensorShape};

@@ -1,7 +1,7 @@
 //! Graphs: the networks of a bundle, loaded and run.
 //!
-//! [`LoadedGraph::load`] reads one, which says of itself what it takes and gives ([`LoadedGraph::shape`]). Held
-//! against its bundle, it is [bound](LoadedGraph::bind) to memory for one batch of every tensor, which every
+//! [`LoadedGraph::load`] reads one, which declares its inputs and outputs ([`LoadedGraph::shape`]). Once
+//! checked against its bundle, it is [bound](LoadedGraph::bind) to memory for one batch of every tensor, which every
 //! later run reads and writes in place.
 //!
 //! Invariant: a run on bound memory allocates nothing on this side of the library.
@@ -16,47 +16,38 @@ use super::library::Environment;
 
 /// Why a graph cannot be loaded or run.
 #[derive(Debug, thiserror::Error)]
-pub enum GraphError {
-    /// The file is no graph, or one this onnxruntime cannot run.
-    #[error("{name}: onnxruntime cannot load it: {error}")]
-    Load {
-        /// The graph's file.
-        name: String,
-        /// In onnxruntime's words.
-        error: String,
-    },
-    /// A tensor of a kind that no bundle has.
-    #[error("{name}: `{tensor}` is not a tensor of 32-bit floats or 64-bit integers with at most 2^31 elements")]
-    Kind {
-        /// The graph's file.
-        name: String,
-        /// The input or output.
-        tensor: String,
-    },
-    /// An input is missing.
-    #[error("{name}: there is no input `{input}`")]
-    NoInput {
-        /// The graph's file.
-        name: String,
-        /// The input's name.
-        input: String,
-    },
-    /// What is written to an input does not suit it.
-    #[error("{name}: input {index} does not take what it is given")]
-    Input {
-        /// The graph's file.
-        name: String,
-        /// The place among the inputs.
-        index: usize,
-    },
-    /// A run failed.
-    #[error("{name}: {error}")]
-    Run {
-        /// The graph's file.
-        name: String,
-        /// In onnxruntime's words.
-        error: String,
-    },
+#[error("{name}: {what}")]
+pub struct GraphError {
+    /// The graph's file.
+    pub name: String,
+    /// What is wrong.
+    pub what: GraphProblem,
+}
+
+/// What is wrong with a graph.
+#[derive(Debug, thiserror::Error)]
+pub enum GraphProblem {
+    /// The file is no graph, or one this onnxruntime cannot run; in its words.
+    #[error("onnxruntime cannot load it: {0}")]
+    Load(String),
+    /// A tensor, of this name, of a kind that no bundle has.
+    #[error("`{0}` is not a tensor of 32-bit floats or 64-bit integers with at most 2^31 elements")]
+    Kind(String),
+    /// The input of this name is missing.
+    #[error("there is no input `{0}`")]
+    NoInput(String),
+    /// What is written to the input at this place does not suit it.
+    #[error("input {0} does not take what it is given")]
+    Input(usize),
+    /// A run failed, in onnxruntime's words.
+    #[error("{0}")]
+    Run(String),
+}
+
+impl GraphProblem {
+    fn of(self, name: &str) -> GraphError {
+        GraphError { name: name.to_owned(), what: self }
+    }
 }
 
 /// A graph that has been loaded.
@@ -73,10 +64,10 @@ impl LoadedGraph {
     /// # Errors
     /// When the bytes are no graph that this onnxruntime can run.
     pub fn load(environment: &Environment, name: &str, bytes: &[u8], threads: usize) -> Result<Self, GraphError> {
-        let session = Session::builder(environment.ort())
+        let session = Session::builder(&environment.ort)
             .and_then(|builder| configure(builder, name, threads))
             .and_then(|mut builder| builder.commit_from_memory(bytes))
-            .map_err(|error| GraphError::Load { name: name.to_owned(), error: error.to_string() })?;
+            .map_err(|error| GraphProblem::Load(error.to_string()).of(name))?;
         Ok(Self { name: name.to_owned(), session })
     }
 
@@ -126,7 +117,7 @@ impl BoundGraph {
     /// When there is none.
     pub fn input_index(&self, name: &str) -> Result<usize, GraphError> {
         let place = self.session.inputs().iter().position(|input| input.name() == name);
-        place.ok_or_else(|| GraphError::NoInput { name: self.name.clone(), input: name.to_owned() })
+        place.ok_or_else(|| GraphProblem::NoInput(name.to_owned()).of(&self.name))
     }
 
     /// Writes the numbers of an input.
@@ -165,7 +156,7 @@ impl BoundGraph {
         };
         match filled {
             Ok(true) => Ok(()),
-            Ok(false) => Err(GraphError::Input { name: self.name.clone(), index }),
+            Ok(false) => Err(GraphProblem::Input(index).of(&self.name)),
             Err(error) => Err(run_error(&self.name, &error)),
         }
     }
@@ -173,7 +164,7 @@ impl BoundGraph {
     /// Runs the graph on what its inputs hold, and hands over its first output.
     ///
     /// # Errors
-    /// When onnxruntime says so.
+    /// When onnxruntime reports an error.
     pub fn run<T>(&mut self, read: impl FnOnce(&[f32]) -> T) -> Result<T, GraphError> {
         let outputs = self.session.run_with_options(self.inputs.as_slice(), &self.options);
         outputs
@@ -191,8 +182,8 @@ impl std::fmt::Debug for BoundGraph {
     }
 }
 
-/// One node after the other, on as few threads as were asked for, none of which burns time while it
-/// has nothing to do: the rig's other tasks want the processor too.
+/// One node after the other, on as few threads as requested, none of which spins while idle: the rig's
+/// other tasks need the processor too.
 fn configure(builder: SessionBuilder, name: &str, threads: usize) -> ort::Result<SessionBuilder> {
     Ok(builder
         .with_intra_threads(threads.max(1))?
@@ -246,7 +237,7 @@ fn make_input(graph: &str, shape: &TensorShape) -> Result<DynValue, GraphError> 
     value.map_err(|error| run_error(graph, &error))
 }
 
-/// Memory that a run writes before anybody reads it.
+/// Memory that a run writes before it is read.
 fn make_output(graph: &str, shape: &TensorShape) -> Result<DynValue, GraphError> {
     let (dims, _) = dims(graph, shape)?;
     if shape.element != Element::F32 {
@@ -257,9 +248,9 @@ fn make_output(graph: &str, shape: &TensorShape) -> Result<DynValue, GraphError>
 }
 
 fn kind(graph: &str, shape: &TensorShape) -> GraphError {
-    GraphError::Kind { name: graph.to_owned(), tensor: shape.name.clone() }
+    GraphProblem::Kind(shape.name.clone()).of(graph)
 }
 
 fn run_error(graph: &str, error: &ort::Error) -> GraphError {
-    GraphError::Run { name: graph.to_owned(), error: error.to_string() }
+    GraphProblem::Run(error.to_string()).of(graph)
 }

@@ -1,9 +1,9 @@
-//! The receding horizon: which action of which chunk is executed at which tick, or that none is.
+//! The receding horizon: which action of which chunk is executed at which tick, or none.
 //!
 //! A policy answers an observation of tick o with a chunk of `horizon` actions, and action
 //! `action_start + (k - o)` of it is the one of tick k. The next observation is sent
-//! `n_action_steps` ticks after o, or at once when a modality comes or goes; the chunk goes on to its end, so that it bridges the time until
-//! the new one is there. The new one is joined at the action of the tick, never at its beginning: a
+//! `n_action_steps` ticks after o, or at once when a modality comes or goes; the chunk is executed to its end, so
+//! that it bridges the time until the new one arrives. The new one is joined at the action of the tick, never at its beginning: a
 //! chunk stands for moments, and those that have passed are left out.
 //!
 //! What can go wrong, and what happens then:
@@ -12,30 +12,28 @@
 //! * A chunk more than one tick late: used from the action of the tick. So late that none of its
 //!   actions is left: not used.
 //! * A value beyond the action's limits: the limit is executed.
-//! * An observation too old: no chunk is asked for. The one there is goes on to its end.
-//! * A required modality missing: hold at once, for a robot must not go on blindly with what was
-//!   decided when it could see. Another one missing: go on if the policy knows of the mask; if it
-//!   does not, hold until it is back, unless told to go on ([`WithoutMask`]).
+//! * An observation too old: no chunk is requested. The current one is executed to its end.
+//! * A required modality missing: hold at once: a robot must not continue blindly with actions that were
+//!   computed when it could see. Another one missing: continue if the policy is mask-aware; otherwise
+//!   hold until it is back, unless configured to continue ([`WithoutMask`]).
 //! * None of several pictures present: hold likewise. In training one of them was always there.
 //! * No action left: hold.
 //!
 //! Invariant: pure: time comes in as ticks of the control grid, rising. One call a tick to
-//! [`Executor::wants_observation`], then one to [`Executor::step`].
+//! [`ActionQueue::wants_observation`], then one to [`ActionQueue::step`].
 //! Invariant: no action is given of a chunk whose observation is older than the last hold's
-//! beginning: what was planned before a stop says nothing about the world after it.
+//! beginning: a plan from before a stop may not fit the world after it.
 //! Invariant: at most one observation is with the policy at a time.
 //! Invariant: nothing here allocates after construction, and no input makes it panic.
 
-mod told;
-
 use std::time::Duration;
+
+use serde::Serialize;
 
 use super::bundle::{Bundle, ObservationInput};
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
 use crate::registry::Registry;
-
-pub use told::{Counts, HoldReason, Refused, Step};
 
 /// What a policy that was not trained with modalities left out does when one leaves that it does not
 /// require.
@@ -44,7 +42,7 @@ pub enum WithoutMask {
     /// Hold until it is back.
     #[default]
     Hold,
-    /// Go on, as the operator wishes; what the policy does then nobody has taught it.
+    /// Continue, at the request of the operator; the policy was not trained for this.
     GoOn,
 }
 
@@ -58,9 +56,121 @@ pub struct Situation {
     pub observation_age: Option<Duration>,
 }
 
+/// Why no action is executed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum HoldReason {
+    /// A modality without which the policy must not run is not there.
+    RequiredMissing,
+    /// A modality is not there, and the policy was not trained to do without.
+    NotMaskAware,
+    /// None of the pictures that the policy observes is there.
+    NoPicture,
+    /// What the sensors last saw is older than the bundle allows.
+    ObservationOld,
+    /// The policy is computing, and no action is left of its last chunk.
+    Waiting,
+    /// The policy's last answer could not be used.
+    Unusable,
+}
+
+impl HoldReason {
+    const fn is_missing(self) -> bool {
+        matches!(self, Self::RequiredMissing | Self::NotMaskAware | Self::NoPicture)
+    }
+}
+
+impl std::fmt::Display for HoldReason {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::RequiredMissing => "a modality that the policy requires is missing",
+            Self::NotMaskAware => "a modality is missing, and the policy was not trained to do without",
+            Self::NoPicture => "no picture that the policy observes is there",
+            Self::ObservationOld => "the observation is too old",
+            Self::Waiting => "the next actions are still being computed",
+            Self::Unusable => "the policy's last answer could not be used",
+        })
+    }
+}
+
+/// What to do at a tick.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Step<'a> {
+    /// The values to execute, within the limits; none means hold.
+    pub action: Option<&'a [f32]>,
+    /// Why there are none.
+    pub hold: Option<HoldReason>,
+    /// Does a hold begin here, or its reason change? Reported once.
+    pub hold_is_news: bool,
+    /// The modality whose absence is the reason.
+    pub missing: Option<&'a str>,
+    /// The index of the action in its chunk.
+    pub index: Option<usize>,
+    /// Ticks since the observation the action follows from.
+    pub chunk_age_ticks: Option<u64>,
+    /// Was this the first action of its chunk that went beyond the limits? Reported once.
+    pub clamped_is_news: bool,
+}
+
+/// Why a chunk is not used.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, thiserror::Error)]
+#[serde(rename_all = "snake_case")]
+pub enum ChunkError {
+    /// No such observation is with the policy.
+    #[error("actions for an observation that was not asked about")]
+    Unasked,
+    /// Not `horizon` actions.
+    #[error("a chunk of the wrong length")]
+    Length,
+    /// NaN or infinity.
+    #[error("a chunk with values that are no finite numbers")]
+    NotFinite,
+    /// Its observation was made before the last hold began.
+    #[error("actions that were decided before the policy had to hold")]
+    BeforeHold,
+    /// None of its actions is left.
+    #[error("actions so late that the time for all of them has passed")]
+    Expired,
+}
+
+/// What has happened so far.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+pub struct Counts {
+    /// Ticks with an action.
+    pub actions: u64,
+    /// Ticks without.
+    pub held_ticks: u64,
+    /// Holds that began, the one at the start among them.
+    pub holds: u64,
+    /// Observations sent to the policy.
+    pub requests: u64,
+    /// Chunks that were used.
+    pub chunks: u64,
+    /// Those of them that came more than one tick after their observation.
+    pub late_chunks: u64,
+    /// Their actions that were skipped for it.
+    pub skipped_actions: u64,
+    /// Chunks of which no action was left.
+    pub expired_chunks: u64,
+    /// Chunks with NaN or infinity.
+    pub not_finite_chunks: u64,
+    /// Chunks of the wrong length.
+    pub wrong_length_chunks: u64,
+    /// Chunks for an observation that was not requested.
+    pub unasked_chunks: u64,
+    /// Chunks of before a hold.
+    pub before_hold_chunks: u64,
+    /// Observations the policy had no answer to.
+    pub failed_requests: u64,
+    /// Executed actions with a value at a limit because it lay beyond.
+    pub clamped_actions: u64,
+    /// Ticks at which an observation was due but too old.
+    pub old_observations: u64,
+}
+
 /// See the module's comment.
 #[derive(Debug)]
-pub struct Executor {
+pub struct ActionQueue {
     horizon: u64,
     n_action_steps: u64,
     action_start: u64,
@@ -73,7 +183,7 @@ pub struct Executor {
     chunk: Vec<f32>,
     /// The observation of what is in `chunk`; `None` if nothing usable is.
     observed: Option<u64>,
-    clamped_told: bool,
+    clamp_reported: bool,
     /// The observation that is with the policy.
     in_flight: Option<u64>,
     /// What of the policy's modalities was present in the last observation sent.
@@ -106,7 +216,7 @@ struct Modality {
     is_picture: bool,
 }
 
-impl Executor {
+impl ActionQueue {
     /// For a bundle that fits the registry, with nothing computed yet.
     #[must_use]
     pub fn new(bundle: &Bundle, registry: &Registry, without_mask: WithoutMask) -> Self {
@@ -135,7 +245,7 @@ impl Executor {
             max: bundle.action.max.clone(),
             chunk: vec![0.0; bundle.horizon * values],
             observed: None,
-            clamped_told: false,
+            clamp_reported: false,
             in_flight: None,
             asked_with: None,
             fence: 0,
@@ -173,8 +283,8 @@ impl Executor {
     /// Returns how many actions were skipped because it came more than one tick late.
     ///
     /// # Errors
-    /// Why none of it is used; whatever was used before goes on.
-    pub fn take(&mut self, observed: u64, values: &[f32]) -> Result<u64, Refused> {
+    /// Why none of it is used; the chunk in use stays in use.
+    pub fn take(&mut self, observed: u64, values: &[f32]) -> Result<u64, ChunkError> {
         let taken = self.check(observed, values);
         if self.in_flight == Some(observed) {
             self.in_flight = None;
@@ -182,11 +292,11 @@ impl Executor {
         let counts = &mut self.counts;
         let counter = match taken {
             Ok(_) => &mut counts.chunks,
-            Err(Refused::Unasked) => &mut counts.unasked_chunks,
-            Err(Refused::Length) => &mut counts.wrong_length_chunks,
-            Err(Refused::NotFinite) => &mut counts.not_finite_chunks,
-            Err(Refused::BeforeHold) => &mut counts.before_hold_chunks,
-            Err(Refused::Expired) => &mut counts.expired_chunks,
+            Err(ChunkError::Unasked) => &mut counts.unasked_chunks,
+            Err(ChunkError::Length) => &mut counts.wrong_length_chunks,
+            Err(ChunkError::NotFinite) => &mut counts.not_finite_chunks,
+            Err(ChunkError::BeforeHold) => &mut counts.before_hold_chunks,
+            Err(ChunkError::Expired) => &mut counts.expired_chunks,
         };
         *counter += 1;
         let skipped = taken?;
@@ -194,26 +304,26 @@ impl Executor {
         counts.skipped_actions += skipped;
         self.chunk.copy_from_slice(values);
         self.observed = Some(observed);
-        self.clamped_told = false;
+        self.clamp_reported = false;
         Ok(skipped)
     }
 
-    fn check(&self, observed: u64, values: &[f32]) -> Result<u64, Refused> {
+    fn check(&self, observed: u64, values: &[f32]) -> Result<u64, ChunkError> {
         if self.in_flight != Some(observed) {
-            return Err(Refused::Unasked);
+            return Err(ChunkError::Unasked);
         }
         if values.len() != self.chunk.len() {
-            return Err(Refused::Length);
+            return Err(ChunkError::Length);
         }
         if !values.iter().all(|value| value.is_finite()) {
-            return Err(Refused::NotFinite);
+            return Err(ChunkError::NotFinite);
         }
         if observed < self.fence {
-            return Err(Refused::BeforeHold);
+            return Err(ChunkError::BeforeHold);
         }
         let passed = self.next.saturating_sub(observed);
         if passed >= self.horizon.saturating_sub(self.action_start) {
-            return Err(Refused::Expired);
+            return Err(ChunkError::Expired);
         }
         // The action of the observation's own tick is not expected to be there in time.
         Ok(passed.saturating_sub(1))
@@ -241,12 +351,6 @@ impl Executor {
     #[must_use]
     pub const fn counts(&self) -> Counts {
         self.counts
-    }
-
-    /// The observation that is with the policy.
-    #[must_use]
-    pub const fn in_flight(&self) -> Option<u64> {
-        self.in_flight
     }
 
     /// Which of the modalities that the policy observes are present.
@@ -294,16 +398,14 @@ impl Executor {
         self.hold = None;
         self.counts.actions += 1;
         self.counts.clamped_actions += u64::from(clamped);
-        let clamped_is_news = clamped && !self.clamped_told;
-        self.clamped_told |= clamped;
+        let clamped_is_news = clamped && !self.clamp_reported;
+        self.clamp_reported |= clamped;
         Step {
             action: Some(&self.out),
-            hold: None,
-            hold_is_news: false,
-            missing: None,
             index: Some(index),
             chunk_age_ticks: Some(age),
             clamped_is_news,
+            ..Step::default()
         }
     }
 
@@ -322,13 +424,10 @@ impl Executor {
         self.counts.holds += u64::from(begins);
         self.counts.held_ticks += 1;
         Step {
-            action: None,
             hold: Some(reason),
             hold_is_news: news,
             missing: missing.and_then(|at| self.modalities.get(at)).map(|modality| modality.name.as_str()),
-            index: None,
-            chunk_age_ticks: None,
-            clamped_is_news: false,
+            ..Step::default()
         }
     }
 }

@@ -1,4 +1,4 @@
-//! onnxruntime: which library it is, and how it comes into the process.
+//! onnxruntime: which library is used, and how it is loaded.
 //!
 //! The program carries the library, packed by `build.rs`. It is unpacked into memory that has no
 //! name in any file system (`memfd_create`) and loaded from there, so that nothing is installed and
@@ -8,7 +8,7 @@
 //! The C++ library that it needs comes first, see [`loader`].
 //!
 //! Invariant: nothing is unpacked, loaded or started before [`Environment::open`] is called.
-//! Invariant: a library that was named is taken or the error says why not; no other one is taken
+//! Invariant: a named library is used or the error gives the reason; no other one is used
 //! instead.
 
 mod loader;
@@ -25,7 +25,7 @@ use ort::logging::LogLevel;
 static INSIDE: &[u8] = include_bytes!(env!("RAPID_ONNXRUNTIME"));
 /// The variable that names another library.
 const VARIABLE: &str = "ORT_DYLIB_PATH";
-/// The oldest onnxruntime that serves: feature `api-24` of the crate `ort`.
+/// The oldest usable onnxruntime: feature `api-24` of the crate `ort`.
 const OLDEST: u32 = ort::MINOR_VERSION;
 
 /// What this process has loaded. Only one environment may ever be made in a process.
@@ -34,8 +34,10 @@ static LOADED: Mutex<Option<Environment>> = Mutex::new(None);
 /// The loaded library, ready for graphs. Clones share it.
 #[derive(Debug, Clone)]
 pub struct Environment {
-    ort: ort::environment::Environment,
-    origin: Origin,
+    /// For graphs.
+    pub(super) ort: ort::environment::Environment,
+    /// Where the library comes from.
+    pub origin: Origin,
 }
 
 /// Where a library comes from.
@@ -122,7 +124,7 @@ impl Environment {
     /// else the one inside. A process loads it once: later calls get what the first one loaded.
     ///
     /// # Errors
-    /// When that library cannot be used. The message says what was tried and what to do.
+    /// When that library cannot be used. The message gives the attempts and the fix.
     pub fn open(named: Option<&Path>) -> Result<Self, LibraryError> {
         let mut loaded = LOADED.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(environment) = &*loaded {
@@ -135,17 +137,6 @@ impl Environment {
         };
         tracing::debug!(origin = %environment.origin, "onnxruntime loaded");
         Ok(loaded.insert(environment).clone())
-    }
-
-    /// Where the library comes from.
-    #[must_use]
-    pub fn origin(&self) -> &Origin {
-        &self.origin
-    }
-
-    /// For graphs.
-    pub(super) fn ort(&self) -> &ort::environment::Environment {
-        &self.ort
     }
 }
 
@@ -228,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_there_says_what_was_tried_and_what_to_do() {
+    fn a_missing_library_is_an_error_with_the_attempts_and_a_fix() {
         let missing = tempfile::tempdir().unwrap().path().join("missing.so");
         let origin = Origin::Option(missing.clone());
         let error = LibraryError { cause: load(&origin).unwrap_err(), origin }.to_string();
@@ -254,6 +245,6 @@ mod tests {
         drop(memory);
         let first = Environment::open(None).unwrap();
         let second = Environment::open(Some(Path::new("/no/such/file"))).unwrap();
-        assert_eq!(first.origin(), second.origin());
+        assert_eq!(first.origin, second.origin);
     }
 }

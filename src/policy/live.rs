@@ -7,35 +7,39 @@
 //! The grid begins a few milliseconds after the capture of the newest sample that was needed to see everything: the
 //! samples of devices that run at the rate of the grid are fresh at each tick.
 //!
-//! Invariant: between two ticks nothing here allocates, locks or logs; a chunk is told of as an event.
-//! Invariant: once the handle is told to stop, nothing more is published.
-
-mod control;
+//! Invariant: between two ticks nothing here allocates, locks or logs; a chunk is announced as an event.
+//! Invariant: once the handle is stopped, nothing more is published.
 
 use std::io;
 use std::sync::Arc;
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, sync_channel};
 use std::thread::JoinHandle;
+use std::time::Duration;
 
 use hdrhistogram::Histogram;
 use tokio_util::sync::CancellationToken;
 
-use control::Control;
-
 use super::bundle::Bundle;
-use super::horizon::WithoutMask;
+use super::horizon::{Counts, WithoutMask};
 use super::model::Model;
+use super::pilot::{FIRST_TICK_AFTER, Pilot};
 use super::request::Request;
 use crate::bus::{Inbox, Writer};
 use crate::fault;
 use crate::registry::Registry;
-use crate::status::Board;
+use crate::sample::{Encoding, SampleHeader};
+use crate::status::{Board, Hold, Level, PolicyEnd, PolicyStatus, What};
 use crate::time::Stamp;
 
 /// Of the thread that computes, beside 0 of all others.
 const NICE: i32 = 5;
 /// Latencies up to a minute, in us, to three digits.
 const LONGEST_US: u64 = 60_000_000;
+
+/// The longest time between two looks at the bus, at any rate of the grid.
+const LOOK: Duration = Duration::from_millis(20);
+/// How often the board is updated.
+const STATUS_EVERY: Duration = Duration::from_millis(200);
 
 /// What a policy is started with.
 #[derive(Debug)]
@@ -73,14 +77,34 @@ impl Live {
         board: Arc<Board>,
     ) -> io::Result<Self> {
         let (stop, ended) = (CancellationToken::new(), CancellationToken::new());
-        let (ask, asked) = sync_channel(1);
-        let (tell, told) = sync_channel(1);
+        let (requests, received) = sync_channel(1);
+        let (answered, answers) = sync_channel(1);
         let chunk = vec![0.0; model.chunk_len()];
-        let request = Exchange { request: Request::new(&options.bundle), chunk, outcome: Ok(()), done: Stamp(0) };
-        let policy =
-            std::thread::Builder::new().name("policy".to_owned()).spawn(move || compute(model, &asked, &tell))?;
-        let latencies = Histogram::new_with_bounds(1, LONGEST_US, 3).map_err(io::Error::other)?;
-        let control = Control::new(options, registry, (inbox, actions, board), (ask, told), request, latencies);
+        let request = Request::new(&options.bundle);
+        let policy = std::thread::Builder::new()
+            .name("policy".to_owned())
+            .spawn(move || compute(model, &received, &answered))?;
+        let values = options.bundle.action.len();
+        let control = Control {
+            pilot: Pilot::new(&options.bundle, registry, options.without_mask, options.seed),
+            inbox,
+            actions: actions.filter(|_| !options.dry_run),
+            board,
+            requests,
+            answers,
+            devices: registry.devices.len(),
+            exchange: Some(Exchange { request, chunk, outcome: Ok(()), done: Stamp(0) }),
+            payload: Vec::with_capacity(values * size_of::<f64>()),
+            action: Vec::with_capacity(values),
+            latencies: Histogram::new_with_bounds(1, LONGEST_US, 3).map_err(io::Error::other)?,
+            last_latency_ms: None,
+            chunk_age: None,
+            hold: None,
+            acting: false,
+            complained: None,
+            reported: Stamp(0),
+            options,
+        };
         let (stopped, guard) = (stop.clone(), ended.clone().drop_guard());
         let control = std::thread::Builder::new().name("grid".to_owned()).spawn(move || {
             // Dropped by a panic too.
@@ -90,14 +114,14 @@ impl Live {
         Ok(Self { stop, ended, control, policy })
     }
 
-    /// Cancelled when the policy no longer runs, whatever ended it.
+    /// Cancelled when the policy no longer runs, for any reason.
     #[must_use]
     pub fn ended(&self) -> CancellationToken {
         self.ended.clone()
     }
 
-    /// Ends both threads and waits for them, for a chunk that is being computed too. Says whether one of
-    /// them panicked.
+    /// Ends both threads and waits for them, for a chunk that is being computed too. A panic of one of
+    /// them is an error.
     ///
     /// # Errors
     /// The thread that panicked.
@@ -119,19 +143,261 @@ struct Exchange {
     done: Stamp,
 }
 
-fn compute(mut model: Model, asked: &Receiver<Exchange>, tell: &SyncSender<Exchange>) {
-    // A tick is not to wait until a chunk has had its share of the processor; whoever may not do so computes
-    // as important as the rest. Of the calling thread alone, on Linux.
+fn compute(mut model: Model, requests: &Receiver<Exchange>, answers: &SyncSender<Exchange>) {
+    // A tick is not to wait until a chunk has had its share of the processor; without the permission it computes
+    // with the priority of the rest. Of the calling thread alone, on Linux.
     if let Err(error) = rustix::process::setpriority_process(None, NICE) {
         tracing::debug!(%error, "thread `policy` keeps its priority");
     }
-    while let Ok(mut exchange) = asked.recv() {
+    while let Ok(mut exchange) = requests.recv() {
         fault::point("policy");
         let answer = model.answer(&exchange.request, &mut exchange.chunk);
         exchange.outcome = answer.map_err(|error| error.to_string());
         exchange.done = Stamp::now();
-        if tell.send(exchange).is_err() {
+        if answers.send(exchange).is_err() {
             return;
         }
     }
+}
+
+/// Thread `grid`: the control grid.
+struct Control {
+    options: LiveOptions,
+    pilot: Pilot,
+    inbox: Inbox,
+    /// Where actions are published; none in a dry run.
+    actions: Option<Arc<Writer>>,
+    board: Arc<Board>,
+    requests: SyncSender<Exchange>,
+    answers: Receiver<Exchange>,
+    /// How many are registered: digits of the mask.
+    devices: usize,
+    /// Here, unless it is with the policy.
+    exchange: Option<Exchange>,
+    payload: Vec<u8>,
+    action: Vec<f32>,
+    latencies: Histogram<u64>,
+    last_latency_ms: Option<f64>,
+    chunk_age: Option<u64>,
+    /// Why nothing is done.
+    hold: Option<Hold>,
+    acting: bool,
+    complained: Option<Stamp>,
+    reported: Stamp,
+}
+
+impl Control {
+    /// Keeps the grid until it is stopped, or the thread `policy` has ended.
+    fn run(mut self, stop: &CancellationToken) {
+        let Some(begin) = self.first_sight(stop) else { return self.end() };
+        let period = Duration::from_secs_f64(1.0 / self.options.bundle.control_hz);
+        let mut tick: u64 = 0;
+        while !stop.is_cancelled() {
+            let at = begin.after(period.mul_f64(tick as f64));
+            self.sleep_until(at, stop);
+            if stop.is_cancelled() {
+                break;
+            }
+            fault::point("grid");
+            if !self.take_answer() {
+                break;
+            }
+            self.tick(tick, at);
+            // Ticks that have passed altogether are left out: actions are for their moments.
+            let behind = Stamp::now().since(at).as_secs_f64() / period.as_secs_f64();
+            #[expect(
+                clippy::cast_possible_truncation,
+                clippy::cast_sign_loss,
+                reason = "a count of ticks, not negative"
+            )]
+            let skipped = behind as u64;
+            tick += 1 + skipped;
+        }
+        self.end();
+    }
+
+    /// Waits until everything present is seen; returns when the grid begins.
+    fn first_sight(&mut self, stop: &CancellationToken) -> Option<Stamp> {
+        // What came while the policy was loaded and waited is of no interest now, save for the mask.
+        self.drain();
+        self.pilot.observer.clear();
+        while !stop.is_cancelled() {
+            self.drain();
+            if let Some(newest) = self.pilot.first_sight() {
+                return Some(newest.after(FIRST_TICK_AFTER).max(Stamp::now()));
+            }
+            let _ = self.inbox.wait(LOOK);
+            self.report();
+        }
+        None
+    }
+
+    fn sleep_until(&mut self, at: Stamp, stop: &CancellationToken) {
+        loop {
+            let left = at.since(Stamp::now());
+            if left.is_zero() || stop.is_cancelled() {
+                break;
+            }
+            std::thread::sleep(left.min(LOOK));
+            // Not right before the tick, which is to come on time and looks by itself.
+            if at.since(Stamp::now()) > Duration::from_millis(2) {
+                self.drain();
+                self.report();
+            }
+        }
+    }
+
+    fn drain(&mut self) {
+        let Self { inbox, pilot, .. } = self;
+        let drained = inbox.drain(&mut |topic, header, payload| pilot.take(topic, header, payload));
+        if let Err(error) = drained {
+            self.complain(&format!("policy: {error}"));
+        }
+    }
+
+    /// Takes the answer, if it has come; returns whether the thread `policy` still runs.
+    fn take_answer(&mut self) -> bool {
+        let exchange = match self.answers.try_recv() {
+            Ok(exchange) => exchange,
+            Err(TryRecvError::Empty) => return true,
+            // It panicked. What it was asked has gone with it.
+            Err(TryRecvError::Disconnected) => return false,
+        };
+        let request = &exchange.request;
+        let latency = exchange.done.since(request.stamp);
+        match &exchange.outcome {
+            Ok(()) => {
+                let answered = self.pilot.queue.take(request.tick, &exchange.chunk);
+                let latency_ms = latency.as_secs_f64() * 1e3;
+                self.last_latency_ms = Some(latency_ms);
+                let us = u64::try_from(latency.as_micros()).unwrap_or(LONGEST_US);
+                self.latencies.saturating_record(us.clamp(1, LONGEST_US));
+                // Also of one that is not used: its pictures may have become the reference of all later ones.
+                let (bundle, chunk) = (&self.options.bundle, &exchange.chunk);
+                self.board.announce(request.answered(bundle, self.devices, latency_ms, answered, chunk));
+                if let Err(refused) = answered {
+                    self.complain(&format!("policy: not used: {refused}"));
+                }
+            }
+            Err(reason) => {
+                self.pilot.queue.failed(request.tick);
+                let text = format!("policy: no answer: {reason}");
+                self.complain(&text);
+            }
+        }
+        self.exchange = Some(exchange);
+        true
+    }
+
+    fn tick(&mut self, tick: u64, at: Stamp) {
+        self.drain();
+        // While a request is with the policy there is none to be made.
+        if self.pilot.look(tick, at, Stamp::now())
+            && let Some(mut exchange) = self.exchange.take()
+        {
+            self.pilot.fill(tick, at, &mut exchange.request);
+            if self.requests.send(exchange).is_err() {
+                self.pilot.queue.failed(tick);
+            }
+        }
+        let step = self.pilot.step(tick);
+        self.chunk_age = step.chunk_age_ticks;
+        if let Some(reason) = step.hold
+            && step.hold_is_news
+        {
+            let hold = Hold { device: step.missing.map(str::to_owned), reason: reason.to_string() };
+            self.hold = Some(hold.clone());
+            self.board.announce(What::Hold(hold));
+        }
+        if step.hold.is_none() {
+            self.hold = None;
+        }
+        if step.clamped_is_news {
+            let text = "policy: an action beyond its limits: the limit is executed".to_owned();
+            self.board.announce(What::Log { level: Level::Warn, text });
+        }
+        let Some(action) = step.action else {
+            self.acting = false;
+            return;
+        };
+        self.action.clear();
+        self.action.extend_from_slice(action);
+        if !std::mem::replace(&mut self.acting, true) {
+            self.board.announce(What::Act { tick });
+        }
+        self.publish(tick, at);
+    }
+
+    fn publish(&mut self, tick: u64, at: Stamp) {
+        let Some(writer) = &self.actions else { return };
+        self.payload.clear();
+        self.payload.extend(self.action.iter().flat_map(|value| f64::from(*value).to_le_bytes()));
+        let header = SampleHeader {
+            seq: tick,
+            capture_ns: at.0,
+            recv_ns: Stamp::now().0,
+            encoding: Encoding::F64 as u32,
+            width: u32::try_from(self.action.len()).unwrap_or(0),
+            ..SampleHeader::default()
+        };
+        if let Err(error) = writer.publish(header, &self.payload) {
+            self.complain(&format!("policy: an action is lost: {error}"));
+        }
+    }
+
+    /// Reports a problem, at most once in five seconds.
+    fn complain(&mut self, text: &str) {
+        const EVERY: Duration = Duration::from_secs(5);
+        let now = Stamp::now();
+        if self.complained.is_none_or(|at| now.since(at) >= EVERY) {
+            self.complained = Some(now);
+            self.board.announce(What::Log { level: Level::Error, text: text.to_owned() });
+        }
+    }
+
+    fn report(&mut self) {
+        let now = Stamp::now();
+        if now.since(self.reported) < STATUS_EVERY {
+            return;
+        }
+        self.reported = now;
+        let (action, counts) = (&self.options.bundle.action, self.pilot.queue.counts());
+        let axes = action.names.iter().zip(&action.units).zip(&self.action);
+        self.board.set_policy(Some(PolicyStatus {
+            name: self.options.bundle.name.clone(),
+            dry_run: self.options.dry_run,
+            mask: self.pilot.mask,
+            latency_ms: self.last_latency_ms,
+            chunk_age: self.chunk_age,
+            action: axes.map(|((name, unit), value)| (name.clone(), f64::from(*value), unit.clone())).collect(),
+            hold: self.hold.clone(),
+            actions: counts.actions,
+            held: counts.held_ticks,
+            chunks: counts.chunks,
+            unused: unused(&counts),
+        }));
+    }
+
+    fn end(self) {
+        let counts = self.pilot.queue.counts();
+        let quantile = |share| self.latencies.value_at_quantile(share) as f64 / 1e3;
+        self.board.announce(What::PolicyEnd(PolicyEnd {
+            actions: counts.actions,
+            held: counts.held_ticks,
+            chunks: counts.chunks,
+            unused: unused(&counts),
+            latency_p50_ms: quantile(0.5),
+            latency_p99_ms: quantile(0.99),
+        }));
+    }
+}
+
+/// Answers that were not used, or never came.
+const fn unused(counts: &Counts) -> u64 {
+    counts.expired_chunks
+        + counts.not_finite_chunks
+        + counts.wrong_length_chunks
+        + counts.unasked_chunks
+        + counts.before_hold_chunks
+        + counts.failed_requests
 }

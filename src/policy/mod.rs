@@ -1,7 +1,7 @@
-//! Policies: what a trained model wants to see, and what becomes of its answers.
+//! Policies: the inputs of a trained model, and the use of its answers.
 //!
-//! A policy is a folder, a [`bundle`]: two graphs and `policy.json`, which says everything about
-//! them that a rig must know. [`library`] brings onnxruntime into the process, [`graphs`] run on it.
+//! A policy is a folder, a [`bundle`]: two graphs and `policy.json`, with all the facts about
+//! them that a rig needs. [`library`] brings onnxruntime into the process, [`graphs`] run on it.
 //! [`picture`] and [`observation`] make what the encoder reads, [`sampler`] makes action chunks of
 //! it: [`scheduler`] takes the noise out of a chunk step by step, [`normalize`] maps numbers into the
 //! range a network was trained on and back. [`model`] is all that: requests in, chunks out.

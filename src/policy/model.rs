@@ -2,7 +2,7 @@
 //!
 //! Invariant: the same request gives the same chunk, given the same pictures before the first one of each
 //! modality that is compared with a reference.
-//! Invariant: of an absent modality nothing is read: its numbers are zeros and its element of the mask is 0.
+//! Invariant: samples of an absent modality are not read: its numbers are zeros and its element of the mask is 0.
 
 use super::bundle::{Bundle, ObservationInput};
 use super::library::Environment;
@@ -15,31 +15,31 @@ use crate::sample::Encoding;
 /// Why a request has no answer.
 #[derive(Debug, thiserror::Error)]
 pub enum AnswerError {
-    /// A picture cannot be used.
+    /// A sample cannot be used.
     #[error("{modality}: {reason}")]
-    Picture {
+    Sample {
         /// The modality.
         modality: String,
         /// Why.
-        reason: PictureError,
-    },
-    /// A vector cannot be used.
-    #[error("{modality}: {reason}")]
-    Vector {
-        /// The modality.
-        modality: String,
-        /// Why.
-        reason: VectorError,
-    },
-    /// A sample is of a kind that no policy takes.
-    #[error("{modality}: samples of an unknown encoding")]
-    Encoding {
-        /// The modality.
-        modality: String,
+        reason: SampleError,
     },
     /// The graphs.
     #[error(transparent)]
     Policy(#[from] PolicyError),
+}
+
+/// Why a sample cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum SampleError {
+    /// It is a picture.
+    #[error(transparent)]
+    Picture(#[from] PictureError),
+    /// It is a vector.
+    #[error(transparent)]
+    Vector(#[from] VectorError),
+    /// It is of a kind that no policy takes.
+    #[error("samples of an unknown encoding")]
+    Encoding,
 }
 
 /// See the module's comment.
@@ -113,9 +113,9 @@ impl Model {
                 continue;
             }
             for step in 0..request.steps() {
-                if let Some(cell) = request.cell(at, step) {
-                    lane.write(cell, at, step, &mut self.tensors)?;
-                }
+                let written =
+                    request.cell(at, step).map_or(Ok(()), |cell| lane.write(cell, at, step, &mut self.tensors));
+                written.map_err(|reason| AnswerError::Sample { modality: lane.modality.clone(), reason })?;
             }
         }
         Ok(&self.tensors)
@@ -129,23 +129,19 @@ impl Lane {
         at: usize,
         step: usize,
         tensors: &mut ObservationTensors,
-    ) -> Result<(), AnswerError> {
-        let Some(encoding) = cell.encoding else {
-            return Err(AnswerError::Encoding { modality: self.modality.clone() });
-        };
+    ) -> Result<(), SampleError> {
+        let encoding = cell.encoding.ok_or(SampleError::Encoding)?;
         if let Some(pictures) = &mut self.pictures {
             let Some(place) = tensors.step_mut(at, step) else { return Ok(()) };
             let picture = Picture { encoding, width: cell.width, height: cell.height, bytes: &cell.bytes };
-            let written = pictures.write(&picture, place);
-            return written.map_err(|reason| AnswerError::Picture { modality: self.modality.clone(), reason });
+            return Ok(pictures.write(&picture, place)?);
         }
         let (numbers, rest) = cell.bytes.as_chunks::<8>();
         if encoding != Encoding::F64 || !rest.is_empty() {
-            return Err(AnswerError::Encoding { modality: self.modality.clone() });
+            return Err(SampleError::Encoding);
         }
         self.numbers.clear();
         self.numbers.extend(numbers.iter().map(|number| f64::from_le_bytes(*number)));
-        let written = tensors.write_vector(at, step, &self.numbers);
-        written.map_err(|reason| AnswerError::Vector { modality: self.modality.clone(), reason })
+        Ok(tensors.write_vector(at, step, &self.numbers)?)
     }
 }

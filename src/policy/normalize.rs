@@ -1,4 +1,4 @@
-//! Numbers as a network was trained on them, and back.
+//! Normalisation of numbers as in training, and its inverse.
 //!
 //! `min_max`: `(v - min) / (max - min) * 2 - 1`. `mean_std`: `(v - mean) / (std + eps)`. `identity`:
 //! `v`. Arithmetic is that of 32-bit floats, as in training.
@@ -35,8 +35,8 @@ impl Dimension {
 }
 
 impl Normalizer {
-    /// For `len` dimensions: channels of a picture, values of a vector. What the statistics lack is
-    /// left as it is; those of a checked bundle lack nothing.
+    /// For `len` dimensions: channels of a picture, values of a vector. Dimensions without statistics are
+    /// left unchanged; those of a checked bundle are complete.
     #[must_use]
     pub fn new(normalization: &Normalization, len: usize) -> Self {
         let mut dimensions = vec![Dimension::IDENTITY; len];
@@ -54,31 +54,7 @@ impl Normalizer {
         Self { dimensions }
     }
 
-    /// Number of dimensions.
-    #[must_use]
-    pub fn dimensions(&self) -> usize {
-        self.dimensions.len()
-    }
-
-    /// Normalises vectors that lie one after the other, `[.., D]`, into `out` of the same length.
-    pub fn forward(&self, values: &[f32], out: &mut [f32]) {
-        for (values, out) in self.vectors(values, out) {
-            for ((dimension, value), out) in self.dimensions.iter().zip(values).zip(out) {
-                *out = dimension.forward(*value);
-            }
-        }
-    }
-
-    /// The inverse of [`Self::forward`], as for a denoiser's output `[Tp, Da]`.
-    pub fn inverse(&self, normalized: &[f32], out: &mut [f32]) {
-        for (normalized, out) in self.vectors(normalized, out) {
-            for ((dimension, value), out) in self.dimensions.iter().zip(normalized).zip(out) {
-                *out = dimension.inverse(*value);
-            }
-        }
-    }
-
-    /// [`Self::inverse`] in place.
+    /// Maps vectors that lie one after the other, as in a denoiser's output `[Tp, Da]`, back in place.
     pub fn invert(&self, values: &mut [f32]) {
         for vector in values.chunks_exact_mut(self.dimensions.len().max(1)) {
             for (dimension, value) in self.dimensions.iter().zip(vector) {
@@ -95,11 +71,6 @@ impl Normalizer {
                 *value = dimension.forward(*value);
             }
         }
-    }
-
-    fn vectors<'v>(&self, from: &'v [f32], to: &'v mut [f32]) -> impl Iterator<Item = (&'v [f32], &'v mut [f32])> {
-        let len = self.dimensions.len().max(1);
-        from.chunks_exact(len).zip(to.chunks_exact_mut(len))
     }
 }
 
@@ -126,24 +97,34 @@ mod tests {
 
     use super::*;
 
+    fn forward(normalizer: &Normalizer, values: &[f32]) -> Vec<f32> {
+        let mut out = values.to_vec();
+        for vector in out.chunks_mut(normalizer.dimensions.len()) {
+            normalizer.normalize_planes(vector);
+        }
+        out
+    }
+
+    fn inverse(normalizer: &Normalizer, values: &[f32]) -> Vec<f32> {
+        let mut out = values.to_vec();
+        normalizer.invert(&mut out);
+        out
+    }
+
     fn min_max() -> Normalization {
         Normalization::MinMax { min: vec![0.0, -2.0], max: vec![1.0, 6.0] }
     }
 
     #[test]
-    fn every_mode_does_what_its_formula_says() {
+    fn every_mode_follows_its_formula() {
         let normalizer = Normalizer::new(&min_max(), 2);
-        let mut out = [0.0; 6];
-        normalizer.forward(&[0.0, -2.0, 1.0, 6.0, 0.5, 0.0], &mut out);
+        let out = forward(&normalizer, &[0.0, -2.0, 1.0, 6.0, 0.5, 0.0]);
         assert_eq!(out, [-1.0, -1.0, 1.0, 1.0, 0.0, -0.5]);
         let mean_std = Normalization::MeanStd { mean: vec![1.0, 2.0], std: vec![1.5, 0.0], eps: 0.5 };
-        let mut out = [0.0; 2];
-        Normalizer::new(&mean_std, 2).forward(&[5.0, 3.0], &mut out);
-        assert_eq!(out, [2.0, 2.0]);
-        Normalizer::new(&mean_std, 2).inverse(&[2.0, 2.0], &mut out);
-        assert_eq!(out, [5.0, 3.0]);
-        Normalizer::new(&Normalization::Identity, 2).forward(&[0.1, f32::MAX], &mut out);
-        assert_eq!(out, [0.1, f32::MAX]);
+        assert_eq!(forward(&Normalizer::new(&mean_std, 2), &[5.0, 3.0]), [2.0, 2.0]);
+        assert_eq!(inverse(&Normalizer::new(&mean_std, 2), &[2.0, 2.0]), [5.0, 3.0]);
+        let identity = Normalizer::new(&Normalization::Identity, 2);
+        assert_eq!(forward(&identity, &[0.1, f32::MAX]), [0.1, f32::MAX]);
     }
 
     #[test]
@@ -177,9 +158,8 @@ mod tests {
                 Normalization::MeanStd { mean: vec![min], std: vec![width], eps: 1e-8 },
             ] {
                 let normalizer = Normalizer::new(&normalization, 1);
-                let (mut there, mut back) = ([0.0], [0.0]);
-                normalizer.forward(&[value], &mut there);
-                normalizer.inverse(&there, &mut back);
+                let there = forward(&normalizer, &[value]);
+                let back = inverse(&normalizer, &there);
                 prop_assert!((back[0] - value).abs() <= 1e-5 * (1.0 + value.abs()), "{value} -> {} -> {}", there[0], back[0]);
             }
         }

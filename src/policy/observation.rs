@@ -1,7 +1,7 @@
-//! What a policy looks at for one chunk: numbers of every observation key, and the mask.
+//! The input of a policy for one chunk: numbers of every observation key, and the mask.
 //!
-//! Invariant: the memory is made once, and is as long as the bundle says.
-//! Invariant: what is absent is zeros after normalisation, and its element of the mask is 0.
+//! Invariant: the memory is made once, with the length that the bundle gives.
+//! Invariant: an absent modality is zeros after normalisation, and its element of the mask is 0.
 
 use super::bundle::{Bundle, ObservationInput, VectorSpec};
 use super::normalize::Normalizer;
@@ -79,7 +79,7 @@ impl ObservationTensors {
     /// that there is not stays unwritten.
     ///
     /// # Errors
-    /// When the sample has other numbers than the bundle says.
+    /// When the sample does not have the shape that the bundle gives.
     pub fn write_vector(&mut self, observation: usize, step: usize, sample: &[f64]) -> Result<(), VectorError> {
         let Some(tensor) = self.tensors.get_mut(observation) else { return Ok(()) };
         let Some((spec, normalizer)) = &tensor.vector else { return Err(VectorError::Pictures(tensor.key.clone())) };
@@ -106,7 +106,7 @@ impl ObservationTensors {
         Ok(())
     }
 
-    /// Says whether an observation's modality is there. One that is not is zeros from here on, until
+    /// Sets whether an observation's modality is present. An absent one is zeros from here on, until
     /// it is written again.
     pub fn set_present(&mut self, observation: usize, present: bool) {
         let Some(tensor) = self.tensors.get_mut(observation) else { return };

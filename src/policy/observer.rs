@@ -47,7 +47,6 @@ struct Place {
 struct Chosen {
     place: usize,
     seq: u64,
-    age_ns: i64,
 }
 
 impl Observer {
@@ -78,7 +77,7 @@ impl Observer {
         }
     }
 
-    /// Keeps a sample; one of a modality that the policy does not observe, or that its device says is
+    /// Keeps a sample; one of a modality that the policy does not observe, or that its device marks as
     /// damaged, is not kept.
     pub fn push(&mut self, id: ModalityId, header: &SampleHeader, payload: &[u8]) {
         if header.flags & FLAG_ERROR != 0 {
@@ -125,7 +124,7 @@ impl Observer {
                 continue;
             };
             let sample = self.sync.sample(slot);
-            *newest = sample.map(|sample| Chosen { place: sample.keep, seq: sample.seq, age_ns: slot.age_ns });
+            *newest = sample.map(|sample| Chosen { place: sample.keep, seq: sample.seq });
             whole &= newest.is_some();
             let age = Duration::from_nanos(u64::try_from(slot.age_ns).unwrap_or(0));
             oldest = oldest.max(Some(age));
@@ -151,7 +150,7 @@ impl Observer {
                 chosen = kept.or(chosen);
                 let (Some(kept), Some(cell)) = (chosen, request.cell_mut(at, step)) else { continue };
                 if let Some(place) = lane.places.get(kept.place) {
-                    cell.set(&place.header, kept.age_ns, &place.bytes);
+                    cell.set(&place.header, &place.bytes);
                 }
             }
         }

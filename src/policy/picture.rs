@@ -2,7 +2,7 @@
 //!
 //! Decoded to 8-bit colours, divided by 255, resized (bilinear, half-pixel centres, no antialiasing),
 //! cropped to the middle, compared with a reference if the policy was trained so, normalised. All of
-//! it in memory that is made once; the JPEG decoder alone makes its own for every picture.
+//! it in memory allocated once; only the JPEG decoder allocates for every picture.
 //!
 //! Invariant: a picture that is refused has changed nothing: not the observation, not the reference.
 
@@ -95,7 +95,7 @@ struct Tap {
     share: f32,
 }
 
-/// What later pictures are compared with: the first one, be the camera unplugged or not.
+/// The reference of later pictures: the first one, kept across unplugs.
 #[derive(Debug)]
 pub struct Reference {
     values: Vec<f32>,
@@ -110,12 +110,6 @@ impl Reference {
     /// A new episode: the next picture is the reference.
     pub fn reset(&mut self) {
         self.taken = false;
-    }
-
-    /// Is there one?
-    #[must_use]
-    pub fn is_taken(&self) -> bool {
-        self.taken
     }
 
     /// `(v - reference) / 2 + 0.5`.
@@ -167,7 +161,7 @@ impl Preprocessor {
     /// # Panics
     /// When `out` is not [`Self::output_len`] long.
     pub fn write(&mut self, picture: &Picture<'_>, out: &mut [f32]) -> Result<(), PictureError> {
-        assert_eq!(out.len(), self.output_len(), "an observation's place is as long as the bundle says");
+        assert_eq!(out.len(), self.output_len(), "an observation's place has the length that the bundle gives");
         let size = self.decode(picture)?;
         if self.size != size {
             self.fit(size)?;
@@ -214,7 +208,7 @@ impl Preprocessor {
 
     fn decode_jpeg(&mut self, bytes: &[u8], width: usize, height: usize) -> Result<(), PictureError> {
         with_mark(bytes, &mut self.jpeg);
-        // Strict: what is cut short is refused, and not shown with grey in place of what is missing.
+        // Strict: a truncated picture is refused, and not completed with grey.
         let options = DecoderOptions::default()
             .jpeg_set_out_colorspace(ColorSpace::RGB)
             .set_max_width(LARGEST)

@@ -1,18 +1,18 @@
-//! A policy at the controls: what it sees at each tick, when it is asked, and what is done.
+//! A policy in control: its observation at each tick, its requests, and the action of the tick.
 //!
-//! [`Observer`] and [`Executor`] put together, without thread, clock or network: who keeps the time says
-//! which tick it is, and carries requests to a [`Model`](super::model::Model) and answers back.
+//! [`Observer`] and [`ActionQueue`] put together, without thread, clock or network: the caller keeps the time, names
+//! the tick, and carries requests to a [`Model`](super::model::Model) and answers back.
 //!
 //! Invariant: an answer belongs to the request that is out; there is one at most.
 
 use std::time::Duration;
 
 use super::bundle::Bundle;
-use super::horizon::{Counts, Executor, Refused, Situation, Step, WithoutMask};
+use super::horizon::{ActionQueue, Situation, Step, WithoutMask};
 use super::observer::Observer;
 use super::request::Request;
+use crate::bus::TopicId;
 use crate::mask::PhysicalMask;
-use crate::modality::ModalityId;
 use crate::registry::Registry;
 use crate::sample::SampleHeader;
 use crate::time::Stamp;
@@ -24,9 +24,12 @@ pub const FIRST_TICK_AFTER: Duration = Duration::from_millis(10);
 /// See the module's comment.
 #[derive(Debug)]
 pub struct Pilot {
-    observer: Observer,
-    executor: Executor,
-    mask: PhysicalMask,
+    /// What is seen; takes samples.
+    pub observer: Observer,
+    /// What is done; takes the answers to requests.
+    pub queue: ActionQueue,
+    /// The mask in force, as it was published last.
+    pub mask: PhysicalMask,
     seed: u64,
     situation: Situation,
 }
@@ -38,32 +41,24 @@ impl Pilot {
         let mask = PhysicalMask::EMPTY;
         Self {
             observer: Observer::new(bundle, registry),
-            executor: Executor::new(bundle, registry, without_mask),
+            queue: ActionQueue::new(bundle, registry, without_mask),
             mask,
             seed,
             situation: Situation { mask, observation_age: None },
         }
     }
 
-    /// Takes a sample.
-    pub fn sample(&mut self, id: ModalityId, header: &SampleHeader, payload: &[u8]) {
-        self.observer.push(id, header, payload);
-    }
-
-    /// Takes a publication of the mask.
-    pub fn mask(&mut self, mask: PhysicalMask) {
-        self.mask = mask;
-    }
-
-    /// Forgets the samples it was given.
-    pub fn forget(&mut self) {
-        self.observer.clear();
-    }
-
-    /// The mask in force.
-    #[must_use]
-    pub const fn mask_in_force(&self) -> PhysicalMask {
-        self.mask
+    /// Takes what the bus brought.
+    pub fn take(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
+        match topic {
+            TopicId::Modality(id) => self.observer.push(id, header, payload),
+            TopicId::Mask => {
+                if let Some(mask) = payload.first_chunk() {
+                    self.mask = PhysicalMask(u64::from_le_bytes(*mask));
+                }
+            }
+            TopicId::Action => {}
+        }
     }
 
     /// The capture of the newest sample, once every modality that is present has sent one.
@@ -72,12 +67,12 @@ impl Pilot {
         self.observer.first_sight(self.mask)
     }
 
-    /// Looks at tick number `number` of the control grid, which is at `tick`. Says whether the policy is to
-    /// be asked; if so, [`Self::fill`] says what, and [`Self::answer`] or [`Self::failed`] must follow.
+    /// Looks at tick number `number` of the control grid, which is at `tick`. Returns whether a request to the policy
+    /// is due; if so, [`Self::fill`] fills it, and [`ActionQueue::take`] or [`ActionQueue::failed`] must follow.
     pub fn look(&mut self, number: u64, tick: Stamp, now: Stamp) -> bool {
         let observation_age = self.observer.look(tick, now, self.mask);
         self.situation = Situation { mask: self.mask, observation_age };
-        self.executor.wants_observation(number, self.situation)
+        self.queue.wants_observation(number, self.situation)
     }
 
     /// Makes `request` the question of tick `number`, which was looked at last and is at `tick`.
@@ -90,25 +85,6 @@ impl Pilot {
 
     /// What is to be done at tick `number`, which was looked at.
     pub fn step(&mut self, number: u64) -> Step<'_> {
-        self.executor.step(number, self.situation)
-    }
-
-    /// The answer to the request of tick `asked`. Returns how many of its actions came too late.
-    ///
-    /// # Errors
-    /// Why it is not used.
-    pub fn answer(&mut self, asked: u64, chunk: &[f32]) -> Result<u64, Refused> {
-        self.executor.take(asked, chunk)
-    }
-
-    /// There is no answer to the request of tick `asked`.
-    pub fn failed(&mut self, asked: u64) {
-        self.executor.failed(asked);
-    }
-
-    /// What has happened so far.
-    #[must_use]
-    pub const fn counts(&self) -> Counts {
-        self.executor.counts()
+        self.queue.step(number, self.situation)
     }
 }

@@ -1,14 +1,15 @@
-//! What a policy is asked: the samples of the last ticks, as they came from the devices.
+//! A request to a policy: the samples of the last ticks, as they came from the devices.
 //!
 //! The control loop fills it, the thread that computes reads it; it goes back and forth between them and is
-//! never made anew.
+//! never allocated again.
 //!
 //! Invariant: nothing here allocates once its cells have grown to the largest samples.
 
-use super::bundle::Bundle;
-use crate::mask::PhysicalMask;
+use super::bundle::{Bundle, ObservationSpec};
+use super::horizon::ChunkError;
+use crate::mask::{PhysicalMask, SizedMask};
 use crate::sample::{Encoding, SampleHeader};
-use crate::status::ObservedSamples;
+use crate::status::{Chunk, ObservedSamples, What};
 use crate::time::Stamp;
 
 /// The samples of `To` ticks, and what was present at the last of them.
@@ -33,8 +34,6 @@ pub struct Request {
 pub struct Cell {
     /// Its number.
     pub seq: u64,
-    /// How old it was at its tick, ns; negative for one after it.
-    pub age_ns: i64,
     /// How `bytes` are encoded.
     pub encoding: Option<Encoding>,
     /// Pixels, of a picture.
@@ -47,9 +46,8 @@ pub struct Cell {
 
 impl Cell {
     /// Becomes this sample.
-    pub fn set(&mut self, header: &SampleHeader, age_ns: i64, bytes: &[u8]) {
+    pub fn set(&mut self, header: &SampleHeader, bytes: &[u8]) {
         self.seq = header.seq;
-        self.age_ns = age_ns;
         self.encoding = Encoding::from_raw(header.encoding);
         (self.width, self.height) = (header.width, header.height);
         self.bytes.clear();
@@ -83,7 +81,7 @@ impl Request {
         self.present.get(observation).copied().unwrap_or(false)
     }
 
-    /// Says whether it is.
+    /// Sets whether it is.
     pub fn set_present(&mut self, observation: usize, present: bool) {
         if let Some(place) = self.present.get_mut(observation) {
             *place = present;
@@ -96,10 +94,34 @@ impl Request {
         self.steps
     }
 
+    /// The event that it was answered with `actions`. `devices` are registered; `answered` gives how many of the actions
+    /// came too late, or why none is used.
+    #[must_use]
+    pub fn answered(
+        &self,
+        bundle: &Bundle,
+        devices: usize,
+        latency_ms: f64,
+        answered: Result<u64, ChunkError>,
+        actions: &[f32],
+    ) -> What {
+        What::Chunk(Box::new(Chunk {
+            tick: self.tick,
+            observed_ns: self.stamp.0,
+            mask: SizedMask { mask: self.mask, devices },
+            seed: self.seed,
+            latency_ms,
+            used: answered.is_ok(),
+            skipped: answered.unwrap_or(0),
+            samples: self.samples(bundle),
+            actions: actions.to_vec(),
+        }))
+    }
+
     /// Which samples these are.
     #[must_use]
     pub fn samples(&self, bundle: &Bundle) -> Vec<ObservedSamples> {
-        let samples = |(at, observation): (usize, &super::bundle::ObservationSpec)| {
+        let samples = |(at, observation): (usize, &ObservationSpec)| {
             let seqs =
                 (0..self.steps).filter(|_| self.is_present(at)).filter_map(|step| Some(self.cell(at, step)?.seq));
             ObservedSamples { modality: observation.modality.clone(), seqs: seqs.collect() }

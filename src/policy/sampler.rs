@@ -1,11 +1,11 @@
 //! Action chunks: from observations and a seed.
 //!
 //! The encoder runs once. The denoiser then takes the noise out of a sample step by step, as the
-//! scheduler says, and the last sample is mapped back to the units of the action.
+//! scheduler requires, and the last sample is mapped back to the units of the action.
 //!
 //! Invariant: the same observations and the same seed give the same chunk, on the same machine with
 //! the same onnxruntime and number of threads.
-//! Invariant: a number that is not finite is passed on as it is: whoever executes actions refuses it.
+//! Invariant: a number that is not finite is passed on as it is: the action queue refuses it.
 //! Invariant: a chunk is computed without an allocation on this side of onnxruntime.
 
 use super::bundle::{Bundle, BundleErrors, Graph};
@@ -22,7 +22,7 @@ const NOISE: u64 = 0x706f_6c69_6379;
 /// Why a policy cannot be run.
 #[derive(Debug, thiserror::Error)]
 pub enum PolicyError {
-    /// The graphs are not what `policy.json` says.
+    /// The graphs do not match `policy.json`.
     #[error(transparent)]
     Bundle(#[from] BundleErrors),
     /// A graph cannot be loaded or run.
@@ -31,12 +31,12 @@ pub enum PolicyError {
     /// The schedule cannot be run.
     #[error(transparent)]
     Scheduler(#[from] SchedulerError),
-    /// There is not the place that a chunk takes.
+    /// The output does not have the length of a chunk.
     #[error("a chunk of {expected} numbers does not go into {found}")]
     Place {
         /// Numbers of a chunk.
         expected: usize,
-        /// Numbers there is place for.
+        /// Numbers of the output.
         found: usize,
     },
 }
@@ -103,7 +103,7 @@ impl Sampler {
     /// Steps of denoising.
     #[must_use]
     pub fn steps(&self) -> usize {
-        self.scheduler.len()
+        self.scheduler.timesteps().count()
     }
 
     /// Writes a chunk, action by action, in the units of the action. The noise is the seed's.

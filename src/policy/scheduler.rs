@@ -2,10 +2,9 @@
 //!
 //! DDIM with eta = 0 (Song et al., "Denoising Diffusion Implicit Models") and DDPM with the variance
 //! called `fixed_small` (Ho et al., "Denoising Diffusion Probabilistic Models"), as the `diffusers`
-//! library computes them, so that a policy does here what it did where it was trained. What is easily
-//! got wrong: tables and samples are 32-bit floats; `leading` strides by the integer `T / n`; the
-//! alpha before the first timestep is 1 unless `set_alpha_to_one` says otherwise; DDIM does not
-//! compute the noise anew after it has clipped the clean sample.
+//! library computes them, so that a policy behaves as in training. Easily mistaken: tables and samples are 32-bit floats; `leading` strides by the integer `T / n`; the
+//! alpha before the first timestep is 1 unless `set_alpha_to_one` is false; DDIM does not
+//! compute the noise again after it has clipped the clean sample.
 //!
 //! Invariant: pure; noise is given by the caller. A step allocates nothing.
 
@@ -99,18 +98,6 @@ impl Scheduler {
             .map(|(at, timestep)| Step::new(spec.kind, *timestep, alphas[*timestep], before(at, *timestep)))
             .collect();
         Ok(Self { steps, prediction: spec.prediction_type, clip: spec.clip_sample.then_some(spec.clip_sample_range) })
-    }
-
-    /// How many steps there are.
-    #[must_use]
-    pub fn len(&self) -> usize {
-        self.steps.len()
-    }
-
-    /// Never true.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.steps.is_empty()
     }
 
     /// The denoiser's input `timestep` at each step, falling.

@@ -1,11 +1,10 @@
-//! What goes wrong while an episode is recorded, said while something can still be done about it.
+//! Faults reported while an episode is recorded, early enough to act on them.
 //!
 //! Invariant: at most one announcement a modality a second, however fast things go wrong.
 
 use std::time::Duration;
 
 use super::quality::{Measures, Meter};
-use crate::modality::MAX_MODALITIES;
 use crate::registry::{DeviceSpec, Limits, Registry};
 use crate::status::{Board, Level, What};
 use crate::time::{Stamp, nanoseconds};
@@ -15,15 +14,9 @@ const ANNOUNCE_EVERY: Duration = Duration::from_secs(1);
 /// So many samples make a trouble that is announced; fewer may be chance, and the verdict has them.
 const LEAST_SAMPLES: u64 = 3;
 
-/// See the module's comment.
-#[derive(Debug)]
-pub(super) struct Announcer {
-    told: Vec<Told>,
-}
-
 /// What has been announced of a modality.
 #[derive(Debug, Clone, Copy, Default)]
-struct Told {
+pub(super) struct Announced {
     dropped: u64,
     lost: u64,
     damaged: u64,
@@ -32,45 +25,31 @@ struct Told {
     at: Option<Stamp>,
 }
 
-impl Announcer {
-    pub(super) fn new() -> Self {
-        Self { told: vec![Told::default(); MAX_MODALITIES] }
-    }
-
-    /// Announces what is new and was not announced within the last second.
-    pub(super) fn look(&mut self, measures: &Measures, registry: &Registry, board: &Board, now: Stamp) {
-        self.each(measures, registry, board, now, |told| told.at.is_none_or(|at| now.since(at) >= ANNOUNCE_EVERY));
-    }
-
-    /// Announces what has not been announced yet, at the end.
-    pub(super) fn last(&mut self, measures: &Measures, registry: &Registry, board: &Board, now: Stamp) {
-        self.each(measures, registry, board, now, |_| true);
-    }
-
-    fn each(
-        &mut self,
-        measures: &Measures,
-        registry: &Registry,
-        board: &Board,
-        now: Stamp,
-        due: impl Fn(&Told) -> bool,
-    ) {
-        for device in &registry.devices {
-            let Some(told) = self.told.get_mut(device.id.index()) else { continue };
-            let Some(meter) = measures.meter(device.id) else { continue };
-            if due(told)
-                && let Some(text) = told.news(device, meter)
-            {
-                told.at = Some(now);
-                let text = format!("{}: {text}", device.name);
-                board.announce(What::Log { level: Level::Warn, text });
-            }
+/// Announces what is new and was not announced within the last second; at the end all that is new. `announced` has an entry
+/// a modality.
+pub(super) fn look(
+    announced: &mut [Announced],
+    measures: &Measures,
+    registry: &Registry,
+    board: &Board,
+    now: Stamp,
+    is_end: bool,
+) {
+    for device in &registry.devices {
+        let Some(known) = announced.get_mut(device.id.index()) else { continue };
+        let Some(meter) = measures.meter(device.id) else { continue };
+        if (is_end || known.at.is_none_or(|at| now.since(at) >= ANNOUNCE_EVERY))
+            && let Some(text) = known.news(device, meter)
+        {
+            known.at = Some(now);
+            let text = format!("{}: {text}", device.name);
+            board.announce(What::Log { level: Level::Warn, text });
         }
     }
 }
 
-impl Told {
-    /// What is new, if anything; from now on it is told.
+impl Announced {
+    /// A new fault, if there is one; it counts as reported from now on.
     fn news(&mut self, device: &DeviceSpec, meter: &Meter) -> Option<String> {
         let Limits { lost, damaged, late, frozen, .. } = device.verdict.suspect;
         let counts = &meter.counts;

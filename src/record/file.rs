@@ -7,7 +7,6 @@
 //! Invariant: only [`EpisodeFile::finish`] gives a file its end; after an error it never gets one.
 
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::io::{self, Write};
 use std::ops::Range;
 use std::sync::Arc;
@@ -16,13 +15,13 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use mcap::Attachment;
 use mcap::records::MessageHeader;
 
-use super::chunks::{self, Chunks, io_error};
-use super::encode::{self, EventText};
 use super::guard::Guard;
-use super::schema::{self, PROTOBUF, SampleSchema, Schema};
 use crate::action::ACTION_TOPIC;
-use crate::episode_format::own::EpisodeId;
-use crate::episode_format::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, SUMMARY};
+use crate::episode::chunk_writer::{self, ChunkWriter, Sink, io_error};
+use crate::episode::encode::{self, EventText};
+use crate::episode::own::EpisodeId;
+use crate::episode::schema::{self, PROTOBUF, SampleSchema, Schema};
+use crate::episode::{ABOUT, EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC, SUMMARY};
 use crate::mask::{MASK_TOPIC, PhysicalMask};
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::registry::Registry;
@@ -31,31 +30,16 @@ use crate::status::Level;
 use crate::sync::Observation;
 use crate::time::{Stamp, WallClock};
 
-/// What an episode's bytes go to.
-pub trait Sink: Write + Send {
-    /// Returns once everything written is on the disk.
-    ///
-    /// # Errors
-    /// When the disk does not take it.
-    fn sync(&mut self) -> io::Result<()>;
-}
-
-impl Sink for File {
-    fn sync(&mut self) -> io::Result<()> {
-        self.sync_all()
-    }
-}
-
 /// See the module's comment.
 pub(super) struct EpisodeFile {
     /// Before the writer, which writes an end of its own when it is dropped.
     #[expect(dead_code, reason = "held to be dropped")]
     shut: Shut,
-    writer: Chunks<Latch>,
+    writer: ChunkWriter<Latch>,
     /// Bytes that the sink took.
     written: Arc<AtomicU64>,
-    /// None where no other program can reach the file.
-    guard: Option<Guard>,
+    /// Looks at every flush and at the end whether another program has damaged the file.
+    guard: Guard,
     clock: WallClock,
     message: Vec<u8>,
     tracks: Vec<Option<Track>>,
@@ -140,11 +124,12 @@ impl EpisodeFile {
         clock: WallClock,
         begin: Stamp,
         metadata: BTreeMap<String, String>,
+        guard: Guard,
     ) -> io::Result<Self> {
         let (shut, written) = (Shut::default(), Arc::<AtomicU64>::default());
         let wall_ns = clock.wall_ns(begin);
         let latch = Latch { sink, shut: Arc::clone(&shut.0), written: Arc::clone(&written) };
-        let mut writer = Chunks::new(latch, Some(EpisodeId::new(wall_ns, begin.0)))?;
+        let mut writer = ChunkWriter::new(latch, Some(EpisodeId::new(wall_ns, begin.0)))?;
         writer.metadata(ABOUT, metadata).map_err(io_error)?;
         writer
             .attach(&Attachment {
@@ -177,7 +162,7 @@ impl EpisodeFile {
             shut,
             writer,
             written,
-            guard: None,
+            guard,
             clock,
             message: Vec::new(),
             tracks,
@@ -207,12 +192,6 @@ impl EpisodeFile {
             }
         }
         Ok(file)
-    }
-
-    /// Looks at every flush and at the end whether another program has damaged the file.
-    pub(super) fn guarded(mut self, guard: Guard) -> Self {
-        self.guard = Some(guard);
-        self
     }
 
     /// Is this, byte for byte, the newest sample of the modality? Compared with what was written, of which a
@@ -282,7 +261,7 @@ impl EpisodeFile {
     pub(super) fn flush(&mut self) -> io::Result<()> {
         self.writer.flush().map_err(io_error)?;
         let written = self.written.load(Ordering::Relaxed);
-        self.guard.as_mut().map_or(Ok(()), |guard| guard.look(written))
+        self.guard.look(written)
     }
 
     /// Ends the file with the summary and waits for the disk. A file that is dropped instead, or
@@ -291,7 +270,7 @@ impl EpisodeFile {
         self.writer.metadata(SUMMARY, summary).map_err(io_error)?;
         self.writer.finish()?;
         let written = self.written.load(Ordering::Relaxed);
-        self.guard.map_or(Ok(()), |guard| guard.verify(written))
+        self.guard.verify(written)
     }
 
     fn write(&mut self, channel_id: u16, sequence: u64, log_time: u64, published: Stamp) -> io::Result<()> {
@@ -309,7 +288,7 @@ fn message_header(channel_id: u16, sequence: u64, log_time: u64, publish_time: u
 }
 
 impl Track {
-    fn channel(&mut self, writer: &mut Chunks<Latch>, schema: SampleSchema) -> io::Result<u16> {
+    fn channel(&mut self, writer: &mut ChunkWriter<Latch>, schema: SampleSchema) -> io::Result<u16> {
         if let Some(Some(channel)) = self.channels.get(schema.index()) {
             return Ok(*channel);
         }
@@ -322,11 +301,11 @@ impl Track {
 }
 
 fn add_channel(
-    writer: &mut Chunks<Latch>,
+    writer: &mut ChunkWriter<Latch>,
     schema: Schema,
     topic: &str,
     metadata: &BTreeMap<String, String>,
 ) -> io::Result<u16> {
     let schema = writer.schema(None, schema.name, PROTOBUF, schema.data).map_err(io_error)?;
-    writer.channel(None, &chunks::Channel { schema, topic, encoding: PROTOBUF, metadata }).map_err(io_error)
+    writer.channel(None, &chunk_writer::Channel { schema, topic, encoding: PROTOBUF, metadata }).map_err(io_error)
 }

@@ -7,7 +7,7 @@
 //!    closed it is not known, as equal events are merged, and what they wrote within it is not visible from outside.
 //!    Such a file is read back once it is finished, and all its check values must be right. Others are not read back.
 //!
-//! A removed file is no damage: it is written again when the episode ends (`keep`).
+//! A removed file is no damage: it is written again when the episode ends (`episode_path::keep`).
 //!
 //! Invariant: between two samples nothing here runs: a look belongs to a flush.
 
@@ -21,8 +21,8 @@ use std::sync::Arc;
 use rustix::fs::inotify::{self, CreateFlags, ReadFlags, Reader, WatchFlags};
 use rustix::fs::{OFlags, fcntl_getfl, fcntl_setfl, fstat, stat};
 
-use super::episode::EpisodePath;
-use super::walk::walk;
+use super::episode_path::EpisodePath;
+use crate::episode::record_iter::RecordIter;
 
 /// Room for the events of one look; more are read by another read.
 const EVENT_BYTES: usize = 1024;
@@ -64,7 +64,7 @@ impl Guard {
     /// Is the file what was written, `written` bytes of which the kernel has?
     ///
     /// # Errors
-    /// When another program cut, extended or replaced it; the text says so.
+    /// When another program cut, extended or replaced it; the text is the reason.
     pub(super) fn look(&mut self, written: u64) -> io::Result<()> {
         let is = fstat(&self.file)?;
         let size = u64::try_from(is.st_size).unwrap_or(0);
@@ -89,16 +89,17 @@ impl Guard {
     /// Is the finished file sound, as far as there is reason for doubt?
     ///
     /// # Errors
-    /// When it is not; the text says so.
+    /// When it is not; the text is the reason.
     pub(super) fn verify(mut self, written: u64) -> io::Result<()> {
         self.look(written)?;
         if !self.was_opened {
             return Ok(());
         }
-        let file = File::open(itself(&self.file))?;
-        let walked = walk(file, written, None, &mut |_, _| {})?;
-        if walked.is_some_and(|walked| walked.proven) {
-            return Ok(());
+        if let Some(mut records) = RecordIter::new(File::open(itself(&self.file))?, written)? {
+            while records.advance()? {}
+            if records.integrity().proven {
+                return Ok(());
+            }
         }
         Err(io::Error::other("another program wrote into it while it was recorded: its check values are not right"))
     }

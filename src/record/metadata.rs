@@ -1,16 +1,18 @@
-//! What a file says about itself: the metadata records `rapid` at its beginning and
-//! `rapid/summary` at its end. Values are text; those that are JSON say so here.
+//! The metadata of an episode: the record `rapid` at its beginning and
+//! `rapid/summary` at its end. Values are text; those that are JSON are marked as such here.
 
 use std::collections::BTreeMap;
 
+use serde::Serialize;
 use serde_json::{Map, Value, json};
 
-use super::configuration::{self, Configuration};
 use super::provenance::Units;
-use super::publishers::{self, Publisher};
+use super::publishers;
 use super::quality::{Quality, Spread};
-use crate::episode_format::{self, BOOT_ID};
-use crate::registry::{DeviceSpec, Registry, WhenStale};
+use super::verdict::Facts;
+use crate::episode::{self, BOOT_ID, text_map};
+use crate::mask::PhysicalMask;
+use crate::registry::{Registry, WhenStale};
 use crate::status::Verdict;
 use crate::time::{Stamp, WallClock, nanoseconds};
 
@@ -63,7 +65,7 @@ pub(super) fn beginning(
         ("rig", registry.rig.name.clone()),
         ("task", task.to_owned()),
         ("tags", Value::Object(tags).to_string()),
-        (configuration::KEY, json!(configuration).to_string()),
+        (CONFIGURATION, json!(configuration).to_string()),
         ("layout", Value::Object(layout).to_string()),
         ("modalities", Value::Array(modalities).to_string()),
         ("serials", units.serials().to_string()),
@@ -80,33 +82,23 @@ pub(super) fn beginning(
     ]);
     said.extend(units.policy().map(|policy| (POLICY.to_owned(), policy.to_string())));
     // A repair trusts what was written last only where the kernel that wrote it still runs.
-    said.extend(episode_format::boot_id().map(|id| (BOOT_ID.to_owned(), id)));
+    said.extend(episode::boot_id().map(|id| (BOOT_ID.to_owned(), id)));
     said
 }
 
-/// What the record at the end says.
+/// Contents of the record at the end.
 #[derive(Debug)]
 pub(super) struct Ending<'a> {
-    /// Length in seconds.
-    pub(super) seconds: f64,
+    /// What the verdict follows from.
+    pub(super) facts: &'a Facts<'a>,
     /// Messages written, those of the frame index included.
     pub(super) messages: u64,
     /// Ticks written.
     pub(super) frames: u64,
-    /// Events that came faster than they were read.
-    pub(super) events_missed: u64,
-    /// Publications of the mask lost.
-    pub(super) masks_dropped: u64,
-    /// Actions lost.
-    pub(super) actions_dropped: u64,
-    /// Other programs that published on topics of ours.
-    pub(super) publishers: &'a [Publisher],
-    /// What each modality was like.
-    pub(super) qualities: &'a [(&'a DeviceSpec, Quality)],
     /// Between the earliest and the latest sample of a frame.
     pub(super) skew: Option<Spread>,
     /// The verdict.
-    pub(super) verdict: Verdict,
+    pub(super) verdict: &'a Verdict,
     /// Why the episode is not whole, if it is not.
     pub(super) cut_short: Option<&'a str>,
     /// Everything that was attached or ran at some time.
@@ -117,7 +109,7 @@ pub(super) struct Ending<'a> {
 
 /// The record at the end.
 ///
-/// `cut_short` says why the recorder ended the episode before its time, and is absent where it did
+/// `cut_short` is the reason why the recorder ended the episode before its time, and is absent where it did
 /// not. `verdict` is GOOD, SUSPECT or BAD. JSON: `reasons` `["..."]`, why it is not GOOD; `sensors`
 /// `{registered, recorded, without}`; `modalities`
 /// `{name: {samples, bytes, lost, dropped, damaged, ...}}`, the fields of [`Quality`]; `skew_ms` `{p50,
@@ -125,36 +117,97 @@ pub(super) struct Ending<'a> {
 /// `provenance` as at the beginning, of whatever was attached or ran at some time; `policy` likewise;
 /// `publishers` `[{topic, process, command, samples}]` of other programs that published on our topics, absent if none did.
 pub(super) fn end(ending: &Ending<'_>) -> BTreeMap<String, String> {
-    let modalities: Map<String, Value> =
-        ending.qualities.iter().map(|(device, quality)| (device.name.clone(), json!(quality))).collect();
+    let Facts { modalities, missing, publishers, seconds, .. } = *ending.facts;
+    let reports: Map<String, Value> =
+        modalities.iter().map(|judged| (judged.name.to_owned(), json!(judged.quality))).collect();
     let sum = |count: fn(&Quality) -> u64| {
-        ending.qualities.iter().map(|(_, quality)| count(quality)).fold(0, u64::saturating_add).to_string()
+        modalities.iter().map(|judged| count(judged.quality)).fold(0, u64::saturating_add).to_string()
     };
     let mut said = text_map([
         ("verdict", ending.verdict.grade.word().to_owned()),
         ("reasons", json!(ending.verdict.reasons).to_string()),
         ("sensors", json!(ending.verdict.sensors).to_string()),
-        ("duration_s", ending.seconds.to_string()),
+        ("duration_s", seconds.to_string()),
         ("messages", ending.messages.to_string()),
         ("frames", ending.frames.to_string()),
         ("lost", sum(|quality| quality.lost)),
         ("dropped", sum(|quality| quality.dropped)),
         ("damaged", sum(|quality| quality.damaged)),
-        ("masks_dropped", ending.masks_dropped.to_string()),
-        ("actions_dropped", ending.actions_dropped.to_string()),
-        ("events_missed", ending.events_missed.to_string()),
-        ("modalities", Value::Object(modalities).to_string()),
+        ("masks_dropped", missing.masks.to_string()),
+        ("actions_dropped", missing.actions.to_string()),
+        ("events_missed", missing.events.to_string()),
+        ("modalities", Value::Object(reports).to_string()),
         ("skew_ms", json!(ending.skew).to_string()),
         ("serials", ending.units.serials().to_string()),
         ("provenance", ending.units.epochs(ending.begin).to_string()),
     ]);
     said.extend(ending.units.policy().map(|policy| (POLICY.to_owned(), policy.to_string())));
-    let others = (!ending.publishers.is_empty()).then(|| json!(ending.publishers).to_string());
+    let others = (!publishers.is_empty()).then(|| json!(publishers).to_string());
     said.extend(others.map(|others| (publishers::KEY.to_owned(), others)));
     said.extend(ending.cut_short.map(|reason| (CUT_SHORT.to_owned(), reason.to_owned())));
     said
 }
 
-fn text_map<const N: usize>(pairs: [(&str, String); N]) -> BTreeMap<String, String> {
-    pairs.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
+/// The configuration an episode is recorded with: modules, tags, and the sensors that were present. As JSON the value of
+/// [`CONFIGURATION`] in the metadata of an episode's beginning.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
+pub(super) struct Configuration {
+    /// Mounted modules: those declared, and those whose sensors are all present.
+    pub(super) modules: Vec<String>,
+    /// Modalities whose bits are set when the episode begins, ascending by bit.
+    pub(super) present: Vec<String>,
+    /// Those of the user, then those of the modules whose keys the user did not use.
+    #[serde(skip)]
+    pub(super) tags: Vec<(String, String)>,
+}
+
+/// Key of the configuration in the metadata of an episode's beginning.
+pub(super) const CONFIGURATION: &str = "configuration";
+
+impl Configuration {
+    /// With the declared modules and tags, and the mask of the beginning.
+    pub(super) fn of(registry: &Registry, said: &[String], tags: &[(String, String)], mask: PhysicalMask) -> Self {
+        let is_present = |name: &String| registry.named(name).is_some_and(|device| mask.contains(device.id));
+        let mut found = Self {
+            modules: Vec::new(),
+            present: registry.devices.iter().map(|device| device.name.clone()).filter(is_present).collect(),
+            tags: tags.to_vec(),
+        };
+        for module in &registry.modules {
+            let sensed = !module.devices.is_empty() && module.devices.iter().all(is_present);
+            if !sensed && !said.contains(&module.name) {
+                continue;
+            }
+            found.modules.push(module.name.clone());
+            for (key, value) in &module.tags {
+                if !tags.iter().any(|(own, _)| own == key) {
+                    found.tags.push((key.clone(), value.clone()));
+                }
+            }
+        }
+        found
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn modules_are_declared_or_detected_and_bring_their_tags() {
+        let modules = "\n[module.tactile]\nslot = \"tip\"\ntags = [\"finger=tactile\"]\ndevices = [\"tactile_tip\"]\n\
+            [module.soft]\nslot = \"tip\"\ntags = [\"finger=soft\", \"colour=red\"]\n[module.never]\nslot = \"front\"\n";
+        let registry = Registry::parse(&format!("{}{modules}", crate::registry::BUILTIN), None).unwrap().registry;
+        let of = |said: &[&str], tags: &[(&str, &str)], mask| {
+            let said: Vec<String> = said.iter().map(|name| (*name).to_owned()).collect();
+            let tags: Vec<_> = tags.iter().map(|(key, value)| ((*key).to_owned(), (*value).to_owned())).collect();
+            let found = Configuration::of(&registry, &said, &tags, PhysicalMask(mask));
+            let tags: Vec<String> = found.tags.iter().map(|(key, value)| format!("{key}={value}")).collect();
+            format!("{} | {} | {}", found.modules.join(" "), found.present.join(" "), tags.join(" "))
+        };
+        assert_eq!(of(&[], &[], 0b101), " | cam_wrist motor_state | ");
+        assert_eq!(of(&[], &[], 0b011), "tactile | cam_wrist tactile_tip | finger=tactile");
+        assert_eq!(of(&["soft"], &[], 0b001), "soft | cam_wrist | finger=soft colour=red");
+        assert_eq!(of(&["soft"], &[("finger", "mine")], 0), "soft |  | finger=mine colour=red");
+    }
 }

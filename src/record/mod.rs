@@ -5,51 +5,35 @@
 //! `file` writes it. `inspect` reads such a file back.
 //!
 //! Invariant: only the `writer` thread touches a file of an episode of a run, and nothing waits for it but
-//! who asks it to start or to stop. On a virtual clock there is no thread: `stepped` writes when it is told.
+//! the caller that starts or stops it. On a virtual clock there is no thread: `stepped` writes when it is called.
 //! Invariant: a file without `.partial` at its end is finished; one that exists is never replaced.
-//! Invariant: what could not be recorded is counted and said.
+//! Invariant: losses are counted and reported.
 
 mod announce;
-mod chunks;
-mod configuration;
-mod describe;
-pub mod encode;
-mod episode;
+mod episode_path;
 mod file;
 mod guard;
-mod hole;
 pub mod inspect;
-mod keep;
-mod lock;
-mod masks;
 mod metadata;
 mod provenance;
 mod publishers;
 mod quality;
 mod recorder;
-pub mod recover;
-pub mod schema;
 mod session;
-mod short;
-mod source;
 mod space;
 pub mod stepped;
 mod streams;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 mod verdict;
 mod writeback;
-mod writer;
 
 use std::path::PathBuf;
 
-use crate::episode_format::{walk, wire};
-
-pub use episode::{EpisodeReport, EpisodeRequest, open_folder};
-pub use file::Sink;
+pub use crate::episode::chunk_writer::Sink;
+pub use episode_path::{EpisodeReport, EpisodeRequest, open_folder};
 pub use quality::{Quality, Spread};
-pub use recorder::{Recorder, RecorderConfig};
-pub use source::Source;
+pub use recorder::{Recorder, RecorderConfig, Source};
 pub use space::Asker;
 
 use crate::text;
@@ -68,10 +52,10 @@ pub enum RecordError {
     Io {
         /// Folder or file.
         path: PathBuf,
-        /// What the system says.
+        /// The error of the system.
         source: std::io::Error,
     },
-    /// The folder lies behind a link of somebody else, or cannot be entered.
+    /// The folder lies behind another user's link, or cannot be entered.
     #[error("{0}, or choose another with --out")]
     Folder(crate::folder::FolderError),
     /// There is no room for an episode.

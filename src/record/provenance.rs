@@ -1,10 +1,10 @@
 //! Which unit each modality's samples come from, and which policy is at the controls: what runs now, and
 //! what ran in an episode.
 //!
-//! An epoch begins when the device is opened and ends when its slot runs no more. All of it is told by
+//! An epoch begins when the device is opened and ends when its slot runs no more. All of it follows from
 //! events, which are in the file too.
 //!
-//! Invariant: pure: what is known is what events told.
+//! Invariant: pure: all knowledge comes from events.
 
 use std::collections::BTreeMap;
 
@@ -25,13 +25,6 @@ struct Policy {
     dry_run: bool,
 }
 
-impl Policy {
-    fn of(what: &What) -> Option<Self> {
-        let What::Policy { policy, hash, dry_run, .. } = what else { return None };
-        Some(Self { name: policy.clone(), hash: hash.clone(), dry_run: *dry_run })
-    }
-}
-
 /// One epoch of a modality.
 #[derive(Debug, Clone)]
 struct Incarnation {
@@ -42,40 +35,33 @@ struct Incarnation {
 
 /// What is attached and what runs at this moment, recording or not.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Attached {
-    serials: Serials,
-    running: BTreeMap<String, Incarnation>,
-    policy: Option<Policy>,
-}
+pub(super) struct Attached(Units);
 
 impl Attached {
     /// Takes an event.
     pub(super) fn take(&mut self, event: &Event) {
+        let Self(units) = self;
         match &event.what {
-            What::Attach { device, unit, .. } => {
-                drop(self.serials.insert(device.clone(), unit.serial().map(str::to_owned)));
+            What::Detach { device, .. } => drop(units.serials.remove(device)),
+            What::State { device, state, .. } if has_ended(*state) => drop(units.epochs.remove(device)),
+            What::PolicyEnd { .. } => units.policy = None,
+            what => {
+                if let What::Opened { device, .. } = what {
+                    units.epochs.remove(device);
+                }
+                units.take(event);
             }
-            What::Detach { device, .. } => drop(self.serials.remove(device)),
-            What::Opened { device, provenance, .. } => {
-                self.running.insert(device.clone(), opened(event.stamp, provenance));
-            }
-            What::State { device, state, .. } if has_ended(*state) => drop(self.running.remove(device)),
-            What::Policy { .. } => self.policy = Policy::of(&event.what),
-            What::PolicyEnd { .. } => self.policy = None,
-            _ => {}
         }
     }
-}
 
-impl Attached {
     /// Is the device of this name plugged in?
     pub(super) fn has(&self, device: &str) -> bool {
-        self.serials.contains_key(device)
+        self.0.serials.contains_key(device)
     }
 }
 
 /// Every unit and every epoch of an episode, and its policy.
-#[derive(Debug)]
+#[derive(Debug, Clone, Default)]
 pub(super) struct Units {
     serials: Serials,
     epochs: BTreeMap<String, Vec<Incarnation>>,
@@ -85,12 +71,7 @@ pub(super) struct Units {
 impl Units {
     /// Those that are there when an episode begins.
     pub(super) fn new(attached: &Attached) -> Self {
-        let running = attached.running.iter();
-        Self {
-            serials: attached.serials.clone(),
-            epochs: running.map(|(device, epoch)| (device.clone(), vec![epoch.clone()])).collect(),
-            policy: attached.policy.clone(),
-        }
+        attached.0.clone()
     }
 
     /// Takes an event.
@@ -101,10 +82,13 @@ impl Units {
             }
             What::Opened { device, provenance, .. } => {
                 self.end(device, event.stamp);
-                self.epochs.entry(device.clone()).or_default().push(opened(event.stamp, provenance));
+                let opened = Incarnation { opened: event.stamp, ended: None, provenance: (**provenance).clone() };
+                self.epochs.entry(device.clone()).or_default().push(opened);
             }
             What::State { device, state, .. } if has_ended(*state) => self.end(device, event.stamp),
-            What::Policy { .. } => self.policy = Policy::of(&event.what),
+            What::Policy { policy, hash, dry_run, .. } => {
+                self.policy = Some(Policy { name: policy.clone(), hash: hash.clone(), dry_run: *dry_run });
+            }
             _ => {}
         }
     }
@@ -143,10 +127,6 @@ impl Units {
     }
 }
 
-fn opened(at: Stamp, provenance: &Provenance) -> Incarnation {
-    Incarnation { opened: at, ended: None, provenance: provenance.clone() }
-}
-
 const fn has_ended(state: SlotState) -> bool {
     match state {
         SlotState::Absent | SlotState::Backoff | SlotState::Failed => true,
@@ -157,10 +137,12 @@ const fn has_ended(state: SlotState) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::mask::SizedMask;
     use crate::modality::ModalityId;
     use crate::provenance::Negotiated;
     use crate::registry::UsbIdentity;
     use crate::sample::Epoch;
+    use crate::status::PolicyEnd;
 
     const BEGIN: Stamp = Stamp(10_000_000_000);
 
@@ -190,7 +172,7 @@ mod tests {
 
     fn state(ms: u64, state: SlotState) -> Event {
         let bit = ModalityId::new(0).unwrap();
-        let what = What::State { device: "cam".into(), bit, state, mask: String::new(), detail: String::new() };
+        let what = What::State { device: "cam".into(), bit, state, mask: SizedMask::default(), detail: String::new() };
         Event { stamp: Stamp(ms * 1_000_000), what }
     }
 
@@ -207,7 +189,7 @@ mod tests {
             attach(13_000, "B"),
             open(15_000, 2, "B"),
             state(15_100, SlotState::Stalled),
-            // The end of the second was not told: the third says it.
+            // The end of the second was not reported: the third implies it.
             open(16_500, 3, "B"),
         ] {
             units.take(&event);
@@ -243,8 +225,14 @@ mod tests {
 
     #[test]
     fn the_policy_of_an_episode_is_the_one_that_ran_in_it() {
-        let end =
-            What::PolicyEnd { actions: 0, held: 0, chunks: 0, unused: 0, latency_p50_ms: 0.0, latency_p99_ms: 0.0 };
+        let end = What::PolicyEnd(PolicyEnd {
+            actions: 0,
+            held: 0,
+            chunks: 0,
+            unused: 0,
+            latency_p50_ms: 0.0,
+            latency_p99_ms: 0.0,
+        });
         let end = Event { stamp: Stamp(0), what: end };
         let mut attached = Attached::default();
         assert_eq!(Units::new(&attached).policy(), None);
@@ -262,7 +250,7 @@ mod tests {
     }
 
     #[test]
-    fn what_ended_before_the_episode_is_not_in_it() {
+    fn epochs_that_ended_before_the_episode_are_not_in_it() {
         let mut attached = Attached::default();
         for event in [attach(1_000, "A"), open(2_000, 1, "A"), state(3_000, SlotState::Failed)] {
             attached.take(&event);

@@ -29,7 +29,7 @@ pub(super) struct Publisher {
     pub(super) process: u32,
     /// Its command line.
     pub(super) command: String,
-    /// Samples it published; 0 where nothing says.
+    /// Samples it published; 0 if unknown.
     #[serde(default)]
     pub(super) samples: u64,
 }

@@ -13,49 +13,57 @@
 //!    `publish_time`: whoever reads the file can choose the same samples again.
 //! 4. A sample received after its tick's deadline is in the file and in no frame.
 //! 5. The file is closed [`SETTLE`] `+` [`GRACE`] `+` the longest latency after `end`. A sample captured before `end` that
-//!    arrives later than that is lost and not counted: nobody knows of it.
+//!    arrives later than that is lost and cannot be counted.
 //! 6. A damaged sample is recorded and counted, and belongs to no frame.
 //!
 //! Invariant: every sample a frame names was written to the file before the frame.
-
-mod beginning;
 
 use std::io;
 use std::sync::Arc;
 use std::time::Duration;
 
-pub(super) use beginning::Beginning;
-
-use self::beginning::synchronised;
-use super::announce::Announcer;
-use super::configuration::Configuration;
-use super::describe::describe;
-use super::encode::EventText;
-use super::episode::{Closing, EpisodePath, EpisodeReport};
+use super::announce::{Announced, look};
+use super::episode_path::{self, EpisodePath, EpisodeReport, EpisodeRequest};
 use super::file::EpisodeFile;
 use super::guard::Guard;
-use super::hole::Hole;
-use super::keep;
-use super::masks::MaskHistory;
-use super::metadata::{self, Ending};
-use super::provenance::Units;
+use super::metadata::{self, Configuration, Ending};
+use super::provenance::{Attached, Units};
+use super::publishers::Publisher;
 use super::quality::{Frames, Measured, Measures, Seen};
-use super::verdict::{Facts, FileState, Judged, Losses, judge};
+use super::streams::{Hole, MaskHistory};
+use super::verdict::{Facts, FileState, Judged, Losses, Missing, judge};
 use super::writeback::Writeback;
+use crate::episode::chunk_writer::Sink;
+use crate::episode::encode::EventText;
 use crate::mask::PhysicalMask;
-use crate::modality::ModalityId;
+use crate::modality::{MAX_MODALITIES, ModalityId};
 use crate::registry::Registry;
 use crate::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
 use crate::status::{Board, Event, RecordingStatus, What};
-use crate::sync::{Grid, SyncSample, Synchronizer};
-use crate::time::Stamp;
+use crate::sync::{Grid, SyncModality, SyncSample, Synchronizer};
+use crate::time::{Stamp, WallClock};
 
+/// Samples of a modality that may arrive while those of a whole queue are being written.
+const RING_SLACK: usize = 1024;
 /// How long after its capture a sample may arrive and still belong to its frame. The slowest we
 /// know: a camera at 15 Hz stamps the start of exposure and delivers after exposure, transfer and
 /// one frame in the kernel's queue, some 70 ms later.
 pub(super) const SETTLE: Duration = Duration::from_millis(100);
 /// What has been received may still lie on the bus for this long.
 pub(super) const GRACE: Duration = Duration::from_millis(20);
+
+/// What a session begins with.
+pub(super) struct Beginning<'a> {
+    pub(super) registry: Arc<Registry>,
+    pub(super) board: Arc<Board>,
+    pub(super) request: &'a EpisodeRequest,
+    pub(super) path: EpisodePath,
+    pub(super) sink: Box<dyn Sink>,
+    pub(super) attached: &'a Attached,
+    pub(super) clock: WallClock,
+    pub(super) begin: Stamp,
+}
+
 /// See the module's comment.
 pub(super) struct Session {
     registry: Arc<Registry>,
@@ -70,12 +78,10 @@ pub(super) struct Session {
     next_tick: u64,
     sync: Synchronizer<()>,
     measures: Measures,
-    announcer: Announcer,
-    masks_dropped: u64,
-    actions_dropped: u64,
+    announced: Vec<Announced>,
+    missing: Missing,
     logs: u64,
     events: u64,
-    events_missed: u64,
     units: Units,
     /// How long a tick waits for its samples beside the window.
     settle: Duration,
@@ -91,7 +97,7 @@ impl Session {
         let mask = masks.at(begin).map_or(PhysicalMask::default(), |(_, mask, _)| *mask);
         let configuration = Configuration::of(&registry, &request.modules, &request.tags, mask);
         let said = metadata::beginning(&registry, &request.task, &configuration, &units, clock, begin);
-        let mut file = EpisodeFile::begin(sink, &registry, clock, begin, said)?.guarded(Guard::begin(&path));
+        let mut file = EpisodeFile::begin(sink, &registry, clock, begin, said, Guard::begin(&path))?;
         let settle = SETTLE + registry.devices.iter().map(|device| device.latency).max().unwrap_or_default();
         let mut measures = Measures::new(&Measured::all(&registry), Frames::of(&registry, begin, settle));
         for device in registry.devices.iter().filter(|device| attached.has(&device.name)) {
@@ -116,12 +122,10 @@ impl Session {
             begin,
             next_tick: 0,
             measures,
-            announcer: Announcer::new(),
-            masks_dropped: 0,
-            actions_dropped: 0,
+            announced: vec![Announced::default(); MAX_MODALITIES],
+            missing: Missing::default(),
             logs: 0,
             events: 0,
-            events_missed: 0,
             units,
             settle,
             failed: None,
@@ -171,7 +175,7 @@ impl Session {
     /// Takes a publication of the mask, and the hole before it.
     pub(super) fn mask(&mut self, header: &SampleHeader, mask: PhysicalMask, sequence: u64, hole: Option<Hole>) {
         if let (Some(hole), None) = (hole, &self.failed) {
-            self.masks_dropped = self.masks_dropped.saturating_add(self.share(&hole, hole.dropped, Duration::ZERO));
+            self.missing.masks = self.missing.masks.saturating_add(self.share(&hole, hole.dropped, Duration::ZERO));
         }
         // One of before the beginning that comes only now follows the one that the episode began with.
         let captured = Stamp(header.capture_ns);
@@ -186,7 +190,7 @@ impl Session {
     pub(super) fn action(&mut self, header: &SampleHeader, payload: &[u8], hole: Option<Hole>) {
         if let (Some(hole), None) = (hole, &self.failed) {
             let missing = self.share(&hole, hole.lost.saturating_add(hole.dropped), Duration::ZERO);
-            self.actions_dropped = self.actions_dropped.saturating_add(missing);
+            self.missing.actions = self.missing.actions.saturating_add(missing);
         }
         if self.holds(Stamp(header.capture_ns), Duration::ZERO) && self.failed.is_none() {
             self.failed = self.file.action(header, payload).err();
@@ -204,7 +208,7 @@ impl Session {
             Ok(json) => json,
             Err(error) => {
                 tracing::error!(%error, ?event, "an event is not recorded");
-                self.events_missed += 1;
+                self.missing.events += 1;
                 return;
             }
         };
@@ -217,7 +221,7 @@ impl Session {
 
     /// Counts events that came faster than they were read.
     pub(super) fn missed_events(&mut self, count: u64) {
-        self.events_missed += count;
+        self.missing.events += count;
     }
 
     /// Writes the frames whose deadline has passed by `now`, everything received before which was
@@ -228,7 +232,7 @@ impl Session {
             self.write_frame(masks);
         }
         self.measures.settle();
-        self.announcer.look(&self.measures, &self.registry, &self.board, now);
+        look(&mut self.announced, &self.measures, &self.registry, &self.board, now, false);
     }
 
     /// Fixes the end of the episode, if it is not fixed to an earlier moment.
@@ -262,16 +266,22 @@ impl Session {
         self.failed = self.failed.take().or(ended.err());
     }
 
-    /// Writes what is left, ends the file and gives it its name.
-    pub(super) fn finish(mut self, now: Stamp, masks: &MaskHistory, close: Closing<'_>) -> EpisodeReport {
-        let Closing { reason, publishers } = close;
+    /// Writes what is left, ends the file and gives it its name. `reason`: why the episode is not whole although its file
+    /// may be; `publishers`: other programs that published on topics of ours.
+    pub(super) fn finish(
+        mut self,
+        now: Stamp,
+        masks: &MaskHistory,
+        reason: Option<String>,
+        publishers: &[Publisher],
+    ) -> EpisodeReport {
         self.end_writeback();
         let end = self.end.unwrap_or(now).min(now).max(self.begin);
         let ticks = self.grid.ticks_before(end);
         while self.failed.is_none() && self.next_tick < ticks {
             self.write_frame(masks);
         }
-        self.announcer.last(&self.measures, &self.registry, &self.board, now);
+        look(&mut self.announced, &self.measures, &self.registry, &self.board, now, true);
         let seconds = end.since(self.begin).as_secs_f64();
         let messages = self.file.messages;
         let dropped = self.measures.dropped();
@@ -282,35 +292,23 @@ impl Session {
             .iter()
             .map(|(device, quality)| Judged { name: &device.name, quality, limits: device.verdict })
             .collect();
-        let (masks_dropped, events_missed) = (self.masks_dropped, self.events_missed);
-        let (actions_dropped, expect) = (self.actions_dropped, self.registry.rig.expect.as_slice());
-        let verdict = |file: FileState<'_>| {
-            let (losses, findings) = (Losses::Apart, [].as_slice());
-            judge(&Facts {
-                modalities: &judged,
-                masks_dropped,
-                actions_dropped,
-                expect,
-                events_missed,
-                publishers,
-                seconds,
-                losses,
-                file,
-                findings,
-            })
-        };
-        let state = reason.as_deref().map_or(FileState::Whole, FileState::NotWhole);
-        let ending = Ending {
+        let facts = Facts {
+            modalities: &judged,
+            missing: self.missing,
+            expect: &self.registry.rig.expect,
+            publishers,
             seconds,
+            losses: Losses::Apart,
+            file: reason.as_deref().map_or(FileState::Whole, FileState::NotWhole),
+            findings: &[],
+        };
+        let whole = judge(&facts);
+        let ending = Ending {
+            facts: &facts,
             messages,
             frames: self.next_tick,
-            events_missed,
-            masks_dropped,
-            actions_dropped,
-            publishers,
-            qualities: &qualities,
             skew: self.measures.skew(),
-            verdict: verdict(state),
+            verdict: &whole,
             cut_short: reason.as_deref(),
             units: &self.units,
             begin: self.begin,
@@ -318,11 +316,10 @@ impl Session {
         let closed = match self.failed {
             None => {
                 let finished = self.file.finish(metadata::end(&ending));
-                finished.and_then(|()| keep::publish(&self.path))
+                finished.and_then(|()| episode_path::keep(&self.path))
             }
             Some(error) => Err(error),
         };
-        let whole = ending.verdict;
         let (file, error, verdict) = match closed {
             Ok(file) => {
                 self.path.tell_name(&file, &self.board);
@@ -330,7 +327,8 @@ impl Session {
             }
             Err(error) => {
                 let error = error.to_string();
-                let (verdict, file) = (verdict(FileState::Failed(&error)), keep::failed(&self.path, &error));
+                let verdict = judge(&Facts { file: FileState::Failed(&error), ..facts });
+                let file = episode_path::failed(&self.path, &error);
                 (file, Some(reason.into_iter().chain([error]).collect::<Vec<_>>().join("; ")), verdict)
             }
         };
@@ -387,7 +385,7 @@ impl Session {
 
     fn write_event(&mut self, event: &Event, json: &serde_json::Value) -> io::Result<()> {
         let field = |name| json.get(name).and_then(serde_json::Value::as_str).unwrap_or_default();
-        let text = describe(&event.what);
+        let text = event.what.describe().sentence;
         let said = EventText { kind: field("event"), device: field("device"), text: &text, json: &json.to_string() };
         self.file.event(self.events, event.stamp, &said)?;
         if let What::Log { level, text } = &event.what {
@@ -396,4 +394,16 @@ impl Session {
         }
         Ok(())
     }
+}
+
+/// The modalities of a registry, as frames are made of them.
+fn synchronised(registry: &Registry) -> Vec<SyncModality> {
+    let devices = registry.devices.iter();
+    let modality = devices.map(|device| SyncModality {
+        id: device.id,
+        when_stale: device.when_stale,
+        latency: device.latency,
+        capacity: device.depth.saturating_add(RING_SLACK),
+    });
+    modality.collect()
 }

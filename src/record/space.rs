@@ -7,7 +7,7 @@
 //! | free, above the reserve                     | then                                       |
 //! |---------------------------------------------|--------------------------------------------|
 //! | for [`WARN_LEFT`], and another reserve      |                                            |
-//! | less, at the rate it is written with        | said once, and shown with the time left    |
+//! | less, at the rate it is written with        | reported once, shown with the time left    |
 //! | nothing                                     | the episode is closed, no other begins     |
 //!
 //! Invariant: free is what other programs may still take, and what is set aside for the file.
@@ -27,7 +27,7 @@ use crate::disk::Disk;
 use crate::text;
 use crate::time::Stamp;
 
-/// With less time than this left, it is said.
+/// With less time than this left, it is reported.
 const WARN_LEFT: Duration = Duration::from_mins(5);
 /// How often it is looked whether more must be set aside: at 300 MB/s half of [`ASIDE_MOST`] is
 /// written in that time.
@@ -41,7 +41,7 @@ const ASIDE_MOST: u64 = 64 << 20;
 const ASIDE_LEAST: u64 = 4 << 20;
 /// The rate is the mean over this long.
 const RATE_OVER: Duration = Duration::from_secs(10);
-/// No rate is told of less than this.
+/// No rate is computed over less than this.
 const RATE_LEAST: Duration = Duration::from_secs(2);
 /// Times longer than this are no forecast.
 const LEFT_MOST: Duration = Duration::from_hours(100);
@@ -66,10 +66,10 @@ fn room(free: u64, reserve: u64, rate: f64) -> Room {
     if left >= WARN_LEFT && above >= reserve { Room::Ample } else { Room::Low(left) }
 }
 
-/// What is to be told.
+/// A report to be made.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Finding {
-    /// Nearly full; told once an episode.
+    /// Nearly full; reported once an episode.
     Low {
         /// What is free, bytes.
         free: u64,
@@ -78,7 +78,7 @@ pub(super) enum Finding {
     },
     /// The episode is to be closed now; why.
     Spent(String),
-    /// The file has no name any more; told once.
+    /// The file has no name any more; reported once.
     Removed,
 }
 
@@ -111,7 +111,7 @@ impl Space {
         now: Stamp,
         ask: &mut Asker,
     ) -> Result<Self, RecordError> {
-        // A disk that does not say is tried.
+        // A disk of unknown size is tried.
         let disk = ask(&file).unwrap_or(Disk { free: u64::MAX, size: 0 });
         let reserve = disk.reserve(reserve);
         let mut space = Self {
@@ -262,7 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn a_small_disk_keeps_a_twentieth_unless_told_otherwise() {
+    fn a_small_disk_keeps_a_twentieth_by_default() {
         let disk = |size| Disk { free: 0, size };
         assert_eq!(disk(200 * GIB).reserve(None), GIB);
         assert_eq!(disk(64 << 20).reserve(None), (64 << 20) / 20);
@@ -286,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_set_aside_lies_behind_the_end_and_is_given_back() {
+    fn reserved_space_lies_behind_the_end_and_is_released() {
         let file = Arc::new(tempfile::tempfile().unwrap());
         let mut ask: Asker = Box::new(Disk::of);
         let blocks = |file: &File| fstat(file).unwrap().st_blocks;

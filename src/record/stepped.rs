@@ -6,16 +6,24 @@
 use std::sync::Arc;
 
 use super::RecordError;
-use super::episode::{Closing, EpisodePath, EpisodeReport, EpisodeRequest};
-use super::file::Sink;
+use super::episode_path::{EpisodePath, EpisodeReport, EpisodeRequest};
 use super::provenance::Attached;
 use super::session::{Beginning, Session};
 use super::streams::Streams;
 use crate::bus::TopicId;
+use crate::episode::chunk_writer::Sink;
 use crate::registry::Registry;
 use crate::sample::SampleHeader;
 use crate::status::{Board, Event};
 use crate::time::{Stamp, WallClock};
+
+/// Who sees what a rig sends, in the order of time.
+pub trait Taker {
+    /// A sample, a publication of the mask, or an action.
+    fn take(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]);
+    /// An event.
+    fn event(&mut self, event: &Event);
+}
 
 /// What passes before an episode and during it.
 pub struct Stepped {
@@ -34,7 +42,7 @@ impl std::fmt::Debug for Stepped {
 }
 
 impl Stepped {
-    /// A recorder without an episode. `clock` says what the moments handed in are on the wall clock.
+    /// A recorder without an episode. `clock` converts the given moments to the wall clock.
     #[must_use]
     pub fn new(registry: Arc<Registry>, board: Arc<Board>, clock: WallClock) -> Self {
         Self { registry, board, clock, streams: Streams::new(), attached: Attached::default(), session: None }
@@ -45,7 +53,7 @@ impl Stepped {
     /// # Errors
     /// When its file cannot be made or written.
     pub fn begin(&mut self, request: &EpisodeRequest, begin: Stamp) -> Result<(), RecordError> {
-        let path = EpisodePath::create(&request.out, &request.task, self.clock.wall_ns(begin))?;
+        let path = EpisodePath::create(&request.out, &request.task, self.clock.wall_ns(begin), &[])?;
         let partial = path.partial.clone();
         let failed = |source| RecordError::Io { path: partial.clone(), source };
         let sink: Box<dyn Sink> = Box::new(path.file.try_clone().map_err(failed)?);
@@ -63,19 +71,6 @@ impl Stepped {
         Ok(())
     }
 
-    /// Takes a sample, a publication of the mask, or an action.
-    pub fn take(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
-        self.streams.take(self.session.as_mut(), topic, header, payload);
-    }
-
-    /// Takes an event.
-    pub fn event(&mut self, event: &Event) {
-        self.attached.take(event);
-        if let Some(session) = &mut self.session {
-            session.event(event);
-        }
-    }
-
     /// Writes what is due by `now`.
     pub fn advance(&mut self, now: Stamp) {
         if let Some(session) = &mut self.session {
@@ -87,6 +82,19 @@ impl Stepped {
     pub fn finish(&mut self, end: Stamp) -> Option<EpisodeReport> {
         let mut session = self.session.take()?;
         session.end_at(end);
-        Some(session.finish(end, &self.streams.masks, Closing::default()))
+        Some(session.finish(end, &self.streams.masks, None, &[]))
+    }
+}
+
+impl Taker for Stepped {
+    fn take(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
+        self.streams.take(self.session.as_mut(), topic, header, payload);
+    }
+
+    fn event(&mut self, event: &Event) {
+        self.attached.take(event);
+        if let Some(session) = &mut self.session {
+            session.event(event);
+        }
     }
 }

@@ -50,7 +50,7 @@ impl Script {
         self.0.1.notify_all();
     }
 
-    /// A sample of a device that says it lost `lost` ones so far.
+    /// A sample of a device that reports `lost` lost samples so far.
     fn sample_after(&self, lost: u64, bit: u8, epoch: u32, seq: u64, capture: u64, flags: u32) {
         let (encoding, payload) = match bit {
             CAM => (Encoding::Mjpeg, picture(seq)),
@@ -84,7 +84,7 @@ impl Script {
         self.put((TopicId::Mask, header, payload));
     }
 
-    /// What [`Bench::one_second`] tells of.
+    /// The events of [`Bench::one_second`].
     fn one_second(&self, t0: u64) {
         for n in 0..500 {
             let at = t0 + n * 2 * MS;
@@ -153,7 +153,7 @@ fn picture(number: u64) -> Vec<u8> {
     [&[0xff, 0xd8], inside.as_slice(), &[0xff, 0xd9]].concat()
 }
 
-pub(super) fn registry() -> Registry {
+pub(crate) fn registry() -> Registry {
     let mut text = "[rig]\nname = \"bench\"\n".to_owned();
     let cameras = [(CAM, "cam_wrist", "MJPG"), (NEVER, "never", "YUYV"), (RAW, "raw", "GREY")];
     for (bit, name, format) in cameras {
@@ -168,13 +168,13 @@ pub(super) fn registry() -> Registry {
     let _ = write!(
         text,
         "[device.tof]\nvid = \"0001\"\npid = \"{TOF:04x}\"\nnode = \"serial\"\ntopic = \"/rapid/tof\"\nbit = {TOF}\n\
-         [device.tof.serial]\nbaud = 115200\nparse = \"csv\"\nchannels = 2\n"
+         [device.tof.tty]\nbaud = 115200\nparse = \"csv\"\nchannels = 2\n"
     );
     Registry::parse(&text, None).unwrap().registry
 }
 
-pub(super) struct Bench {
-    pub(super) folder: tempfile::TempDir,
+pub(crate) struct Bench {
+    pub(crate) folder: tempfile::TempDir,
     board: Arc<Board>,
     script: Script,
     recorder: Recorder,
@@ -185,7 +185,7 @@ pub(super) struct Bench {
 type AtBegin = Box<dyn FnOnce(Stamp) + Send>;
 
 impl Bench {
-    pub(super) fn new() -> Self {
+    pub(crate) fn new() -> Self {
         Self::with_sink(|file| Box::new(file))
     }
 
@@ -230,7 +230,7 @@ impl Bench {
     }
 
     /// Half a second in which nothing is sent and these events are announced, `before` it begins and within.
-    pub(super) async fn half_a_second(&self, before: Vec<What>, within: Vec<What>) -> PathBuf {
+    pub(crate) async fn half_a_second(&self, before: Vec<What>, within: Vec<What>) -> PathBuf {
         self.mask(0, 1, Stamp::now().0);
         self.script.taken().await;
         for what in before {
@@ -249,7 +249,7 @@ impl Bench {
     /// the mask at first.
     ///
     /// Returns the file's name and `t0`, which lies 1 ms after the beginning of the episode.
-    pub(super) async fn one_second(&self) -> (PathBuf, Stamp) {
+    pub(crate) async fn one_second(&self) -> (PathBuf, Stamp) {
         self.mask(0b11, 1, Stamp::now().0);
         self.script.taken().await;
         let script = self.script.clone();
@@ -275,7 +275,7 @@ impl Bench {
     }
 
     /// Waits until a file has its final name.
-    pub(super) async fn until_file(&self, file: &Path) {
+    pub(crate) async fn until_file(&self, file: &Path) {
         while !file.exists() {
             tokio::time::sleep(Duration::from_millis(5)).await;
         }

@@ -2,12 +2,12 @@
 //!
 //! 1. Each check of a modality has a limit for SUSPECT and one for BAD; the graver one that is
 //!    exceeded counts. An episode is as good as its worst check.
-//! 2. A modality that the mask says was not there is not missed, unless its device was plugged in all
+//! 2. A modality that was absent by the mask is not missed, unless its device was plugged in all
 //!    the same: longer than a limit, or for half the episode and nothing came of it.
 //! 3. Nothing received from a modality that was there: BAD. So is an episode in which nothing at all
 //!    was received: GOOD has at least one sample.
 //! 4. A file that is not whole, or not proven to be as it was written, is SUSPECT; one that the disk did not
-//!    take is BAD. What could not be measured is a [`Finding`] of whoever could not.
+//!    take is BAD. What could not be measured is a finding of whoever could not.
 //! 5. An episode in which another program published on a topic of ours is SUSPECT.
 //! 6. One shorter than [`SHORTEST`] is BAD: that is too short for a demonstration.
 //! 7. One without a sample of a modality that `expect` names is SUSPECT.
@@ -42,9 +42,9 @@ pub(super) struct Judged<'a> {
 pub(super) enum FileState<'a> {
     /// It holds all that was taken.
     Whole,
-    /// Something is missing at its end; the text says why.
+    /// Something is missing at its end; the text is the reason.
     NotWhole(&'a str),
-    /// It could not be written; the text says why.
+    /// It could not be written; the text is the reason.
     Failed(&'a str),
 }
 
@@ -57,48 +57,39 @@ pub(super) enum Losses {
     Together,
 }
 
+/// What of an episode is not in its file, beside samples.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Missing {
+    /// Publications of the mask.
+    pub(super) masks: u64,
+    /// Actions.
+    pub(super) actions: u64,
+    /// Events.
+    pub(super) events: u64,
+}
+
 /// What an episode is judged by.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Facts<'a> {
     /// Its modalities.
     pub(super) modalities: &'a [Judged<'a>],
-    /// Publications of the mask that are not in the file.
-    pub(super) masks_dropped: u64,
-    /// Actions that are not in the file.
-    pub(super) actions_dropped: u64,
+    /// What beside samples is not in the file.
+    pub(super) missing: Missing,
     /// Names of the modalities that every episode has to have.
     pub(super) expect: &'a [String],
-    /// Events that are not in the file.
-    pub(super) events_missed: u64,
     /// Other programs that published on topics of ours.
     pub(super) publishers: &'a [Publisher],
     /// Its length, seconds.
     pub(super) seconds: f64,
-    /// Whether losses are told apart.
+    /// Whether losses are distinguished.
     pub(super) losses: Losses,
     /// Its file.
     pub(super) file: FileState<'a>,
-    /// What else speaks against it.
-    pub(super) findings: &'a [Finding],
+    /// Why else it is SUSPECT, found by something other than the checks here.
+    pub(super) findings: &'a [String],
 }
 
-/// What speaks against an episode and was found by something other than the checks here.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Finding {
-    /// How grave it is.
-    pub(super) grade: Grade,
-    /// A sentence for people.
-    pub(super) reason: String,
-}
-
-impl Finding {
-    /// The finding that something is SUSPECT.
-    pub(super) fn suspect(reason: impl Into<String>) -> Self {
-        Self { grade: Grade::Suspect, reason: reason.into() }
-    }
-}
-
-/// Less than this many expected samples, or less than this long, says nothing about a rate.
+/// Less than this many expected samples, or less than this long, give no rate.
 const LEAST_SAMPLES: f64 = 10.0;
 const LEAST_PRESENCE: f64 = 1.0;
 
@@ -118,14 +109,14 @@ pub(super) fn judge(facts: &Facts<'_>) -> Verdict {
         FileState::NotWhole(why) => found.push((Grade::Suspect, format!("the file is not whole: {why}"))),
         FileState::Failed(why) => found.push((Grade::Bad, format!("the file could not be written: {why}"))),
     }
-    found.extend(facts.findings.iter().map(|finding| (finding.grade, finding.reason.clone())));
+    found.extend(facts.findings.iter().map(|finding| (Grade::Suspect, finding.clone())));
     if is_short(facts.seconds) {
         let limit = seconds(SHORTEST.as_secs_f64());
         found.push((Grade::Bad, format!("too short: {} (limit {limit})", seconds(facts.seconds))));
     }
     for judged in facts.modalities {
         let mut of_it = modality(judged, facts);
-        // What was found says more.
+        // The finding is more exact.
         if of_it.is_empty() && judged.quality.samples == 0 && facts.expect.iter().any(|name| name == judged.name) {
             of_it.push((Grade::Suspect, "took no part, and is expected (expect under [rig])".to_owned()));
         }
@@ -136,9 +127,9 @@ pub(super) fn judge(facts: &Facts<'_>) -> Verdict {
         found.push((Grade::Bad, "nothing was received from any modality".to_owned()));
     }
     let missing = [
-        (facts.actions_dropped, "action is", "actions are"),
-        (facts.masks_dropped, "publication of the mask is", "publications of the mask are"),
-        (facts.events_missed, "event is", "events are"),
+        (facts.missing.actions, "action is", "actions are"),
+        (facts.missing.masks, "publication of the mask is", "publications of the mask are"),
+        (facts.missing.events, "event is", "events are"),
     ];
     for (count, is, are) in missing.into_iter().filter(|(count, ..)| *count > 0) {
         let are = if count == 1 { is } else { are };
@@ -170,7 +161,7 @@ fn modality(judged: &Judged<'_>, facts: &Facts<'_>) -> Vec<(Grade, String)> {
         let silent = silent.then_some((Grade::Bad, text));
         return silent.or_else(|| never_ran(quality, limits, facts.seconds)).into_iter().collect();
     }
-    let expected = quality.samples.saturating_add(quality.lost).saturating_add(quality.dropped);
+    let expected = quality.expected();
     let share = |limit: fn(&Limits) -> Option<f64>, count: u64, what: &str| {
         let (grade, limit) =
             exceeded(limits, |limits| limit(limits).filter(|limit| count as f64 > limit * expected as f64))?;
@@ -191,7 +182,8 @@ fn modality(judged: &Judged<'_>, facts: &Facts<'_>) -> Vec<(Grade, String)> {
         cut => format!("damaged, {cut} of them not whole pictures"),
     };
     let damaged = share(|limits| limits.damaged, quality.damaged, &cut);
-    let duplicate = share(|limits| limits.duplicate, quality.duplicates, "whose number or capture time does not go on");
+    let duplicate =
+        share(|limits| limits.duplicate, quality.duplicates, "with a non-increasing sequence number or capture time");
     let late = quality.lateness.map_or(0.0, |lateness| lateness.max / 1e3);
     let late = format!("too late for their frame, up to {} after capture", seconds(late));
     let late = share(|limits| limits.late, quality.late, &late);
@@ -273,13 +265,13 @@ fn longer(limits: &VerdictSpec, limit: impl Fn(&Limits) -> Option<Duration>, len
     Some((grade, seconds(limit.as_secs_f64())))
 }
 
-/// Is `found` graver than everything that already tells of the same fault?
+/// Is `found` graver than every finding of the same fault so far?
 fn unless<const N: usize>(found: &(Grade, String), others: [&Option<(Grade, String)>; N]) -> bool {
     others.iter().all(|other| other.as_ref().is_none_or(|(grade, _)| *grade < found.0))
 }
 
 fn percent(share: f64) -> String {
-    // Three decimals say more than anybody sets.
+    // Three decimals are more than any limit has.
     format!("{} %", (share * 1e5).round() / 1e3)
 }
 

@@ -1,14 +1,13 @@
 //! The `writeback` thread of an episode: has the kernel bring to the disk what was written, so that a
 //! loss of power takes little of it.
 //!
-//! The writer asks and goes on: a disk that is slow is asked less often, and no sample waits for it.
+//! The writer asks and continues: a disk that is slow is asked less often, and no sample waits for it.
 //!
 //! Invariant: an error of the disk reaches the writer, from [`Writeback::ask`] or [`Writeback::end`]:
-//! the kernel tells each only once.
+//! the kernel reports each only once.
 
 use std::fs::File;
 use std::io;
-use std::os::fd::OwnedFd;
 use std::sync::Arc;
 use std::sync::mpsc::{self, SyncSender, TrySendError};
 use std::thread::JoinHandle;
@@ -24,19 +23,17 @@ pub(super) struct Writeback {
 impl Writeback {
     /// Starts the thread for `file`, whose name is in `folder`; `None` if the system gives none.
     pub(super) fn start(file: Arc<File>, folder: &Folder) -> Option<Self> {
-        let started = folder.descriptor().try_clone().and_then(|folder| Self::of(file, folder));
+        let started = folder.descriptor().try_clone().and_then(|folder| {
+            let mut folder = Some(folder);
+            Self::with(move || {
+                // Once, for the name; not every file system can be asked for that.
+                if let Some(Err(error)) = folder.take().map(rustix::fs::fsync) {
+                    tracing::debug!(%error, "folder not synced");
+                }
+                file.sync_data()
+            })
+        });
         started.map_err(|error| tracing::warn!(%error, "no writeback while recording")).ok()
-    }
-
-    fn of(file: Arc<File>, folder: OwnedFd) -> io::Result<Self> {
-        let mut folder = Some(folder);
-        Self::with(move || {
-            // Once, for the name; not every file system can be asked for that.
-            if let Some(Err(error)) = folder.take().map(rustix::fs::fsync) {
-                tracing::debug!(%error, "folder not synced");
-            }
-            file.sync_data()
-        })
     }
 
     fn with(mut sync: impl FnMut() -> io::Result<()> + Send + 'static) -> io::Result<Self> {
@@ -47,7 +44,7 @@ impl Writeback {
     }
 
     /// Asks for what was written so far; never waits. `None` once the disk has refused:
-    /// [`Self::end`] says what.
+    /// [`Self::end`] returns it.
     pub(super) fn ask(&self) -> Option<()> {
         match self.ask.try_send(()) {
             // It is at work, and will look again.
@@ -73,7 +70,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_disk_that_stands_still_holds_up_nobody() {
+    fn a_blocked_disk_delays_no_caller() {
         let (go_on, wait) = mpsc::channel::<()>();
         let (begun, begins) = mpsc::channel();
         let synced = Arc::new(AtomicU32::new(0));
@@ -99,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_disk_refuses_is_told() {
+    fn errors_of_the_disk_are_reported() {
         let writeback = Writeback::with(|| Err(io::ErrorKind::StorageFull.into())).unwrap();
         while writeback.ask().is_some() {
             std::thread::yield_now();

@@ -3,7 +3,7 @@
 //! ```toml
 //! task = "place block"            # optional: episodes of other tasks do not count
 //! episodes = 20                   # of each configuration, default 10
-//! tag = "finger"                  # the tag that tells the finger, the default
+//! tag = "finger"                  # the tag that names the finger, the default
 //! fingers = ["rigid", "soft"]
 //! modalities = ["vision", "vision+tactile"]
 //! [words]                         # optional: the entries that a word of `modalities` means
@@ -16,8 +16,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use super::diagnostic::RegistryErrors;
-use super::parse::read_file;
-use super::section::{Problems, Section, file_label, read};
+use super::section::{Section, file_label, read, read_file};
 
 /// What is compared.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -63,40 +62,33 @@ impl AblationPlan {
     /// # Errors
     /// All that is wrong with the text.
     pub fn parse(text: &str, path: &Path) -> Result<Self, RegistryErrors> {
-        let mut problems = Problems::new(file_label(Some(path), ""), text);
-        let document = read(text, &mut problems);
-        problems.check()?;
-        let root = Section::new(document.get_ref(), 0, String::new());
-        root.allow(&mut problems, &["task", "episodes", "tag", "fingers", "modalities", "words"]);
-        let task = root.text(&mut problems, "task").map(|task| task.value.to_owned());
+        read(&file_label(Some(path), ""), text, |root| Ok(Self::of(root)))
+    }
+
+    fn of(root: &Section<'_>) -> Self {
+        root.allow(&["task", "episodes", "tag", "fingers", "modalities", "words"]);
+        let task = root.text("task").map(str::to_owned);
         let mut plan = Self { task, ..Self::default() };
-        if let Some(episodes) = root.integer(&mut problems, "episodes", 1..=1_000_000) {
-            plan.episodes = usize::try_from(episodes.value).unwrap_or(plan.episodes);
-        }
-        if let Some(tag) = root.text(&mut problems, "tag") {
-            tag.value.clone_into(&mut plan.tag);
-        }
+        plan.episodes = root.integer("episodes", 1..=1_000_000).unwrap_or(plan.episodes);
+        plan.tag = root.text("tag").map_or(plan.tag, str::to_owned);
         for (key, list) in [("fingers", &mut plan.fingers), ("modalities", &mut plan.modalities)] {
-            if !root.has(key) {
-                root.missing(&mut problems, key, &format!("write {key} = [\"...\", \"...\"]"));
-            }
-            *list = root.texts(&mut problems, key).unwrap_or_default();
-            if root.has(key) && list.is_empty() && problems.is_empty() {
-                root.report(&mut problems, key, format!("{key} is empty"), "name at least one");
+            root.need(key, &format!("write {key} = [\"...\", \"...\"]"));
+            *list = root.texts(key).unwrap_or_default();
+            if root.has(key) && list.is_empty() && root.is_faultless() {
+                root.report(key, format!("{key} is empty"), "name at least one");
             }
             if let Some(twice) = list.iter().enumerate().find(|(at, word)| list.iter().take(*at).any(|w| w == *word)) {
-                root.report(&mut problems, key, format!("{:?} stands twice", twice.1), "remove one");
+                root.report(key, format!("{:?} stands twice", twice.1), "remove one");
             }
         }
-        if let Some(words) = root.table(&mut problems, "words") {
+        if let Some(words) = root.table("words") {
             for (_, word, _) in words.fields() {
-                if let Some(entries) = words.texts(&mut problems, word) {
+                if let Some(entries) = words.texts(word) {
                     plan.words.insert(word.to_owned(), entries);
                 }
             }
         }
-        problems.check()?;
-        Ok(plan)
+        plan
     }
 }
 
@@ -105,7 +97,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_plan_is_read_or_everything_wrong_with_it_is_said() {
+    fn a_plan_parses_or_all_its_errors_are_reported() {
         let path = Path::new("ablation.toml");
         let text = "task = \"t\"\nepisodes = 3\nfingers = [\"rigid\"]\nmodalities = [\"vision\"]\n[words]\nvision = [\"cam\"]\n";
         let plan = AblationPlan::parse(text, path).unwrap();

@@ -5,14 +5,16 @@
 //! Invariant: a serial number, which a device chose, can neither add a line to a file nor match
 //! more than itself; where a format cannot say it, the file says so in a comment.
 
-mod descriptor;
 mod rules;
-mod unit;
 
+use std::collections::BTreeSet;
+use std::fmt::Write as _;
 use std::path::PathBuf;
 
-use super::spec::Registry;
-pub use unit::SYSTEM_REGISTRY;
+use super::spec::{
+    CanAdapter, CanProtocol, CanSpec, DeviceSpec, IdentitySpec, InterlockInput, NodeSpec, Opens, Registry,
+};
+use crate::modality::ModalityKind;
 
 /// First line of every file written here: a file that begins otherwise is not ours to remove.
 pub const HEADER: &str = "# Written by `rapid artifacts` from devices.toml: change that file and run it again.";
@@ -50,14 +52,317 @@ pub fn artifacts(registry: &Registry) -> Vec<Artifact> {
     let artifact = |path: PathBuf, contents, kind| Artifact { path, contents, mode: 0o644, kind };
     let mut all = vec![
         artifact("99-rapid.rules".into(), rules::rules(registry), ArtifactKind::Rules),
-        artifact("rapid.service".into(), unit::unit(registry), ArtifactKind::Unit),
+        artifact("rapid.service".into(), unit(registry), ArtifactKind::Unit),
     ];
     for device in &registry.devices {
         let path = PathBuf::from(DESCRIPTORS).join(format!("{}.yaml", device.name));
         let stable_path = rules::identify(registry, device).ok().map(|_| format!("/dev/rapid/{}", device.name));
-        all.push(artifact(path, descriptor::descriptor(device, stable_path.as_deref()), ArtifactKind::Descriptor));
+        all.push(artifact(path, descriptor(device, stable_path.as_deref()), ArtifactKind::Descriptor));
     }
     all
+}
+
+/// `descriptors/<name>.yaml`: what a module is, for people and for other programs (paper, appendix "Module Catalog":
+/// module, slot, sensors, bring-up). The descriptor of one entry; `stable_path` is the name the rules give it, if they can.
+fn descriptor(device: &DeviceSpec, stable_path: Option<&str>) -> String {
+    let slot = device.mount.map_or_else(|| "null".to_owned(), |mount| quoted(&mount.to_string()));
+    format!(
+        "{HEADER}\n\
+         module: {}\n\
+         slot: {slot}\n\
+         sensors:\n{}\
+         bring_up: \"{}\"\n\
+         {}\
+         path: {}\n\
+         topic: {}\n\
+         bit: {}\n",
+        quoted(&device.name),
+        sensor(&device.node),
+        if device.identity.usb().is_some() { "usb" } else { "lan" },
+        identity(&device.identity),
+        optional(stable_path),
+        quoted(&device.topic),
+        device.id,
+    )
+}
+
+fn optional(text: Option<&str>) -> String {
+    text.map_or_else(|| "null".to_owned(), quoted)
+}
+
+fn identity(identity: &IdentitySpec) -> String {
+    let Some(usb) = identity.usb() else { return "identity: null\n".to_owned() };
+    format!(
+        "identity:\n  vid: \"{:04x}\"\n  pid: \"{:04x}\"\n  serial: {}\n  port: {}\n",
+        usb.vid,
+        usb.pid,
+        optional(usb.serial.as_deref()),
+        optional(usb.port.as_deref()),
+    )
+}
+
+fn sensor(node: &NodeSpec) -> String {
+    let kind = node.kind();
+    match node {
+        NodeSpec::Camera(camera) => format!(
+            "  - kind: \"{kind}\"\n    width: {}\n    height: {}\n    fps: {}\n    format: \"{}\"\n",
+            camera.width, camera.height, camera.fps, camera.format
+        ),
+        NodeSpec::Serial(serial) => format!(
+            "  - kind: \"{kind}\"\n    baud: {}\n    framing: \"{}\"\n    parse: \"{}\"\n    channels: {}\n",
+            serial.baud, serial.framing, serial.parse, serial.channels
+        ),
+        NodeSpec::Can(can) => {
+            format!("  - kind: \"{kind}\"\n    adapter: \"{}\"\n    bitrate: {}\n", can.adapter, can.bitrate)
+        }
+        NodeSpec::Lan(lan) => format!("  - kind: \"{kind}\"\n    format: {}\n", quoted(&lan.format())),
+        NodeSpec::Process(process) => {
+            let program = process.program.file_name().unwrap_or_default().to_string_lossy();
+            let shape = match (process.kind, process.shape.as_slice()) {
+                (ModalityKind::Image, [height, width]) => format!("    width: {width}\n    height: {height}\n"),
+                (ModalityKind::Scalars, [channels]) => format!("    channels: {channels}\n"),
+                _ => String::new(),
+            };
+            format!("  - kind: \"{kind}\"\n    program: {}\n{shape}", quoted(&program))
+        }
+    }
+}
+
+/// A YAML double-quoted scalar (YAML 1.2.2 section 7.3.1), in ASCII: readers disagree about line
+/// separators and non-characters.
+fn quoted(text: &str) -> String {
+    let mut quoted = String::with_capacity(text.len() + 2);
+    quoted.push('"');
+    for c in text.chars() {
+        // Writing to a String cannot fail.
+        let _ = match (c, u32::from(c)) {
+            ('"' | '\\', _) => write!(quoted, "\\{c}"),
+            (' '..='~', _) => write!(quoted, "{c}"),
+            (_, code @ 0..=0xffff) => write!(quoted, "\\u{code:04x}"),
+            (_, code) => write!(quoted, "\\U{code:08x}"),
+        };
+    }
+    quoted.push('"');
+    quoted
+}
+
+/// Where the unit expects the registry.
+pub const SYSTEM_REGISTRY: &str = "/etc/rapid/devices.toml";
+
+/// Device nodes: the group that may open them, that of our rules or of udev's own, and what /proc/devices calls them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+struct Nodes {
+    group: &'static str,
+    kind: &'static str,
+}
+
+/// A program opens the USB device itself.
+const USB: Nodes = Nodes { group: "plugdev", kind: "char-usb_device" };
+/// A stop is a key.
+const KEYS: Nodes = Nodes { group: "input", kind: "char-input" };
+/// A stop, or the brake of a joint, is a line of a GPIO chip.
+const GPIO: Nodes = Nodes { group: "gpio", kind: "char-gpiochip" };
+
+/// What the entries of a registry need of the system.
+#[derive(Debug, Default)]
+struct Needs {
+    /// Kinds of sockets, besides those of udev, the journal and programs. A CAN adapter on a serial line has none.
+    sockets: BTreeSet<&'static str>,
+    /// Nodes that only some registries need.
+    nodes: BTreeSet<Nodes>,
+    /// Programs of others run: nodes and hooks.
+    programs: bool,
+    /// Motors have a guard, which outlives the program.
+    guard: bool,
+    /// A stop is on a serial port of the board.
+    uarts: bool,
+}
+
+impl Needs {
+    fn of(registry: &Registry) -> Self {
+        let mut needs = Self::default();
+        for device in &registry.devices {
+            if let NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(motors), .. }) = &device.node {
+                needs.guard = true;
+                if motors.motors.iter().any(|motor| motor.brake.is_some()) {
+                    needs.nodes.insert(GPIO);
+                }
+            }
+            match &device.node {
+                NodeSpec::Can(can) if can.adapter == CanAdapter::SocketCan => {
+                    needs.sockets.insert("AF_CAN");
+                }
+                NodeSpec::Lan(lan) => {
+                    let families = ["AF_INET", "AF_INET6"].into_iter().zip(lan.find.families());
+                    needs.sockets.extend(families.filter(|(_, is_needed)| *is_needed).map(|(family, _)| family));
+                }
+                NodeSpec::Process(process) => {
+                    needs.programs = true;
+                    if process.opens == Opens::Usb {
+                        needs.nodes.insert(USB);
+                    }
+                }
+                NodeSpec::Can(_) | NodeSpec::Camera(_) | NodeSpec::Serial(_) => {}
+            }
+            needs.programs |= !device.hooks.is_empty();
+        }
+        for stop in &registry.stops {
+            match &stop.input {
+                InterlockInput::Key(_) => _ = needs.nodes.insert(KEYS),
+                InterlockInput::Gpio(_) => _ = needs.nodes.insert(GPIO),
+                // Those on USB are allowed to every unit.
+                InterlockInput::Serial(line) => needs.uarts |= !line.path.starts_with("/dev/serial"),
+                InterlockInput::Field(_) => {}
+            }
+        }
+        needs
+    }
+
+    /// Of nodes that only some registries need: commands that make their groups, the groups, and what is allowed.
+    fn nodes(&self) -> (String, String, String) {
+        let (mut make, mut groups, mut allow) = (String::new(), String::new(), String::new());
+        for Nodes { group, kind } in &self.nodes {
+            make += &["#   groupadd --system --force ", group, "\n"].concat();
+            groups += &[" ", group].concat();
+            allow += &["DeviceAllow=", kind, " rw\n"].concat();
+        }
+        if self.uarts {
+            allow += UARTS;
+        }
+        (make, groups, allow)
+    }
+
+    /// `RestrictAddressFamilies=`: udev speaks netlink, the journal and programs `AF_UNIX`.
+    fn families(&self) -> String {
+        let all = ["AF_UNIX", "AF_NETLINK"].into_iter().chain(self.sockets.iter().copied());
+        all.collect::<Vec<_>>().join(" ")
+    }
+
+    /// Settings that only some registries permit, a line each.
+    fn only_without(&self) -> String {
+        let network = if self.sockets.iter().any(|family| family.starts_with("AF_INET")) { "" } else { NO_NETWORK };
+        let programs = if self.programs { PROGRAMS } else { "MemoryDenyWriteExecute=yes\n" };
+        format!("{network}{programs}")
+    }
+}
+
+/// Of a unit with a stop on a serial port of the board.
+const UARTS: &str = "DeviceAllow=char-ttyS rw\nDeviceAllow=char-ttyAMA rw\n";
+
+/// Of a unit without sockets for the network.
+const NO_NETWORK: &str = "IPAddressDeny=any\n";
+
+/// Of a unit with motors.
+const GUARDED: &str = "\
+# Motors have a guard: a process of its own that stops them if rapid is killed. It ends by itself.
+KillMode=process
+# What keeps the beat of the motors is not to wait for a disk because memory is short.
+LimitMEMLOCK=infinity
+";
+
+/// What whoever has programs of their own should know.
+const PROGRAMS: &str = "\
+# Programs run under these settings as well. One that needs the network gets it from `systemctl edit rapid`:
+#   [Service]
+#   RestrictAddressFamilies=AF_INET AF_INET6
+#   IPAddressAllow=any
+";
+
+/// `rapid.service`: records without a screen from boot to shutdown.
+///
+/// Invariant: the service may do what the entries of its registry need, and no more: kinds of sockets, device nodes
+/// and groups follow from them. `systemd-analyze security` gives every unit 2.0 or better (a test, on every kind of
+/// registry).
+///
+/// What the unit deliberately leaves out, as settings are named in systemd.exec(5):
+///
+/// * `PrivateTmp`, `PrivateNetwork`, `PrivateDevices`: subscribers find the bus through `/tmp` and `/dev/shm`, udev
+///   reports through a netlink socket of the machine's network, and devices are what the program is for.
+/// * `RemoveIPC`: it would remove from `/dev/shm` what the bus shares with subscribers of the same user, and leave
+///   the other half in `/tmp`.
+/// * `ProcSubset`: who holds the mask is in `/proc/locks`, routes are in `/proc/net`, the boot's id and the machine's
+///   name are in `/proc/sys`.
+/// * `RestrictRealtime`: the thread that publishes the mask runs with real-time priority.
+///
+/// The unit. The rig's name is the only thing taken from the registry; its characters are letters,
+/// digits, `-`, `_` and `.`, none of which systemd interprets.
+fn unit(registry: &Registry) -> String {
+    let rig = &registry.rig.name;
+    let needs = Needs::of(registry);
+    let (families, only_without, kill_mode) =
+        (needs.families(), needs.only_without(), if needs.guard { GUARDED } else { "KillMode=mixed\n" });
+    let (make_group, group, allow) = needs.nodes();
+    let groups = format!("video dialout{group}");
+    let listed = groups.replace(' ', ",");
+    let touched =
+        if needs.nodes.contains(&USB) { "cameras, serial lines, USB devices" } else { "cameras, serial lines" };
+    format!(
+        r"{HEADER}
+# Before the first start:
+{make_group}#   useradd --system --user-group --no-create-home --groups {listed} rapid
+#   install -D -m 644 devices.toml {SYSTEM_REGISTRY}
+# The recordings, in /var/lib/rapid, are readable for the group of that user. To be in it from the next login on:
+#   usermod --append --groups rapid YOUR_NAME
+[Unit]
+Description=rapid: sensors and recording of rig {rig}
+Documentation=man:udev(7)
+After=systemd-udevd.service local-fs.target time-sync.target
+ConditionPathExists={SYSTEM_REGISTRY}
+
+[Service]
+Type=exec
+ExecStart=/usr/local/bin/rapid --headless --record --config {SYSTEM_REGISTRY} --out /var/lib/rapid
+User=rapid
+SupplementaryGroups={groups}
+StateDirectory=rapid
+StateDirectoryMode=0750
+UMask=0027
+# SIGINT ends the episode in progress and closes its file; that takes one fsync.
+KillSignal=SIGINT
+{kill_mode}TimeoutStopSec=30
+# An episode that is BAD is no failure of the service.
+SuccessExitStatus=4
+Restart=on-failure
+RestartSec=2
+# A rapid that hangs is killed, and started again.
+WatchdogSec=20
+# The thread `mask` asks for real-time scheduling.
+LimitRTPRIO=80
+
+# What it may touch: {touched}, its recordings, and the bus that other programs
+# subscribe to in /tmp and /dev/shm (which is why /tmp is not private).
+DevicePolicy=closed
+DeviceAllow=char-video4linux rw
+DeviceAllow=char-ttyACM rw
+DeviceAllow=char-ttyUSB rw
+{allow}ReadWritePaths=/tmp /dev/shm
+ProtectSystem=strict
+ProtectHome=yes
+ProtectClock=yes
+ProtectKernelModules=yes
+ProtectKernelTunables=yes
+ProtectKernelLogs=yes
+ProtectControlGroups=yes
+ProtectHostname=yes
+ProtectProc=invisible
+PrivateMounts=yes
+PrivateUsers=yes
+NoNewPrivileges=yes
+CapabilityBoundingSet=
+RestrictNamespaces=yes
+RestrictSUIDSGID=yes
+LockPersonality=yes
+SystemCallArchitectures=native
+SystemCallFilter=@system-service
+SystemCallFilter=~@privileged @keyring
+SystemCallErrorNumber=EPERM
+# The kinds of sockets that the devices of the registry need; AF_NETLINK is for udev.
+RestrictAddressFamilies={families}
+{only_without}
+[Install]
+WantedBy=multi-user.target
+"
+    )
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! What is wrong in a file a person wrote, said so that the person can mend it.
+//! Mistakes in a file that a person wrote, worded so that the person can fix them.
 //!
 //! Invariant: text taken from the file is shown escaped: no file can send control characters to a
 //! terminal.
@@ -79,7 +79,9 @@ pub(super) fn nearest<'k>(given: &str, known: impl IntoIterator<Item = &'k str>)
 }
 
 /// The fix for a name that is not known: the nearest one, or all there are.
-pub(crate) fn did_you_mean(given: &str, known: &[&str], what: &str) -> String {
+pub(crate) fn did_you_mean<S: AsRef<str>>(given: &str, known: impl IntoIterator<Item = S>, what: &str) -> String {
+    let known: Vec<S> = known.into_iter().collect();
+    let known: Vec<&str> = known.iter().map(AsRef::as_ref).collect();
     match nearest(given, known.iter().copied()) {
         Some(name) => format!("did you mean \"{name}\"?"),
         None => format!("{what}: {}", known.join(", ")),

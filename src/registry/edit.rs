@@ -3,7 +3,7 @@
 //!
 //! Pure: from one text to the next; who writes the file parses it first.
 //!
-//! Invariant: every byte of the old text is in the new one, but for those of an entry taken out.
+//! Invariant: every byte of the old text is in the new one, but for those of an entry taken out and of a key renamed.
 //! Invariant: a value, which a device may have chosen, is written as the TOML text that means it, and
 //! a comment is one line.
 
@@ -156,18 +156,33 @@ pub fn remove(text: &str, name: &str) -> Result<String, EditError> {
     // The empty line that parted it from what was above.
     if rest.is_empty() {
         let end = new.trim_end_matches(['\n', '\r']).len();
-        new.replace_range(
-            end..,
-            if end == 0 {
-                ""
-            } else if text.contains("\r\n") {
-                "\r\n"
-            } else {
-                "\n"
-            },
-        );
+        new.truncate(end);
+        if end > 0 {
+            new.push_str(if text.contains("\r\n") { "\r\n" } else { "\n" });
+        }
     }
     Ok(new)
+}
+
+/// `text` with each table of a serial line that has its old name, `[device.NAME.serial]`, under the present one,
+/// `[device.NAME.tty]`; one that is written as dotted keys stays, and so does a text that is no TOML.
+#[must_use]
+pub fn renamed(text: &str) -> String {
+    let Ok(document) = Document::parse(text) else { return text.to_owned() };
+    let devices = document.as_table().get("device").and_then(Item::as_table_like);
+    let table = |device: &Item| {
+        let device = device.as_table_like()?;
+        let (key, item) = device.get_key_value("serial")?;
+        let is_dotted = item.as_table().is_some_and(Table::is_dotted);
+        if is_dotted || !item.is_table_like() || device.contains_key("tty") { None } else { key.span() }
+    };
+    let mut keys: Vec<_> = devices.into_iter().flat_map(|all| all.iter()).filter_map(|(_, item)| table(item)).collect();
+    keys.sort_by_key(|key| std::cmp::Reverse(key.start));
+    let mut new = text.to_owned();
+    for key in keys {
+        new.replace_range(key, "tty");
+    }
+    new
 }
 
 /// Does `text` name no device yet? False of a text that is no TOML.

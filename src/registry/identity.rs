@@ -1,6 +1,6 @@
 //! Which attached device is which entry of the registry.
 //!
-//! Pure: told what is attached and detached, says which modality begins and which ends.
+//! Pure: from what is attached and detached to the modality that begins or ends.
 //!
 //! 1. A unit with the vid, pid and serial number of an entry belongs to that entry alone.
 //! 2. Otherwise a unit at the port of an entry that has a port and no serial number belongs to it.
@@ -16,15 +16,13 @@
 //! Invariant: two units never collapse into one entry, and one unit (one port) never takes two
 //! entries of one kind.
 
-mod entry;
-
 use std::collections::VecDeque;
 use std::path::Path;
 
 use super::attachment::{Attachment, DeviceNode, Unit, UsbIdentity};
-use super::spec::Registry;
+use super::scenario::{SimSource, TaskPart};
+use super::spec::{DeviceSpec, IdentitySpec, NodeSpec, Opens, Registry};
 use crate::modality::ModalityId;
-use entry::{Entry, Kind, Rule, rule};
 
 /// What an attached node is to the rig.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -104,7 +102,7 @@ impl Assigner {
             .any(|node| node.attachment.syspath == attachment.syspath && node.attachment.unit != attachment.unit)
     }
 
-    /// A node is there. Told twice of the same node, says the same.
+    /// A node is there. Reported twice, the same node gives the same answer.
     pub fn attach(&mut self, attachment: &Attachment) -> Assignment {
         let known = self.attached.iter().position(|node| node.attachment.syspath == attachment.syspath);
         if let Some(node) = known.and_then(|index| self.attached.get_mut(index)) {
@@ -169,7 +167,8 @@ impl Assigner {
         let fitting = self.fitting(attachment);
         let Some((rule, best)) = fitting.first() else { return self.refuse(attachment) };
         if let Some(other) = self.other_node(attachment) {
-            let name = self.name(other.assigned);
+            let name =
+                self.entries.iter().find(|entry| Some(entry.id) == other.assigned).map_or("", |entry| &entry.name);
             let reason = format!("[device.{name}] already reads another node of this device");
             return Assignment::WrongNode { reason };
         }
@@ -191,11 +190,13 @@ impl Assigner {
         match chosen {
             Some(id) => Assignment::Entry(id),
             None if *rule == Rule::Model => {
-                Assignment::Waiting { reason: format!("every entry of this model is taken ({})", names(&fitting)) }
+                let names: Vec<_> = fitting.iter().map(|(_, entry)| entry.name.as_str()).collect();
+                Assignment::Waiting { reason: format!("every entry of this model is taken ({})", names.join(", ")) }
             }
-            None => Assignment::Waiting {
-                reason: format!("[device.{}] is taken by a unit at port {}", best.name, self.port_of(best.id)),
-            },
+            None => {
+                let port = self.attached_as(best.id).map(|node| format!("{:?}", node.unit.place())).unwrap_or_default();
+                Assignment::Waiting { reason: format!("[device.{}] is taken by a unit at port {port}", best.name) }
+            }
         }
     }
 
@@ -226,13 +227,13 @@ impl Assigner {
     fn refuse(&self, attachment: &Attachment) -> Assignment {
         let entry = self.entries.iter().find(|entry| rule(entry, &attachment.unit).is_some());
         // Hubs and keyboards are USB devices too: only one that an entry nearly means is worth a word.
-        let nearly = |entry: &Entry| entry.kind == Kind::Usb && entry.is_model(&attachment.unit);
+        let nearly = |entry: &Entry| entry.opens == Some(Opens::Usb) && entry.is_model(&attachment.unit);
         if entry.is_none() && matches!(attachment.node, DeviceNode::Usb(_)) && !self.entries.iter().any(nearly) {
             return Assignment::WrongNode { reason: format!("no entry reads {}", attachment.node.label()) };
         }
         if let Some(entry) = entry {
             let label = attachment.node.label();
-            let reason = format!("[device.{}] reads its {}, not {label}", entry.name, entry.kind.label());
+            let reason = format!("[device.{}] reads its {}, not {label}", entry.name, entry.label());
             return Assignment::WrongNode { reason };
         }
         Assignment::Unregistered { reason: self.near_misses(attachment).join("; ") }
@@ -258,7 +259,7 @@ impl Assigner {
                             usb.port
                         )
                     }
-                    _ => format!("it is [device.{name}], which reads its {}", entry.kind.label()),
+                    _ => format!("it is [device.{name}], which reads its {}", entry.label()),
                 }
             })
             .collect();
@@ -275,7 +276,7 @@ impl Assigner {
             let found = self.remembered.iter().rev().filter(|(past, _)| model(past) && same(past));
             found.map(|(_, id)| *id).collect()
         };
-        // Cheap devices share one serial number: the port tells twins apart.
+        // Cheap devices share one serial number: the port distinguishes twins.
         let mut ids = newest(&|past| past.serial == usb.serial && past.port == usb.port);
         if usb.serial.is_some() {
             ids.extend(newest(&|past| past.serial == usb.serial));
@@ -309,18 +310,96 @@ impl Assigner {
         }
         begun
     }
+}
 
-    fn name(&self, id: Option<ModalityId>) -> &str {
-        self.entries.iter().find(|entry| Some(entry.id) == id).map_or("", |entry| entry.name.as_str())
+#[derive(Debug, Clone)]
+struct Entry {
+    id: ModalityId,
+    name: String,
+    identity: IdentitySpec,
+    /// The node of its device that it reads; `None` is an address on the network.
+    opens: Option<Opens>,
+    /// A program reads it.
+    is_process: bool,
+}
+
+/// The rule of the module above by which a unit fits an entry.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Rule {
+    Serial,
+    Port,
+    Lan,
+    Model,
+}
+
+impl Entry {
+    fn new(device: &DeviceSpec) -> Self {
+        let opens = match &device.node {
+            NodeSpec::Lan(_) if device.identity.usb().is_none() => None,
+            node => Some(node.opens()),
+        };
+        let is_process = matches!(device.node, NodeSpec::Process(_));
+        Self { id: device.id, name: device.name.clone(), identity: device.identity.clone(), opens, is_process }
     }
 
-    fn port_of(&self, id: ModalityId) -> String {
-        self.attached_as(id).map_or_else(String::new, |node| format!("{:?}", node.unit.place()))
+    const fn label(&self) -> &'static str {
+        match self.opens {
+            Some(Opens::Video) => "camera",
+            Some(Opens::Tty) => "serial line",
+            Some(Opens::Usb) => "USB device",
+            Some(Opens::Net) => "network interface",
+            None => "network address",
+        }
+    }
+
+    /// Of the model of this unit?
+    fn is_model(&self, unit: &Unit) -> bool {
+        let (Some(wished), Some(usb)) = (self.identity.usb(), unit.usb()) else { return false };
+        (wished.vid, wished.pid) == (usb.vid, usb.pid)
+    }
+
+    fn reads(&self, node: &DeviceNode) -> bool {
+        match node {
+            DeviceNode::Video(_) => self.opens == Some(Opens::Video),
+            DeviceNode::Tty(_) => self.opens == Some(Opens::Tty),
+            DeviceNode::Usb(_) => self.opens == Some(Opens::Usb),
+            DeviceNode::Net(_) => self.opens == Some(Opens::Net),
+            DeviceNode::Lan { .. } => self.opens.is_none(),
+            DeviceNode::Sim(device) => match device.source {
+                // What stands for a device that has neither a picture's node nor a line sends as if it had.
+                SimSource::Camera { .. } | SimSource::Serial { .. }
+                    if matches!(self.opens, None | Some(Opens::Net)) =>
+                {
+                    !self.is_process
+                }
+                SimSource::Camera { .. } | SimSource::Task { part: TaskPart::Wrist | TaskPart::Tactile, .. } => {
+                    self.opens == Some(Opens::Video) && !self.is_process
+                }
+                SimSource::Serial { .. } | SimSource::Task { part: TaskPart::Arm, .. } => {
+                    self.opens == Some(Opens::Tty) && !self.is_process
+                }
+                SimSource::Process => self.is_process,
+                // A recorded topic stands for whatever recorded it.
+                SimSource::Replay { .. } => true,
+            },
+        }
     }
 }
 
-fn names(fitting: &[(Rule, &Entry)]) -> String {
-    fitting.iter().map(|(_, entry)| entry.name.as_str()).collect::<Vec<_>>().join(", ")
+fn rule(entry: &Entry, unit: &Unit) -> Option<Rule> {
+    let (wished, usb) = match (&entry.identity, unit) {
+        (IdentitySpec::Usb(wished), Unit::Usb(usb)) => (wished, usb),
+        (IdentitySpec::Lan {}, Unit::Lan(lan)) => return (lan.entry == entry.name).then_some(Rule::Lan),
+        _ => return None,
+    };
+    if (wished.vid, wished.pid) != (usb.vid, usb.pid) {
+        return None;
+    }
+    match (&wished.serial, &wished.port) {
+        (Some(serial), _) => (usb.serial.as_ref() == Some(serial)).then_some(Rule::Serial),
+        (None, Some(port)) => (usb.port == *port).then_some(Rule::Port),
+        (None, None) => Some(Rule::Model),
+    }
 }
 
 #[cfg(test)]

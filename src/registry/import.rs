@@ -10,10 +10,8 @@
 use std::path::Path;
 
 use super::diagnostic::RegistryErrors;
-use super::section::{Problems, Section, file_label, read};
-
-/// Commands that `rapid_driver` would run, by their keys.
-const COMMANDS: [&str; 4] = ["on_attach", "on_detach", "on_record_start", "on_record_stop"];
+use super::section::{Section, file_label, read};
+use super::spec::Hooks;
 
 /// A `[[device]]` of `rapid_driver`.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
@@ -36,26 +34,23 @@ pub struct Foreign {
 /// All that is wrong with the text.
 pub fn devices(text: &str, path: &Path) -> Result<Vec<Foreign>, RegistryErrors> {
     let label = file_label(Some(path), "");
-    let mut problems = Problems::new(label.clone(), text);
-    let document = read(text, &mut problems);
-    problems.check()?;
-    let root = Section::new(document.get_ref(), 0, String::new());
-    if root.is_table("device") {
-        let fix = "it has [device.NAME] tables, as a devices.toml of rapid: use it with --config";
-        return Err(RegistryErrors::whole_file(label, "this is no registry of rapid_driver", fix));
-    }
-    let found = root.tables(&mut problems, "device").iter().map(|section| device(section, &mut problems)).collect();
-    problems.check()?;
-    if !root.has("device") {
-        let fix = "it lists devices as [[device]]; its usual place is ~/.config/rapid_driver/registry.toml";
-        return Err(RegistryErrors::whole_file(label, "no [[device]] in it", fix));
-    }
-    Ok(found)
+    read(&label, text, |root| {
+        let wrong = |message: &str, fix: &str| Err(RegistryErrors::whole_file(label.clone(), message, fix));
+        if root.is_table("device") {
+            let fix = "it has [device.NAME] tables, as a devices.toml of rapid: use it with --config";
+            return wrong("this is no registry of rapid_driver", fix);
+        }
+        if !root.has("device") {
+            let fix = "it lists devices as [[device]]; its usual place is ~/.config/rapid_driver/registry.toml";
+            return wrong("no [[device]] in it", fix);
+        }
+        Ok(root.tables("device").unwrap_or_default().iter().map(device).collect())
+    })
 }
 
-fn device(section: &Section<'_>, problems: &mut Problems<'_>) -> Foreign {
-    let mut text = |key: &str| {
-        let value = section.text(problems, key).map(|text| text.value.to_owned());
+fn device(section: &Section<'_>) -> Foreign {
+    let text = |key: &str| {
+        let value = section.text(key).map(str::to_owned);
         value.filter(|text| !text.is_empty())
     };
     let backend = text("backend");
@@ -63,33 +58,31 @@ fn device(section: &Section<'_>, problems: &mut Problems<'_>) -> Foreign {
         name: text("name").unwrap_or_default(),
         serial: text("serial"),
         service: text("service_type"),
-        commands: COMMANDS.iter().filter_map(|key| Some((*key, text(key)?))).collect(),
+        commands: Hooks::KEYS.into_iter().filter_map(|key| Some((key, text(key)?))).collect(),
         usb: None,
     };
     let has_ids = text("vid").is_some() || text("pid").is_some();
     if found.name.is_empty() {
-        section.missing(problems, "name", "write name = \"...\"");
+        section.missing("name", "write name = \"...\"");
     }
     match backend.as_deref() {
         None | Some("usb") => {
             found.service = None;
             for key in ["vid", "pid"] {
-                if !section.has(key) {
-                    section.missing(problems, key, "write the four hexadecimal digits that lsusb shows");
-                }
+                section.need(key, "write the four hexadecimal digits that lsusb shows");
             }
             if has_ids {
-                let ids = (section.usb_id(problems, "vid"), section.usb_id(problems, "pid"));
+                let ids = (section.usb_id("vid"), section.usb_id("pid"));
                 found.usb = ids.0.zip(ids.1);
             }
         }
         Some("mdns") if found.service.is_none() => {
-            section.missing(problems, "service_type", "write service_type = \"_name._tcp\"");
+            section.missing("service_type", "write service_type = \"_name._tcp\"");
         }
         Some("mdns") => {}
         Some(other) => {
             let message = format!("unknown backend {other:?}");
-            section.report(problems, "backend", message, "write \"usb\" or \"mdns\"");
+            section.report("backend", message, "write \"usb\" or \"mdns\"");
         }
     }
     found
@@ -101,17 +94,13 @@ fn device(section: &Section<'_>, problems: &mut Problems<'_>) -> Foreign {
 /// All that is wrong with the text.
 pub fn layout(text: &str, path: &Path) -> Result<Vec<String>, RegistryErrors> {
     let label = file_label(Some(path), "");
-    let mut problems = Problems::new(label.clone(), text);
-    let document = read(text, &mut problems);
-    problems.check()?;
-    let root = Section::new(document.get_ref(), 0, String::new());
-    if !root.has("device_order") {
-        let fix = "it has device_order = [\"name of bit 0\", \"name of bit 1\", ...]";
-        return Err(RegistryErrors::whole_file(label, "no device_order in it", fix));
-    }
-    let order = root.texts(&mut problems, "device_order");
-    problems.check()?;
-    Ok(order.unwrap_or_default())
+    read(&label, text, |root| {
+        if !root.has("device_order") {
+            let fix = "it has device_order = [\"name of bit 0\", \"name of bit 1\", ...]";
+            return Err(RegistryErrors::whole_file(label.clone(), "no device_order in it", fix));
+        }
+        Ok(root.texts("device_order").unwrap_or_default())
+    })
 }
 
 #[cfg(test)]

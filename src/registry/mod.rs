@@ -11,7 +11,6 @@ mod diagnostic;
 pub mod edit;
 mod identity;
 pub mod import;
-mod limits;
 mod parse;
 pub mod scenario;
 mod scenario_file;
@@ -20,19 +19,18 @@ mod spec;
 pub mod task;
 pub mod trust;
 pub mod units;
-mod words;
 
 pub use attachment::{Attachment, DeviceNode, Heard, LanIdentity, Unit, UsbIdentity};
 pub(crate) use diagnostic::did_you_mean;
 pub use diagnostic::{Diagnostic, RegistryErrors};
 pub use identity::{Assigner, Assignment, Detached, Explanation};
-pub use limits::{Limits, VerdictSpec};
-pub use parse::{BUILTIN, Loaded, like_a_name, name_problem, read_file};
+pub use parse::{BUILTIN, Loaded, like_a_name, name_problem};
+pub use section::read_file;
 pub use spec::{
     ActionSpec, Bound, BrakeSpec, CAN_BATCH, CAN_RECORD, CAN_RESTART_MS, CameraSpec, CanAdapter, CanProtocol, CanSpec,
     DamiaoSpec, DeviceSpec, FieldInput, Framing, GpioInput, Hook, Hooks, IdentitySpec, InterlockInput, InterlockSpec,
-    KeyInput, LanFind, LanPicture, LanProtocol, LanSpec, LineInput, MAX_BORROWED, MAX_MOTORS, MAX_SUBSCRIBERS,
+    KeyInput, LanFind, LanPicture, LanProtocol, LanSpec, Limits, LineInput, MAX_BORROWED, MAX_MOTORS, MAX_SUBSCRIBERS,
     MOTOR_CHANNELS, ModuleError, ModuleSpec, MotionSpec, MotorKind, MotorMode, MotorSpec, Mount, NodeSpec, Opens,
     POOL_SPARE, Parse, PhoneStream, PixelFormat, Probe, ProcessSpec, Registry, RigSpec, SLCAN_BITRATES, SerialSpec,
-    Stop, StopSpec, UsbSpec, WatchSpec, WhenStale, mounted, own_side,
+    Stop, StopSpec, UsbSpec, VerdictSpec, WatchSpec, WhenStale, mounted, own_side,
 };

@@ -1,44 +1,35 @@
 //! From the text of `devices.toml` to a [`Registry`], or to everything that is wrong with it.
 //!
 //! Text -> [`toml::de::DeTable`] -> one draft an entry (`device`) -> checks between entries
-//! (here) -> depths within the memory budget (`budget`).
+//! (here) -> depths within the memory budget, and whether the window around each tick fits the rates (here).
 //!
 //! Invariant: no text makes this panic.
 //! Invariant: all problems of a file are reported at once, each with its place and a fix.
 
-mod action;
-mod budget;
-mod can;
 mod device;
-mod file;
-mod hooks;
 mod identity;
 mod interlock;
 mod lan;
-mod module;
 mod motors;
-mod name;
 mod node;
-mod process;
 mod program;
 mod verdict;
-mod window;
 
 use std::path::Path;
 use std::time::Duration;
 
 use super::diagnostic::{Diagnostic, RegistryErrors, did_you_mean};
-use super::section::{At, Problems, Section, file_label, read};
-use super::spec::{IdentitySpec, NodeSpec, Registry, RigSpec};
+use super::section::{Section, file_label, read, read_file};
+use super::spec::{DeviceSpec, IdentitySpec, NodeSpec, POOL_SPARE, RESERVED_BYTES, Registry, RigSpec, SAMPLE_OVERHEAD};
 use super::trust::distrust;
+use super::units::{show_duration, show_size};
 use crate::modality::{MAX_MODALITIES, ModalityId};
 use device::Draft;
 use program::Programs;
 use verdict::Whose;
 
-pub use file::read_file;
 pub(super) use identity::is_port;
-pub use name::{like_a_name, name_problem};
+pub use identity::{like_a_name, name_problem};
 
 /// The registry used when there is no file: the rig `rapid --sim` simulates.
 pub const BUILTIN: &str = include_str!("../../devices.toml");
@@ -83,42 +74,12 @@ impl Registry {
     /// All that is wrong with the text.
     pub fn parse(text: &str, path: Option<&Path>) -> Result<Loaded, RegistryErrors> {
         let file = file_label(path, "devices.toml");
-        let mut problems = Problems::new(file.clone(), text);
-        let document = read(text, &mut problems);
-        problems.check()?;
-        let root = Section::new(document.get_ref(), 0, String::new());
-        root.allow(&mut problems, &["rig", "verdict", "device", "module", "stop"]);
-        let mut rig = rig(&root, &mut problems);
-        let verdict = verdict::read(&root, Whose::Rig, &mut problems);
         let programs = path.map_or(Programs::Nowhere, Programs::Beside);
-        let mut drafts = drafts(&root, programs, &mut problems);
-        if drafts.is_empty() && problems.is_empty() {
-            return Err(nothing_registered(file));
-        }
-        check_identities(&drafts, &mut problems);
-        check_topics(&drafts, &mut problems);
-        rig.expect = expected(&root, &drafts, &mut problems);
-        check_actuators(&drafts, &mut problems);
-        lan::check_ports(&drafts, &mut problems);
-        let mut warnings = assign_bits(&mut drafts, &mut problems);
-        warnings.extend(unused_ports(&drafts, &problems));
-        warnings.extend(drafts.iter().flat_map(|draft| program::distrusted(draft, &problems)));
-        warnings.extend(budget::fit(&mut drafts, rig.memory_budget, root.at_of("rig"), &mut problems));
-        let modules = module::modules(&root, &drafts, &mut problems);
-        let stops = interlock::interlocks(&root, &drafts, &mut problems, &mut warnings);
-        problems.check()?;
-        let entries = window::entries(&drafts);
-        let mut devices: Vec<_> = drafts.into_iter().filter_map(|draft| draft.finish(&verdict)).collect();
-        devices.sort_by_key(|device| device.id);
-        warnings.extend(window::too_narrow(&devices, &entries, rig.sync_window, &problems));
-        warnings.extend(motors::slow_to_stop(&devices, &entries, &problems));
-        for device in &mut devices {
-            if let NodeSpec::Lan(lan) = &mut device.node {
-                lan.keep_free(rig.disk_reserve);
-            }
-        }
-        let registry = Self { rig, devices, modules, stops, path: path.map(Path::to_path_buf), text: text.to_owned() };
-        Ok(Loaded { registry, warnings })
+        let path = path.map(Path::to_path_buf);
+        read(&file, text, |root| {
+            let registry = Self { path, text: text.to_owned(), ..registry(root, programs, &file)? };
+            Ok(Loaded { registry, warnings: root.warnings() })
+        })
     }
 
     /// The registry of the simulated demonstration rig, `devices.toml` of the repository.
@@ -132,15 +93,45 @@ impl Registry {
     }
 }
 
-fn nothing_registered(file: String) -> RegistryErrors {
-    RegistryErrors::whole_file(
-        file,
-        "no device is registered",
-        "add a [device.NAME] table with vid, pid and node; `lsusb` shows vid:pid of what is plugged in",
-    )
+/// What the tables of the text say.
+fn registry(root: &Section<'_>, programs: Programs<'_>, file: &str) -> Result<Registry, RegistryErrors> {
+    root.allow(&["rig", "verdict", "device", "module", "stop"]);
+    let section = root.table("rig");
+    let mut rig = rig(section.as_ref());
+    let verdict = verdict::read(root, Whose::Rig);
+    let mut drafts = drafts(root, programs);
+    if drafts.is_empty() && root.is_faultless() {
+        let fix = "add a [device.NAME] table with vid, pid and node; `lsusb` shows vid:pid of what is plugged in";
+        return Err(RegistryErrors::whole_file(file.to_owned(), "no device is registered", fix));
+    }
+    check_identities(&drafts);
+    check_topics(&drafts);
+    rig.expect = section.map(|section| expected(&section, &drafts)).unwrap_or_default();
+    check_actuators(&drafts);
+    lan::check_ports(&drafts);
+    assign_bits(&mut drafts);
+    node::warn_of_old_names(&drafts);
+    warn_of_unused_ports(&drafts);
+    program::warn_of_distrusted(&drafts);
+    fit(&mut drafts, rig.memory_budget, root);
+    let modules = interlock::modules(root, &drafts);
+    let stops = interlock::interlocks(root, &drafts);
+    root.check()?;
+
+    let mut devices: Vec<_> = drafts.into_iter().filter_map(|draft| draft.finish(&verdict)).collect();
+    devices.sort_by_key(|(_, device)| device.id);
+    warn_of_narrow_window(&devices, rig.sync_window);
+    motors::warn_of_slow_stop(&devices);
+    let mut devices: Vec<_> = devices.into_iter().map(|(_, device)| device).collect();
+    for device in &mut devices {
+        if let NodeSpec::Lan(lan) = &mut device.node {
+            lan.keep_free(rig.disk_reserve);
+        }
+    }
+    Ok(Registry { rig, devices, modules, stops, path: None, text: String::new() })
 }
 
-fn rig(root: &Section<'_>, problems: &mut Problems<'_>) -> RigSpec {
+fn rig(section: Option<&Section<'_>>) -> RigSpec {
     let mut rig = RigSpec {
         name: "rig".to_owned(),
         observation_hz: 30.0,
@@ -150,57 +141,54 @@ fn rig(root: &Section<'_>, problems: &mut Problems<'_>) -> RigSpec {
         disk_reserve: None,
         expect: Vec::new(),
     };
-    let Some(section) = root.table(problems, "rig") else { return rig };
+    let Some(section) = section else { return rig };
     let known = ["name", "observation_hz", "sync_window", "cooldown", "memory_budget", "disk_reserve", "expect"];
-    section.allow(problems, &known);
-    if let Some(name) = section.text(problems, "name") {
+    section.allow(&known);
+    if let Some(name) = section.text("name") {
         // The name becomes part of file names.
         let legal = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
-        if (1..=64).contains(&name.value.len()) && name.value.chars().all(legal) && !name.value.starts_with('.') {
-            name.value.clone_into(&mut rig.name);
+        if (1..=64).contains(&name.len()) && name.chars().all(legal) && !name.starts_with('.') {
+            name.clone_into(&mut rig.name);
         } else {
             let fix = "use letters, digits, `-`, `_` and `.`, at most 64, not beginning with `.`";
-            section.report(problems, "name", format!("rig name {:?} cannot be part of a file name", name.value), fix);
+            section.report("name", format!("rig name {name:?} cannot be part of a file name"), fix);
         }
     }
-    if let Some(hz) = section.number(problems, "observation_hz", 0.1..=1000.0) {
+    if let Some(hz) = section.number("observation_hz", 0.1..=1000.0) {
         rig.observation_hz = hz;
     }
     let window = Duration::from_millis(1)..=Duration::from_secs(10);
-    rig.sync_window = section.duration(problems, "sync_window", window).unwrap_or(rig.sync_window);
+    rig.sync_window = section.duration("sync_window", window).unwrap_or(rig.sync_window);
     let cooldown = Duration::ZERO..=Duration::from_mins(1);
-    rig.cooldown = section.duration(problems, "cooldown", cooldown).unwrap_or(rig.cooldown);
+    rig.cooldown = section.duration("cooldown", cooldown).unwrap_or(rig.cooldown);
     let budget = 1 << 20..=64 << 30;
-    rig.memory_budget = section.size(problems, "memory_budget", budget).unwrap_or(rig.memory_budget);
-    rig.disk_reserve = section.size(problems, "disk_reserve", 0..=1 << 40);
+    rig.memory_budget = section.size("memory_budget", budget).unwrap_or(rig.memory_budget);
+    rig.disk_reserve = section.size("disk_reserve", 0..=1 << 40);
     rig
 }
 
 /// One draft an entry, in the order of the file.
-fn drafts<'a>(root: &Section<'a>, programs: Programs<'_>, problems: &mut Problems<'_>) -> Vec<Draft<'a>> {
-    if let Some((at, _, value)) = root.fields().into_iter().find(|(_, key, _)| *key == "device")
-        && value.get_ref().is_array()
+fn drafts<'a>(root: &Section<'a>, programs: Programs<'_>) -> Vec<Draft<'a>> {
+    if let Some((at, ..)) = root.fields().iter().find(|(_, key, value)| *key == "device" && value.get_ref().is_array())
     {
         let fix = "write each entry as a table of its own, [device.NAME], without `name =`";
-        problems.report(at, "", "[[device]] lists belong to rapid_driver's registry", fix);
+        root.report_at(*at, "[[device]] lists belong to rapid_driver's registry", fix);
         return Vec::new();
     }
-    let Some(devices) = root.table(problems, "device") else { return Vec::new() };
+    let Some(devices) = root.table("device") else { return Vec::new() };
     let mut drafts = Vec::new();
     for (at, name, value) in devices.fields() {
         if drafts.len() == MAX_MODALITIES {
             let message =
                 format!("more than {MAX_MODALITIES} devices: the mask has one bit for each and is 64 bits wide");
-            problems.report(at, &devices.child(name), message, "remove entries that are not used, or run two rigs");
+            devices.report_child(at, name, message, "remove entries that are not used, or run two rigs");
             break;
         }
-        let Some(section) = value.get_ref().as_table() else {
-            let message = format!("{name:?} is not a table");
-            problems.report(at, &devices.child(name), message, "write it as a table [device.NAME]");
-            continue;
-        };
-        let section = Section::new(section, at, devices.child(name));
-        drafts.push(device::read(name, section, programs, problems));
+        if let Some(table) = value.get_ref().as_table() {
+            drafts.push(device::read(name, devices.part(table, at, devices.child(name)), programs));
+        } else {
+            devices.report_child(at, name, format!("{name:?} is not a table"), "write it as a table [device.NAME]");
+        }
     }
     drafts
 }
@@ -208,7 +196,7 @@ fn drafts<'a>(root: &Section<'a>, programs: Programs<'_>, problems: &mut Problem
 /// Two entries may not mean the same unit: the same serial number, or the same port where there is
 /// no serial number. Entries with neither are interchangeable units and may repeat. A composite
 /// device may have one entry for its camera and one for its serial line.
-fn check_identities(drafts: &[Draft<'_>], problems: &mut Problems<'_>) {
+fn check_identities(drafts: &[Draft<'_>]) {
     for (index, draft) in drafts.iter().enumerate() {
         let Some(identity) = draft.identity.as_ref().and_then(IdentitySpec::usb) else { continue };
         let same_unit = |other: &&Draft<'_>| {
@@ -222,114 +210,201 @@ fn check_identities(drafts: &[Draft<'_>], problems: &mut Problems<'_>) {
             same_model && same_place
         };
         let Some(earlier) = drafts.iter().take(index).find(same_unit) else { continue };
-        let (key, what) =
-            if identity.serial.is_some() { (draft.serial_key(), "serial number") } else { ("port", "port") };
-        let message = format!(
-            "same vid, pid and {what} as [{}] on line {}",
-            earlier.section.entry,
-            problems.line(earlier.section.at)
-        );
+        let (key, what) = match identity.serial {
+            Some(_) if draft.section.has("serial_number") => ("serial_number", "serial number"),
+            Some(_) => ("serial", "serial number"),
+            None => ("port", "port"),
+        };
+        let message =
+            format!("same vid, pid and {what} as [{}] on line {}", earlier.section.entry, earlier.section.line());
         let fix = format!("give each entry the {what} of its own unit; one physical device is one entry");
-        draft.section.report(problems, key, message, fix);
+        draft.section.report(key, message, fix);
     }
 }
 
-fn unused_ports(drafts: &[Draft<'_>], problems: &Problems<'_>) -> Vec<Diagnostic> {
-    let both = drafts.iter().filter(|draft| {
+fn warn_of_unused_ports(drafts: &[Draft<'_>]) {
+    for draft in drafts {
         let usb = draft.identity.as_ref().and_then(IdentitySpec::usb);
-        usb.is_some_and(|usb| usb.serial.is_some() && usb.port.is_some())
-    });
-    let warn = |draft: &Draft<'_>| {
-        let message = "port has no effect beside a serial number: the unit is recognised in every port".to_owned();
-        let fix = "remove port, or remove the serial number to accept any unit in that port".to_owned();
-        problems.diagnostic(draft.section.at_of("port"), &draft.section.entry, message, fix)
-    };
-    both.map(warn).collect()
+        if usb.is_some_and(|usb| usb.serial.is_some() && usb.port.is_some()) {
+            let message = "port has no effect beside a serial number: the unit is recognised in every port";
+            let fix = "remove port, or remove the serial number to accept any unit in that port";
+            draft.section.warn_at(draft.section.at_of("port"), message, fix);
+        }
+    }
 }
 
-fn check_topics(drafts: &[Draft<'_>], problems: &mut Problems<'_>) {
+fn check_topics(drafts: &[Draft<'_>]) {
     for (index, draft) in drafts.iter().enumerate() {
         if OWN_TOPICS.contains(&draft.topic.as_str()) {
             let message = format!("topic {:?} is published by rapid itself", draft.topic);
-            let fix = format!("choose another, for example {:?}", draft.default_topic());
-            draft.section.report(problems, "topic", message, fix);
+            let fix = format!("choose another, for example {:?}", device::default_topic(draft.kind, &draft.name));
+            draft.section.report("topic", message, fix);
         }
         let Some(earlier) = drafts.iter().take(index).find(|earlier| earlier.topic == draft.topic) else { continue };
         let message = format!(
             "topic {:?} is already used by [{}] on line {}",
             draft.topic,
             earlier.section.entry,
-            problems.line(earlier.section.at)
+            earlier.section.line()
         );
         let fix = format!("choose another, for example {:?}", format!("{}/{}", draft.topic, draft.name));
-        draft.section.report(problems, "topic", message, fix);
+        draft.section.report("topic", message, fix);
     }
 }
 
 /// The entries that every episode has to have samples of.
-fn expected(root: &Section<'_>, drafts: &[Draft<'_>], problems: &mut Problems<'_>) -> Vec<String> {
-    // One that is no table has been reported.
-    let rig = root.fields().into_iter().find(|(_, key, _)| *key == "rig");
-    let Some((at, table)) = rig.and_then(|(at, _, value)| Some((at, value.get_ref().as_table()?))) else {
-        return Vec::new();
-    };
-    let rig = Section::new(table, at, root.child("rig"));
-    let expected = rig.texts(problems, "expect").unwrap_or_default();
+fn expected(rig: &Section<'_>, drafts: &[Draft<'_>]) -> Vec<String> {
+    let expected = rig.texts("expect").unwrap_or_default();
     for (index, name) in expected.iter().enumerate() {
         if !drafts.iter().any(|draft| draft.name == *name) {
-            let known: Vec<&str> = drafts.iter().map(|draft| draft.name.as_str()).collect();
-            let fix = did_you_mean(name, &known, "entries are");
-            rig.report(problems, "expect", format!("expect: there is no [device.{name}]"), fix);
+            let fix = did_you_mean(name, names(drafts), "entries are");
+            rig.report("expect", format!("expect: there is no [device.{name}]"), fix);
         } else if expected.iter().take(index).any(|earlier| earlier == name) {
-            rig.report(problems, "expect", format!("expect: {name:?} is in the list twice"), "name it once");
+            rig.report("expect", format!("expect: {name:?} is in the list twice"), "name it once");
         }
     }
     expected
 }
 
+/// What the entries are called.
+fn names<'d>(drafts: &'d [Draft<'_>]) -> impl Iterator<Item = &'d str> {
+    drafts.iter().map(|draft| draft.name.as_str())
+}
+
 /// An action has no name of a device in it: it means the one actuator there is.
-fn check_actuators(drafts: &[Draft<'_>], problems: &mut Problems<'_>) {
+fn check_actuators(drafts: &[Draft<'_>]) {
     let mut actuators = drafts.iter().filter(|draft| draft.action.is_some());
     let Some(first) = actuators.next() else { return };
     for draft in actuators {
         let message = format!("[{}] is an actuator already, and a rig has one", first.section.entry);
         let fix = "remove one of the two action tables; the motors of a CAN bus have one without being asked";
-        draft.section.report(problems, "action", message, fix);
+        draft.section.report("action", message, fix);
     }
 }
 
 /// Gives entries without a bit the lowest free one, in the order of the file, after all bits that
 /// are written down are taken.
-fn assign_bits(drafts: &mut [Draft<'_>], problems: &mut Problems<'_>) -> Vec<Diagnostic> {
-    let mut taken: Vec<At<u8>> = Vec::new();
-    let mut free = (0..64).filter({
-        let written: Vec<u8> = drafts.iter().filter_map(|draft| draft.bit.map(|bit| bit.value)).collect();
-        move |bit| !written.contains(bit)
-    });
-    let mut warnings = Vec::new();
+fn assign_bits(drafts: &mut [Draft<'_>]) {
+    let written: Vec<u8> = drafts.iter().filter_map(|draft| draft.bit).collect();
+    let mut free = (0..64).filter(move |bit| !written.contains(bit));
+    // Bits that are written, and their lines.
+    let mut taken: Vec<(u8, usize)> = Vec::new();
     for draft in drafts {
+        let section = &draft.section;
         if let Some(bit) = draft.bit {
-            if let Some(earlier) = taken.iter().find(|earlier| earlier.value == bit.value) {
-                let message = format!("bit {} is already taken on line {}", bit.value, problems.line(earlier.at));
+            if let Some((_, line)) = taken.iter().find(|(earlier, _)| *earlier == bit) {
+                let message = format!("bit {bit} is already taken on line {line}");
                 let fix =
                     free.clone().next().map_or("choose another".to_owned(), |free| format!("bit = {free} is free"));
-                problems.report(bit.at, &draft.section.entry, message, fix);
+                section.report("bit", message, fix);
             }
-            taken.push(bit);
-            draft.id = ModalityId::new(bit.value);
+            taken.push((bit, section.line_of("bit")));
+            draft.id = ModalityId::new(bit);
             continue;
         }
         // A bit that was written and is wrong has been reported; there is nothing to give.
-        if draft.section.has("bit") {
+        if section.has("bit") {
             continue;
         }
         let Some(bit) = free.next() else { continue };
         draft.id = ModalityId::new(bit);
         let message = format!("no bit given, it gets bit {bit}: another entry above it would move it");
         let fix = format!("pin it with bit = {bit}; a policy is trained on bit positions");
-        warnings.push(problems.diagnostic(draft.section.at, &draft.section.entry, message, fix));
+        section.warn_at(section.at, message, fix);
     }
-    warnings
+}
+
+/// Fewer pictures than this cannot cover the pauses of a writer.
+const LEAST_CAMERA_DEPTH: u64 = 8;
+
+/// Lowers the default depths of cameras, all in proportion, until the topics fit into `budget`.
+/// Depths written in the file stay. Too much even so is a problem that names the largest topics.
+/// What was lowered is warned of.
+fn fit(drafts: &mut [Draft<'_>], budget: u64, root: &Section<'_>) {
+    let scaled = |draft: &Draft<'_>, permille: u64| {
+        if draft.depth_written || draft.kind != Some(device::Kind::Camera) {
+            return draft.depth;
+        }
+        // Depths are at most 4096: no overflow.
+        (draft.depth * permille / 1000).max(LEAST_CAMERA_DEPTH)
+    };
+    let total = |drafts: &[Draft<'_>], permille| -> u64 {
+        drafts.iter().map(|draft| pool(draft, scaled(draft, permille))).fold(RESERVED_BYTES, u64::saturating_add)
+    };
+    if total(drafts, 0) > budget {
+        return report(drafts, total(drafts, 0), budget, root);
+    }
+    let permille = (0..=1000).rev().find(|permille| total(drafts, *permille) <= budget).unwrap_or(0);
+    for draft in drafts {
+        let depth = scaled(draft, permille);
+        if depth < draft.depth {
+            let message = format!(
+                "depth lowered from {} to {depth} to keep all topics within memory_budget = {}",
+                draft.depth,
+                show_size(budget)
+            );
+            let fix = format!("write depth = {depth}, a smaller max_bytes, or a larger memory_budget in [rig]");
+            draft.section.warn_at(draft.section.at, message, fix);
+        }
+        draft.depth = depth;
+    }
+}
+
+/// Shared memory that the topic of `draft` takes with this depth, in bytes.
+fn pool(draft: &Draft<'_>, depth: u64) -> u64 {
+    let sample = draft.max_bytes.saturating_add(SAMPLE_OVERHEAD as u64);
+    sample.saturating_mul(depth + POOL_SPARE as u64)
+}
+
+fn report(drafts: &[Draft<'_>], total: u64, budget: u64, root: &Section<'_>) {
+    let size = |draft: &Draft<'_>| {
+        let depth = if draft.depth_written || draft.kind != Some(device::Kind::Camera) {
+            draft.depth
+        } else {
+            LEAST_CAMERA_DEPTH
+        };
+        (pool(draft, depth), depth)
+    };
+    let mut largest: Vec<_> = drafts.iter().map(|draft| (size(draft), draft)).collect();
+    largest.sort_by_key(|((bytes, _), _)| std::cmp::Reverse(*bytes));
+    let named: Vec<String> = largest
+        .iter()
+        .take(3)
+        .map(|((bytes, depth), draft)| {
+            let samples = depth + POOL_SPARE as u64;
+            format!("{} {} ({} x {samples})", draft.name, show_size(*bytes), show_size(draft.max_bytes))
+        })
+        .collect();
+    let message = format!(
+        "the topics need {} of shared memory, more than memory_budget = {}; largest: {}",
+        show_size(total),
+        show_size(budget),
+        named.join(", ")
+    );
+    let fix = "lower max_bytes, depth or the pictures' size of these, or raise memory_budget in [rig]";
+    root.report_child(root.at_of("rig"), "rig", message, fix);
+}
+
+/// Warns of every device that is so slow that ticks without a sample in `window` alone make an episode SUSPECT.
+fn warn_of_narrow_window(devices: &[(Section<'_>, DeviceSpec)], window: Duration) {
+    for (section, device) in devices {
+        let (Some(hz), Some(least)) = (device.verdict.hz, device.verdict.suspect.valid) else { continue };
+        // A tick has a sample if one lies within the window before or after it, wherever the two stand to each other.
+        let share = hz * 2.0 * window.as_secs_f64();
+        if share >= least.min(1.0) {
+            continue;
+        }
+        let shown = show_duration(window);
+        let message = format!(
+            "at {hz} samples a second only {:.0} % of the ticks have one within sync_window = {shown}: every episode is SUSPECT",
+            share * 100.0
+        );
+        // Half of the time between two samples, rounded up to a millisecond.
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saturates, as wanted")]
+        let wide = show_duration(Duration::from_millis((500.0 / hz).ceil() as u64));
+        let fix = format!("write sync_window = \"{wide}\" in [rig], or valid = \"off\" in [{}.verdict]", section.entry);
+        section.warn_at(section.at, message, fix);
+    }
 }
 
 #[cfg(test)]

@@ -41,18 +41,16 @@
 //! Invariant: in a scenario that was accepted a device is only plugged while unplugged and the
 //! reverse, at every repetition.
 
-mod standing;
-
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Duration;
 
+use super::attachment::{LanIdentity, UsbIdentity};
 use super::diagnostic::{RegistryErrors, did_you_mean};
-use super::parse::{is_port, read_file};
+use super::parse::is_port;
 use super::scenario::{Scenario, ScenarioAction, ScenarioDevice, ScenarioEvent, SimFaults, SimSource};
-use super::section::{Problems, Section, file_label, read};
-use super::spec::{NodeSpec, Registry};
-use standing::{invent_ports, standing_for};
+use super::section::{Section, file_label, read, read_file};
+use super::spec::{DeviceSpec, LanPicture, NodeSpec, Registry};
 
 const DEVICE_KEYS: [&str; 14] = [
     "name",
@@ -91,19 +89,17 @@ impl Scenario {
     /// # Errors
     /// All that is wrong with the text.
     pub fn parse(text: &str, path: Option<&Path>, registry: &Registry) -> Result<Self, RegistryErrors> {
-        let mut problems = Problems::new(file_label(path, "scenario"), text);
-        let document = read(text, &mut problems);
-        problems.check()?;
-        let root = Section::new(document.get_ref(), 0, String::new());
-        root.allow(&mut problems, &["repeat", "device", "event"]);
-        let repeat = root.duration(&mut problems, "repeat", Duration::from_millis(10)..=LONGEST);
-        let devices = if root.has("device") { devices(&root, registry, &mut problems) } else { every_entry(registry) };
-        let mut events = events(&root, &devices, &mut problems);
-        // Stable: the order in the file decides between equal times.
-        events.sort_by_key(|event| event.event.at);
-        check_order(&events, &devices, repeat, &mut problems);
-        problems.check()?;
-        Ok(Self { devices, events: events.into_iter().map(|placed| placed.event).collect(), repeat })
+        read(&file_label(path, "scenario"), text, |root| {
+            root.allow(&["repeat", "device", "event"]);
+            let repeat = root.duration("repeat", Duration::from_millis(10)..=LONGEST);
+            let devices = if root.has("device") { devices(root, registry) } else { every_entry(registry) };
+            let sections = root.tables("event").unwrap_or_default();
+            let mut events: Vec<_> = sections.into_iter().filter_map(|section| event(section, &devices)).collect();
+            // Stable: the order in the file decides between equal times.
+            events.sort_by_key(|event| event.event.at);
+            check_order(&events, &devices, repeat);
+            Ok(Self { devices, events: events.into_iter().map(|placed| placed.event).collect(), repeat })
+        })
     }
 
     /// Every entry is plugged in, and nothing happens.
@@ -138,22 +134,22 @@ fn every_entry(registry: &Registry) -> Vec<ScenarioDevice> {
     devices
 }
 
-fn devices(root: &Section<'_>, registry: &Registry, problems: &mut Problems<'_>) -> Vec<ScenarioDevice> {
+fn devices(root: &Section<'_>, registry: &Registry) -> Vec<ScenarioDevice> {
     let mut devices = Vec::new();
     let mut ports: BTreeMap<String, usize> = BTreeMap::new();
-    for section in root.tables(problems, "device") {
-        let Some(device) = device(&section, registry, problems) else { continue };
+    for section in root.tables("device").unwrap_or_default() {
+        let Some(device) = device(&section, registry) else { continue };
         if devices.iter().any(|earlier: &ScenarioDevice| earlier.name == device.name) {
             let message = format!("{:?} is already a device of this scenario", device.name);
             let fix = format!("give it a name of its own and like = {:?}", device.name);
-            section.report(problems, "name", message, fix);
+            section.report("name", message, fix);
         }
         if !device.usb.port.is_empty() {
             if let Some(line) = ports.get(&device.usb.port) {
                 let message = format!("port {} is already that of the device on line {line}", device.usb.port);
-                section.report(problems, "port", message, "give each device a port of its own: port = \"1-4\"");
+                section.report("port", message, "give each device a port of its own: port = \"1-4\"");
             }
-            ports.insert(device.usb.port.clone(), problems.line(section.at));
+            ports.insert(device.usb.port.clone(), section.line());
         }
         devices.push(device);
     }
@@ -161,30 +157,25 @@ fn devices(root: &Section<'_>, registry: &Registry, problems: &mut Problems<'_>)
     devices
 }
 
-fn device(section: &Section<'_>, registry: &Registry, problems: &mut Problems<'_>) -> Option<ScenarioDevice> {
-    section.allow(problems, &DEVICE_KEYS);
-    if !section.has("name") {
-        section.missing(problems, "name", "write name = the device's name in devices.toml");
-    }
-    let name = section.text(problems, "name")?.value;
-    let (key, entry) =
-        if section.has("like") { ("like", section.text(problems, "like")?.value) } else { ("name", name) };
+fn device(section: &Section<'_>, registry: &Registry) -> Option<ScenarioDevice> {
+    section.allow(&DEVICE_KEYS);
+    section.need("name", "write name = the device's name in devices.toml");
+    let name = section.text("name")?;
+    let (key, entry) = if section.has("like") { ("like", section.text("like")?) } else { ("name", name) };
     let Some(spec) = registry.named(entry) else {
-        let known: Vec<&str> = registry.devices.iter().map(|device| device.name.as_str()).collect();
-        let fix = did_you_mean(entry, &known, "registered are");
-        section.report(problems, key, format!("{entry:?} is not in the registry"), fix);
-        return None;
+        let fix = did_you_mean(entry, registry.devices.iter().map(|device| &device.name), "registered are");
+        return section.refuse(key, format!("{entry:?} is not in the registry"), fix);
     };
     let mut device = standing_for(spec, name);
-    let seed = section.integer(problems, "seed", 0..=i64::MAX).and_then(|seed| u64::try_from(seed.value).ok());
-    let hz = section.integer(problems, "hz", 1..=10_000).and_then(|hz| u32::try_from(hz.value).ok());
+    let seed = section.integer("seed", 0..=i64::MAX);
+    let hz = section.integer("hz", 1..=10_000);
     let most = spec.max_bytes.saturating_sub(PICTURE_NAME_BYTES) as u64;
-    let bytes = section.size(problems, "bytes", 0..=most).and_then(|bytes| usize::try_from(bytes).ok());
+    let bytes = section.size("bytes", 0..=most).and_then(|bytes| usize::try_from(bytes).ok());
     if let (Some(filled), SimSource::Camera { bytes, .. }) = (bytes, &mut device.source) {
         *bytes = filled;
     } else if section.has("bytes") && !matches!(device.source, SimSource::Camera { .. }) {
         let message = format!("{entry:?} sends no pictures, only they have a size");
-        section.report(problems, "bytes", message, "leave bytes out");
+        section.report("bytes", message, "leave bytes out");
     }
     match &mut device.source {
         SimSource::Camera { fps: rate, seed: chosen, .. } | SimSource::Serial { hz: rate, seed: chosen, .. } => {
@@ -193,57 +184,55 @@ fn device(section: &Section<'_>, registry: &Registry, problems: &mut Problems<'_
         }
         SimSource::Task { .. } | SimSource::Process | SimSource::Replay { .. } => {}
     }
-    device.plugged = section.flag(problems, "plugged").unwrap_or(true);
-    device.usb.vid = section.usb_id(problems, "vid").unwrap_or(device.usb.vid);
-    device.usb.pid = section.usb_id(problems, "pid").unwrap_or(device.usb.pid);
-    if let Some(serial) = section.text(problems, "serial").map(|serial| serial.value) {
+    device.plugged = section.flag("plugged").unwrap_or(true);
+    device.usb.vid = section.usb_id("vid").unwrap_or(device.usb.vid);
+    device.usb.pid = section.usb_id("pid").unwrap_or(device.usb.pid);
+    if let Some(serial) = section.text("serial") {
         // What a device says of itself is no mistake of the file, whatever it is.
         device.usb.serial = (!serial.is_empty()).then(|| serial.to_owned());
     }
-    if let Some(port) = port(section, problems) {
+    if let Some(port) = port(section) {
         device.usb.port = port;
     }
-    device.faults = faults(section, problems);
+    device.faults = faults(section);
     let usb = &mut device.usb;
     for (key, place) in
         [("firmware", &mut usb.firmware), ("manufacturer", &mut usb.manufacturer), ("product", &mut usb.product)]
     {
-        if let Some(text) = section.text(problems, key) {
-            *place = (!text.value.is_empty()).then(|| text.value.to_owned());
+        if let Some(text) = section.text(key) {
+            *place = (!text.is_empty()).then(|| text.to_owned());
         }
     }
     Some(device)
 }
 
-fn faults(section: &Section<'_>, problems: &mut Problems<'_>) -> SimFaults {
-    let Some(table) = section.table(problems, "fault") else { return SimFaults::default() };
+fn faults(section: &Section<'_>) -> SimFaults {
+    let Some(table) = section.table("fault") else { return SimFaults::default() };
     let every = ["truncate_every", "duplicate_every", "lose_every"];
     let mut known = every.to_vec();
     known.extend(["freeze_at", "delay", "latency", "clock_ppm", "close"]);
-    table.allow(problems, &known);
+    table.allow(&known);
     // At least 2: of a device all of whose samples are lost none ever comes.
-    let [truncate_every, duplicate_every, lose_every] =
-        every.map(|key| u64::try_from(table.integer(problems, key, 2..=1_000_000)?.value).ok());
+    let [truncate_every, duplicate_every, lose_every] = every.map(|key| table.integer(key, 2..=1_000_000));
     SimFaults {
-        freeze_at: table.duration(problems, "freeze_at", Duration::ZERO..=LONGEST),
+        freeze_at: table.duration("freeze_at", Duration::ZERO..=LONGEST),
         truncate_every,
         duplicate_every,
         lose_every,
-        delay: table.duration(problems, "delay", Duration::ZERO..=Duration::from_secs(10)).unwrap_or_default(),
-        latency: table.duration(problems, "latency", Duration::ZERO..=Duration::from_secs(1)).unwrap_or_default(),
-        clock_ppm: table.integer(problems, "clock_ppm", -100_000..=100_000).map_or(0, |ppm| ppm.value),
-        close: table.duration(problems, "close", Duration::ZERO..=Duration::from_secs(10)).unwrap_or_default(),
+        delay: table.duration("delay", Duration::ZERO..=Duration::from_secs(10)).unwrap_or_default(),
+        latency: table.duration("latency", Duration::ZERO..=Duration::from_secs(1)).unwrap_or_default(),
+        clock_ppm: table.integer("clock_ppm", -100_000..=100_000).unwrap_or_default(),
+        close: table.duration("close", Duration::ZERO..=Duration::from_secs(10)).unwrap_or_default(),
     }
 }
 
-fn port(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<String> {
-    let port = section.text(problems, "port")?.value;
+fn port(section: &Section<'_>) -> Option<String> {
+    let port = section.text("port")?;
     if is_port(port) {
         return Some(port.to_owned());
     }
     let fix = "write it as the kernel does, bus-port.port, for example port = \"1-2.3\"";
-    section.report(problems, "port", format!("{port:?} is not a USB port path"), fix);
-    None
+    section.refuse("port", format!("{port:?} is not a USB port path"), fix)
 }
 
 /// An event and where the file says it.
@@ -253,34 +242,25 @@ struct Placed<'a> {
     event: ScenarioEvent,
 }
 
-fn events<'a>(root: &Section<'a>, devices: &[ScenarioDevice], problems: &mut Problems<'_>) -> Vec<Placed<'a>> {
-    let sections = root.tables(problems, "event");
-    sections.into_iter().filter_map(|section| event(section, devices, problems)).collect()
-}
-
-fn event<'a>(section: Section<'a>, devices: &[ScenarioDevice], problems: &mut Problems<'_>) -> Option<Placed<'a>> {
-    section.allow(problems, &EVENT_KEYS);
-    if !section.has("at") {
-        section.missing(problems, "at", "write at = the time from the beginning, for example at = \"3s\"");
-    }
-    let at = section.duration(problems, "at", Duration::ZERO..=LONGEST);
+fn event<'a>(section: Section<'a>, devices: &[ScenarioDevice]) -> Option<Placed<'a>> {
+    section.allow(&EVENT_KEYS);
+    section.need("at", "write at = the time from the beginning, for example at = \"3s\"");
+    let at = section.duration("at", Duration::ZERO..=LONGEST);
     let given: Vec<&'static str> = ACTIONS.into_iter().filter(|action| section.has(action)).collect();
     let [key] = given.as_slice() else {
         let message = match given.as_slice() {
             [] => "nothing happens in this event".to_owned(),
             several => format!("{} in one event", several.join(" and ")),
         };
-        problems.report(section.at, &section.entry, message, "write exactly one of plug, unplug, silence, resume");
+        section.report_at(section.at, message, "write exactly one of plug, unplug, silence, resume");
         return None;
     };
-    let name = section.text(problems, key)?.value;
+    let name = section.text(key)?;
     if !devices.iter().any(|device| device.name == name) {
-        let known: Vec<&str> = devices.iter().map(|device| device.name.as_str()).collect();
-        let fix = did_you_mean(name, &known, "devices of this scenario");
-        section.report(problems, key, format!("{name:?} is not a device of this scenario"), fix);
-        return None;
+        let fix = did_you_mean(name, devices.iter().map(|device| &device.name), "devices of this scenario");
+        return section.refuse(key, format!("{name:?} is not a device of this scenario"), fix);
     }
-    let port = port(&section, problems);
+    let port = port(&section);
     let action = match *key {
         "plug" => ScenarioAction::Plug { port },
         "unplug" => ScenarioAction::Unplug,
@@ -288,19 +268,14 @@ fn event<'a>(section: Section<'a>, devices: &[ScenarioDevice], problems: &mut Pr
         _ => ScenarioAction::Resume,
     };
     if section.has("port") && *key != "plug" {
-        section.report(problems, "port", format!("a port has no meaning with {key}"), "give a port with plug only");
+        section.report("port", format!("a port has no meaning with {key}"), "give a port with plug only");
     }
     let event = ScenarioEvent { at: at?, device: name.to_owned(), action };
     Some(Placed { section, key, event })
 }
 
 /// Plays the events once on paper.
-fn check_order(
-    events: &[Placed<'_>],
-    devices: &[ScenarioDevice],
-    repeat: Option<Duration>,
-    problems: &mut Problems<'_>,
-) {
+fn check_order(events: &[Placed<'_>], devices: &[ScenarioDevice], repeat: Option<Duration>) {
     // Device to its port while plugged, and its port now or last.
     let begin: BTreeMap<&str, bool> = devices.iter().map(|device| (device.name.as_str(), device.plugged)).collect();
     let mut plugged = begin.clone();
@@ -308,17 +283,15 @@ fn check_order(
         devices.iter().map(|device| (device.name.as_str(), device.usb.port.as_str())).collect();
     for placed in events {
         let ScenarioEvent { at, device, action } = &placed.event;
-        let report = |problems: &mut Problems<'_>, message: String, fix: &str| {
-            placed.section.report(problems, placed.key, message, fix);
-        };
+        let report = |message: String, fix: &str| placed.section.report(placed.key, message, fix);
         let Some(state) = plugged.get(device.as_str()).copied() else { continue };
         match (action, state) {
             (ScenarioAction::Plug { .. }, true) => {
                 let message = format!("{device} is already plugged at {at:?}");
-                report(problems, message, "unplug it before, or write plugged = false at its [[device]]");
+                report(message, "unplug it before, or write plugged = false at its [[device]]");
             }
             (ScenarioAction::Unplug | ScenarioAction::Silence | ScenarioAction::Resume, false) => {
-                report(problems, format!("{device} is not plugged at {at:?}"), "plug it before");
+                report(format!("{device} is not plugged at {at:?}"), "plug it before");
             }
             _ => {}
         }
@@ -331,19 +304,17 @@ fn check_order(
                 **name != device.as_str() && Some(**port) == own && plugged.get(*name).copied().unwrap_or(false)
             });
             if let Some((holder, port)) = holder {
-                report(problems, format!("port {port} is taken by {holder} at {at:?}"), "name another port");
+                report(format!("port {port} is taken by {holder} at {at:?}"), "name another port");
             }
-        }
-        match action {
-            ScenarioAction::Plug { .. } => drop(plugged.insert(device, true)),
-            ScenarioAction::Unplug => drop(plugged.insert(device, false)),
-            ScenarioAction::Silence | ScenarioAction::Resume => {}
+            plugged.insert(device, true);
+        } else if *action == ScenarioAction::Unplug {
+            plugged.insert(device, false);
         }
     }
     let Some(repeat) = repeat else { return };
     for placed in events.iter().filter(|placed| placed.event.at >= repeat) {
         let message = "it never happens: the events begin again before".to_owned();
-        placed.section.report(problems, "at", message, "make repeat longer than the time of every event");
+        placed.section.report("at", message, "make repeat longer than the time of every event");
     }
     for (name, state) in begin {
         if plugged.get(name).is_some_and(|end| *end != state)
@@ -351,8 +322,51 @@ fn check_order(
         {
             let message =
                 format!("with repeat {name} must end as it began: {}", if state { "plugged" } else { "unplugged" });
-            last.section.report(problems, last.key, message, "add the event that undoes this one");
+            last.section.report(last.key, message, "add the event that undoes this one");
         }
+    }
+}
+
+/// Rate of a simulated serial line, Hz: that of a usual motor controller's state.
+const SERIAL_HZ: u32 = 100;
+
+/// A simulated device with an entry's identity and format; its port may still be empty.
+fn standing_for(spec: &DeviceSpec, name: &str) -> ScenarioDevice {
+    let seed = u64::from(spec.id.bit());
+    let source = match (&spec.node, spec.node.picture(), spec.node.shape().as_slice()) {
+        (NodeSpec::Process(_), ..) => SimSource::Process,
+        (_, Some(LanPicture { width, height, fps }), [_, _]) => {
+            SimSource::Camera { width, height, fps, seed, bytes: 0 }
+        }
+        (.., [channels]) => SimSource::Serial { channels: *channels as usize, hz: SERIAL_HZ, seed },
+        // What sends bytes has no channels: a number of its messages a second is all that is written here.
+        _ => SimSource::Serial { channels: 1, hz: SERIAL_HZ, seed },
+    };
+    let wished = spec.identity.usb();
+    let lan = wished.is_none().then(|| LanIdentity {
+        entry: spec.name.clone(),
+        address: format!("sim:{name}"),
+        instance: None,
+    });
+    let usb = UsbIdentity {
+        vid: wished.map_or(0, |wished| wished.vid),
+        pid: wished.map_or(0, |wished| wished.pid),
+        serial: Some(spec.identity.serial().map_or_else(|| format!("SIM-{name}"), str::to_owned)),
+        port: wished.and_then(|wished| wished.port.clone()).unwrap_or_default(),
+        product: Some(format!("simulated {}", spec.name)),
+        manufacturer: Some("rapid".to_owned()),
+        firmware: Some("1.00".to_owned()),
+    };
+    ScenarioDevice { name: name.to_owned(), usb, lan, source, plugged: true, faults: SimFaults::default() }
+}
+
+/// Ports of a bus no rig has, for devices whose port nothing says.
+fn invent_ports(devices: &mut [ScenarioDevice]) {
+    let mut taken: Vec<String> = devices.iter().map(|device| device.usb.port.clone()).collect();
+    for device in devices.iter_mut().filter(|device| device.usb.port.is_empty()) {
+        let port = (1..=taken.len() + 1).map(|number| format!("9-{number}")).find(|port| !taken.contains(port));
+        device.usb.port = port.unwrap_or_default();
+        taken.push(device.usb.port.clone());
     }
 }
 

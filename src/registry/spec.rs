@@ -3,31 +3,24 @@
 //! Invariant: every value here is within the range its comment states; names, topics and bits are
 //! unique; no two entries of one kind of node mean the same unit; `Registry::devices` is in
 //! ascending order of bit.
+//!
+//! Every default of the limits of the verdict has its reason here; `[verdict]` changes it for all devices,
+//! `[device.NAME.verdict]` for one.
 
-mod can;
-mod hooks;
-mod interlock;
 mod lan;
-mod module;
 mod motors;
 
+use std::fmt;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use serde::Serialize;
 
-pub use hooks::{Hook, Hooks};
-
-use super::limits::VerdictSpec;
+use crate::interlock::StopKind;
 use crate::modality::{Modality, ModalityId, ModalityKind};
 use crate::sample::SampleHeader;
 
-pub use can::{
-    CAN_BATCH, CAN_RECORD, CAN_RESTART_MS, CanAdapter, CanProtocol, CanSpec, MOTOR_CHANNELS, SLCAN_BITRATES,
-};
-pub use interlock::{Bound, FieldInput, GpioInput, InterlockInput, InterlockSpec, KeyInput, LineInput};
 pub use lan::{LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, Probe, own_side};
-pub use module::{ModuleError, ModuleSpec, mounted};
 pub use motors::{
     BrakeSpec, DamiaoSpec, MAX_MOTORS, MotionSpec, MotorKind, MotorMode, MotorSpec, Stop, StopSpec, WatchSpec,
 };
@@ -118,7 +111,7 @@ pub struct DeviceSpec {
     pub hooks: Hooks,
 }
 
-/// `[device.NAME.action]`: what an actuator may be told. All lists have one entry an axis, `1..=64` of
+/// `[device.NAME.action]`: the limits of an actuator's actions. All lists have one entry an axis, `1..=64` of
 /// them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ActionSpec {
@@ -216,7 +209,7 @@ pub enum PixelFormat {
     Grey,
 }
 
-/// `[device.NAME.serial]`.
+/// `[device.NAME.tty]`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SerialSpec {
     /// Bits per second, default 115200.
@@ -322,11 +315,23 @@ impl NodeSpec {
     pub fn shape(&self) -> Vec<u32> {
         match (self, self.modality_kind()) {
             (Self::Camera(camera), _) => vec![camera.height, camera.width],
-            (Self::Serial(_), ModalityKind::Bytes) => Vec::new(),
-            (Self::Serial(serial), _) => vec![u32::try_from(serial.channels).unwrap_or(u32::MAX)],
             (Self::Process(process), _) => process.shape.clone(),
-            (Self::Can(can), _) => can.shape(),
             (Self::Lan(lan), _) => lan.shape(),
+            (_, ModalityKind::Bytes) => Vec::new(),
+            (Self::Serial(serial), _) => vec![u32::try_from(serial.channels).unwrap_or(u32::MAX)],
+            (Self::Can(can), _) => vec![u32::try_from(can.channels()).unwrap_or(u32::MAX)],
+        }
+    }
+
+    /// What its pictures are, if it sends any and the entry says so.
+    #[must_use]
+    pub fn picture(&self) -> Option<LanPicture> {
+        match self {
+            Self::Camera(CameraSpec { width, height, fps, .. }) => {
+                Some(LanPicture { width: *width, height: *height, fps: *fps })
+            }
+            Self::Lan(lan) => lan.picture(),
+            Self::Serial(_) | Self::Process(_) | Self::Can(_) => None,
         }
     }
 
@@ -348,9 +353,9 @@ impl NodeSpec {
         match self {
             Self::Camera(_) => ModalityKind::Image,
             Self::Serial(serial) if serial.parse == Parse::Raw => ModalityKind::Bytes,
-            Self::Serial(_) => ModalityKind::Scalars,
+            Self::Can(can) if can.protocol == CanProtocol::Raw => ModalityKind::Bytes,
+            Self::Serial(_) | Self::Can(_) => ModalityKind::Scalars,
             Self::Process(process) => process.kind,
-            Self::Can(can) => can.modality_kind(),
             Self::Lan(lan) => lan.modality_kind(),
         }
     }
@@ -373,5 +378,515 @@ impl Registry {
     #[must_use]
     pub fn named(&self, name: &str) -> Option<&DeviceSpec> {
         self.devices.iter().find(|device| device.name == name)
+    }
+}
+
+/// What a user wants run when something happens to a device: the hooks of an entry; by default none.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Hooks {
+    /// `on_attach`: the device was attached. Its node is opened meanwhile.
+    pub attach: Option<Hook>,
+    /// `on_detach`: it was removed, and the program that read it, if one did, has ended.
+    pub detach: Option<Hook>,
+    /// `on_record_start`: an episode begins, or the device was attached during one.
+    pub record_start: Option<Hook>,
+    /// `on_record_stop`: that episode is over, or the device was removed.
+    pub record_stop: Option<Hook>,
+}
+
+/// A program and its arguments; no shell reads them.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Hook {
+    /// As in [`ProcessSpec::program`].
+    pub program: PathBuf,
+    /// Its arguments.
+    pub args: Vec<String>,
+}
+
+impl Hooks {
+    /// Their keys in `devices.toml`.
+    pub const KEYS: [&str; 4] = ["on_attach", "on_detach", "on_record_start", "on_record_stop"];
+
+    /// Each hook with its key in `devices.toml`.
+    pub fn all(&self) -> impl Iterator<Item = (&'static str, &Hook)> {
+        let hooks = [&self.attach, &self.detach, &self.record_start, &self.record_stop];
+        Self::KEYS.into_iter().zip(hooks).filter_map(|(key, hook)| Some((key, hook.as_ref()?)))
+    }
+
+    /// Is there none?
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.all().next().is_none()
+    }
+}
+
+/// `[module.NAME]`: something that is mounted on the gripper, of those that bear sensors and those that are mechanics alone (paper, section "Module
+/// Catalog").
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct ModuleSpec {
+    /// Its name, as a modality's.
+    pub name: String,
+    /// Where it sits.
+    #[serde(rename = "slot")]
+    pub mount: Mount,
+    /// What an episode with it is tagged with: keys and values.
+    pub tags: Vec<(String, String)>,
+    /// The entries of its sensors; a module without any is mounted only if `--module` names it.
+    pub devices: Vec<String>,
+}
+
+/// Why modules cannot be mounted as requested.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum ModuleError {
+    /// There is no such module.
+    #[error("--module {name}: no [module.{name}] in the registry; {fix}")]
+    Unknown {
+        /// The name that was given.
+        name: String,
+        /// What there is.
+        fix: String,
+    },
+    /// Two of one slot.
+    #[error("--module {first} and --module {second} both sit in the slot {mount}: name the one that is mounted")]
+    SameSlot {
+        /// One.
+        first: String,
+        /// The other.
+        second: String,
+        /// The slot.
+        mount: Mount,
+    },
+}
+
+/// The modules of these names.
+///
+/// # Errors
+/// When one is not known, or two sit in one slot.
+pub fn mounted<'a>(modules: &'a [ModuleSpec], names: &[String]) -> Result<Vec<&'a ModuleSpec>, ModuleError> {
+    let mut found: Vec<&ModuleSpec> = Vec::new();
+    for name in names {
+        let Some(module) = modules.iter().find(|module| module.name == *name) else {
+            let fix = if modules.is_empty() {
+                "it names no modules: write one, or say it with --tag".to_owned()
+            } else {
+                crate::registry::did_you_mean(name, modules.iter().map(|module| &module.name), "modules are")
+            };
+            return Err(ModuleError::Unknown { name: name.clone(), fix });
+        };
+        if let Some(other) = found.iter().find(|other| other.mount == module.mount && other.name != module.name) {
+            let (first, second) = (other.name.clone(), module.name.clone());
+            return Err(ModuleError::SameSlot { first, second, mount: module.mount });
+        }
+        if !found.contains(&module) {
+            found.push(module);
+        }
+    }
+    Ok(found)
+}
+
+/// Numbers in a sample of one motor: position rad, velocity rad/s, torque Nm, temperatures of its
+/// transistors and of its winding °C, and its error code.
+pub const MOTOR_CHANNELS: usize = 6;
+
+/// Bytes that stand for one frame in a sample of [`CanProtocol::Raw`].
+pub const CAN_RECORD: usize = 24;
+/// Frames in such a sample, at most.
+pub const CAN_BATCH: usize = 128;
+/// A controller that left the bus after too many errors is made to return after this many ms.
+pub const CAN_RESTART_MS: u32 = 100;
+/// Bit rates that slcan has a name for, `S0` to `S8`.
+pub const SLCAN_BITRATES: [u32; 9] = [10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000];
+
+/// `[device.NAME.can]`: a CAN adapter and what is behind it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CanSpec {
+    /// How the adapter is spoken to, default `SocketCAN`.
+    pub adapter: CanAdapter,
+    /// Bits a second on the bus, `10_000..=1_000_000`, default 1,000,000.
+    pub bitrate: u32,
+    /// What is on the bus, default [`CanProtocol::Raw`].
+    pub protocol: CanProtocol,
+}
+
+/// How a CAN adapter is spoken to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum CanAdapter {
+    /// The kernel has a driver for it, which makes it a network interface.
+    SocketCan,
+    /// A serial line that speaks slcan (Lawicel's protocol).
+    Slcan,
+    /// A serial line with the framing of Damiao's adapter.
+    Damiao,
+}
+
+/// What is on the bus.
+#[derive(Debug, Clone, PartialEq)]
+pub enum CanProtocol {
+    /// Frames, not looked into. None is sent.
+    Raw,
+    /// Damiao's motors.
+    Damiao(DamiaoSpec),
+}
+
+impl CanSpec {
+    /// Numbers in a sample; 0 if it holds bytes.
+    #[must_use]
+    pub fn channels(&self) -> usize {
+        match &self.protocol {
+            CanProtocol::Raw => 0,
+            CanProtocol::Damiao(damiao) => MOTOR_CHANNELS * damiao.motors.len(),
+        }
+    }
+}
+
+/// Gives a type the words for its values: a table that the parser reads, the word of a value, and that as its text.
+macro_rules! words {
+    ($($(#[$doc:meta])* $type:ident, $count:literal: $($word:literal = $value:ident),+ $(; $more:literal = $other:ident)?;)+) => {$(
+        impl $type {
+            $(#[$doc])*
+            pub const WORDS: [(&str, Self); $count] = [$(($word, Self::$value)),+];
+
+            /// The word for it.
+            #[must_use]
+            pub const fn word(self) -> &'static str {
+                match self {
+                    $(Self::$value => $word,)+
+                    $(Self::$other => $more,)?
+                }
+            }
+        }
+
+        impl fmt::Display for $type {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str(self.word())
+            }
+        }
+    )+};
+}
+
+words! {
+    /// Every format and its V4L2 name.
+    PixelFormat, 3: "MJPG" = Mjpg, "YUYV" = Yuyv, "GREY" = Grey;
+    /// Every kind of content and its name.
+    Parse, 4: "csv" = Csv, "json" = Json, "f32le" = F32le, "raw" = Raw;
+    /// Every slot and its name.
+    Mount, 4: "front" = Front, "tip" = Tip, "top" = Top, "bottom" = Bottom;
+    /// Every kind of adapter and its name.
+    CanAdapter, 3: "socketcan" = SocketCan, "slcan" = Slcan, "damiao" = Damiao;
+    /// Every way to stop and its name.
+    Stop, 4: "limp" = Limp, "damp" = Damp, "hold" = Hold, "brake" = Brake;
+    /// Every node a program may open and its name.
+    Opens, 3: "video" = Video, "tty" = Tty, "usb" = Usb; "net" = Net;
+    /// Every policy and its name.
+    WhenStale, 2: "hold" = Hold, "zero" = Zero;
+}
+
+/// What the samples of a program may hold.
+pub(super) const KINDS: [(&str, ModalityKind); 3] =
+    [("scalars", ModalityKind::Scalars), ("image", ModalityKind::Image), ("bytes", ModalityKind::Bytes)];
+
+impl fmt::Display for Framing {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Line => f.write_str("line"),
+            Self::Cobs => f.write_str("cobs"),
+            Self::Fixed(bytes) => write!(f, "fixed {bytes}"),
+        }
+    }
+}
+
+impl NodeSpec {
+    /// The kind of node: `camera`, `serial`, `can`, `lan` or `process`.
+    #[must_use]
+    pub const fn kind(&self) -> &'static str {
+        match self {
+            Self::Camera(_) => "camera",
+            Self::Serial(_) => "serial",
+            Self::Process(_) => "process",
+            Self::Can(_) => "can",
+            Self::Lan(_) => "lan",
+        }
+    }
+
+    /// The format on one line: `640x480@30 MJPG`, `115200 baud line csv x3`, `tactile_publisher scalars x16`.
+    #[must_use]
+    pub fn format(&self) -> String {
+        match self {
+            Self::Camera(camera) => format!("{}x{}@{} {}", camera.width, camera.height, camera.fps, camera.format),
+            Self::Serial(serial) if serial.parse == Parse::Raw => {
+                format!("{} baud {} raw", serial.baud, serial.framing)
+            }
+            Self::Can(can) => match &can.protocol {
+                CanProtocol::Raw => format!("{} {} bit/s raw", can.adapter, can.bitrate),
+                CanProtocol::Damiao(damiao) => {
+                    format!("{} {} bit/s damiao x{}", can.adapter, can.bitrate, damiao.motors.len())
+                }
+            },
+            Self::Lan(lan) => lan.format(),
+            Self::Serial(serial) => {
+                format!("{} baud {} {} x{}", serial.baud, serial.framing, serial.parse, serial.channels)
+            }
+            Self::Process(process) => {
+                let name = process.program.file_name().unwrap_or(process.program.as_os_str()).display();
+                match process.shape.as_slice() {
+                    [height, width] => format!("{name} {width}x{height}"),
+                    [channels] => format!("{name} scalars x{channels}"),
+                    _ => {
+                        let word = KINDS.iter().find(|(_, kind)| *kind == process.kind).map_or("", |(word, _)| word);
+                        format!("{name} {word}")
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// One `[stop.NAME]` table.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct InterlockSpec {
+    /// Its name: `[a-z][a-z0-9_]*`, at most 64 bytes.
+    pub name: String,
+    /// What it stops.
+    pub kind: StopKind,
+    /// Names of the entries that it stops, each an actuator; empty if the rig has none.
+    pub actuators: Vec<String>,
+    /// What it is read from.
+    pub input: InterlockInput,
+}
+
+/// What a stop is read from.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum InterlockInput {
+    /// A key of an input device of the kernel (evdev).
+    Key(KeyInput),
+    /// A line of a GPIO chip.
+    Gpio(GpioInput),
+    /// Lines of text on a serial port.
+    Serial(LineInput),
+    /// A number in the samples of an entry.
+    Field(FieldInput),
+}
+
+/// `key = { ... }`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct KeyInput {
+    /// The device: an absolute path, or the name that it gives itself.
+    pub device: String,
+    /// The key's name in `linux/input-event-codes.h`.
+    pub code: String,
+    /// The key's number there.
+    pub number: u16,
+    /// The actuator may move while the key is pressed; otherwise while it is not.
+    pub runs_while_pressed: bool,
+}
+
+/// `gpio = { ... }`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct GpioInput {
+    /// The chip, for example `/dev/gpiochip0`.
+    pub chip: PathBuf,
+    /// Its line.
+    pub line: u32,
+    /// The actuator may move while the line is high; otherwise while it is low. The line is pulled the other way, so
+    /// that a broken wire stops.
+    pub runs_while_high: bool,
+}
+
+/// `serial = { ... }`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct LineInput {
+    /// The port, absolute.
+    pub path: PathBuf,
+    /// Bits a second, default 115200.
+    pub baud: u32,
+    /// The line that says that the actuator may move.
+    pub run: String,
+    /// The line that says that it may not; then any other than the two is left out. Without it every other line says so.
+    pub stop: Option<String>,
+    /// Without one of the two for this long the input is lost.
+    pub silence: Duration,
+}
+
+/// `field = { ... }`.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct FieldInput {
+    /// The entry, whose samples are numbers.
+    pub device: String,
+    /// Which number of a sample, from 0.
+    pub index: usize,
+    /// The numbers at which the actuator may move.
+    pub runs: Bound,
+    /// Without a sample for this long the input is lost.
+    pub silence: Duration,
+}
+
+/// One side of a number.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Bound {
+    /// Above this.
+    Above(f64),
+    /// Below this.
+    Below(f64),
+}
+
+impl Bound {
+    /// Is `value` on this side? One that is no number is not.
+    #[must_use]
+    pub fn holds(self, value: f64) -> bool {
+        match self {
+            Self::Above(bound) => value > bound,
+            Self::Below(bound) => value < bound,
+        }
+    }
+}
+
+impl fmt::Display for InterlockInput {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Key(key) => {
+                let state = if key.runs_while_pressed { "pressed" } else { "not pressed" };
+                write!(f, "{} of {}, runs while {state}", key.code, key.device)
+            }
+            Self::Gpio(gpio) => {
+                let level = if gpio.runs_while_high { "high" } else { "low" };
+                write!(f, "line {} of {}, runs while {level}", gpio.line, gpio.chip.display())
+            }
+            Self::Serial(line) => {
+                let (path, run) = (line.path.display(), &line.run);
+                write!(f, "{path} at {} baud, runs with {run:?}, lost after {:?} without it", line.baud, line.silence)
+            }
+            Self::Field(field) => {
+                let (device, index) = (&field.device, field.index);
+                let (side, bound) = match field.runs {
+                    Bound::Above(bound) => ("above", bound),
+                    Bound::Below(bound) => ("below", bound),
+                };
+                write!(f, "number {index} of {device}, runs {side} {bound}, lost after {:?} without it", field.silence)
+            }
+        }
+    }
+}
+
+/// How much of what can go wrong an episode may have before it gets a grade: the limits of one. A figure beyond its limit earns the grade; `None` is a check that is off.
+///
+/// Shares are of the samples that should be there, `0.0..=1.0`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Limits {
+    /// Samples the device lost before `rapid` had them.
+    pub lost: Option<f64>,
+    /// Samples lost between the driver and the file.
+    pub dropped: Option<f64>,
+    /// Samples that the driver called damaged, and JPEG pictures without their beginning or end.
+    pub damaged: Option<f64>,
+    /// Samples with a non-increasing sequence number or capture time.
+    pub duplicate: Option<f64>,
+    /// Samples that are byte for byte the one before.
+    pub repeated: Option<f64>,
+    /// Longest time in which every sample is byte for byte the one before.
+    pub frozen: Option<Duration>,
+    /// Samples that came too late for their frame.
+    pub late: Option<f64>,
+    /// Longest time without a sample while the device was there.
+    pub gap: Option<Duration>,
+    /// Longest time in which the device was plugged in and did not run.
+    pub opening: Option<Duration>,
+    /// Change of the stamps against this machine's clock over the episode, and how far they lie in
+    /// the future.
+    pub clock: Option<Duration>,
+    /// Least rate while the device was there, as a share of the nominal one.
+    pub rate: Option<f64>,
+    /// Least share of the ticks at which the device was there that have a sample of it in `sync_window`.
+    pub valid: Option<f64>,
+}
+
+/// What the verdict on a modality is made of.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct VerdictSpec {
+    /// Beyond these the episode is SUSPECT.
+    pub suspect: Limits,
+    /// Beyond these it is BAD.
+    pub bad: Limits,
+    /// Samples a second the device should send, if anything says so: a camera's `fps`, or `hz`.
+    pub hz: Option<f64>,
+}
+
+impl VerdictSpec {
+    /// The limits of a modality of which the registry says nothing else.
+    ///
+    /// * lost 1 %, 5 %: one picture in a hundred is a hole that a neighbour fills; from some 2 to 5 %
+    ///   on other recorders call a rig overloaded.
+    /// * dropped 0, 5 %: this machine could not keep up, which it always should.
+    /// * damaged 1 %, 5 %: as good as lost. A camera's first picture after it was plugged in often is.
+    /// * duplicate 0.1 %, 5 %: a stamp that does not increase puts a sample into the wrong frame.
+    /// * repeated 10 %, 60 %: a camera that sends every second picture twice (50 %) runs at half its
+    ///   rate; more than that stands still.
+    /// * frozen 500 ms, 2 s: a live sensor has noise, and no two pictures of it are equal. Only of
+    ///   images: numbers and bytes may well be constant.
+    /// * late 1 %, 20 %: the frame went without them, although the file has them.
+    /// * gap `stall_after`, ten times that: longer is what the monitor calls stalled.
+    /// * opening 5 s, off: two of them a replugged device is made to wait, and a slow camera takes
+    ///   another two. Longer is a node that does not start. How bad that is depends on the task.
+    /// * clock 10 ms, 100 ms: less than half the usual window of 25 ms cannot move many samples into
+    ///   another frame.
+    /// * valid 90 %, 50 %: a policy learns from what the frames hold, and of a tick without a valid sample that is
+    ///   an old one or nothing. A device slower than twice `sync_window` misses ticks by its phase alone.
+    /// * rate 90 %, 50 %: in poor light cameras expose longer and halve their rate.
+    #[must_use]
+    pub fn of(kind: ModalityKind, stall_after: Duration, hz: Option<f64>) -> Self {
+        let image = kind == ModalityKind::Image;
+        let suspect = Limits {
+            lost: Some(0.01),
+            dropped: Some(0.0),
+            damaged: Some(0.01),
+            duplicate: Some(0.001),
+            repeated: image.then_some(0.1),
+            frozen: image.then_some(Duration::from_millis(500)),
+            late: Some(0.01),
+            gap: Some(stall_after),
+            opening: Some(Duration::from_secs(5)),
+            clock: Some(Duration::from_millis(10)),
+            rate: Some(0.9),
+            valid: Some(0.9),
+        };
+        let bad = Limits {
+            lost: Some(0.05),
+            dropped: Some(0.05),
+            damaged: Some(0.05),
+            duplicate: Some(0.05),
+            repeated: image.then_some(0.6),
+            frozen: image.then_some(Duration::from_secs(2)),
+            late: Some(0.2),
+            gap: Some(stall_after.saturating_mul(10)),
+            opening: None,
+            clock: Some(Duration::from_millis(100)),
+            rate: Some(0.5),
+            valid: Some(0.5),
+        };
+        Self { suspect, bad, hz }
+    }
+
+    /// Does anything here want to know whether two payloads are equal?
+    #[must_use]
+    pub fn compares(&self) -> bool {
+        [self.suspect, self.bad].iter().any(|limits| limits.frozen.is_some() || limits.repeated.is_some())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_value_has_a_word() {
+        let formats = [PixelFormat::Mjpg, PixelFormat::Yuyv, PixelFormat::Grey].map(|format| format.to_string());
+        assert_eq!(formats, ["MJPG", "YUYV", "GREY"]);
+        let parses = [Parse::Csv, Parse::Json, Parse::F32le, Parse::Raw].map(|parse| parse.to_string());
+        assert_eq!(parses, ["csv", "json", "f32le", "raw"]);
+        let mounts = [Mount::Front, Mount::Tip, Mount::Top, Mount::Bottom].map(|mount| mount.to_string());
+        assert_eq!(mounts, ["front", "tip", "top", "bottom"]);
+        assert_eq!([WhenStale::Hold, WhenStale::Zero].map(|stale| stale.to_string()), ["hold", "zero"]);
+        assert_eq!(Framing::Fixed(12).to_string(), "fixed 12");
     }
 }

@@ -11,16 +11,13 @@
 //! Invariant: a path without an objection cannot be changed between the look at it and its use, by
 //! anybody who is not trusted.
 
-use std::collections::VecDeque;
-use std::ffi::OsString;
 use std::fmt;
-use std::fs::Metadata;
 use std::io;
-use std::os::unix::fs::MetadataExt;
-use std::path::{Component, Path, PathBuf};
+use std::path::{Path, PathBuf};
 
-/// Links on one way before it is taken for a circle; as in Linux, see `path_resolution(7)`.
-const MOST_LINKS: usize = 40;
+use rustix::fs::{FileType, Stat};
+
+use crate::folder::{FolderError, Missing, Walk};
 
 /// Why what a path leads to cannot be trusted. As text, the reason without the file's own name.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -88,69 +85,26 @@ impl fmt::Display for Distrust {
 /// When there is no such file, or its folder may not be looked at.
 pub fn distrust(path: &Path) -> io::Result<Option<Distrust>> {
     let euid = rustix::process::geteuid().as_raw();
-    let mut rest: VecDeque<OsString> = VecDeque::new();
-    let mut here = if path.is_absolute() { PathBuf::from("/") } else { std::env::current_dir()? };
     // The way to the working folder is part of the way.
-    if !path.is_absolute() {
-        push_front(&mut rest, &here);
-        here = PathBuf::from("/");
-    }
-    push_back(&mut rest, path);
-    let mut links = 0;
-    let root = std::fs::symlink_metadata(&here)?;
-    if let Some(why) = judge(Place::Folder, &root, euid) {
-        return Ok(Some(Distrust { place: Place::Folder, path: here, why }));
-    }
-    while let Some(name) = rest.pop_front() {
-        if name == ".." {
-            here.pop();
-            continue;
-        }
-        let next = here.join(&name);
-        let metadata = std::fs::symlink_metadata(&next)?;
-        let place = match metadata.file_type() {
-            kind if kind.is_symlink() => Place::Link,
-            kind if kind.is_dir() => Place::Folder,
+    let path = if path.is_absolute() { path.to_owned() } else { std::env::current_dir()?.join(path) };
+    let mut found = None;
+    let mut check = |part: &Path, stat: &Stat| {
+        let place = match FileType::from_raw_mode(stat.st_mode) {
+            FileType::Symlink => Place::Link,
+            FileType::Directory => Place::Folder,
             _ => Place::File,
         };
-        if let Some(why) = judge(place, &metadata, euid) {
-            return Ok(Some(Distrust { place, path: next, why }));
-        }
-        if place != Place::Link {
-            here = next;
-            continue;
-        }
-        links += 1;
-        if links > MOST_LINKS {
-            return Err(rustix::io::Errno::LOOP.into());
-        }
-        let target = std::fs::read_link(&next)?;
-        if target.is_absolute() {
-            here = PathBuf::from("/");
-        }
-        push_front(&mut rest, &target);
+        let bits = Bits { mode: stat.st_mode & 0o7777, owner: stat.st_uid, group: stat.st_gid };
+        let Some(why) = judge(place, bits, euid) else { return Ok(()) };
+        found = Some(Distrust { place, path: part.to_owned(), why });
+        // Goes no further.
+        Err(FolderError::NoFolder(part.to_owned()))
+    };
+    let walked = Walk::new(Missing::Refused, &mut check).to(&path);
+    if found.is_none() {
+        walked?;
     }
-    Ok(None)
-}
-
-fn names(path: &Path) -> impl DoubleEndedIterator<Item = OsString> + '_ {
-    path.components().filter_map(|component| match component {
-        Component::Normal(name) => Some(name.to_owned()),
-        Component::ParentDir => Some(OsString::from("..")),
-        Component::RootDir | Component::CurDir | Component::Prefix(_) => None,
-    })
-}
-
-fn push_front(rest: &mut VecDeque<OsString>, path: &Path) {
-    names(path).rev().for_each(|name| rest.push_front(name));
-}
-
-fn push_back(rest: &mut VecDeque<OsString>, path: &Path) {
-    rest.extend(names(path));
-}
-
-fn judge(place: Place, metadata: &Metadata, euid: u32) -> Option<Why> {
-    judge_bits(place, Bits { mode: metadata.mode() & 0o7777, owner: metadata.uid(), group: metadata.gid() }, euid)
+    Ok(found)
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -160,7 +114,7 @@ struct Bits {
     group: u32,
 }
 
-fn judge_bits(place: Place, bits: Bits, euid: u32) -> Option<Why> {
+fn judge(place: Place, bits: Bits, euid: u32) -> Option<Why> {
     let Bits { mode, owner, group } = bits;
     if owner != 0 && owner != euid {
         return Some(Why::Owner(owner));
@@ -187,9 +141,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn who_may_write_is_told_by_owner_and_mode() {
+    fn write_access_follows_owner_and_mode() {
         use Place::{File, Folder, Link};
-        let why = |place, mode, owner, group, euid| judge_bits(place, Bits { mode, owner, group }, euid);
+        let why = |place, mode, owner, group, euid| judge(place, Bits { mode, owner, group }, euid);
         for (place, mode, owner, group, euid, expected) in [
             (File, 0o644, 0, 0, 0, None),
             (File, 0o664, 0, 0, 0, Some(Why::Mode(0o664))),
@@ -214,7 +168,7 @@ mod tests {
     struct Tree(tempfile::TempDir);
 
     impl Tree {
-        /// `a/b/file`, which nobody else may change.
+        /// `a/b/file`, which no other user may change.
         fn new() -> (Self, PathBuf) {
             let dir = tempfile::tempdir().unwrap();
             fs::create_dir_all(dir.path().join("a/b")).unwrap();
@@ -266,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn what_belongs_to_another_user_is_not_trusted() {
+    fn files_of_another_user_are_not_trusted() {
         const OTHER: u32 = 12_345;
         let (tree, file) = Tree::new();
         if chown(&file, Some(OTHER), None).is_err() {

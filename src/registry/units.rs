@@ -120,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_shown_can_be_read_again() {
+    fn formatted_units_can_be_parsed_again() {
         for ms in [1_u64, 25, 500, 2_000, 60_000, 90_000, 3_600_000] {
             let duration = Duration::from_millis(ms);
             assert_eq!(parse_duration(&show_duration(duration)), Some(duration));

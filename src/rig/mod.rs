@@ -8,6 +8,7 @@
 //! Invariant: the end of a stream, by value or by panic, is an event like any other.
 
 mod attendant;
+pub mod core;
 mod logbook;
 mod output;
 mod owner;

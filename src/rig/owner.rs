@@ -1,7 +1,9 @@
-//! The task that owns all slots.
+//! The task that carries out what the core decides: streams, announcements, the published mask.
+//!
+//! Invariant: the mask is published before anything is announced, which allocates and locks.
+//! Invariant: nothing here waits for a device; a stream that is to end is notified and forgotten.
 
 use std::collections::HashMap;
-use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -12,21 +14,24 @@ use tokio::time::{Instant, MissedTickBehavior, interval, sleep, timeout};
 use tokio_util::sync::CancellationToken;
 
 use super::attendant::Post;
-use super::presence::{PERIOD, Presence};
+use super::core::{Core, DeviceEffect, Effect, Input, StreamEvent, Transition};
+use super::presence::{JsonDevice, PERIOD, Presence};
 use super::programs::Programs;
-use super::slot::{Effects, End, Input, Slot};
-use super::stream::{Controls, Numbers, Reported, Stream};
+use super::slot::End;
+use super::stream::{Controls, Ended, Numbers, Report, Reported, Stream};
 use super::worker::Seat;
 use super::{RigCommand, RigError};
-use crate::action::Arming;
+use crate::action::{ActuatorNotice, Arming};
 use crate::bus::{Bus, TopicId, Writer};
-use crate::hotplug::{HotplugEvent, HotplugStream, Witness};
+use crate::driver::DriverError;
+use crate::hotplug::HotplugStream;
 use crate::interlocks::tap::Tap;
-use crate::mask::PhysicalMask;
+use crate::mask::SizedMask;
 use crate::modality::ModalityId;
-use crate::registry::{Assigner, Assignment, Attachment, DeviceSpec, Registry};
+use crate::permission::Permission;
+use crate::registry::{Attachment, DeviceSpec, Registry};
 use crate::sample::Epoch;
-use crate::status::{Board, EpisodeWatch, SlotState, What};
+use crate::status::{Board, EpisodeWatch, Level, SlotState, What};
 use crate::time::Stamp;
 
 /// The JSON file is written this often, and at every change.
@@ -35,18 +40,21 @@ const JSON_PERIOD: Duration = Duration::from_secs(1);
 const STOP_LIMIT: Duration = Duration::from_millis(4500);
 /// Reports that may wait; streams report a few times in their life.
 const REPORT_DEPTH: usize = 1024;
+/// Effects for which there is room without an allocation: far more than one event has.
+const EFFECTS: usize = 64;
 
-/// Owner of every device's life and of the mask.
+/// Executes the rig's core with real devices.
 #[derive(Debug)]
 pub struct Rig {
+    core: Core,
+    /// Effects of the step in progress; kept, so that a step allocates nothing.
+    effects: Vec<Effect>,
     modalities: Vec<Modality>,
-    assigner: Assigner,
     presence: Presence,
     board: Arc<Board>,
-    mask: PhysicalMask,
     /// The mask's JSON file is to be written, once for everything that one event changes.
     json_is_stale: bool,
-    streams: JoinSet<(End, String)>,
+    streams: JoinSet<Ended>,
     /// Which stream a task is.
     tasks: HashMap<Id, (ModalityId, Epoch)>,
     reports: mpsc::Sender<Reported>,
@@ -58,29 +66,24 @@ pub struct Rig {
     ending: CancellationToken,
 }
 
-/// A slot and what belongs to it.
+/// What the live rig keeps for a modality.
 #[derive(Debug)]
 struct Modality {
     spec: Arc<DeviceSpec>,
-    slot: Slot<Attachment>,
     writer: Arc<Writer>,
     numbers: Arc<Numbers>,
-    /// When the newest device was attached.
-    attached: Stamp,
-    /// Tells the running stream to end.
+    /// Ends the running stream.
     stop: CancellationToken,
     /// Where its program works, if it has one.
     seat: Option<Seat>,
-    /// Where its hooks are run, if a program is run at all.
+    /// Runs its hooks, if the rig runs programs at all.
     post: Option<Post>,
-    /// What it is told, if it is the actuator and no program reads it.
+    /// Its commands, if it is the actuator and no program moves it.
     controls: Option<Controls>,
     /// Emergency stops and enabling switches that are numbers of its samples.
     taps: Arc<[Tap]>,
-    /// What the actuator said last in this epoch.
+    /// What the actuator reported last in this epoch.
     arming: Option<Arming>,
-    /// A removal was told and no attachment after it.
-    was_told_gone: bool,
     /// What was agreed with the device, or why it does not run.
     detail: String,
 }
@@ -99,12 +102,10 @@ impl Rig {
                 .as_ref()
                 .map(|programs| Post::new(programs, &spec, prefix.clone(), seat.as_ref().map(Seat::turn)));
             Some(Modality {
-                slot: Slot::new(registry.rig.cooldown),
                 writer,
                 numbers: Arc::default(),
-                attached: Stamp::default(),
                 stop: CancellationToken::new(),
-                // A program that moves its device listens itself.
+                // A program that moves its device subscribes to actions itself.
                 controls: spec
                     .action
                     .as_ref()
@@ -112,7 +113,6 @@ impl Rig {
                     .and_then(|_| Some(Controls::new(bus.actions()?))),
                 taps: Arc::from([]),
                 arming: None,
-                was_told_gone: false,
                 seat,
                 post,
                 spec,
@@ -120,12 +120,12 @@ impl Rig {
             })
         };
         Self {
+            core: Core::new(registry),
+            effects: Vec::with_capacity(EFFECTS),
             // The bus was opened from the same registry: it has a writer for each of them.
             modalities: registry.devices.iter().filter_map(modality).collect(),
-            assigner: Assigner::new(registry),
             presence,
             board,
-            mask: PhysicalMask::EMPTY,
             json_is_stale: false,
             streams: JoinSet::new(),
             tasks: HashMap::new(),
@@ -133,6 +133,51 @@ impl Rig {
             programs,
             episode: tokio::sync::watch::channel(None).1,
             ending: CancellationToken::new(),
+        }
+    }
+
+    /// Devices and their hooks follow the episodes of this watch.
+    #[must_use]
+    pub fn following(mut self, episode: EpisodeWatch) -> Self {
+        self.episode = episode;
+        self
+    }
+
+    /// Its actuator moves as `permission` allows; without this nothing arms it.
+    #[must_use]
+    pub fn obeying(mut self, permission: &Arc<Permission>) -> Self {
+        for controls in self.modalities.iter_mut().filter_map(|modality| modality.controls.as_mut()) {
+            controls.obey(permission);
+        }
+        self
+    }
+
+    /// Samples of its devices are examined for these emergency stops and enabling switches.
+    #[must_use]
+    pub fn tapped(mut self, taps: &[Tap]) -> Self {
+        for modality in &mut self.modalities {
+            modality.taps = taps.iter().filter(|tap| tap.device() == modality.spec.name).cloned().collect();
+        }
+        self
+    }
+
+    /// Cancelled by [`Self::run`] before it closes the first device at its end.
+    #[must_use]
+    pub fn ending(&self) -> CancellationToken {
+        self.ending.clone()
+    }
+
+    /// Cancelled, it kills the programs that are being ended.
+    #[must_use]
+    pub fn hurry(&self) -> CancellationToken {
+        self.programs.as_ref().map_or_else(CancellationToken::new, |programs| programs.hurry.clone())
+    }
+
+    /// After a run and the episode in it, waits for the programs of its devices, which were notified to end,
+    /// and for their hooks.
+    pub async fn programs_ended(&self) {
+        if let Some(programs) = &self.programs {
+            programs.ended().await;
         }
     }
 
@@ -152,9 +197,10 @@ impl Rig {
         let mut json = interval(JSON_PERIOD);
         json.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let result = loop {
-            let deadline = self.next_deadline();
+            // Far away if no slot waits.
+            let deadline = self.core.deadline().unwrap_or_else(|| Stamp::now().after(Duration::from_hours(1)));
             tokio::select! {
-                // Shutdown first, then the earliest witnesses of an unplug, then the rest.
+                // Shutdown first, then the earliest sources of an unplug, then the rest.
                 biased;
                 () = shutdown.cancelled() => break Ok(()),
                 Some(ended) = self.streams.join_next_with_id(), if !self.streams.is_empty() => {
@@ -162,15 +208,15 @@ impl Rig {
                     self.stream_ended(ended);
                 }
                 event = hotplug.next() => match event {
-                    Some(Ok(event)) => self.hotplug(event),
+                    Some(Ok(event)) => self.step(Input::Hotplug(event)),
                     Some(Err(error)) => break Err(error.into()),
                     None => break Ok(()),
                 },
-                Some((id, epoch, report)) = reported.recv() => self.report(id, epoch, report),
+                Some(reported) = reported.recv() => self.report(reported),
                 Some(command) = commands.recv() => match command {
-                    RigCommand::Restart(id) => self.apply(id, Input::Restart),
+                    RigCommand::Restart(id) => self.step(Input::Restart(id)),
                 },
-                () = sleep(deadline.since(Stamp::now())) => self.deadlines_passed(),
+                () = sleep(deadline.since(Stamp::now())) => self.step(Input::Timer),
                 _ = json.tick() => self.json_is_stale = true,
                 // The mask it belongs to is not published yet.
                 () = sleep(PERIOD), if self.json_is_stale => {}
@@ -180,156 +226,142 @@ impl Rig {
         self.ending.cancel();
         self.reports_so_far(&mut reported);
         self.stop_streams().await;
-        for id in self.modalities.iter().map(|modality| modality.spec.id).collect::<Vec<_>>() {
-            self.lay_down(id, false);
+        for modality in &mut self.modalities {
+            modality.disarm(&self.board, false);
         }
         result
     }
 
-    fn hotplug(&mut self, event: HotplugEvent) {
-        match event {
-            HotplugEvent::Added(attachment) => {
-                if self.assigner.replaces(&attachment) {
-                    self.removed(&attachment.syspath, Witness::Enumeration);
+    /// Takes one step of the core and carries out its effects.
+    fn step(&mut self, input: Input) {
+        let mut effects = std::mem::take(&mut self.effects);
+        self.core.step(input, Stamp::now(), &mut effects);
+        for effect in effects.drain(..) {
+            match effect {
+                Effect::Publish(mask) => self.presence.publish(mask),
+                Effect::Unused { unit, reason } => {
+                    let serial = unit.serial().unwrap_or("no serial");
+                    let device = format!("{} ({serial}) at {}", unit.model(), unit.place());
+                    self.board.announce(What::Unregistered { device, reason });
                 }
-                match self.assigner.attach(&attachment) {
-                    Assignment::Entry(id) => self.attached(id, attachment),
-                    Assignment::Waiting { reason } | Assignment::Unregistered { reason } => {
-                        let unit = &attachment.unit;
-                        let serial = unit.serial().unwrap_or("no serial");
-                        let device = format!("{} ({serial}) at {}", unit.model(), unit.place());
-                        self.board.announce(What::Unregistered { device, reason });
-                    }
-                    Assignment::WrongNode { reason } => tracing::debug!(%reason, "node not used"),
+                Effect::WrongNode { reason } => tracing::debug!(%reason, "node not used"),
+                Effect::Device(id, effect) => self.carry_out(id, effect),
+            }
+        }
+        self.effects = effects;
+    }
+
+    fn carry_out(&mut self, id: ModalityId, effect: DeviceEffect) {
+        let Some(modality) = self.modalities.iter_mut().find(|modality| modality.spec.id == id) else { return };
+        let device = || modality.spec.name.clone();
+        match effect {
+            DeviceEffect::Stop => modality.stop.cancel(),
+            DeviceEffect::Ended => modality.disarm(&self.board, true),
+            DeviceEffect::AnnounceAttach => {
+                if let Some(Attachment { node, unit, driver, .. }) = self.core.attached(id) {
+                    let (node, unit, driver) = (node.label(), unit.clone(), driver.as_deref().cloned());
+                    self.board.announce(What::Attach { device: device(), bit: id, node, unit, driver });
                 }
             }
-            HotplugEvent::Removed { syspath, witness, .. } => self.removed(&syspath, witness),
-        }
-    }
-
-    fn attached(&mut self, id: ModalityId, attachment: Attachment) {
-        let Some(modality) = self.modality(id) else { return };
-        if modality.slot.attached() == Some(&attachment) {
-            return;
-        }
-        modality.attached = Stamp::now();
-        self.tell_attach(id, &attachment);
-        self.attend(id, &attachment);
-        self.apply(id, Input::Attached(attachment));
-    }
-
-    fn removed(&mut self, syspath: &Path, witness: Witness) {
-        let detached = self.assigner.detach(syspath);
-        for id in detached.freed {
-            self.set_bit(id, false);
-            self.tell_detach(id, witness.word());
-            self.apply(id, Input::Detached);
-            self.dismiss(id);
-        }
-        for (id, attachment) in detached.assigned {
-            self.attached(id, attachment);
-        }
-    }
-
-    fn stream_ended(&mut self, ended: Result<(Id, (End, String)), JoinError>) {
-        let (task, end, reason) = match ended {
-            Ok((task, (end, reason))) => (task, end, reason),
-            Err(error) if error.is_panic() => {
-                (error.id(), End::Retry, "its reader panicked; please report this".to_owned())
+            DeviceEffect::AnnounceDetach(source) => {
+                self.board.announce(What::Detach { device: device(), bit: id, source });
             }
-            Err(error) => (error.id(), End::Retry, error.to_string()),
+            DeviceEffect::Plugged => {
+                if let Some((post, attachment)) = modality.post.as_mut().zip(self.core.attached(id)) {
+                    post.attached(attachment, &self.episode);
+                }
+            }
+            DeviceEffect::Unplugged => modality.post.iter().for_each(Post::removed),
+            DeviceEffect::Start(epoch, attachment) => {
+                modality.detail = attachment.node.label();
+                self.start(id, epoch, attachment);
+            }
+            DeviceEffect::State(transition) => {
+                modality.describe(transition);
+                self.show(id);
+                self.announce_state(id, transition.to);
+                self.json_is_stale = true;
+            }
+        }
+    }
+
+    fn stream_ended(&mut self, ended: Result<(Id, Ended), JoinError>) {
+        let (task, Ended { end, reason }) = match ended {
+            Ok(ended) => ended,
+            Err(error) => {
+                let reason = if error.is_panic() {
+                    "its reader panicked; please report this".to_owned()
+                } else {
+                    error.to_string()
+                };
+                (error.id(), Ended { end: End::Retry, reason })
+            }
         };
         let Some((id, epoch)) = self.tasks.remove(&task) else { return };
-        let Some(modality) = self.modality(id).filter(|modality| modality.slot.is_current(epoch)) else { return };
-        if let End::Retry | End::Fatal = end {
-            modality.detail.clone_from(&reason);
+        let is_current = self.core.is_current(id, epoch);
+        if let Some(modality) = self.modality(id).filter(|_| is_current && end != End::Gone) {
+            modality.detail = reason;
         }
-        // Whatever ended it, nothing of it comes any more.
-        self.set_bit(id, false);
-        match end {
-            End::Gone => self.tell_detach(id, "stream"),
-            End::Unlinked => {
-                self.tell_detach(id, Witness::Link.word());
-                self.modality(id).into_iter().for_each(|modality| modality.detail.clone_from(&reason));
+        self.step(Input::Stream { id, epoch, event: StreamEvent::Ended(end) });
+    }
+
+    /// Takes what streams reported by now: of one that has ended, all of it.
+    fn reports_so_far(&mut self, reports: &mut mpsc::Receiver<Reported>) {
+        for _ in 0..reports.len() {
+            let Ok(reported) = reports.try_recv() else { return };
+            self.report(reported);
+        }
+    }
+
+    fn report(&mut self, Reported { id, epoch, report }: Reported) {
+        // A report may arrive after the end of its stream, whose reason must stay.
+        if !self.core.is_current(id, epoch) {
+            return;
+        }
+        match report {
+            Report::Event(event) => return self.step(Input::Stream { id, epoch, event }),
+            Report::LinkDown => self.step(Input::Stream { id, epoch, event: StreamEvent::LinkDown }),
+            Report::Opened(..) => self.step(Input::Stream { id, epoch, event: StreamEvent::Opened }),
+            Report::Silent(_) | Report::Refused(_) | Report::Actuator(_) => {}
+        }
+        let Some(modality) = self.modalities.iter_mut().find(|modality| modality.spec.id == id) else { return };
+        let device = modality.spec.name.clone();
+        let what = match report {
+            Report::Event(_) => return,
+            Report::LinkDown => {
+                modality.detail = DriverError::Unlinked.to_string();
+                let text = format!("{device}: {}; it is opened when that is over", modality.detail);
+                What::Log { level: Level::Warn, text }
             }
-            End::Retry | End::Fatal => {}
-        }
-        self.apply(id, Input::Ended(epoch, end));
-    }
-
-    fn deadlines_passed(&mut self) {
-        let now = Stamp::now();
-        let due = |modality: &&Modality| modality.slot.deadline().is_some_and(|deadline| deadline <= now);
-        for id in self.modalities.iter().filter(due).map(|modality| modality.spec.id).collect::<Vec<_>>() {
-            self.apply(id, Input::Timer);
-        }
-    }
-
-    /// The next moment a slot wants to be woken; far away if none does.
-    fn next_deadline(&self) -> Stamp {
-        let deadlines = self.modalities.iter().filter_map(|modality| modality.slot.deadline());
-        deadlines.min().unwrap_or_else(|| Stamp::now().after(Duration::from_hours(1)))
-    }
-
-    /// Publishes the mask with this bit, if that changes it. Comes before everything else that an unplug brings with it:
-    /// what is announced allocates and locks.
-    fn set_bit(&mut self, id: ModalityId, present: bool) {
-        let mask = self.mask.with(id, present);
-        if mask != self.mask {
-            self.mask = mask;
-            self.presence.publish(mask);
-        }
-    }
-
-    /// Applies an input to a slot, does what it says, and publishes the mask if it changed.
-    fn apply(&mut self, id: ModalityId, input: Input<Attachment>) {
-        let now = Stamp::now();
-        let Some(modality) = self.modality(id) else { return };
-        let (before, epoch) = (modality.slot.state(), modality.slot.epoch());
-        let ran = modality.slot.is_current(epoch);
-        let Effects { stop, start } = modality.slot.apply(input, now);
-        let (state, present) = (modality.slot.state(), modality.slot.is_present());
-        self.set_bit(id, present);
-        let Some(modality) = self.modality(id) else { return };
-        if stop.is_some() {
-            modality.stop.cancel();
-        }
-        if ran && !modality.slot.is_current(epoch) {
-            self.lay_down(id, true);
-        }
-        let Some(modality) = self.modality(id) else { return };
-        let changed = state != before || start.is_some();
-        if changed
-            && state == SlotState::Backoff
-            && let Some(deadline) = modality.slot.deadline()
-        {
-            let wait = deadline.since(now).as_secs_f64();
-            let reason = if before == SlotState::Absent { "cooldown" } else { modality.detail.as_str() };
-            modality.detail = format!("{reason}; starts in {wait:.1} s");
-        }
-        if changed && state == SlotState::Failed && before == SlotState::Absent {
-            "attached, though its driver said again and again that it is gone: replug it, or restart it"
-                .clone_into(&mut modality.detail);
-        }
-        if let Some((epoch, attachment)) = start {
-            modality.detail = attachment.node.label();
-            self.start(id, epoch, attachment);
-        }
-        if changed {
-            self.show(id);
-            self.announce_state(id);
-            self.json_is_stale = true;
-        }
+            Report::Opened(description, provenance) => {
+                modality.detail = description;
+                What::Opened { device, bit: id, provenance }
+            }
+            Report::Silent(limit) => {
+                let limit = limit.as_secs();
+                modality.detail = format!("{}; it has sent nothing for {limit} s", modality.detail);
+                What::Log { level: Level::Warn, text: format!("{device}: open, but it has sent nothing for {limit} s") }
+            }
+            Report::Refused(reason) => What::Log { level: Level::Error, text: format!("{device}: {reason}") },
+            Report::Actuator(ActuatorNotice { arming, text, is_problem }) => {
+                modality.detail = format!("{}: {text}", arming.word());
+                modality.arming = Some(arming);
+                What::Actuator { device, bit: id, arming, is_problem, text }
+            }
+        };
+        self.show(id);
+        self.board.announce(what);
     }
 
     fn start(&mut self, id: ModalityId, epoch: Epoch, attachment: Attachment) {
         let (board, reports, episode) = (Arc::clone(&self.board), self.reports.clone(), self.episode.clone());
+        let attached = self.core.attached_at(id);
         let Some(modality) = self.modality(id) else { return };
         modality.stop = CancellationToken::new();
         let stream = Stream {
             spec: Arc::clone(&modality.spec),
             attachment,
-            attached: modality.attached,
+            attached,
             epoch,
             writer: Arc::clone(&modality.writer),
             numbers: Arc::clone(&modality.numbers),
@@ -345,13 +377,38 @@ impl Rig {
         self.tasks.insert(task.id(), (id, epoch));
     }
 
-    fn show(&mut self, id: ModalityId) {
-        let board = Arc::clone(&self.board);
-        let Some(modality) = self.modality(id) else { return };
-        board.set_slot(id, modality.slot.state(), modality.slot.epoch(), &modality.detail);
+    fn show(&self, id: ModalityId) {
+        let (state, epoch) = self.core.state(id);
+        if let Some(modality) = self.modalities.iter().find(|modality| modality.spec.id == id) {
+            self.board.set_slot(id, state, epoch, &modality.detail);
+        }
     }
 
-    /// Tells every stream to end and gives them a moment to close their devices.
+    fn announce_state(&mut self, id: ModalityId, state: SlotState) {
+        let mask = SizedMask { mask: self.core.mask(), devices: self.modalities.len() };
+        let Some(modality) = self.modalities.iter().find(|modality| modality.spec.id == id) else { return };
+        let (device, detail) = (modality.spec.name.clone(), modality.detail.clone());
+        self.board.announce(What::State { device, bit: id, state, mask, detail });
+    }
+
+    /// Writes the file for people, with mask and sequence of one publication; `false` if the mask of now is still to be
+    /// published.
+    fn write_json(&self) -> bool {
+        let device = |modality: &Modality| {
+            let Modality { spec, .. } = modality;
+            JsonDevice {
+                name: spec.name.clone(),
+                bit: spec.id,
+                online: self.core.mask().contains(spec.id),
+                usb_connected: self.core.attached(spec.id).is_some(),
+                state: self.core.state(spec.id).0,
+            }
+        };
+        let devices: Vec<_> = self.modalities.iter().map(device).collect();
+        self.presence.write_json(self.core.mask(), &devices)
+    }
+
+    /// Notifies every stream to end and gives them a moment to close their devices.
     async fn stop_streams(&mut self) {
         for modality in &self.modalities {
             modality.stop.cancel();
@@ -379,7 +436,31 @@ impl Rig {
     }
 }
 
-mod programs;
-mod report;
+impl Modality {
+    /// The stream has ended, or was told to. What the actuator reported last no longer holds: nothing is sent to it
+    /// until the next arm.
+    fn disarm(&mut self, board: &Board, is_problem: bool) {
+        if self.arming.take().is_some_and(|last| !matches!(last, Arming::Disarmed | Arming::Faulted)) {
+            let (device, text) = (self.spec.name.clone(), "disarmed; arm it again to resume".to_owned());
+            board.announce(What::Actuator { device, bit: self.spec.id, arming: Arming::Disarmed, is_problem, text });
+        }
+    }
+
+    /// Keeps, for people, why the slot is in its new state.
+    fn describe(&mut self, Transition { from, to, wait, source }: Transition) {
+        if let Some(source) = source {
+            self.detail = format!("unplugged, reported by {}", source.word());
+        }
+        if let Some(wait) = wait {
+            let reason = if from == SlotState::Absent { "cooldown" } else { self.detail.as_str() };
+            self.detail = format!("{reason}; starts in {:.1} s", wait.as_secs_f64());
+        }
+        if (from, to) == (SlotState::Absent, SlotState::Failed) {
+            "attached, but its driver repeatedly reported a disconnection: replug it, or restart it"
+                .clone_into(&mut self.detail);
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests;

@@ -57,7 +57,7 @@ pub enum End {
     /// The device is no longer there.
     Gone,
     /// It is there and cannot be reached before a link is up again, which its next start waits for.
-    Unlinked,
+    LinkDown,
     /// Starting again may help.
     Retry,
     /// Starting again cannot help.
@@ -197,7 +197,7 @@ impl<A: Clone> Slot<A> {
             }
             End::Fatal => self.enter(SlotState::Failed),
             // As often as somebody pulls the cable.
-            End::Unlinked => {
+            End::LinkDown => {
                 self.restarts.clear();
                 self.wait_until(now.after(FIRST_BACKOFF));
             }

@@ -12,9 +12,10 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use tokio::sync::mpsc;
-use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until, timeout};
+use tokio::time::{Instant, sleep_until, timeout};
 use tokio_util::sync::CancellationToken;
 
+use super::core::StreamEvent;
 use super::slot::End;
 use super::worker::Seat;
 use crate::action::ActuatorNotice;
@@ -22,6 +23,7 @@ use crate::bus::Writer;
 use crate::driver::{Driver, DriverError, Reading};
 use crate::fault;
 use crate::interlocks::tap::{Tap, lost_at_the_end};
+use crate::modality::ModalityId;
 use crate::registry::{Attachment, DeviceSpec, NodeSpec};
 use crate::sample::{Epoch, SampleHeader};
 use crate::status::{Board, EpisodeWatch, Provenance};
@@ -38,9 +40,8 @@ const SILENT_AFTER: Duration = Duration::from_secs(2);
 const START_LIMIT: Duration = Duration::from_secs(5);
 /// How long a device may take to be closed in order.
 const CLOSE_LIMIT: Duration = Duration::from_secs(4);
-/// How often the actuator is asked whether it was told something.
-const ACTIONS_EVERY: Duration = Duration::from_millis(2);
 
+use controls::Controlled;
 pub(super) use controls::Controls;
 use source::Source;
 
@@ -48,17 +49,13 @@ use source::Source;
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Report {
     /// The node is not opened before its link is up.
-    Unlinked,
+    LinkDown,
     /// The node is open; what was agreed with the device, for people and for the recording.
     Opened(String, Box<Provenance>),
     /// Open for so long, and no sample yet.
     Silent(Duration),
-    /// The first sample was published.
-    Started,
-    /// Nothing came for `DeviceSpec::stall_after`.
-    Stalled,
-    /// Samples come again.
-    Resumed,
+    /// What concerns the core alone.
+    Event(StreamEvent),
     /// Samples or actions are lost, and why, told once an epoch each; or an order.
     Refused(String),
     /// What an actuator has to tell.
@@ -66,7 +63,20 @@ pub(super) enum Report {
 }
 
 /// A report with its sender.
-pub(super) type Reported = (crate::modality::ModalityId, Epoch, Report);
+#[derive(Debug)]
+pub(super) struct Reported {
+    pub(super) id: ModalityId,
+    pub(super) epoch: Epoch,
+    pub(super) report: Report,
+}
+
+/// How a stream ended.
+#[derive(Debug)]
+pub(super) struct Ended {
+    pub(super) end: End,
+    /// Why, for people.
+    pub(super) reason: String,
+}
 
 /// How far a modality has come, over all its epochs.
 #[derive(Debug, Default)]
@@ -111,15 +121,15 @@ pub(super) struct Stream {
 }
 
 impl Stream {
-    /// Reads the device until it ends or the stream is told to stop. The reason is for people.
-    pub(super) async fn run(self) -> (End, String) {
-        // However it ends, a panic included, what its samples said is so no more.
+    /// Reads the device until it ends or the stream is told to stop.
+    pub(super) async fn run(self) -> Ended {
+        // However it ends, a panic included, what its samples said no longer holds.
         let _lost = lost_at_the_end(&self.taps);
-        let stopped = || (End::Gone, "stopped".to_owned());
+        let stopped = || Ended { end: End::Gone, reason: "stopped".to_owned() };
         let open = async {
-            if let Some(is_over) = Driver::unlinked(&self.spec, &self.attachment.node) {
-                self.report(Report::Unlinked).await;
-                is_over.await;
+            if let Some(is_up) = Driver::unlinked(&self.spec, &self.attachment.node) {
+                self.report(Report::LinkDown).await;
+                is_up.await;
             }
             timeout(OPEN_LIMIT, Source::open(&self)).await
         };
@@ -130,46 +140,44 @@ impl Stream {
         };
         let mut source = match opened {
             Ok(Ok(source)) => source,
-            Ok(Err(error)) => return end(&error),
-            Err(_) => return (End::Retry, format!("did not open within {} s", OPEN_LIMIT.as_secs())),
+            Ok(Err(error)) => return error.into(),
+            Err(_) => return Ended::retry(format!("did not open within {} s", OPEN_LIMIT.as_secs())),
         };
+        let mut notices = source.notices();
         tokio::select! {
             biased;
             () = self.stop.cancelled() => {}
-            end = self.read(&mut source) => {
-                // What it said last, before it ended.
-                self.pass_on_notices(&mut source).await;
-                return end;
+            ended = self.read(&mut source, &mut notices) => {
+                // What it reported last, before it ended.
+                self.pass_on_notices(&mut notices).await;
+                return ended;
             }
         }
         source.close().await;
         stopped()
     }
 
-    async fn read(&self, source: &mut Source) -> (End, String) {
+    async fn read(&self, source: &mut Source, notices: &mut Notices) -> Ended {
         self.report(Report::Opened(source.description(), Box::new(self.provenance(source)))).await;
         let patience = source.patience(self.spec.stall_after);
-        let mut pulse = Pulse::Silent;
-        let (mut refused, mut unmoved) = (false, false);
+        let mut progress = Progress::default();
         let stall = sleep_until(Instant::now() + self.spec.stall_after);
         tokio::pin!(stall);
         let silent = self.silence();
         tokio::pin!(silent);
-        let mut told = interval(ACTIONS_EVERY);
-        told.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let mut controls = match self.controls.as_ref().map(|controls| controls.begin(source)).transpose() {
-            Ok(controls) => controls,
-            Err(error) => return end(&error),
+            Ok(controls) => controls.flatten(),
+            Err(error) => return error.into(),
         };
-        // An order that is carried out at once is told before its first sample.
-        self.pass_on_notices(source).await;
+        // An order that is carried out at once is reported before its first sample.
+        self.pass_on_notices(notices).await;
         let mut episode = self.episode.clone();
         if episode.borrow_and_update().is_some() {
             episode.mark_changed();
         }
         let news = changed(episode.clone());
         tokio::pin!(news);
-        // The timer is looked at when it fires, not set anew at every sample.
+        // The timer is examined when it fires, not set again at every sample.
         let mut newest = Instant::now();
         loop {
             tokio::select! {
@@ -177,55 +185,38 @@ impl Stream {
                 reading = source.read() => {
                     let reading = match reading {
                         Ok(reading) => reading,
-                        Err(error) => return end(&error),
+                        Err(error) => return error.into(),
                     };
                     newest = Instant::now();
-                    if let Err(reason) = self.publish(&reading)
-                        && !refused
-                    {
-                        refused = true;
-                        self.report(Report::Refused(format!("samples are lost: {reason}"))).await;
-                    }
-                    if pulse != Pulse::Beating {
-                        let report = if pulse == Pulse::Silent { Report::Started } else { Report::Resumed };
-                        pulse = Pulse::Beating;
-                        self.report(report).await;
-                    }
-                    // A device that always has something to read never lets us get to `news`.
-                    self.tell(source, &mut episode).await;
+                    self.pass_on_sample(&reading, &mut progress).await;
+                    // A device that always has something to read never reaches `news`.
+                    self.pass_on_episode(source, &mut episode).await;
                 }
-                _ = told.tick(), if controls.is_some() => {
+                () = changed_controls(controls.as_mut()) => {
                     if let Some(controls) = &mut controls {
-                        if let Err(error) = controls.pass_on_orders(source) {
-                            self.report(Report::Refused(format!("an order is not carried out: {error}"))).await;
-                        }
-                        if let Err(error) = controls.pass_on_action(source)
-                            && !std::mem::replace(&mut unmoved, true)
-                        {
-                            self.report(Report::Refused(format!("it does not move: {error}"))).await;
-                        }
+                        self.pass_on_orders(source, controls, &mut progress).await;
                     }
-                    self.pass_on_notices(source).await;
                 }
+                notice = next_notice(notices) => self.report(Report::Actuator(notice)).await,
                 () = &mut news => {
-                    self.tell(source, &mut episode).await;
+                    self.pass_on_episode(source, &mut episode).await;
                     news.set(changed(episode.clone()));
                 }
-                reason = &mut silent, if pulse == Pulse::Silent => return (End::Retry, reason),
+                reason = &mut silent, if progress.pulse == Pulse::Silent => return Ended::retry(reason),
                 () = &mut stall => {
                     let due = newest + self.spec.stall_after;
                     if due > Instant::now() {
                         stall.as_mut().reset(due);
                         continue;
                     }
-                    // To begin takes longer than to go on: an interpreter has its libraries to load.
-                    let least = if pulse == Pulse::Silent { START_LIMIT } else { Duration::ZERO };
+                    // To start takes longer than to continue: an interpreter has its libraries to load.
+                    let least = if progress.pulse == Pulse::Silent { START_LIMIT } else { Duration::ZERO };
                     if patience.is_some_and(|patience| newest.elapsed() >= patience.max(least)) {
-                        return (End::Retry, format!("nothing came for {:?}", newest.elapsed()));
+                        return Ended::retry(format!("nothing came for {:?}", newest.elapsed()));
                     }
-                    if pulse == Pulse::Beating {
-                        pulse = Pulse::Stalled;
-                        self.report(Report::Stalled).await;
+                    if progress.pulse == Pulse::Beating {
+                        progress.pulse = Pulse::Stalled;
+                        self.report(Report::Event(StreamEvent::Stalled)).await;
                     }
                     stall.as_mut().reset(Instant::now() + self.spec.stall_after);
                 }
@@ -233,8 +224,36 @@ impl Stream {
         }
     }
 
-    /// Tells the device what is new of the episode in progress, if anything is.
-    async fn tell(&self, source: &mut Source, episode: &mut EpisodeWatch) {
+    /// Publishes a sample, and reports the first of a stream and the first after a stall.
+    async fn pass_on_sample(&self, reading: &Reading<'_>, progress: &mut Progress) {
+        if let Err(reason) = self.publish(reading)
+            && !std::mem::replace(&mut progress.has_lost, true)
+        {
+            self.report(Report::Refused(format!("samples are lost: {reason}"))).await;
+        }
+        let event = match progress.pulse {
+            Pulse::Beating => return,
+            Pulse::Silent => StreamEvent::Started,
+            Pulse::Stalled => StreamEvent::Resumed,
+        };
+        progress.pulse = Pulse::Beating;
+        self.report(Report::Event(event)).await;
+    }
+
+    /// Hands the actuator the orders and the newest action that came since the last call.
+    async fn pass_on_orders(&self, source: &mut Source, controls: &mut Controlled, progress: &mut Progress) {
+        if let Err(error) = controls.pass_on_orders(source) {
+            self.report(Report::Refused(format!("an order is not carried out: {error}"))).await;
+        }
+        if let Err(error) = controls.pass_on_action(source)
+            && !std::mem::replace(&mut progress.has_refused, true)
+        {
+            self.report(Report::Refused(format!("it does not move: {error}"))).await;
+        }
+    }
+
+    /// Notifies the device of a change of the episode in progress, if there was one.
+    async fn pass_on_episode(&self, source: &mut Source, episode: &mut EpisodeWatch) {
         if !episode.has_changed().unwrap_or(false) {
             return;
         }
@@ -245,9 +264,9 @@ impl Stream {
         }
     }
 
-    /// Reports what the actuator has to tell.
-    async fn pass_on_notices(&self, source: &mut Source) {
-        while let Some(notice) = source.take_notice() {
+    /// Reports the notices of the actuator that wait.
+    async fn pass_on_notices(&self, notices: &mut Notices) {
+        while let Some(Ok(notice)) = notices.as_mut().map(mpsc::Receiver::try_recv) {
             self.report(Report::Actuator(notice)).await;
         }
     }
@@ -315,16 +334,48 @@ impl Stream {
 
     /// The rig reads its reports at once; the channel is full only if it has ended.
     async fn report(&self, report: Report) {
-        let _ = self.reports.send((self.spec.id, self.epoch, report)).await;
+        let _ = self.reports.send(Reported { id: self.spec.id, epoch: self.epoch, report }).await;
     }
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// What a stream has reported so far.
+#[derive(Debug, Default)]
+struct Progress {
+    pulse: Pulse,
+    /// A sample could not be published.
+    has_lost: bool,
+    /// An action was refused.
+    has_refused: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 enum Pulse {
     /// No sample yet.
+    #[default]
     Silent,
     Beating,
     Stalled,
+}
+
+/// Of an actuator.
+type Notices = Option<mpsc::Receiver<ActuatorNotice>>;
+
+/// The next notice. Never, if it has none or has ended.
+async fn next_notice(notices: &mut Notices) -> ActuatorNotice {
+    if let Some(notices) = notices
+        && let Some(notice) = notices.recv().await
+    {
+        return notice;
+    }
+    std::future::pending().await
+}
+
+/// Returns when the device is to be given orders or an action.
+async fn changed_controls(controls: Option<&mut Controlled>) {
+    match controls {
+        Some(controls) => controls.changed().await,
+        None => std::future::pending().await,
+    }
 }
 
 /// Returns when there is news of an episode.
@@ -335,14 +386,22 @@ async fn changed(mut episode: EpisodeWatch) {
     }
 }
 
-fn end(error: &DriverError) -> (End, String) {
-    let how = match error {
-        DriverError::Gone => End::Gone,
-        DriverError::Unlinked => End::Unlinked,
-        DriverError::Retry(_) => End::Retry,
-        DriverError::Fatal(_) => End::Fatal,
-    };
-    (how, error.to_string())
+impl Ended {
+    fn retry(reason: String) -> Self {
+        Self { end: End::Retry, reason }
+    }
+}
+
+impl From<DriverError> for Ended {
+    fn from(error: DriverError) -> Self {
+        let end = match error {
+            DriverError::Gone => End::Gone,
+            DriverError::Unlinked => End::LinkDown,
+            DriverError::Retry(_) => End::Retry,
+            DriverError::Fatal(_) => End::Fatal,
+        };
+        Self { end, reason: error.to_string() }
+    }
 }
 
 #[cfg(test)]

@@ -15,8 +15,8 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use tokio::sync::broadcast;
 
 use super::{
-    DeviceStatus, Event, Grade, Level, LogLine, PolicyStatus, RecordingStatus, ShortEpisode, SlotState, Snapshot,
-    StopStatus, Verdict, What,
+    DeviceStatus, Event, Grade, LogLine, PolicyStatus, RecordingStatus, ShortEpisode, SlotState, Snapshot, StopStatus,
+    Verdict, What,
 };
 use crate::interlock::InputState;
 use crate::mask::PhysicalMask;
@@ -28,7 +28,7 @@ use crate::time::{Stamp, realtime_ns};
 
 /// Log lines kept for the screen.
 const LOG_LINES: usize = 500;
-/// Events a slow reader may fall behind before it is told that it missed some.
+/// Events a slow reader may fall behind before it misses some, and is notified.
 const EVENT_DEPTH: usize = 4096;
 
 /// Counters of one stream, written by its task alone.
@@ -135,7 +135,7 @@ impl Board {
         detail.clone_into(&mut slot.detail);
     }
 
-    /// Reports what stop `index` of the registry says, and announces it.
+    /// Reports the state of stop `index` of the registry, and announces it.
     pub fn set_stop(&self, index: usize, state: InputState, detail: &str) {
         let changed = lock(&self.stops).get_mut(index).map(|stop| {
             stop.state = state;
@@ -214,11 +214,9 @@ impl Board {
         log.push_back(line);
     }
 
-    /// Announces an event, now, to whoever subscribed, and adds it to the log.
+    /// Announces an event, now, to all subscribers, and adds it to the log.
     pub fn announce(&self, what: What) {
-        // A policy gives chunks all the time: only a late one is worth a line.
-        let said = what.sentence().filter(|(level, _)| !matches!(what, What::Chunk(_)) || *level > Level::Debug);
-        if let Some((level, text)) = said {
+        if let Some((level, text)) = what.log_line() {
             self.log(LogLine { wall_ns: realtime_ns(), level, text });
         }
         if let What::Episode { file, error, verdict, .. } = &what {
@@ -229,7 +227,7 @@ impl Board {
                 *bad = Some((before + 1, file.clone()));
             }
         }
-        // An error only says that nobody listens.
+        // An error only means that there is no subscriber.
         let _ = self.events.send(Event { stamp: Stamp::now(), what });
     }
 
@@ -297,7 +295,7 @@ fn unreported(stop: &InterlockSpec) -> StopStatus {
     StopStatus { stop: stop.name.clone(), kind: stop.kind, state: InputState::Lost, detail }
 }
 
-/// A poisoned lock here guards plain values that are whole at every moment: go on with them.
+/// A poisoned lock here guards plain values that are whole at every moment: they remain usable.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

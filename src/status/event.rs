@@ -1,14 +1,16 @@
-//! Events: state changes worth a line on a screen and a message in a recording.
+//! Events: state changes worth a line on a screen and a message in a recording; and as text for people: the one place of
+//! it. The log and a recording have the sentence; lines in columns have its parts.
 
 use std::path::PathBuf;
 use std::time::Duration;
 
 use serde::Serialize;
 
-use super::{Chunk, Grade, Level, SlotState, StopStatus, Verdict};
+use super::{Chunk, Grade, Hold, Level, PolicyEnd, SlotState, StopStatus, Verdict};
 use crate::action::Arming;
+use crate::mask::SizedMask;
 use crate::modality::ModalityId;
-use crate::provenance::{KernelDriver, Negotiated};
+use crate::provenance::{KernelDriver, Negotiated, UnplugSource};
 use crate::registry::Unit;
 use crate::sample::Epoch;
 use crate::text;
@@ -58,8 +60,9 @@ pub enum What {
         device: String,
         /// Its bit.
         bit: ModalityId,
-        /// Who told first: `stream`, `kernel`, `udev`, `enumeration`, `link`, `goodbye`, `lease` or `script`.
-        witness: String,
+        /// What noticed it first.
+        #[serde(rename = "witness")]
+        source: UnplugSource,
     },
     /// A slot changed its state.
     State {
@@ -69,14 +72,14 @@ pub enum What {
         bit: ModalityId,
         /// The new state.
         state: SlotState,
-        /// The mask after the change, `0x05`.
-        mask: String,
+        /// The mask after the change, in JSON `0x05`.
+        mask: SizedMask,
         /// Why, or what was agreed with the device.
         detail: String,
     },
     /// Something was plugged in that no entry of the registry means.
     Unregistered {
-        /// `vid:pid`, serial, product as the device says.
+        /// `vid:pid`, serial, product as the device reports them.
         device: String,
         /// Why no entry matches.
         reason: String,
@@ -114,7 +117,7 @@ pub enum What {
         /// Length in seconds.
         seconds: f64,
     },
-    /// The disk of the episode in progress is nearly full; told once an episode.
+    /// The disk of the episode in progress is nearly full; reported once an episode.
     DiskLow {
         /// The folder.
         #[serde(serialize_with = "text::lossy")]
@@ -124,7 +127,7 @@ pub enum What {
         /// Until the episode will be closed, at the rate it is written with.
         seconds: u64,
     },
-    /// The wall clock was set. Capture times of an episode in progress go on by the clock it began with.
+    /// The wall clock was set. Capture times of an episode in progress stay on the clock it began with.
     ClockStep {
         /// By how much, forward; back if negative.
         seconds: f64,
@@ -164,32 +167,14 @@ pub enum What {
     /// The policy gave actions.
     Chunk(Box<Chunk>),
     /// The policy does nothing from this moment on.
-    Hold {
-        /// The modality whose absence is the reason, or empty.
-        device: String,
-        /// Why.
-        reason: String,
-    },
+    Hold(Hold),
     /// The policy acts again, or for the first time.
     Act {
         /// Tick of the control grid.
         tick: u64,
     },
     /// The policy ended.
-    PolicyEnd {
-        /// Ticks with an action.
-        actions: u64,
-        /// Ticks without.
-        held: u64,
-        /// Chunks that were used.
-        chunks: u64,
-        /// Answers that were not used or never came.
-        unused: u64,
-        /// From the observation to the chunk, ms: half of them were faster.
-        latency_p50_ms: f64,
-        /// Of a hundred one was slower.
-        latency_p99_ms: f64,
-    },
+    PolicyEnd(PolicyEnd),
     /// An actuator was armed or disarmed, or disabled itself.
     Actuator {
         /// Modality.
@@ -198,12 +183,12 @@ pub enum What {
         bit: ModalityId,
         /// May it move now?
         arming: Arming,
-        /// Somebody should look after it.
+        /// It needs attention.
         is_problem: bool,
         /// What happened, for people.
         text: String,
     },
-    /// The input of an emergency stop or an enabling switch says something else than before, or is lost.
+    /// The input of an emergency stop or an enabling switch has changed, or is lost.
     Stop(StopStatus),
     /// Another program publishes on a topic of ours; once an episode for each topic and program.
     Publisher {
@@ -249,116 +234,197 @@ impl What {
         let Self::Episode { file, error: Some(_), .. } = self else { return false };
         file.extension().is_some_and(|extension| extension == "mcap")
     }
+}
 
-    /// The event as a line of the log; `None` where the event that follows says it all.
+/// Digits by which a bundle is distinguished from another.
+const HASH: usize = 12;
+
+/// An event as text. Names of devices and files are in it as they are, control characters included.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Description {
+    /// How much it matters.
+    pub level: Level,
+    /// The device, or the stage.
+    pub subject: String,
+    /// The bit of the device, if it has one.
+    pub bit: Option<ModalityId>,
+    /// What happened, in a word or two.
+    pub word: &'static str,
+    /// All of it.
+    pub sentence: String,
+    /// Where in `sentence` the detail begins.
+    detail: usize,
+}
+
+impl Description {
+    /// A sentence of its own; it begins neither with `subject` nor with `word`.
+    fn of(level: Level, subject: &str, word: &'static str, sentence: String) -> Self {
+        Self { level, subject: subject.to_owned(), bit: None, word, sentence, detail: 0 }
+    }
+
+    /// The sentence "subject word", and behind `joint` the rest.
+    fn joined(level: Level, subject: &str, word: &'static str, joint: &str, rest: &str) -> Self {
+        let mut sentence = format!("{subject} {word}");
+        let detail = sentence.len() + joint.len();
+        if !rest.is_empty() {
+            sentence.push_str(joint);
+            sentence.push_str(rest);
+        }
+        Self { level, subject: subject.to_owned(), bit: None, word, sentence, detail }
+    }
+
+    /// The detail begins behind `prefix`, with which the sentence begins.
+    fn without(self, prefix: &str) -> Self {
+        Self { detail: prefix.len(), ..self }
+    }
+
+    fn with_bit(self, bit: ModalityId) -> Self {
+        Self { bit: Some(bit), ..self }
+    }
+
+    /// The sentence without `subject` and `word`.
     #[must_use]
-    pub fn sentence(&self) -> Option<(Level, String)> {
-        Some(match self {
-            Self::Attach { device, node, unit, .. } => {
-                let serial = unit.serial().map(|serial| format!(", serial {serial}")).unwrap_or_default();
-                (Level::Info, format!("{device} attached ({node} at {}{serial})", unit.location()))
-            }
-            // The slot's state changes with it and names the witness, or what was agreed.
-            Self::Detach { .. } | Self::Opened { .. } => return None,
-            Self::State { device, state, detail, .. } => {
-                let level = match state {
-                    SlotState::Failed => Level::Error,
-                    SlotState::Stalled | SlotState::Backoff => Level::Warn,
-                    SlotState::Absent | SlotState::Opening | SlotState::Streaming => Level::Info,
-                };
-                let state = state.word();
-                let text = if detail.is_empty() {
-                    format!("{device} {state}")
-                } else {
-                    format!("{device} {state} ({detail})")
-                };
-                (level, text)
-            }
-            Self::Unregistered { device, reason } => (Level::Info, format!("{device} is not used: {reason}")),
-            Self::Policy { policy, hz, dry_run, library, .. } => {
-                let dry = if *dry_run { ", dry run: nothing moves" } else { "" };
-                (Level::Info, format!("policy {policy} loaded: {hz} Hz, onnxruntime {library}{dry}"))
-            }
-            Self::Chunk(chunk) => {
-                let late = match chunk.skipped {
-                    0 => String::new(),
-                    1 => ", 1 action too late".to_owned(),
-                    late => format!(", {late} actions too late"),
-                };
-                let text =
-                    format!("chunk of tick {}: {:.1} ms{late}, mask {}", chunk.tick, chunk.latency_ms, chunk.mask);
-                (if chunk.skipped > 0 { Level::Warn } else { Level::Debug }, text)
-            }
-            Self::Hold { device, reason } => {
-                let device = if device.is_empty() { String::new() } else { format!(": {device}") };
-                (Level::Warn, format!("policy holds: {reason}{device}"))
-            }
-            Self::Act { tick } => (Level::Info, format!("policy acts from tick {tick}")),
-            Self::PolicyEnd { actions, held, chunks, unused, latency_p50_ms, latency_p99_ms } => {
-                let text = format!(
-                    "policy ended: {actions} actions, {held} ticks held, {chunks} chunks, {unused} unused, latency p50 \
-                     {latency_p50_ms:.1} ms p99 {latency_p99_ms:.1} ms"
-                );
-                (Level::Info, text)
-            }
-            Self::Recording { file } => (Level::Info, format!("recording {}", file.display())),
-            Self::Episode { file, seconds, error: Some(error), verdict, .. } => {
-                let word = if self.is_cut_short() { "cut short" } else { "not whole" };
-                let grade = verdict.grade.word();
-                let (file, sensors) = (file.display(), with_comma(verdict));
-                (Level::Error, format!("{grade} {file} is {word} after {seconds:.1} s{sensors}: {error}"))
-            }
-            Self::Episode { file, seconds, error: None, verdict, .. } => {
-                let level = match verdict.grade {
-                    Grade::Good => Level::Info,
-                    Grade::Suspect => Level::Warn,
-                    Grade::Bad => Level::Error,
-                };
-                let (file, word) = (file.display(), verdict.grade.word());
-                let why = if verdict.reasons.is_empty() { String::new() } else { format!(": {}", verdict.why()) };
-                (level, format!("{word} {file} finished, {seconds:.1} s{}{why}", with_comma(verdict)))
-            }
-            Self::Dropped { file, seconds } => {
-                (Level::Info, format!("episode {} dropped; it was {seconds:.1} s long", file.display()))
-            }
-            Self::DiskLow { folder, free, seconds } => {
-                let (free, left) = (text::size(*free), text::about(Duration::from_secs(*seconds)));
-                let folder = folder.display();
-                let text =
-                    format!("{folder}: disk nearly full, {free} free: the episode will be closed in about {left}");
-                (Level::Warn, text)
-            }
-            Self::ClockStep { seconds } => {
-                let direction = if *seconds < 0.0 { "back" } else { "forward" };
-                let by = seconds.abs();
-                (
-                    Level::Warn,
-                    format!("the wall clock was set {direction} by {by:.3} s; times of capture stay as they are"),
-                )
-            }
-            // Something was lost before this run began.
-            Self::Recovered { text, .. } => (Level::Warn, text.clone()),
-            Self::Actuator { device, is_problem, text, .. } => {
-                (if *is_problem { Level::Warn } else { Level::Info }, format!("{device}: {text}"))
-            }
-            Self::Stop(stop) => (if stop.is_problem() { Level::Warn } else { Level::Info }, stop.sentence()),
-            Self::Publisher { topic, process, command } => {
-                let text = format!("another program publishes on {topic}: process {process} ({command}); end it");
-                (Level::Warn, text)
-            }
-            Self::Log { level, text } => (*level, text.clone()),
-        })
+    pub fn detail(&self) -> &str {
+        self.sentence.get(self.detail..).unwrap_or_default()
     }
 }
 
-/// Which sensors took part, behind a comma; nothing if unknown.
-fn with_comma(verdict: &Verdict) -> String {
-    verdict.sensors.as_ref().map(|sensors| format!(", {sensors}")).unwrap_or_default()
+impl What {
+    /// The event as text.
+    #[must_use]
+    pub fn describe(&self) -> Description {
+        use Description as D;
+        match self {
+            Self::Attach { device, bit, node, unit, .. } => {
+                let serial = unit.serial().map(|serial| format!(", serial {serial}")).unwrap_or_default();
+                let rest = format!("{node}, {}{serial}", unit.location());
+                D::joined(Level::Info, device, "attached", ": ", &rest).with_bit(*bit)
+            }
+            Self::Opened { device, bit, provenance } => {
+                let unit = provenance.unit.serial().unwrap_or("without a serial number");
+                let rest = format!("epoch {}: unit {unit}", provenance.epoch.0);
+                D::joined(Level::Info, device, "opened", " in ", &rest).with_bit(*bit)
+            }
+            Self::Detach { device, bit, source } => {
+                let rest = format!("reported by {}", source.word());
+                D::joined(Level::Warn, device, "detached", ", ", &rest).with_bit(*bit)
+            }
+            Self::State { device, bit, state, mask, detail } => {
+                let detail = if detail.is_empty() { String::new() } else { format!(": {detail}") };
+                let rest = format!("mask {mask}{detail}");
+                D::joined(state.level(), device, state.word(), ", ", &rest).with_bit(*bit)
+            }
+            Self::Unregistered { device, reason } => {
+                D::of(Level::Info, "device", "unregistered", format!("{device} not registered: {reason}"))
+            }
+            Self::Policy { policy, hash, hz, dry_run, library, .. } => {
+                let (word, dry) = if *dry_run { ("dry run", ", dry run: nothing moves") } else { ("loaded", "") };
+                let hash: String = hash.chars().take(HASH).collect();
+                let sentence = format!("policy {policy} loaded: {hz} Hz, hash {hash}, onnxruntime {library}{dry}");
+                D::of(Level::Info, "policy", word, sentence).without("policy ")
+            }
+            Self::Chunk(chunk) => describe_chunk(chunk),
+            Self::Hold(hold) => D::joined(Level::Warn, "policy", "holds", ": ", &hold.to_string()),
+            Self::Act { tick } => D::joined(Level::Info, "policy", "acts", " ", &format!("from tick {tick}")),
+            Self::PolicyEnd(end) => D::joined(Level::Info, "policy", "ended", ": ", &end.to_string()),
+            Self::Recording { file } => {
+                D::of(Level::Info, "episode", "recording", format!("recording {}", file.display()))
+                    .without("recording ")
+            }
+            Self::Episode { .. } => self.describe_episode(),
+            Self::Dropped { file, seconds } => {
+                let sentence = format!("episode {} dropped; it was {seconds:.1} s long", file.display());
+                D::of(Level::Info, "episode", "dropped", sentence)
+            }
+            // Something was lost before this run began.
+            Self::Recovered { text, .. } => D::of(Level::Warn, "episode", "repaired", text.clone()),
+            Self::DiskLow { folder, free, seconds } => {
+                let (free, left) = (text::size(*free), text::about(Duration::from_secs(*seconds)));
+                let folder = folder.display();
+                let sentence =
+                    format!("{folder}: disk nearly full, {free} free: the episode will be closed in about {left}");
+                D::of(Level::Warn, "disk", "warn", sentence)
+            }
+            Self::ClockStep { seconds } => {
+                let (direction, by) = (if *seconds < 0.0 { "back" } else { "forward" }, seconds.abs());
+                let sentence =
+                    format!("the wall clock was set {direction} by {by:.3} s; times of capture stay as they are");
+                D::of(Level::Warn, "clock", "warn", sentence)
+            }
+            Self::Actuator { device, bit, arming, is_problem, text } => {
+                let prefix = format!("{device}: ");
+                let sentence = format!("{prefix}{text}");
+                D::of(warn_if(*is_problem), device, arming.word(), sentence).without(&prefix).with_bit(*bit)
+            }
+            Self::Stop(stop) => D::of(warn_if(stop.is_problem()), &stop.stop, stop.word(), stop.sentence()),
+            Self::Publisher { topic, process, command } => {
+                let sentence = format!("another program publishes on {topic}: process {process} ({command}); end it");
+                D::of(Level::Warn, "bus", "warn", sentence)
+            }
+            Self::Log { level, text } => D::of(*level, "log", level.word(), text.clone()),
+        }
+    }
+
+    /// The event as a line of the log. `None` where the event that follows includes it, and for a chunk in time.
+    #[must_use]
+    pub fn log_line(&self) -> Option<(Level, String)> {
+        let described = self.describe();
+        let is_silent = match self {
+            // The slot's state changes with it and names the source, or what was agreed.
+            Self::Detach { .. } | Self::Opened { .. } => true,
+            // A policy gives them all the time.
+            Self::Chunk(chunk) => chunk.skipped == 0,
+            _ => false,
+        };
+        (!is_silent).then_some((described.level, described.sentence))
+    }
+
+    fn describe_episode(&self) -> Description {
+        let Self::Episode { file, seconds, messages, bytes, dropped, error, verdict } = self else {
+            return Description::of(Level::Error, "episode", "", String::new());
+        };
+        let level = match (error, verdict.grade) {
+            (None, Grade::Good) => Level::Info,
+            (None, Grade::Suspect) => Level::Warn,
+            (Some(_), _) | (None, Grade::Bad) => Level::Error,
+        };
+        let end = match error {
+            None => "finished",
+            Some(_) if self.is_cut_short() => "cut short",
+            Some(_) => "not whole",
+        };
+        let sensors = verdict.sensors.as_ref().map(|sensors| format!(", {sensors}")).unwrap_or_default();
+        // Where an error has made a reason, it includes the error.
+        let why = if verdict.reasons.is_empty() { error.clone().unwrap_or_default() } else { verdict.why() };
+        let why = if why.is_empty() { why } else { format!(": {why}") };
+        let (word, file, size) = (verdict.grade.word(), file.display(), text::size(*bytes));
+        let sentence = format!(
+            "{word} {file} {end}, {seconds:.1} s, {messages} messages, {size}, {dropped} dropped{sensors}{why}"
+        );
+        Description::of(level, "episode", word, sentence).without(&format!("{word} "))
+    }
+}
+
+fn warn_if(is_problem: bool) -> Level {
+    if is_problem { Level::Warn } else { Level::Info }
+}
+
+fn describe_chunk(chunk: &Chunk) -> Description {
+    let (level, word, late) = match chunk.skipped {
+        0 => (Level::Debug, "chunk", String::new()),
+        1 => (Level::Warn, "late chunk", ", 1 action too late".to_owned()),
+        late => (Level::Warn, "late chunk", format!(", {late} actions too late")),
+    };
+    let sentence = format!("chunk of tick {}: {:.1} ms{late}, mask {}", chunk.tick, chunk.latency_ms, chunk.mask);
+    Description::of(level, "policy", word, sentence).without("chunk of ")
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::mask::{PhysicalMask, SizedMask};
+    use crate::provenance::UnplugSource;
+    use crate::status::SlotState;
 
     #[test]
     fn a_state_is_a_sentence_of_the_log() {
@@ -367,22 +433,22 @@ mod tests {
             device: "tactile_tip".into(),
             bit,
             state,
-            mask: "0x05".into(),
+            mask: SizedMask { mask: PhysicalMask(5), devices: 3 },
             detail: detail.into(),
         };
         let table = [
             (
-                state(SlotState::Absent, "unplugged, told by kernel"),
+                state(SlotState::Absent, "unplugged, reported by kernel"),
                 Level::Info,
-                "tactile_tip absent (unplugged, told by kernel)",
+                "tactile_tip absent, mask 0x05: unplugged, reported by kernel",
             ),
-            (state(SlotState::Streaming, ""), Level::Info, "tactile_tip streaming"),
-            (state(SlotState::Failed, "busy"), Level::Error, "tactile_tip failed (busy)"),
+            (state(SlotState::Streaming, ""), Level::Info, "tactile_tip streaming, mask 0x05"),
+            (state(SlotState::Failed, "busy"), Level::Error, "tactile_tip failed, mask 0x05: busy"),
         ];
         for (what, level, text) in table {
-            assert_eq!(what.sentence(), Some((level, text.to_owned())));
+            assert_eq!(what.log_line(), Some((level, text.to_owned())));
         }
-        let detach = What::Detach { device: "tactile_tip".into(), bit, witness: "kernel".into() };
-        assert_eq!(detach.sentence(), None);
+        let detach = What::Detach { device: "tactile_tip".into(), bit, source: UnplugSource::Kernel };
+        assert_eq!((detach.log_line(), detach.describe().detail()), (None, "reported by kernel"));
     }
 }

@@ -1,67 +1,84 @@
-//! Status: the only words between the stages and a screen.
+//! Status: the only types that stages and screens share.
 //!
 //! Stages report on the [`board`]; a screen takes a [`Snapshot`] from it and sends [`Command`]s.
 //!
 //! Invariant: a screen holds no handle into a stage.
+//! Invariant: there is no verdict by default. GOOD is a result of `record::verdict`.
 
 pub mod board;
-mod episode;
 mod event;
-#[cfg(test)]
-pub(crate) mod literal;
-mod policy;
 pub mod rates;
-mod stop;
-mod verdict;
 
-use std::path::PathBuf;
+use std::fmt;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize, Serializer};
+use tokio::sync::{SetOnce, watch};
 
-use crate::mask::PhysicalMask;
+use crate::interlock::{InputState, StopKind};
+use crate::mask::{PhysicalMask, SizedMask};
 use crate::modality::ModalityId;
 use crate::sample::Epoch;
 use crate::text;
 use crate::time::Stamp;
 
 pub use board::{Board, EpisodeEnd};
-pub use episode::{Episode, EpisodeWatch, ShortEpisode};
+pub use event::Description;
 pub use event::{Event, Provenance, What};
-pub use policy::{Chunk, ObservedSamples, PolicyStatus};
-pub use stop::StopStatus;
-pub use verdict::{Grade, Sensors, Verdict};
 
-/// What the device of a modality is doing.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum SlotState {
-    /// Not attached.
-    #[default]
-    Absent,
-    /// Attached; its first sample has not come.
-    Opening,
-    /// Samples arrive.
-    Streaming,
-    /// Attached and started, but samples have stopped. The mask bit stays.
-    Stalled,
-    /// Attached; waits before it is started or started again.
-    Backoff,
-    /// Attached; given up until it is replugged or restarted by hand.
-    Failed,
+#[cfg(test)]
+pub(crate) mod literal;
+
+/// Makes an enum whose values have words: `word` gives it, and JSON has it.
+macro_rules! words {
+    ($(#[$meta:meta])* $name:ident { $($(#[$of:meta])* $value:ident = $word:literal,)+ }) => {
+        $(#[$meta])*
+        pub enum $name {
+            $($(#[$of])* #[serde(rename = $word)] $value,)+
+        }
+
+        impl $name {
+            /// The word for it, as in JSON.
+            #[must_use]
+            pub const fn word(self) -> &'static str {
+                match self {
+                    $(Self::$value => $word,)+
+                }
+            }
+        }
+    };
+}
+
+words! {
+    /// What the device of a modality is doing.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize)]
+    SlotState {
+        /// Not attached.
+        #[default]
+        Absent = "absent",
+        /// Attached; its first sample has not come.
+        Opening = "opening",
+        /// Samples arrive.
+        Streaming = "streaming",
+        /// Attached and started, but samples have stopped. The mask bit stays.
+        Stalled = "stalled",
+        /// Attached; waits before it is started or started again.
+        Backoff = "backoff",
+        /// Attached; given up until it is replugged or restarted by hand.
+        Failed = "failed",
+    }
 }
 
 impl SlotState {
-    /// The word for it, as in JSON.
+    /// How much a change to it matters.
     #[must_use]
-    pub const fn word(self) -> &'static str {
+    pub const fn level(self) -> Level {
         match self {
-            Self::Absent => "absent",
-            Self::Opening => "opening",
-            Self::Streaming => "streaming",
-            Self::Stalled => "stalled",
-            Self::Backoff => "backoff",
-            Self::Failed => "failed",
+            Self::Absent | Self::Opening | Self::Streaming => Level::Info,
+            Self::Stalled | Self::Backoff => Level::Warn,
+            Self::Failed => Level::Error,
         }
     }
 }
@@ -120,30 +137,18 @@ pub struct LogLine {
     pub text: String,
 }
 
-/// Severity of a log line.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Level {
-    /// Details.
-    Debug,
-    /// A state change a user cares about.
-    Info,
-    /// Something is not as it should be, and goes on.
-    Warn,
-    /// Something ended that should not have.
-    Error,
-}
-
-impl Level {
-    /// The word for it, as in JSON.
-    #[must_use]
-    pub const fn word(self) -> &'static str {
-        match self {
-            Self::Debug => "debug",
-            Self::Info => "info",
-            Self::Warn => "warn",
-            Self::Error => "error",
-        }
+words! {
+    /// Severity of a log line.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+    Level {
+        /// Details.
+        Debug = "debug",
+        /// A state change a user cares about.
+        Info = "info",
+        /// Something is wrong, and the run continues.
+        Warn = "warn",
+        /// Something ended that should not have.
+        Error = "error",
     }
 }
 
@@ -190,4 +195,299 @@ pub enum Command {
     Restart(ModalityId),
     /// End the program.
     Quit,
+}
+
+/// An emergency stop or an enabling switch, as it is now.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct StopStatus {
+    /// Its name.
+    pub stop: String,
+    /// What it is.
+    pub kind: StopKind,
+    /// The state of its input.
+    pub state: InputState,
+    /// Why it is lost; otherwise empty.
+    pub detail: String,
+}
+
+impl StopStatus {
+    /// It needs attention; a released enabling switch does not.
+    #[must_use]
+    pub fn is_problem(&self) -> bool {
+        match self.kind {
+            StopKind::Emergency => self.state != InputState::Runs,
+            StopKind::Enabling => self.state == InputState::Lost,
+        }
+    }
+
+    /// What it is doing, in one word.
+    #[must_use]
+    pub const fn word(&self) -> &'static str {
+        self.kind.word(self.state)
+    }
+
+    /// For people.
+    #[must_use]
+    pub fn sentence(&self) -> String {
+        let (kind, name, word) = (self.kind.label(), &self.stop, self.word());
+        let rest = match self.state {
+            InputState::Lost => format!(" ({})", self.detail),
+            InputState::Runs => ": nothing moves before the next arm".to_owned(),
+            InputState::Stopped => String::new(),
+        };
+        format!("{kind} {name} {word}{rest}")
+    }
+}
+
+words! {
+    /// What an episode is worth, as far as its data show.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+    Grade {
+        /// No defect was found.
+        Good = "GOOD",
+        /// Look at it before it is used.
+        Suspect = "SUSPECT",
+        /// Do not use it.
+        Bad = "BAD",
+    }
+}
+
+/// The verdict on one episode. As JSON:
+/// `{"verdict":"SUSPECT","reasons":["..."],"sensors":{"registered":3,"recorded":2,"without":["tactile_tip"]}}`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Verdict {
+    /// The word.
+    #[serde(rename = "verdict")]
+    pub grade: Grade,
+    /// Why it is not GOOD, the gravest first: sentences for people, each with modality, figure and
+    /// limit. Empty exactly if it is GOOD.
+    pub reasons: Vec<String>,
+    /// Which sensors took part; unknown (`null`) where the file does not state which were registered.
+    pub sensors: Option<Sensors>,
+}
+
+impl Verdict {
+    /// The reasons in one line; empty for a good episode.
+    #[must_use]
+    pub fn why(&self) -> String {
+        self.reasons.join("; ")
+    }
+
+    /// Has it the same word for the same reasons?
+    #[must_use]
+    pub fn says_as(&self, other: &Self) -> bool {
+        (self.grade, &self.reasons) == (other.grade, &other.reasons)
+    }
+
+    /// `2 of 3 sensors, without tactile_tip`; empty if unknown.
+    #[must_use]
+    pub fn sensors(&self) -> String {
+        self.sensors.as_ref().map(ToString::to_string).unwrap_or_default()
+    }
+}
+
+/// How many of the registered sensors have a sample in an episode.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Sensors {
+    /// Entries of the registry.
+    pub registered: usize,
+    /// Those of them with at least one sample.
+    pub recorded: usize,
+    /// The names of the others, in the order of their bits.
+    pub without: Vec<String>,
+}
+
+impl std::fmt::Display for Sensors {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { registered, recorded, without } = self;
+        write!(f, "{recorded} of {registered} sensor{}", if *registered == 1 { "" } else { "s" })?;
+        if without.is_empty() { Ok(()) } else { write!(f, ", without {}", without.join(", ")) }
+    }
+}
+
+/// An episode in progress.
+#[derive(Debug)]
+pub struct Episode {
+    /// The file it is to be once it is finished, an absolute path.
+    pub file: PathBuf,
+    /// The file that it has become.
+    ended: SetOnce<PathBuf>,
+}
+
+/// The last episode, while it may be dropped because it is too short to be used.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct ShortEpisode {
+    /// Its file.
+    #[serde(serialize_with = "text::lossy")]
+    pub file: PathBuf,
+    /// Its length.
+    pub length: Duration,
+}
+
+/// The episode in progress, if there is one, whenever that changes.
+pub type EpisodeWatch = watch::Receiver<Option<Arc<Episode>>>;
+
+impl Episode {
+    /// The episode that will be `file`.
+    #[must_use]
+    pub fn new(file: &Path) -> Self {
+        Self { file: absolute(file), ended: SetOnce::new() }
+    }
+
+    /// It has become `file`, which may have another name than it was to get. Only the first call counts.
+    pub fn end(&self, file: &Path) {
+        let _ = self.ended.set(absolute(file));
+    }
+
+    /// Waits until it has ended, whether it is whole or not; returns its file. Cancel-safe.
+    pub async fn ended(&self) -> &Path {
+        self.ended.wait().await
+    }
+
+    /// Its name: the name of its file without `.mcap`, or `.mcap.partial`.
+    #[must_use]
+    pub fn id(&self) -> String {
+        let stem = Path::new(self.file.file_stem().unwrap_or_default());
+        let is_whole = stem.extension().is_none_or(|extension| extension != "mcap");
+        let name = if is_whole { stem.as_os_str() } else { stem.file_stem().unwrap_or_default() };
+        name.to_string_lossy().into_owned()
+    }
+
+    /// The folder of its file.
+    #[must_use]
+    pub fn folder(&self) -> &Path {
+        self.file.parent().unwrap_or(Path::new("/"))
+    }
+}
+
+/// Without a working folder there is nothing better than the path as it was given.
+fn absolute(file: &Path) -> PathBuf {
+    std::path::absolute(file).unwrap_or_else(|_| file.to_owned())
+}
+
+/// The policy in control, for a screen.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct PolicyStatus {
+    /// What its bundle calls itself.
+    pub name: String,
+    /// Nothing moves: its actions are shown and recorded, and not carried out.
+    pub dry_run: bool,
+    /// The mask it saw last.
+    pub mask: PhysicalMask,
+    /// From the observation to the chunk, ms, of the newest chunk.
+    pub latency_ms: Option<f64>,
+    /// Ticks since the observation that the action follows from.
+    pub chunk_age: Option<u64>,
+    /// The newest action: name, value and unit of each axis.
+    pub action: Vec<(String, f64, String)>,
+    /// Why nothing is done, if nothing is.
+    pub hold: Option<Hold>,
+    /// Ticks with an action.
+    pub actions: u64,
+    /// Ticks without.
+    pub held: u64,
+    /// Chunks that were used.
+    pub chunks: u64,
+    /// Answers that were not used or never came.
+    pub unused: u64,
+}
+
+/// Why the policy does nothing.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Hold {
+    /// The modality whose absence is the reason; as JSON `""` if there is none.
+    #[serde(serialize_with = "or_empty")]
+    pub device: Option<String>,
+    /// The reason.
+    pub reason: String,
+}
+
+impl fmt::Display for Hold {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match &self.device {
+            None => f.write_str(&self.reason),
+            Some(device) => write!(f, "{}: {device}", self.reason),
+        }
+    }
+}
+
+#[expect(clippy::ref_option, reason = "serde gives it so")]
+fn or_empty<S: Serializer>(device: &Option<String>, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_str(device.as_deref().unwrap_or_default())
+}
+
+/// What a policy did from its start to its end.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct PolicyEnd {
+    /// Ticks with an action.
+    pub actions: u64,
+    /// Ticks without.
+    pub held: u64,
+    /// Chunks that were used.
+    pub chunks: u64,
+    /// Answers that were not used or never came.
+    pub unused: u64,
+    /// From the observation to the chunk, ms: half of them were faster.
+    pub latency_p50_ms: f64,
+    /// Of a hundred one was slower.
+    pub latency_p99_ms: f64,
+}
+
+impl fmt::Display for PolicyEnd {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { actions, held, chunks, unused, latency_p50_ms, latency_p99_ms } = self;
+        write!(f, "{actions} actions, {held} ticks held, {chunks} chunks, {unused} unused")?;
+        // Without a chunk there is nothing to measure.
+        if *chunks + *unused > 0 {
+            write!(f, ", latency p50 {latency_p50_ms:.1} ms p99 {latency_p99_ms:.1} ms")?;
+        }
+        Ok(())
+    }
+}
+
+/// The samples of one modality that a chunk was computed from: with the seed of its noise, enough to compute
+/// it again from the recording.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct ObservedSamples {
+    /// The modality.
+    pub modality: String,
+    /// Numbers of its samples, the oldest step first; none where it was absent.
+    pub seqs: Vec<u64>,
+}
+
+/// A chunk of actions, from what it was computed, and how long that took.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Chunk {
+    /// Tick of its observation on the control grid.
+    pub tick: u64,
+    /// When that was, `CLOCK_MONOTONIC` ns.
+    pub observed_ns: u64,
+    /// What was present, in JSON `0x05`.
+    pub mask: SizedMask,
+    /// Of the noise.
+    pub seed: u64,
+    /// From the tick to the answer, ms.
+    pub latency_ms: f64,
+    /// Its actions were fit to be used.
+    pub used: bool,
+    /// Its actions whose time had passed when it came.
+    pub skipped: u64,
+    /// The samples.
+    pub samples: Vec<ObservedSamples>,
+    /// The actions, one after the other, as the policy gave them.
+    pub actions: Vec<f32>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_episode_is_named_by_its_file() {
+        let episode = Episode::new(Path::new("out/2026-11-21_place-block_001.mcap"));
+        assert!(episode.file.is_absolute());
+        assert_eq!(episode.id(), "2026-11-21_place-block_001");
+        assert_eq!(Episode::new(Path::new("a.b_001.mcap.partial")).id(), "a.b_001");
+        assert!(episode.folder().ends_with("out"));
+    }
 }

@@ -1,6 +1,6 @@
 //! Rates: how many samples and bytes a second, from successive snapshots.
 //!
-//! Invariant: pure; time is only what the snapshots say.
+//! Invariant: pure; time comes from the snapshots alone.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -195,7 +195,7 @@ mod tests {
     }
 
     #[test]
-    fn the_first_samples_have_a_rate_and_bytes_begin_with_the_episode() {
+    fn the_first_samples_have_a_rate_and_bytes_count_from_the_episode_start() {
         let mut rates = Rates::default();
         rates.update(&at(10_000, 0, 0, None));
         rates.update(&at(10_250, 2, 10_190, None));

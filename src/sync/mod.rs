@@ -10,8 +10,6 @@
 //! Invariant: nothing here allocates after construction.
 
 mod grid;
-mod observation;
-mod ring;
 #[cfg(test)]
 mod tests;
 
@@ -24,8 +22,6 @@ use crate::sample::Epoch;
 use crate::time::{Stamp, nanoseconds};
 
 pub use grid::Grid;
-pub use observation::{Handle, Observation, Slot};
-pub use ring::{Ring, SyncSample};
 
 /// A modality as the synchroniser needs to know it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -168,5 +164,132 @@ impl<T> Lane<T> {
         if let Some((handle, sample)) = newest {
             slot.hold(handle, sample.seq, tick, shown(sample));
         }
+    }
+}
+
+/// One modality at one tick.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Slot {
+    /// The modality.
+    pub id: ModalityId,
+    /// Its bit in the mask at the tick.
+    pub present: bool,
+    /// A sample lies in the window of the tick.
+    pub valid: bool,
+    /// Present, and no sample lies in the window.
+    pub stale: bool,
+    /// The tick minus the moment that the sample chosen stands for (its capture time less the
+    /// latency of the modality), ns; negative for one after the tick; 0 without a sample.
+    pub age_ns: i64,
+    /// Sequence number of the sample chosen. Without one the modality is to be filled with zeros.
+    pub seq: Option<u64>,
+    /// Where the sample chosen lies in its modality's ring; good until the next push.
+    pub handle: Option<usize>,
+}
+
+impl Slot {
+    fn clear(&mut self, present: bool) {
+        *self = Self { present, ..Self::empty(self.id) };
+    }
+
+    /// Names the sample `seq`, which stands for the moment `shown`.
+    fn hold(&mut self, handle: usize, seq: u64, tick: Stamp, shown: Stamp) {
+        let age = i128::from(tick.0) - i128::from(shown.0);
+        self.age_ns = i64::try_from(age).unwrap_or(if age < 0 { i64::MIN } else { i64::MAX });
+        self.seq = Some(seq);
+        self.handle = Some(handle);
+    }
+
+    fn empty(id: ModalityId) -> Self {
+        Self { id, present: false, valid: false, stale: false, age_ns: 0, seq: None, handle: None }
+    }
+}
+
+/// What one tick of the observation grid saw, in dimensions that do not depend on what is plugged.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Observation {
+    /// The tick.
+    pub tick: Stamp,
+    /// The mask in force at the tick.
+    pub mask: PhysicalMask,
+    /// One a registered modality, in the order of registration.
+    pub slots: Vec<Slot>,
+}
+
+impl Observation {
+    fn new(ids: &[ModalityId]) -> Self {
+        Self {
+            tick: Stamp::default(),
+            mask: PhysicalMask::EMPTY,
+            slots: ids.iter().map(|id| Slot::empty(*id)).collect(),
+        }
+    }
+
+    /// The slot of a modality.
+    #[must_use]
+    pub fn slot(&self, id: ModalityId) -> Option<&Slot> {
+        self.slots.iter().find(|slot| slot.id == id)
+    }
+}
+
+/// A sample as the synchroniser sees it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SyncSample<T> {
+    /// When it was captured.
+    pub capture: Stamp,
+    /// When it was received.
+    pub recv: Stamp,
+    /// Its sequence number.
+    pub seq: u64,
+    /// Incarnation of the attachment it comes from.
+    pub epoch: Epoch,
+    /// What the user of the synchroniser keeps with it: the payload, a handle to it, or nothing.
+    pub keep: T,
+}
+
+/// The ring of recent samples of one modality: never more than its capacity.
+#[derive(Debug)]
+pub struct Ring<T> {
+    samples: Vec<SyncSample<T>>,
+    capacity: usize,
+    /// Where the next sample goes once the ring is full: the oldest one.
+    next: usize,
+}
+
+impl<T> Ring<T> {
+    /// An empty ring of room for `capacity` samples, at least 1.
+    #[must_use]
+    pub fn new(capacity: usize) -> Self {
+        let capacity = capacity.max(1);
+        Self { samples: Vec::with_capacity(capacity), capacity, next: 0 }
+    }
+
+    /// Keeps a sample in place of the oldest one pushed, if there is no room.
+    pub fn push(&mut self, sample: SyncSample<T>) {
+        if self.samples.len() < self.capacity {
+            self.samples.push(sample);
+            return;
+        }
+        if let Some(oldest) = self.samples.get_mut(self.next) {
+            *oldest = sample;
+        }
+        self.next = (self.next + 1) % self.capacity;
+    }
+
+    /// All samples kept, in no particular order.
+    pub fn iter(&self) -> impl Iterator<Item = (usize, &SyncSample<T>)> {
+        self.samples.iter().enumerate()
+    }
+
+    /// The sample of a handle.
+    #[must_use]
+    pub fn get(&self, handle: usize) -> Option<&SyncSample<T>> {
+        self.samples.get(handle)
+    }
+
+    /// Forgets all samples.
+    pub fn clear(&mut self) {
+        self.samples.clear();
+        self.next = 0;
     }
 }

@@ -122,7 +122,7 @@ fn said(observation: &Observation) -> Vec<Said> {
 
 proptest! {
     #[test]
-    fn what_a_slot_says_follows_from_the_samples(samples in samples(), tick in 0_u64..350, late in 0_u64..150, mask in 0_u64..8) {
+    fn slot_states_follow_from_the_samples(samples in samples(), tick in 0_u64..350, late in 0_u64..150, mask in 0_u64..8) {
         let (tick, now) = (Stamp(tick * MS), Stamp((tick + late) * MS));
         let mut sync = synchronizer(&samples);
         let observation = sync.observe(tick, now, PhysicalMask(mask)).clone();

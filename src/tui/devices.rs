@@ -1,4 +1,4 @@
-//! The device table: one row a modality, and a line about the selected one.
+//! The device table: one row per modality, and a line about the selected one.
 
 use std::time::Duration;
 
@@ -19,14 +19,14 @@ const RATE: usize = 7;
 const AGE: usize = 8;
 const GAPS: usize = 7;
 const TOTAL: usize = 9;
-/// Columns before the name: mark of the selection, bit, space.
+/// Columns before the name: selection mark, bit, space.
 const BIT: usize = 5;
 
 /// The rows in view: `rows` of the table and `selection` lines (0 or 1) about the selected device.
 pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, (rows, selection): (u16, u16), model: &Model, theme: Theme) {
     let devices = &model.shown().devices;
     let rows = usize::from(rows);
-    let first = first_row(model.selected(), rows, devices.len());
+    let first = first_row(model.selected, rows, devices.len());
     let inner = view::panel(frame, area, "Devices", remark(first, rows, devices.len(), theme), theme);
     let name = name_width(model.shown(), inner.width);
     let mut lines = inner.rows();
@@ -41,7 +41,7 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, (rows, selection): (u16, u
     for (index, device) in devices.iter().enumerate().skip(first).take(rows) {
         let Some(line) = lines.next() else { break };
         frame.render_widget(row(device, name, line.width, model, theme), line);
-        if index == model.selected() {
+        if index == model.selected {
             frame.buffer_mut().set_style(line, Style::new().add_modifier(Modifier::BOLD));
         }
     }
@@ -70,7 +70,7 @@ fn name_width(snapshot: &Snapshot, width: u16) -> usize {
     longest.clamp(6, if width >= 110 { 28 } else { 14 })
 }
 
-/// Columns of the total: none where it does not fit whole. Part of a number is another number.
+/// Columns of the total, or none: a truncated number would be another number.
 fn total_width(name: usize, width: u16) -> usize {
     if BIT + name + STATE + RATE + AGE + GAPS + TOTAL <= usize::from(width) { TOTAL } else { 0 }
 }
@@ -104,7 +104,7 @@ fn row(device: &DeviceStatus, name: usize, width: u16, model: &Model, theme: The
     let total = total_width(name, width);
     let used = BIT + name + STATE + RATE + AGE + GAPS + total + 2;
     let detail = usize::from(width).saturating_sub(used);
-    let detail = text::cut(&told(device, model, theme), detail, theme.ellipsis()).into_owned();
+    let detail = text::cut(&detail_of(device, model, theme), detail, theme.ellipsis()).into_owned();
     let figures = if running { Style::new() } else { theme.faint() };
     Line::from(vec![
         Span::styled(if selected { theme.symbol("▸", ">") } else { " " }, theme.title()),
@@ -130,8 +130,8 @@ fn compact(count: u64) -> String {
     }
 }
 
-/// The detail of a device; of an absent one, since when it is.
-fn told(device: &DeviceStatus, model: &Model, theme: Theme) -> String {
+/// The detail of a device; for an absent one, since when.
+fn detail_of(device: &DeviceStatus, model: &Model, theme: Theme) -> String {
     if device.state != SlotState::Absent || !device.detail.is_empty() {
         return theme.safe(&device.detail);
     }
@@ -142,9 +142,9 @@ fn told(device: &DeviceStatus, model: &Model, theme: Theme) -> String {
     }
 }
 
-/// What the table has no room for: the whole detail first, as it is what the table cuts.
+/// What does not fit the table: first the whole detail, which the table truncates.
 fn about(device: &DeviceStatus, width: u16, model: &Model, theme: Theme) -> Line<'static> {
-    let mut parts = vec![told(device, model, theme), theme.safe(&device.topic), text::size(device.bytes)];
+    let mut parts = vec![detail_of(device, model, theme), theme.safe(&device.topic), text::size(device.bytes)];
     parts.retain(|part| !part.is_empty());
     if device.epoch.0 > 1 {
         parts.push(format!("started {} times", device.epoch.0));

@@ -1,8 +1,7 @@
 //! The whole terminal as a light: white or black.
 //!
-//! Invariant: the terminal is given back as it was found, however this ends.
+//! Invariant: the terminal is restored to its previous state, however this ends.
 
-use std::fmt;
 use std::io::{self, Write};
 use std::time::Duration;
 
@@ -13,43 +12,37 @@ use crossterm::terminal::{
     BeginSynchronizedUpdate, DisableLineWrap, EndSynchronizedUpdate, EnterAlternateScreen, size,
 };
 
-use super::terminal::{give_back, take, writer};
+use super::terminal::{enter_raw_mode, restore, writer};
 use crate::text;
 
-/// The terminal while it is a light.
+/// The terminal used as a light.
 pub struct Flashlight {
     terminal: Box<dyn Write>,
     lit: bool,
 }
 
-impl fmt::Debug for Flashlight {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Flashlight").field("lit", &self.lit).finish_non_exhaustive()
-    }
-}
-
-/// Is there a terminal that could be one?
+/// Whether there is a terminal to use as a light.
 #[must_use]
-pub fn is_there() -> bool {
+pub fn is_available() -> bool {
     writer().is_ok()
 }
 
 impl Flashlight {
-    /// Takes the terminal, dark.
+    /// Switches the terminal to black.
     ///
     /// # Errors
     /// When there is none, or it cannot be written to.
     pub fn open() -> io::Result<Self> {
         let terminal = writer()?;
-        take()?;
+        enter_raw_mode()?;
         let mut light = Self { terminal, lit: false };
         crossterm::execute!(light.terminal, EnterAlternateScreen, DisableLineWrap, Hide)?;
         light.switch(false, "")?;
         Ok(light)
     }
 
-    /// Makes it white or black, with a line of text at the bottom. When this returns, the terminal
-    /// has the bytes; when it shows them is its own affair.
+    /// Makes it white or black, with a line of text at the bottom. When this returns, the terminal has
+    /// received the bytes; how soon it shows them is unknown.
     ///
     /// # Errors
     /// When the terminal cannot be written to.
@@ -59,7 +52,7 @@ impl Flashlight {
         let mut bytes = Vec::with_capacity((usize::from(columns) + 8) * usize::from(rows) + 128);
         crossterm::queue!(bytes, BeginSynchronizedUpdate)?;
         colours(&mut bytes, lit)?;
-        // Written out: not every terminal clears in the colour that is set.
+        // Spaces are printed: not every terminal clears in the colour that is set.
         let blank = " ".repeat(usize::from(columns));
         for row in 0..rows {
             crossterm::queue!(bytes, MoveTo(0, row), Print(&blank))?;
@@ -72,7 +65,7 @@ impl Flashlight {
     ///
     /// # Errors
     /// When the terminal cannot be written to.
-    pub fn say(&mut self, line: &str) -> io::Result<()> {
+    pub fn caption(&mut self, line: &str) -> io::Result<()> {
         let mut bytes = Vec::new();
         crossterm::queue!(bytes, BeginSynchronizedUpdate)?;
         colours(&mut bytes, self.lit)?;
@@ -92,7 +85,7 @@ impl Flashlight {
         crossterm::queue!(bytes, grey, place, Print(line), ResetColor, EndSynchronizedUpdate)
     }
 
-    /// Waits so long, at most, for the user to ask for the end: ctrl-C, q or Esc.
+    /// Waits up to `wait` for the user to end it: ctrl-C, q or Esc.
     ///
     /// # Errors
     /// When the terminal is gone.
@@ -108,11 +101,11 @@ impl Flashlight {
 
 impl Drop for Flashlight {
     fn drop(&mut self) {
-        give_back();
+        restore();
     }
 }
 
-/// White or black as far as the terminal can: one that does not know a colour keeps the one before.
+/// White or black as well as the terminal can: one that does not support a colour keeps the previous one.
 fn colours(bytes: &mut Vec<u8>, lit: bool) -> io::Result<()> {
     let (plain, level) = if lit { (Color::White, 255) } else { (Color::Black, 0) };
     let exact = Color::Rgb { r: level, g: level, b: level };

@@ -1,4 +1,4 @@
-//! The last line: the keys, or what the program asks or answers.
+//! The last line: the keys, or a question or message of the program.
 
 use ratatui::Frame;
 use ratatui::layout::Rect;
@@ -10,23 +10,23 @@ use crate::status::SlotState;
 use crate::text;
 
 pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
-    let said = match model.quit() {
-        Quit::Asked => Some("recording: q again to finish the episode and quit, any other key to go on".to_owned()),
-        Quit::Ending if model.is_recording() => Some("finishing the episode, then leaving".to_owned()),
-        Quit::Ending => Some("leaving".to_owned()),
+    let message = match model.quit {
+        Quit::Asked => Some("recording: q again to finish the episode and quit, any other key to continue".to_owned()),
+        Quit::Ending if model.is_recording() => Some("finishing the episode, then quitting".to_owned()),
+        Quit::Ending => Some("quitting".to_owned()),
         Quit::No => model.notice().map(|notice| theme.safe(notice)),
     };
-    let line = match said {
-        Some(said) => {
-            let said = text::cut(&said, usize::from(area.width).saturating_sub(2), theme.ellipsis()).into_owned();
-            Line::styled(format!(" {said}"), theme.warning())
+    let line = match message {
+        Some(message) => {
+            let message = text::cut(&message, usize::from(area.width).saturating_sub(2), theme.ellipsis()).into_owned();
+            Line::styled(format!(" {message}"), theme.warning())
         }
         None => keys(usize::from(area.width), model, theme),
     };
     frame.render_widget(line, area);
 }
 
-/// As many keys as fit, the most needed first; `?` and `q` always.
+/// As many keys as fit, the most used first; `?` and `q` always.
 fn keys(width: usize, model: &Model, theme: Theme) -> Line<'static> {
     let episode = if model.is_recording() { "end episode" } else { "start episode" };
     let failed = model.selected_device().is_some_and(|device| device.state == SlotState::Failed);
@@ -34,7 +34,7 @@ fn keys(width: usize, model: &Model, theme: Theme) -> Line<'static> {
     if failed {
         keys.push(("r", "restart"));
     }
-    keys.extend([("p", if model.is_paused() { "go on" } else { "pause" }), ("pgup/pgdn", "log")]);
+    keys.extend([("p", if model.is_paused() { "continue" } else { "pause" }), ("pgup/pgdn", "log")]);
     let last = [("?", "help"), ("q", "quit")];
     let columns = |(key, meaning): (&str, &str)| text::width(key) + text::width(meaning) + 4;
     let mut room = width.saturating_sub(last.iter().map(|key| columns(*key)).sum::<usize>() + 1);

@@ -1,5 +1,5 @@
-//! The first line: which rig, since when, the mask as a number, emergency stops and enabling switches, and whether an
-//! episode is recorded.
+//! The first line: rig, uptime, the mask as a number, emergency stops and enabling switches, and whether an episode
+//! is being recorded.
 
 use ratatui::Frame;
 use ratatui::layout::Rect;
@@ -16,7 +16,7 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Them
     let width = usize::from(area.width);
     let right = right(model, theme);
     let mut left = identity(model, theme);
-    // In this order as long as they fit; the binary form is the longest and stands back first.
+    // In this order as long as they fit; the binary form is the longest and is left out first.
     let hex = mask_hex(model, theme);
     let publication = publication(model, theme);
     let binary = mask_binary(model);
@@ -67,15 +67,15 @@ fn mask_binary(model: &Model) -> Line<'static> {
 fn publication(model: &Model, theme: Theme) -> Line<'static> {
     Line::from(vec![
         Span::styled("   published ", theme.faint()),
-        Span::raw(format!("{:>3.0} Hz", model.totals().publications)),
+        Span::raw(format!("{:>3.0} Hz", model.totals.publications)),
     ])
 }
 
-/// The first stop that is in the way, and how many more are; without any, that they run.
+/// The first stop that blocks motion, and how many more do; or that all stops permit motion.
 fn stops(model: &Model, theme: Theme) -> Vec<Span<'static>> {
     let all = &model.shown().stops;
     let is_blocked = |stop: &&StopStatus| stop.state != InputState::Runs;
-    // An emergency comes before a switch that nobody holds.
+    // An emergency stop comes before an enabling switch that is not held.
     let blocked = all.iter().filter(is_blocked).min_by_key(|stop| !stop.is_problem());
     let word = match (blocked.or_else(|| all.first()), all.len()) {
         (None, _) => return Vec::new(),

@@ -1,4 +1,4 @@
-//! The help: all keys, and what the states mean.
+//! The help: all keys, and the meaning of the states.
 
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Flex, Layout, Rect};
@@ -9,11 +9,11 @@ use ratatui::widgets::{Block, Clear, Padding, Paragraph};
 use super::theme::Theme;
 use crate::status::SlotState;
 
-/// Of the box with its border and padding.
+/// Width of the box with its border and padding.
 const WIDTH: u16 = 58;
 const KEYS: [(&str, &str); 11] = [
     ("space", "start an episode, end the one in progress"),
-    ("x, y", "drop the last episode, if it is too short"),
+    ("x, y", "delete the last episode, if it is short"),
     ("up, down", "select a device"),
     ("r", "restart the selected device, if it failed"),
     ("a, ctrl-y", "arm the actuator: motors follow actions"),
@@ -28,8 +28,8 @@ const KEYS: [(&str, &str); 11] = [
 const STATES: [(SlotState, &str); 6] = [
     (SlotState::Streaming, "samples arrive; bit set"),
     (SlotState::Stalled, "attached, samples have stopped; bit set"),
-    (SlotState::Opening, "attached, first sample not here yet"),
-    (SlotState::Backoff, "attached, waits before it is started"),
+    (SlotState::Opening, "attached, waiting for the first sample"),
+    (SlotState::Backoff, "attached, waiting to be restarted"),
     (SlotState::Failed, "attached, given up: replug it or press r"),
     (SlotState::Absent, "not attached"),
 ];
@@ -45,7 +45,7 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, theme: Theme) {
     let mut lines: Vec<_> = keys.chain(states).collect();
     let room = usize::from(area.height.saturating_sub(2));
     if lines.len() > room {
-        // On a low screen the keys alone.
+        // A low screen shows only the keys.
         lines.truncate(KEYS.len() - 1);
     }
     let height = u16::try_from(lines.len()).unwrap_or(u16::MAX).saturating_add(2).min(area.height);

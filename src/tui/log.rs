@@ -13,8 +13,8 @@ use crate::text;
 pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
     let log = &model.shown().log;
     let rows = usize::from(area.height.saturating_sub(1));
-    // Scrolled back to the beginning, the panel is still full.
-    let scroll = model.scroll().min(log.len().saturating_sub(rows));
+    // Scrolled back to the start, the panel is still full.
+    let scroll = model.scroll.min(log.len().saturating_sub(rows));
     let remark = if scroll > 0 {
         Span::styled(format!("{scroll} newer below"), theme.warning())
     } else {

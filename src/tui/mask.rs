@@ -1,4 +1,4 @@
-//! The mask panel: one cell a modality, filled while its bit is set.
+//! The mask panel: one cell per modality, filled while its bit is set.
 
 use ratatui::Frame;
 use ratatui::layout::Rect;
@@ -32,7 +32,7 @@ enum Density {
 }
 
 impl Density {
-    /// Columns of a cell with the space behind it.
+    /// Columns of a cell with the space after it.
     fn cell(self) -> usize {
         match self {
             // Space, symbol, space, two digits, space, name, space.
@@ -63,13 +63,13 @@ impl Density {
 }
 
 impl Plan {
-    /// The most telling arrangement in at most `rows` rows.
+    /// The most detailed arrangement in at most `rows` rows.
     pub(super) fn new(model: &Model, width: u16, rows: u16) -> Self {
         let devices = &model.shown().devices;
         let width = usize::from(width.saturating_sub(2));
         let rows = usize::from(rows.clamp(1, 6));
         let name = devices.iter().map(|device| text::width(&device.name)).max().unwrap_or(0).clamp(1, NAME);
-        // Names are worth three rows at most; more of them are a wall of text.
+        // Names in more than three rows are hard to read.
         let names = Self::of(Density::Named(name), devices.len(), width);
         if usize::from(names.rows) <= rows.min(3) {
             return names;

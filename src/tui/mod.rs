@@ -1,12 +1,12 @@
 //! The monitor: a full-screen view of the rig while data is collected.
 //!
-//! A snapshot of the board fifteen times a second and the user's keys change the [`model`]; the
-//! `view` draws it; what the user wants goes out as [`Command`]s, but for orders to the actuator, which are given
-//! to its [`Permission`] at once.
+//! Snapshots of the board, fifteen per second, and the user's keys change the [`model`]; the `view` draws
+//! it. The user's requests are sent as [`Command`]s, except orders to the actuator, which go directly to its
+//! [`Permission`].
 //!
-//! Invariant: the terminal is given back as it was found, however the screen ends.
-//! Invariant: a terminal that takes no output delays nothing: frames are written by a thread of
-//! their own and left out while it is behind.
+//! Invariant: the terminal is restored to its previous state, however the screen ends.
+//! Invariant: a blocked terminal delays nothing: a separate thread writes the frames, and frames are dropped
+//! while it is behind.
 
 mod devices;
 pub mod flashlight;
@@ -41,13 +41,13 @@ use model::{Effect, Model, Msg};
 use terminal::Screen;
 use theme::Theme;
 
-/// Time between two frames when no key comes.
+/// Time between two frames when no key is pressed.
 const FRAME: Duration = Duration::from_millis(67);
 
 /// Why there is no screen.
 #[derive(Debug, thiserror::Error)]
 pub enum TuiError {
-    /// Neither input nor output is a terminal, or it cannot be put into raw mode.
+    /// Input or output is not a terminal, or it cannot be switched to raw mode.
     #[error("no terminal for the monitor: {0}; --headless runs without one")]
     NoTerminal(#[source] io::Error),
     /// The terminal went away.
@@ -63,8 +63,8 @@ pub fn columns() -> Option<usize> {
 
 /// Shows the monitor until `shutdown`.
 ///
-/// Asking to quit only sends [`Command::Quit`]; the screen stays until whoever takes the commands
-/// cancels `shutdown` or drops the receiver.
+/// A request to quit only sends [`Command::Quit`]; the screen stays until the receiver of the commands
+/// cancels `shutdown` or is dropped.
 ///
 /// # Errors
 /// When there is no terminal, or it goes away.
@@ -76,31 +76,31 @@ pub async fn run(
 ) -> Result<(), TuiError> {
     let theme = Theme::detect(|name| std::env::var(name).ok());
     let mut screen = Screen::open().map_err(TuiError::NoTerminal)?;
-    let asked = Asked { commands, permission };
-    let outcome = drive(&board, &asked, &shutdown, EventStream::new(), |model| screen.draw(model, theme)).await;
+    let requests = Requests { commands, permission };
+    let outcome = drive(&board, &requests, &shutdown, EventStream::new(), |model| screen.draw(model, theme)).await;
     screen.close().await;
     outcome
 }
 
-/// Nobody takes commands any more.
-struct Ended;
+/// The receiver of the commands was dropped.
+struct Closed;
 
-/// Who does what the user asks for.
-struct Asked {
+/// Where the user's requests go.
+struct Requests {
     commands: mpsc::Sender<Command>,
     permission: Arc<Permission>,
 }
 
-impl Asked {
-    /// What the model is to know of it.
-    fn carry_out(&self, effect: Effect) -> Result<Option<Msg>, Ended> {
+impl Requests {
+    /// Carries out an effect; returns the answer for the model, if any.
+    fn carry_out(&self, effect: Effect) -> Result<Option<Msg>, Closed> {
         match effect {
             Effect::None => Ok(None),
             Effect::Order(Order::Disarm | Order::Emergency(_)) => {
                 self.permission.disarm(Stamp::now());
                 Ok(None)
             }
-            // The monitor gives the plain one: to drive a joint back is asked for by its name.
+            // The monitor arms without driving back: `rapid arm --drive-back` is a deliberate choice.
             Effect::Order(Order::Arm | Order::ArmBack) => {
                 let now = Stamp::now();
                 Ok(self.permission.arm(now, now).err().map(Msg::Void))
@@ -113,11 +113,11 @@ impl Asked {
         }
     }
 
-    fn send(&self, command: Command) -> Result<Option<Msg>, Ended> {
+    fn send(&self, command: Command) -> Result<Option<Msg>, Closed> {
         match self.commands.try_send(command) {
             Ok(()) => Ok(None),
             Err(TrySendError::Full(_)) => Ok(Some(Msg::Refused)),
-            Err(TrySendError::Closed(_)) => Err(Ended),
+            Err(TrySendError::Closed(_)) => Err(Closed),
         }
     }
 }
@@ -125,7 +125,7 @@ impl Asked {
 /// The loop itself, with any source of terminal events and any way to draw.
 async fn drive(
     board: &Board,
-    asked: &Asked,
+    requests: &Requests,
     shutdown: &CancellationToken,
     events: impl Stream<Item = io::Result<Event>>,
     mut draw: impl FnMut(&Model) -> io::Result<()>,
@@ -140,17 +140,17 @@ async fn drive(
             () = shutdown.cancelled() => return Ok(()),
             event = events.next() => match event {
                 Some(Ok(Event::Key(key))) => model.update(Msg::Key(key)),
-                // Another size, which the next frame finds by itself, and pasted text, which asks for nothing.
+                // A resize, which the next frame detects by itself, and pasted text, which is no request.
                 Some(Ok(_)) => Effect::None,
                 Some(Err(error)) => return Err(TuiError::Gone(error)),
                 None => return Err(TuiError::Gone(io::ErrorKind::UnexpectedEof.into())),
             },
             _ = frames.tick() => model.update(Msg::Snapshot(Box::new(board.snapshot()))),
         };
-        match asked.carry_out(effect) {
+        match requests.carry_out(effect) {
             Ok(Some(answer)) => drop(model.update(answer)),
             Ok(None) => {}
-            Err(Ended) => return Ok(()),
+            Err(Closed) => return Ok(()),
         }
         draw(&model).map_err(TuiError::Gone)?;
     }

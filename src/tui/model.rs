@@ -1,18 +1,17 @@
-//! The model: what the screen remembers from one moment to the next.
+//! The model: the state of the screen between frames.
 //!
-//! Snapshots and keys come in as [`Msg`], what the rest of the program is to do goes out as
-//! [`Effect`]; the views only read.
+//! Snapshots and keys come in as [`Msg`], requests to the rest of the program go out as [`Effect`]; the
+//! views only read.
 //!
-//! Invariant: pure: no clock, no terminal, no channel; time is what the snapshots say.
+//! Invariant: only the file named in the question is deleted, and only while that is still offered. Keys that arrive
+//! immediately, such as text pasted into a terminal that does not mark it, confirm nothing.
+//! Invariant: pure: no clock, no terminal, no channel; time comes from the snapshots.
 
-mod arming;
-mod dropping;
-
+use std::path::PathBuf;
 use std::time::Duration;
 
 use crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 
-use self::dropping::Asked;
 use super::theme::Edge;
 use crate::action::Order;
 use crate::modality::{MAX_MODALITIES, ModalityId};
@@ -33,32 +32,32 @@ pub enum Msg {
     Snapshot(Box<Snapshot>),
     /// A key.
     Key(KeyEvent),
-    /// A command could not be handed over because the program is busy.
+    /// A command could not be sent because the program is busy.
     Refused,
-    /// The actuator is not armed, and why.
+    /// The actuator was not armed, and why.
     Void(Void),
 }
 
-/// What is to be done about it.
+/// A request of the model to the rest of the program.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Effect {
     /// Nothing beyond showing the model.
     None,
-    /// Hand this over.
+    /// Send this command.
     Send(Command),
-    /// Order this of the actuator.
+    /// Give this order to the actuator.
     Order(Order),
     /// Disarm the actuator, then end the program.
     Leave,
 }
 
-/// Has the user asked to quit?
+/// Whether the user asked to quit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Quit {
     /// No.
     #[default]
     No,
-    /// Yes, while an episode is being recorded: the next time counts.
+    /// Yes, while an episode is being recorded: the next request counts.
     Asked,
     /// Yes; the program is ending.
     Ending,
@@ -67,45 +66,50 @@ pub enum Quit {
 /// Measured figures of one device, refreshed a few times a second so that they can be read.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Reading {
-    /// Samples a second.
+    /// Samples per second.
     pub hz: f64,
     /// Age of the newest sample.
     pub age: Option<Duration>,
 }
 
-/// Figures of the whole, refreshed likewise.
+/// Figures of the whole rig, refreshed at the same rate.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Totals {
-    /// Publications of the mask a second.
+    /// Publications of the mask per second.
     pub publications: f64,
-    /// Bytes a second into the episode.
+    /// Bytes per second written to the episode.
     pub recorded: f64,
 }
 
-/// See the module's comment.
+/// The state of the screen.
 #[derive(Debug)]
 pub struct Model {
     latest: Snapshot,
     frozen: Option<Box<Snapshot>>,
     rates: Rates,
     readings: [Reading; MAX_MODALITIES],
-    totals: Totals,
+    /// Figures of the whole rig.
+    pub(super) totals: Totals,
     edges: [Option<Stamp>; MAX_MODALITIES],
-    /// When a device was pulled out, as far as this screen has seen it.
-    pulled: [Option<Stamp>; MAX_MODALITIES],
-    selected: usize,
-    scroll: usize,
-    help: bool,
-    quit: Quit,
-    /// When the user asked to arm the actuator: the next key counts.
+    /// When a device was unplugged, if the screen was open then.
+    unplugged: [Option<Stamp>; MAX_MODALITIES],
+    /// Row of the selected device.
+    pub(super) selected: usize,
+    /// Lines of the log below what is shown.
+    pub(super) scroll: usize,
+    /// The help is open.
+    pub(super) help: bool,
+    /// Whether the user has asked to quit.
+    pub(super) quit: Quit,
+    /// When the user asked to arm the actuator: the next key confirms or cancels.
     arming: Option<Stamp>,
-    /// The user has asked to drop the last episode: the next key counts.
-    dropping: Option<Asked>,
+    /// The user asked to drop the last episode: the next key confirms or cancels.
+    dropping: Option<DropQuestion>,
     notice: Option<(String, Stamp)>,
 }
 
 impl Model {
-    /// A screen that begins with this snapshot.
+    /// A screen that starts with this snapshot.
     #[must_use]
     pub fn new(snapshot: Snapshot) -> Self {
         let mut rates = Rates::default();
@@ -117,7 +121,7 @@ impl Model {
             readings: [Reading::default(); MAX_MODALITIES],
             totals: Totals::default(),
             edges: [None; MAX_MODALITIES],
-            pulled: [None; MAX_MODALITIES],
+            unplugged: [None; MAX_MODALITIES],
             selected: 0,
             scroll: 0,
             help: false,
@@ -130,27 +134,19 @@ impl Model {
         model
     }
 
-    /// Takes in what happened.
+    /// Applies a message.
     pub fn update(&mut self, msg: Msg) -> Effect {
         match msg {
-            Msg::Snapshot(snapshot) => {
-                self.take(*snapshot);
-                Effect::None
-            }
-            Msg::Key(key) if key.kind == KeyEventKind::Release => Effect::None,
-            Msg::Key(key) => self.key(key),
-            Msg::Refused => {
-                self.say("busy: not taken, try again");
-                Effect::None
-            }
-            Msg::Void(why) => {
-                self.say(&format!("not armed: {why}"));
-                Effect::None
-            }
+            Msg::Snapshot(snapshot) => self.advance(*snapshot),
+            Msg::Key(key) if key.kind == KeyEventKind::Release => {}
+            Msg::Key(key) => return self.key(key),
+            Msg::Refused => self.notify("busy: request dropped, try again"),
+            Msg::Void(why) => self.notify(&format!("not armed: {why}")),
         }
+        Effect::None
     }
 
-    fn take(&mut self, snapshot: Snapshot) {
+    fn advance(&mut self, snapshot: Snapshot) {
         for (bit, edge) in self.edges.iter_mut().enumerate() {
             if (snapshot.mask.0 ^ self.latest.mask.0) >> bit & 1 == 1 {
                 *edge = Some(snapshot.taken);
@@ -159,11 +155,11 @@ impl Model {
         for device in &snapshot.devices {
             let before = self.latest.devices.iter().find(|before| before.id == device.id);
             let was_attached = before.is_some_and(|before| before.state != SlotState::Absent);
-            if let Some(pulled) = self.pulled.get_mut(device.id.index())
+            if let Some(unplugged) = self.unplugged.get_mut(device.id.index())
                 && device.state == SlotState::Absent
                 && was_attached
             {
-                *pulled = Some(snapshot.taken);
+                *unplugged = Some(snapshot.taken);
             }
         }
         if self.scroll > 0 && self.frozen.is_none() {
@@ -177,7 +173,7 @@ impl Model {
         if self.quit == Quit::Asked && self.latest.recording.is_none() {
             self.quit = Quit::No;
         }
-        if self.notice.as_ref().is_some_and(|(_, said)| self.latest.taken.since(*said) > NOTICE_SHOWN) {
+        if self.notice.as_ref().is_some_and(|(_, shown)| self.latest.taken.since(*shown) > NOTICE_SHOWN) {
             self.notice = None;
         }
         self.keep_in_bounds();
@@ -195,33 +191,33 @@ impl Model {
 
     fn key(&mut self, key: KeyEvent) -> Effect {
         let control = key.modifiers.contains(KeyModifiers::CONTROL);
-        // Only the key after the first asks for it.
+        // Only the next key confirms.
         let arming = self.arming.take();
         match key.code {
             KeyCode::Char('c') if control => {
-                // Nothing moves while the question is answered.
+                // Nothing moves while the user is being asked.
                 let effect = self.ask_to_quit();
                 return if effect == Effect::None { Effect::Order(Order::Disarm) } else { effect };
             }
             KeyCode::Char('y') if control && key.kind == KeyEventKind::Press => return self.arm(arming),
-            // What stops motion works everywhere, whatever else is held down.
+            // The keys that stop motion work everywhere, with any modifier.
             KeyCode::Char('d' | 'D') | KeyCode::Esc => return self.disarm(key.code == KeyCode::Esc),
             KeyCode::Char(_) if control || key.modifiers.contains(KeyModifiers::ALT) => return Effect::None,
             KeyCode::Char('q') => return self.ask_to_quit(),
             _ => {}
         }
-        // Any other key says that the user has thought again.
+        // Any other key cancels.
         if self.quit == Quit::Asked {
             self.quit = Quit::No;
         }
         let dropping = self.dropping.take();
         if self.help {
-            // A key that closes the help does nothing else.
+            // The key that closes the help has no other effect.
             self.help = false;
             return Effect::None;
         }
         match key.code {
-            // A key held down must not start and stop episodes at the keyboard's repeat rate.
+            // A held key must not start and stop episodes at the keyboard's repeat rate.
             KeyCode::Char(' ') if key.kind == KeyEventKind::Press => return self.toggle_recording(),
             KeyCode::Char('r') => return self.restart(),
             KeyCode::Char('a') if key.kind == KeyEventKind::Press => self.ask_to_arm(),
@@ -252,22 +248,22 @@ impl Model {
 
     fn toggle_recording(&mut self) -> Effect {
         let text = if self.latest.recording.is_some() { "finishing the episode" } else { "starting an episode" };
-        self.say(text);
+        self.notify(text);
         Effect::Send(Command::ToggleRecording)
     }
 
     fn restart(&mut self) -> Effect {
         let Some(device) = self.shown().devices.get(self.selected) else { return Effect::None };
         let id = device.id;
-        // What is shown may be frozen: what counts is the state now.
+        // The view may be paused: the current state counts.
         let Some(now) = self.latest.devices.iter().find(|device| device.id == id) else { return Effect::None };
         if now.state == SlotState::Failed {
             let text = format!("restarting {}", now.name);
-            self.say(&text);
+            self.notify(&text);
             return Effect::Send(Command::Restart(id));
         }
         let text = format!("{} has not failed: nothing to restart", now.name);
-        self.say(&text);
+        self.notify(&text);
         Effect::None
     }
 
@@ -279,7 +275,7 @@ impl Model {
         }
     }
 
-    fn say(&mut self, text: &str) {
+    fn notify(&mut self, text: &str) {
         self.notice = Some((text.to_owned(), self.latest.taken));
     }
 
@@ -289,7 +285,7 @@ impl Model {
         self.scroll = self.scroll.min(lines.saturating_sub(1));
     }
 
-    /// The snapshot to show: the newest, or the one at which the view was paused.
+    /// The snapshot to show: the newest, or that of the moment the view was paused.
     #[must_use]
     pub fn shown(&self) -> &Snapshot {
         self.frozen.as_deref().unwrap_or(&self.latest)
@@ -313,12 +309,6 @@ impl Model {
         self.readings.get(id.index()).copied().unwrap_or_default()
     }
 
-    /// Figures of the whole.
-    #[must_use]
-    pub fn totals(&self) -> Totals {
-        self.totals
-    }
-
     /// Has the bit of `id` just changed?
     #[must_use]
     pub fn edge(&self, id: ModalityId) -> Edge {
@@ -334,39 +324,15 @@ impl Model {
     /// How long a device has been unplugged; `None` if it is not, or was never seen plugged in.
     #[must_use]
     pub fn unplugged_for(&self, device: &DeviceStatus) -> Option<Duration> {
-        let pulled = self.pulled.get(device.id.index()).copied().flatten()?;
+        let unplugged = self.unplugged.get(device.id.index()).copied().flatten()?;
         let shown = self.shown().taken;
-        (device.state == SlotState::Absent && pulled <= shown).then(|| shown.since(pulled))
-    }
-
-    /// Row of the selected device.
-    #[must_use]
-    pub fn selected(&self) -> usize {
-        self.selected
+        (device.state == SlotState::Absent && unplugged <= shown).then(|| shown.since(unplugged))
     }
 
     /// The selected device.
     #[must_use]
     pub fn selected_device(&self) -> Option<&DeviceStatus> {
         self.shown().devices.get(self.selected)
-    }
-
-    /// Lines of the log below what is shown.
-    #[must_use]
-    pub fn scroll(&self) -> usize {
-        self.scroll
-    }
-
-    /// Is the help open?
-    #[must_use]
-    pub fn is_help_open(&self) -> bool {
-        self.help
-    }
-
-    /// Has the user asked to quit?
-    #[must_use]
-    pub fn quit(&self) -> Quit {
-        self.quit
     }
 
     /// The answer to the last key, while it is fresh.
@@ -379,11 +345,89 @@ impl Model {
 /// Lines by which a page key scrolls the log.
 const SCROLL_STEP: usize = 5;
 
-/// How many lines were added to the log. The oldest are dropped from it, so it is the last line known
-/// that tells; when even that is gone, all are new.
+/// How many lines were added to the log. The oldest are dropped, so the count starts at the last known line;
+/// when that is gone too, all are new.
 fn lines_since(before: &Snapshot, after: &Snapshot) -> usize {
     let Some(known) = before.log.last() else { return after.log.len() };
     after.log.iter().rev().take_while(|line| *line != known).count()
+}
+
+/// How long after the question an arm may be confirmed.
+const CONFIRM_WITHIN: Duration = Duration::from_secs(2);
+
+impl Model {
+    /// Asks for confirmation: the actuator is about to move.
+    fn ask_to_arm(&mut self) {
+        self.arming = Some(self.latest.taken);
+        self.notify("ctrl-y within 2 s arms the actuator, any other key cancels");
+    }
+
+    /// The confirming key occurs neither in pasted text nor in the repeats of a held key.
+    fn arm(&mut self, asked: Option<Stamp>) -> Effect {
+        let in_time = asked.is_some_and(|asked| self.latest.taken.since(asked) <= CONFIRM_WITHIN);
+        self.notify(if in_time { "arming the actuator" } else { "not armed: a first, then ctrl-y within 2 s" });
+        if in_time { Effect::Order(Order::Arm) } else { Effect::None }
+    }
+
+    /// Disarms, and closes any open dialog, as Esc usually does.
+    fn disarm(&mut self, is_escape: bool) -> Effect {
+        (self.help, self.dropping) = (false, None);
+        if self.quit == Quit::Asked {
+            self.quit = Quit::No;
+        }
+        if is_escape {
+            self.scroll = 0;
+        } else {
+            self.notify("disarming the actuator");
+        }
+        Effect::Order(Order::Disarm)
+    }
+}
+
+/// Shortest time between question and confirmation: a person does not read faster, and pasted text arrives immediately.
+const SHORTEST: Duration = Duration::from_millis(150);
+
+/// The question shown to the user.
+#[derive(Debug)]
+struct DropQuestion {
+    file: PathBuf,
+    at: Stamp,
+}
+
+impl DropQuestion {
+    /// Whether a confirmation at `now` answers this question.
+    fn is_answered_at(&self, now: &Snapshot) -> bool {
+        let waited = now.taken.since(self.at);
+        (SHORTEST..=NOTICE_SHOWN).contains(&waited)
+            && now.short_episode.as_ref().is_some_and(|short| short.file == self.file)
+    }
+}
+
+impl Model {
+    fn ask_to_drop(&mut self) {
+        let Some(short) = &self.latest.short_episode else {
+            return self.notify("nothing to delete: the last episode is not too short");
+        };
+        let file = short.file.clone();
+        let text = format!("y deletes {}, any other key keeps it", name(&file));
+        self.dropping = Some(DropQuestion { file, at: self.latest.taken });
+        self.notify(&text);
+    }
+
+    fn drop_episode(&mut self, asked: Option<DropQuestion>) -> Effect {
+        let Some(asked) = asked else { return Effect::None };
+        if !asked.is_answered_at(&self.latest) {
+            self.notify("nothing deleted");
+            return Effect::None;
+        }
+        let text = format!("deleting {}", name(&asked.file));
+        self.notify(&text);
+        Effect::Send(Command::DropEpisode(asked.file))
+    }
+}
+
+fn name(file: &std::path::Path) -> String {
+    file.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
-//! The policy panel: what the policy at the controls saw, how fast it answers, and what it does or why not.
+//! The policy panel: what the policy observed, its latency, and its action or the reason of a hold.
 //!
-//! Invariant: what changes while the policy acts keeps its columns.
+//! Invariant: values that change while the policy acts keep their columns.
 
 use ratatui::Frame;
 use ratatui::layout::Rect;
@@ -21,10 +21,10 @@ const UNIT: usize = 6;
 const VALUE: usize = 7;
 /// Space between two axes.
 const GAP: usize = 2;
-/// From so many modalities on, the mask that the policy saw is shown as a number alone.
+/// From this many modalities on, the mask that the policy observed is shown only as a number.
 const MANY: usize = 24;
 
-/// Rows of the panel without its rule; one says all there is room for, three and more say everything.
+/// Rows of the panel without its rule; one row is a summary, three and more show everything.
 pub(super) fn rows(policy: &PolicyStatus, width: u16, most: u16, theme: Theme) -> u16 {
     if most < 3 {
         return most.min(1);
@@ -57,31 +57,28 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, rows: u16, model: &Model, 
     }
 }
 
-/// Does it act, or why not; in at most `columns`.
+/// Whether it acts, or why it holds; in at most `columns`.
 fn state(policy: &PolicyStatus, columns: usize, theme: Theme) -> Span<'static> {
     match &policy.hold {
         None => Span::styled(format!("{} acting", theme.symbol("►", ">")), theme.good()),
-        Some(reason) => {
-            let said = format!("{} holds: {}", theme.symbol("▲", "!"), theme.safe(reason));
-            Span::styled(shortened(&said, columns, theme), theme.warning())
+        Some(hold) => {
+            let head = format!("{} holds: {}", theme.symbol("▲", "!"), theme.safe(&hold.reason));
+            let tail = hold.device.as_ref().map(|device| format!(": {}", theme.safe(device))).unwrap_or_default();
+            Span::styled(shortened(&head, &tail, columns, theme), theme.warning())
         }
     }
 }
 
-/// A reason in at most `columns`; what stands behind its last colon, which names the device, goes last.
-fn shortened(reason: &str, columns: usize, theme: Theme) -> String {
-    let tail = reason.rsplit_once(": ").map(|(_, device)| format!(": {device}")).unwrap_or_default();
-    let room = columns.checked_sub(text::width(&tail)).filter(|room| *room > columns / 2);
-    match (text::width(reason) > columns, room) {
-        (true, Some(room)) => {
-            let head = reason.strip_suffix(tail.as_str()).unwrap_or(reason);
-            format!("{}{tail}", text::cut(head, room, theme.ellipsis()))
-        }
-        _ => text::cut(reason, columns, theme.ellipsis()).into_owned(),
+/// Both in at most `columns`; `tail`, which names the device, goes last.
+fn shortened(head: &str, tail: &str, columns: usize, theme: Theme) -> String {
+    let whole = format!("{head}{tail}");
+    match columns.checked_sub(text::width(tail)).filter(|room| *room > columns / 2) {
+        Some(room) if text::width(&whole) > columns => format!("{}{tail}", text::cut(head, room, theme.ellipsis())),
+        _ => text::cut(&whole, columns, theme.ellipsis()).into_owned(),
     }
 }
 
-/// All in one line: the reason of a hold, or how fast the policy is and what it does.
+/// A summary in one line: the reason of a hold, or latency and action.
 fn short(policy: &PolicyStatus, width: usize, theme: Theme) -> Line<'static> {
     let mut line = Line::from(state(policy, width, theme));
     if policy.hold.is_some() {
@@ -93,7 +90,7 @@ fn short(policy: &PolicyStatus, width: usize, theme: Theme) -> Line<'static> {
     line
 }
 
-/// The state at the left; at the right what has happened so far, as much as fits whole.
+/// The state at the left; at the right the counters that fit.
 fn first(policy: &PolicyStatus, width: usize, theme: Theme) -> Line<'static> {
     let state = state(policy, width, theme);
     let counts = [
@@ -117,13 +114,13 @@ fn first(policy: &PolicyStatus, width: usize, theme: Theme) -> Line<'static> {
 
 /// From the observation to the chunk, in ten columns.
 fn latency(policy: &PolicyStatus, theme: Theme) -> String {
-    let said = policy.latency_ms.map_or(theme.symbol("–", "-").to_owned(), |ms| {
+    let number = policy.latency_ms.map_or(theme.symbol("–", "-").to_owned(), |ms| {
         if ms < 99_999.0 { format!("{ms:.1}") } else { format!("{ms:.0e}") }
     });
-    format!("{said:>7} ms")
+    format!("{number:>7} ms")
 }
 
-/// What the newest chunk was made of, how fast, and how old it is.
+/// The mask that the newest chunk was computed with, its latency and its age.
 fn second(policy: &PolicyStatus, model: &Model, theme: Theme) -> Line<'static> {
     let devices = &model.shown().devices;
     let mut line =
@@ -148,7 +145,7 @@ fn bit(policy: &PolicyStatus, id: ModalityId, theme: Theme) -> Span<'static> {
     Span::styled(symbol, theme.mask_cell(present, Edge::None))
 }
 
-/// The newest action, faint while it is not carried out.
+/// The newest action, faint while it is not executed.
 fn action(policy: &PolicyStatus, width: usize, rows: usize, theme: Theme) -> Vec<Line<'static>> {
     if policy.action.is_empty() {
         return vec![Line::styled("no action yet", theme.faint())];
@@ -197,14 +194,14 @@ impl<'a> Arrangement<'a> {
         cell(self.name(axis), self.unit(axis))
     }
 
-    /// At most `rows` lines; of axes that do not fit, how many there are.
+    /// At most `rows` lines, with the number of axes that do not fit.
     fn lines(self, rows: usize, style: Style) -> Vec<Line<'static>> {
         match self.grid {
             Some((name, unit, per_row)) if rows > 1 => {
                 let fits = per_row * rows;
                 let spare = self.width.saturating_sub(per_row * (cell(name, unit) + GAP));
                 let left = self.axes.len().saturating_sub(fits);
-                // Where there is no room for the rest's number, it stands in place of the last axis.
+                // Without space for the number of the rest, it replaces the last axis.
                 let shown = if left > 0 && text::width(&more(left)) > spare { fits - 1 } else { fits };
                 let shown = self.axes.get(..shown).unwrap_or(self.axes);
                 let mut lines: Vec<Line<'static>> = shown
@@ -264,7 +261,7 @@ fn more(axes: usize) -> String {
     format!("{axes} more")
 }
 
-/// A number without a dimension has the unit 1, which says nothing beside a value.
+/// A dimensionless number has the unit 1, which is not shown.
 fn measure(unit: &str) -> &str {
     if unit == "1" { "" } else { unit }
 }
@@ -272,7 +269,7 @@ fn measure(unit: &str) -> &str {
 /// A value in at most [`VALUE`] columns, with as many decimals as there is room for, three at most.
 fn value(value: f64) -> String {
     let size = value.abs();
-    // What is written as zero has no sign: around zero it would flicker.
+    // A value shown as zero has no sign, which would flicker around zero.
     let value = if size < 0.0005 { 0.0 } else { value };
     match size {
         size if size < 99.9995 => format!("{value:.3}"),

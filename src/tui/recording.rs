@@ -1,4 +1,4 @@
-//! The recording panel: the episode being written, or what the last one was.
+//! The recording panel: the episode being written, or the last one and its verdict.
 
 use std::path::Path;
 
@@ -15,7 +15,7 @@ use crate::text;
 pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Theme) {
     let inner = view::panel(frame, area, "Recording", Line::default(), theme);
     let lines = match &model.shown().recording {
-        Some(recording) => under_way(recording, inner, model, theme),
+        Some(recording) => in_progress(recording, inner, model, theme),
         None => idle(inner, model, theme),
     };
     for (line, row) in lines.into_iter().zip(inner.rows()) {
@@ -23,10 +23,10 @@ pub(super) fn draw(frame: &mut Frame<'_>, area: Rect, model: &Model, theme: Them
     }
 }
 
-fn under_way(recording: &RecordingStatus, area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
+fn in_progress(recording: &RecordingStatus, area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
     let mut figures = vec![Span::raw(text::clock(recording.elapsed))];
     if let Some(left) = recording.room {
-        // In place of what can wait: the line is full.
+        // Replaces the count of messages: the line is full.
         let left = format!("{} disk full in {}", theme.symbol("▲", "!"), text::clock(left));
         figures.extend([Span::raw("   "), Span::styled(left, theme.alarm())]);
     } else {
@@ -35,7 +35,7 @@ fn under_way(recording: &RecordingStatus, area: Rect, model: &Model, theme: Them
     }
     figures.extend([
         Span::raw(format!("   {}", text::size(recording.bytes))),
-        Span::raw(format!("   {:.1} MB/s", model.totals().recorded / 1e6)),
+        Span::raw(format!("   {:.1} MB/s", model.totals.recorded / 1e6)),
     ]);
     let dropped = format!("dropped {}", recording.dropped);
     figures.push(Span::raw("   "));
@@ -70,7 +70,7 @@ fn idle(area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
     let label = Span::styled("last ", theme.faint());
     let width = usize::from(area.width);
     let offer = shown.short_episode.as_ref().filter(|short| short.file == *last);
-    let offer = offer.map(|short| format!("{:.1} s long: x drops it", short.length.as_secs_f64()));
+    let offer = offer.map(|short| format!("{:.1} s long: x deletes it", short.length.as_secs_f64()));
     if area.height < 2 {
         if let Some(offer) = offer {
             first.spans.extend([Span::raw("   "), label, Span::styled(offer, theme.warning())]);
@@ -86,10 +86,10 @@ fn idle(area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
         first.push_span(Span::raw("   "));
         first.push_span(Span::styled(text::cut(&sensors, room, theme.ellipsis()).into_owned(), theme.faint()));
     }
-    // The reasons beside the name as far as there is room; the log has all of them.
+    // As many of the reasons as fit beside the name; the log has all of them.
     let room = width.saturating_sub(label.width() + word.width());
     let name_width = last.file_name().map_or(0, |name| text::width(&name.to_string_lossy()));
-    // The offer repeats the first reason of a short one.
+    // The offer replaces the reasons: the first of them is the length.
     let why = offer.unwrap_or_else(|| theme.safe(&reasons.join("; ")));
     let room_why = room.saturating_sub(name_width + 2);
     let path = file(last, if why.is_empty() { room } else { name_width.min(room) }, theme);

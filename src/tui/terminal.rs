@@ -1,8 +1,8 @@
-//! The terminal: taken for the screen, given back as it was found.
+//! The terminal: switched to raw mode for the screen, and restored afterwards.
 //!
-//! A panic anywhere while the screen is up would write its message into the picture, and a panic that
-//! a supervisor survives must not end the picture. So messages of panics are kept, and printed once
-//! the terminal is given back.
+//! A panic anywhere while the screen is up would write its message into the picture, and a panic that a
+//! supervisor recovers from must not end the picture. So messages of panics are kept, and printed once the
+//! terminal is restored.
 
 use std::fs::File;
 use std::io::{self, IsTerminal, Write};
@@ -24,7 +24,7 @@ use super::view;
 use crate::outlet::Outlet;
 use crate::panics;
 
-/// How long a terminal that is behind may take for the last frame before it is left.
+/// How long a blocked terminal may take for the last frame before it is abandoned.
 const LAST_FRAME: Duration = Duration::from_millis(500);
 
 /// The screen is up.
@@ -38,28 +38,28 @@ pub(super) struct Screen {
 }
 
 impl Screen {
-    /// Takes the terminal.
+    /// Switches the terminal to the screen.
     pub(super) fn open() -> io::Result<Self> {
         if !io::stdout().is_terminal() {
             return Err(io::Error::other("standard output is not a terminal"));
         }
         let outlet = Outlet::new("screen", 1, io::stdout())?;
-        take()?;
+        enter_raw_mode()?;
         let frame = Frame::default();
         let outlet = Some(outlet);
         let mut screen = match Terminal::new(CrosstermBackend::new(frame.clone())) {
             Ok(terminal) => Self { terminal, frame, outlet },
             Err(error) => {
-                give_back();
+                restore();
                 return Err(error);
             }
         };
-        // Pasted text is marked, and not taken for keys.
+        // Pasted text is marked, so it is not read as keys.
         crossterm::queue!(screen.frame, EnterAlternateScreen, DisableLineWrap, Hide, EnableBracketedPaste)?;
         Ok(screen)
     }
 
-    /// Draws the model, unless the terminal has not yet taken the frame before.
+    /// Draws the model, unless the terminal has not yet accepted the previous frame.
     pub(super) fn draw(&mut self, model: &Model, theme: Theme) -> io::Result<()> {
         let Some(outlet) = &self.outlet else { return Ok(()) };
         if !outlet.is_idle() {
@@ -70,15 +70,15 @@ impl Screen {
         if outlet.is_closed() {
             return Err(io::ErrorKind::BrokenPipe.into());
         }
-        // There is room: nobody else sends.
+        // There is space: this is the only sender.
         let _ = outlet.try_send(bytes);
         Ok(())
     }
 
-    /// Gives the terminal back after the last frame.
+    /// Restores the terminal after the last frame.
     pub(super) async fn close(mut self) {
         if let Some(outlet) = self.outlet.take() {
-            // What comes next is to happen however this ended.
+            // The terminal is restored even if this fails.
             let _ = outlet.finish(LAST_FRAME).await;
         }
     }
@@ -89,12 +89,11 @@ impl Drop for Screen {
         if let Some(outlet) = self.outlet.take() {
             outlet.finish_blocking(LAST_FRAME);
         }
-        give_back();
+        restore();
     }
 }
 
-/// What writes to the terminal: standard output, or if that leads elsewhere the terminal that the
-/// program was started on.
+/// A writer to the terminal: standard output or, if that is redirected, the controlling terminal.
 pub(super) fn writer() -> io::Result<Box<dyn Write>> {
     if io::stdout().is_terminal() {
         return Ok(Box::new(io::stdout()));
@@ -102,17 +101,17 @@ pub(super) fn writer() -> io::Result<Box<dyn Write>> {
     Ok(Box::new(File::options().read(true).write(true).open("/dev/tty")?))
 }
 
-/// Takes the terminal, until [`give_back`]: keys come as they are typed.
-pub(super) fn take() -> io::Result<()> {
+/// Switches the terminal to raw mode, until [`restore`].
+pub(super) fn enter_raw_mode() -> io::Result<()> {
     enable_raw_mode()?;
     panics::keep();
     UP.store(true, Ordering::SeqCst);
     Ok(())
 }
 
-/// Restores the terminal and prints what was kept. Errors are passed over: there is no terminal
-/// left to tell them to.
-pub(super) fn give_back() {
+/// Restores the terminal and prints the messages that were kept. Errors are ignored: there is no terminal
+/// left to report them on.
+pub(super) fn restore() {
     if !UP.swap(false, Ordering::SeqCst) {
         return;
     }
@@ -123,7 +122,7 @@ pub(super) fn give_back() {
         }
         let _ = done.send(());
     };
-    // A terminal that is stopped takes nothing: the program ends all the same.
+    // A stopped terminal accepts nothing: the program exits anyway.
     let left = std::thread::Builder::new().name("screen".to_owned()).spawn(leave).is_ok()
         && is_done.recv_timeout(LAST_FRAME).is_ok();
     let _ = disable_raw_mode();
@@ -156,7 +155,7 @@ impl Write for Frame {
     }
 }
 
-/// A poisoned lock here guards whole values: go on with them.
+/// A poisoned lock here guards complete values: continue with them.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

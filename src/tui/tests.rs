@@ -83,7 +83,7 @@ fn three_devices_stream() {
 }
 
 #[test]
-fn the_last_verdict_stands_beside_its_file_with_as_many_reasons_as_there_is_room_for() {
+fn the_last_verdict_is_shown_with_its_file_and_the_reasons_that_fit() {
     let mut end = three_streaming();
     end.last_episode = Some("episodes/2023-11-14_place-block_006.mcap".into());
     for (grade, colour) in [(Grade::Suspect, Color::Yellow), (Grade::Bad, Color::Red)] {
@@ -119,16 +119,13 @@ fn a_short_episode_is_offered_to_be_dropped() {
     assert_snapshot!("short_60x12", draw(&model, (60, 12), ASCII));
     model.update(press(KeyCode::Char('x')));
     let screen = draw(&model, (80, 24), THEME);
-    assert!(
-        screen.to_string().contains("y removes 20231114_cube_003.mcap for good, any other key keeps it"),
-        "{screen}"
-    );
+    assert!(screen.to_string().contains("y deletes 20231114_cube_003.mcap, any other key keeps it"), "{screen}");
     // The next episode has begun, and ended as it should.
     end.recording = Some(recording(0));
     end.short_episode = None;
-    assert!(!draw(&measured(&end), (80, 24), THEME).to_string().contains("drops it"));
+    assert!(!draw(&measured(&end), (80, 24), THEME).to_string().contains("deletes it"));
     end.recording = None;
-    assert!(!draw(&measured(&end), (80, 24), THEME).to_string().contains("drops it"));
+    assert!(!draw(&measured(&end), (80, 24), THEME).to_string().contains("deletes it"));
 }
 
 #[test]
@@ -160,7 +157,7 @@ fn every_state_has_its_word_symbol_and_colour() {
 }
 
 #[test]
-fn without_colours_and_unicode_everything_can_still_be_told() {
+fn without_colours_and_unicode_states_stay_distinguishable() {
     let mut end = every_state();
     end.devices[1].detail = "Kamera für Überblick 相机".to_owned();
     end.recording = Some(recording(2));
@@ -175,7 +172,7 @@ fn without_colours_and_unicode_everything_can_still_be_told() {
 }
 
 #[test]
-fn an_episode_that_loses_samples_says_so() {
+fn an_episode_that_loses_samples_is_marked() {
     let mut end = three_streaming();
     end.recording = Some(recording(17));
     let model = measured(&end);
@@ -187,7 +184,7 @@ fn an_episode_that_loses_samples_says_so() {
 }
 
 #[test]
-fn a_disk_that_fills_up_says_how_long_it_takes() {
+fn a_filling_disk_shows_the_remaining_time() {
     let mut end = three_streaming();
     end.recording = Some(RecordingStatus { room: Some(Duration::from_secs(252)), ..recording(17) });
     let model = measured(&end);
@@ -229,7 +226,7 @@ fn long_and_foreign_names_keep_the_columns() {
 }
 
 #[test]
-fn a_small_terminal_says_what_it_needs() {
+fn a_small_terminal_shows_the_required_size() {
     let model = measured(&three_streaming());
     assert_snapshot!("too_small", draw(&model, (40, 8), THEME));
     assert_snapshot!("smallest", draw(&model, (60, 12), THEME));
@@ -275,7 +272,7 @@ fn a_number_that_does_not_fit_is_left_out_and_not_cut() {
 }
 
 #[test]
-fn an_absent_device_says_since_when() {
+fn an_absent_device_shows_since_when() {
     let mut end = three_streaming();
     end.devices.push(device(3, "imu", SlotState::Absent, ""));
     end.devices[3].samples = 0;
@@ -321,8 +318,8 @@ fn typed(keys: &[KeyCode]) -> impl Stream<Item = io::Result<Event>> + use<> {
     futures::stream::iter(events).chain(futures::stream::pending())
 }
 
-fn desk(commands: &mpsc::Sender<Command>) -> Asked {
-    Asked { commands: commands.clone(), permission: Arc::default() }
+fn desk(commands: &mpsc::Sender<Command>) -> Requests {
+    Requests { commands: commands.clone(), permission: Arc::default() }
 }
 
 #[tokio::test]
@@ -344,7 +341,7 @@ async fn keys_become_commands_and_shutdown_ends_the_screen() {
 }
 
 #[tokio::test]
-async fn a_busy_program_is_said_and_one_that_is_gone_ends_the_screen() {
+async fn a_busy_program_is_shown_and_a_gone_one_ends_the_screen() {
     let board = board(&["cam"]);
     let (sender, commands) = mpsc::channel(1);
     sender.try_send(Command::ToggleRecording).unwrap();
@@ -360,7 +357,7 @@ async fn a_busy_program_is_said_and_one_that_is_gone_ends_the_screen() {
     })
     .await
     .unwrap();
-    assert_eq!(notice.as_deref(), Some("busy: not taken, try again"));
+    assert_eq!(notice.as_deref(), Some("busy: request dropped, try again"));
 
     drop(commands);
     drive(&board, &desk(&sender), &CancellationToken::new(), typed(&[KeyCode::Char('q')]), |_| Ok(())).await.unwrap();
@@ -391,7 +388,7 @@ async fn pasted_text_drops_nothing_whether_the_terminal_marks_it_or_not() {
     let end = shutdown.clone();
     let desk = desk(&sender);
     let screen = drive(&board, &desk, &shutdown, events, |model| {
-        asked |= model.notice().is_some_and(|said| said.starts_with("y removes a_001.mcap"));
+        asked |= model.notice().is_some_and(|said| said.starts_with("y deletes a_001.mcap"));
         Ok(())
     });
     let app = async {

@@ -1,4 +1,4 @@
-//! Colours and symbols, by what the terminal can show.
+//! Colours and symbols, according to what the terminal can show.
 //!
 //! Only the 16 colours that the user's own terminal theme defines, so that dark and light terminals
 //! both read well. Every meaning that has a colour also has a symbol or a word.
@@ -27,7 +27,7 @@ pub enum Charset {
     Ascii,
 }
 
-/// How things look.
+/// Colours and characters to draw with.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Theme {
     /// Colours.
@@ -37,8 +37,8 @@ pub struct Theme {
 }
 
 impl Theme {
-    /// What the environment says: `NO_COLOR` (<https://no-color.org>), `TERM`, and the locale in
-    /// `LC_ALL`, `LC_CTYPE` or `LANG`, of which the first that is set counts.
+    /// The theme for the environment: `NO_COLOR` (<https://no-color.org>), `TERM`, and the locale in
+    /// `LC_ALL`, `LC_CTYPE` or `LANG`, the first that is set.
     #[must_use]
     pub fn detect(variable: impl Fn(&str) -> Option<String>) -> Self {
         let set = |name: &str| variable(name).filter(|value| !value.is_empty());
@@ -59,13 +59,13 @@ impl Theme {
         }
     }
 
-    /// What stands at the end of a text that was cut.
+    /// The mark at the end of a truncated text.
     #[must_use]
     pub fn ellipsis(self) -> &'static str {
         self.symbol("…", "~")
     }
 
-    /// Foreign text as this terminal may show it.
+    /// Untrusted text as this terminal may show it.
     #[must_use]
     pub fn safe(self, foreign: &str) -> String {
         let plain = text::plain(foreign);
@@ -75,7 +75,7 @@ impl Theme {
         }
     }
 
-    /// Foreign text in exactly `columns` columns.
+    /// Untrusted text in exactly `columns` columns.
     #[must_use]
     pub fn column(self, foreign: &str, columns: usize) -> String {
         text::left(&self.safe(foreign), columns, self.ellipsis())
@@ -88,7 +88,7 @@ impl Theme {
         }
     }
 
-    /// Labels, rules, what is not the point.
+    /// Labels, rules, secondary text.
     #[must_use]
     pub fn faint(self) -> Style {
         Style::new().add_modifier(Modifier::DIM)
@@ -100,7 +100,7 @@ impl Theme {
         self.colour(Color::Cyan).add_modifier(Modifier::BOLD)
     }
 
-    /// Something that needs the user's eye.
+    /// Something that needs the user's attention.
     #[must_use]
     pub fn warning(self) -> Style {
         self.colour(Color::Yellow).add_modifier(Modifier::BOLD)
@@ -112,7 +112,7 @@ impl Theme {
         self.colour(Color::Red).add_modifier(Modifier::BOLD)
     }
 
-    /// All is as it should be.
+    /// Everything is in order.
     #[must_use]
     pub fn good(self) -> Style {
         self.colour(Color::Green)
@@ -207,7 +207,7 @@ impl Theme {
     }
 }
 
-/// Has a bit of the mask changed within the last second?
+/// Whether a bit of the mask changed within the last second.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Edge {
     /// No.

@@ -1,4 +1,4 @@
-//! The view: where each panel goes on the screen.
+//! The view: the layout of the panels.
 //!
 //! Invariant: drawing changes nothing but the frame.
 
@@ -12,7 +12,7 @@ use super::model::Model;
 use super::theme::Theme;
 use super::{devices, footer, header, help, log, mask, policy, recording};
 
-/// Below this the screen only says how large it should be.
+/// Below this size the screen only shows the size it needs.
 pub const MINIMUM: (u16, u16) = (60, 12);
 /// From this height on, panels have an empty line between them.
 const ROOMY: u16 = 32;
@@ -41,7 +41,7 @@ pub fn draw(frame: &mut Frame<'_>, model: &Model, theme: Theme) {
     let policy_rows = if policy_lines > 0 { 1 + policy_lines + gap } else { 0 };
     // A rule above each of the four panels, the head of the table, header and footer.
     let fixed = 4 + 1 + 2 + 4 * gap + plan.rows() + selection + recording_lines + policy_rows;
-    // On the smallest terminals the policy stands in the log's place: why it holds, it says itself.
+    // On the smallest terminals the policy panel replaces the log: it shows the reason of a hold itself.
     let with_log = policy_rows == 0 || area.height >= fixed + 1 + LOG_LINES.0;
     let rest = area.height.saturating_sub(if with_log { fixed } else { fixed - 1 });
     let log_least = if with_log { (rest / 3).clamp(LOG_LINES.0, LOG_LINES.1) } else { 0 };
@@ -68,7 +68,7 @@ pub fn draw(frame: &mut Frame<'_>, model: &Model, theme: Theme) {
         log::draw(frame, log_area, model, theme);
     }
     footer::draw(frame, footer_area, model, theme);
-    if model.is_help_open() {
+    if model.help {
         help::draw(frame, area, theme);
     }
 }
@@ -76,13 +76,13 @@ pub fn draw(frame: &mut Frame<'_>, model: &Model, theme: Theme) {
 fn draw_too_small(frame: &mut Frame<'_>, area: Rect) {
     let lines = vec![
         Line::from("The terminal is too small.").bold(),
-        Line::from(format!("needed {}x{}, is {}x{}", MINIMUM.0, MINIMUM.1, area.width, area.height)),
+        Line::from(format!("needs {}x{}, has {}x{}", MINIMUM.0, MINIMUM.1, area.width, area.height)),
     ];
     let [middle] = Layout::vertical([Constraint::Length(2)]).flex(ratatui::layout::Flex::Center).areas(area);
     frame.render_widget(Paragraph::new(lines).centered(), middle);
 }
 
-/// Draws the rule of a panel, with its title at the left and a remark at the right, and gives the rest.
+/// Draws the rule of a panel, with its title at the left and a remark at the right; returns the area below.
 pub(super) fn panel(frame: &mut Frame<'_>, area: Rect, title: &str, remark: Line<'_>, theme: Theme) -> Rect {
     let [rule, rest] = Layout::vertical([Constraint::Length(1), Constraint::Fill(1)]).areas(area);
     let dash = theme.symbol("─", "-");

@@ -33,9 +33,14 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
+/// Allocations of this thread since it began.
+pub(crate) fn of_this_thread() -> u64 {
+    ALLOCATIONS.get()
+}
+
 /// Allocations of this thread while `of` runs.
 pub(crate) fn allocations(of: impl FnOnce()) -> u64 {
-    let before = ALLOCATIONS.get();
+    let before = of_this_thread();
     of();
-    ALLOCATIONS.get() - before
+    of_this_thread() - before
 }

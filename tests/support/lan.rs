@@ -1,4 +1,4 @@
-//! Devices on the network: servers on 127.0.0.1, the entries that name them, and what a run tells of them.
+//! Devices on the network: servers on 127.0.0.1, the entries that name them, and what a run reports about them.
 
 #![allow(dead_code, reason = "each test binary uses its own part of this module")]
 
@@ -27,7 +27,7 @@ pub(crate) fn picture(number: u32) -> Vec<u8> {
     sim::frame(&source, number).expect("a picture")
 }
 
-/// Ports of this machine that nobody is at.
+/// Ports of this machine without a listener.
 pub(crate) fn free_ports<const N: usize>() -> [u16; N] {
     let held = [(); N].map(|()| TcpListener::bind("127.0.0.1:0").expect("a port"));
     held.map(|listener| listener.local_addr().expect("an address").port())
@@ -127,13 +127,13 @@ pub(crate) fn camera_entry(name: &str, bit: u32, port: u16) -> String {
 
 pub(crate) const RIG: &str = "[rig]\ncooldown = \"100ms\"\n";
 
-/// What was told of a device: its states, and who told of its removals.
+/// What was reported of a device: its states, and what reported its removals.
 pub(crate) fn life(running: &Running, device: &str) -> Vec<String> {
-    life_of(&running.told(), device)
+    life_of(&running.reported(), device)
 }
 
-pub(crate) fn life_of(told: &[Value], device: &str) -> Vec<String> {
-    let of = told.iter().filter(|event| event["device"] == device);
+pub(crate) fn life_of(reported: &[Value], device: &str) -> Vec<String> {
+    let of = reported.iter().filter(|event| event["device"] == device);
     of.filter_map(|event| match event["event"].as_str()? {
         "state" => event["state"].as_str().map(str::to_owned),
         "detach" => Some(format!("by {}", event["witness"].as_str()?)),
@@ -144,11 +144,11 @@ pub(crate) fn life_of(told: &[Value], device: &str) -> Vec<String> {
 
 pub(crate) fn wait_for(running: &Running, device: &str, word: &str, times: usize) {
     until(&format!("{device} {word} {times} times"), || {
-        life(running, device).iter().filter(|told| *told == word).count() >= times
+        life(running, device).iter().filter(|reported| *reported == word).count() >= times
     });
 }
 
-/// Ends a run; all that it told.
+/// Ends a run; all that it reported.
 pub(crate) fn stop(running: Running) -> Vec<Value> {
     running.signal(Signal::INT);
     let (code, output, errors) = running.end();

@@ -1,4 +1,4 @@
-//! Files with mistakes, and beside each what is said of it: `NAME.expected`.
+//! Files with mistakes, and beside each the expected message: `NAME.expected`.
 
 use std::path::{Path, PathBuf};
 
@@ -16,13 +16,13 @@ pub(crate) fn files(folder: &str, extension: &str) -> Vec<PathBuf> {
     files
 }
 
-/// The text of a file, whose name is told if there is none.
+/// The text of a file, whose name is reported if there is none.
 pub(crate) fn read(path: &Path) -> String {
     std::fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }
 
 /// Each file of `folder` is refused with exactly the text beside it, and each problem has a fix and moves no
-/// cursor. There are `count` files at least, so that none is lost unseen. `refused` gives what is said of a
+/// cursor. There are `count` files at least, so that none is lost unseen. `refused` gives the message about a
 /// text and its problems; `None` if it is accepted.
 pub(crate) fn check(
     folder: &str,
@@ -36,8 +36,8 @@ pub(crate) fn check(
         assert!(expected.with_extension(extension).exists(), "{} is of no file", expected.display());
     }
     for path in mistakes {
-        let (said, problems) = refused(&read(&path)).unwrap_or_else(|| panic!("{} is accepted", path.display()));
-        assert_eq!(format!("{said}\n"), read(&path.with_extension("expected")), "{}", path.display());
+        let (printed, problems) = refused(&read(&path)).unwrap_or_else(|| panic!("{} is accepted", path.display()));
+        assert_eq!(format!("{printed}\n"), read(&path.with_extension("expected")), "{}", path.display());
         for problem in &problems {
             assert!(problem.fix.as_ref().is_some_and(|fix| !fix.is_empty()), "{problem}");
             assert!(!problem.to_string().chars().any(|c| c.is_control() && c != '\n'), "{problem:?}");

@@ -3,6 +3,7 @@
 #![allow(dead_code, reason = "each test binary uses its own part of this module")]
 #![allow(clippy::expect_used, reason = "what fails here fails a test")]
 
+pub(crate) mod lan;
 pub(crate) mod terminal;
 
 use std::path::{Path, PathBuf};
@@ -122,11 +123,11 @@ impl Place {
         command
             .current_dir(self.folder.path())
             .env_remove("RAPID_LOG")
+            .env("RAPID_INSTANCE", &self.instance)
             .env("HOME", self.folder.path())
             .env_remove("XDG_CONFIG_HOME")
             .env_remove("XDG_STATE_HOME")
             .env_remove("STATE_DIRECTORY")
-            .args(["--instance", &self.instance])
             .args(arguments)
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
@@ -185,7 +186,7 @@ impl Running {
     }
 
     /// The events so far of a run with `--json`. A line that is half written is none yet.
-    pub(crate) fn told(&self) -> Vec<serde_json::Value> {
+    pub(crate) fn reported(&self) -> Vec<serde_json::Value> {
         events(self.output().rsplit_once('\n').map_or("", |(whole, _)| whole))
     }
 
@@ -242,7 +243,7 @@ pub(crate) fn logged<'a>(events: &'a [serde_json::Value], words: &str) -> Vec<&'
     events.iter().filter_map(|event| event["text"].as_str()).filter(|text| text.contains(words)).collect()
 }
 
-/// Everything a recorded episode says, read by the mcap crate.
+/// The content of a recorded episode, read by the mcap crate.
 pub(crate) struct Episode {
     pub(crate) metadata: Vec<mcap::records::Metadata>,
     /// Topics that have a channel, with or without messages.
@@ -286,7 +287,7 @@ impl Episode {
     }
 
     /// A value of the metadata record `name`.
-    pub(crate) fn said(&self, name: &str, key: &str) -> &str {
+    pub(crate) fn value(&self, name: &str, key: &str) -> &str {
         let record = self.metadata.iter().find(|record| record.name == name).expect("the metadata record");
         record.metadata.get(key).unwrap_or_else(|| panic!("no {key} in {name}"))
     }

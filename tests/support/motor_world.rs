@@ -70,10 +70,10 @@ pub(crate) struct World {
     pub(crate) motors: Vec<Motor>,
     pub(crate) spec: DamiaoSpec,
     pub(crate) now: Stamp,
-    /// When it was told, and its words.
+    /// When it was reported, and its words.
     pub(crate) notices: Vec<(Stamp, Notice, String)>,
     pub(crate) judge: Judge,
-    /// Drives the motors from now on, judged by nobody.
+    /// Drives the motors from now on, without a judge.
     pub(crate) instead: Option<Program>,
     /// The target that is followed.
     pub(crate) followed: Option<Vec<f64>>,
@@ -85,7 +85,7 @@ pub(crate) struct World {
     killed: Option<Stamp>,
     brakes: Brakes,
     are_brakes_stuck: bool,
-    /// Of each joint, whether its brake lets it turn, and since when its line says something else.
+    /// Of each joint, whether its brake lets it turn, and since when its line is set otherwise.
     turns: Vec<(bool, Option<Stamp>)>,
     damage: Vec<(usize, usize, f64)>,
 }
@@ -105,7 +105,7 @@ pub(crate) struct Judge {
     was_armed: bool,
 }
 
-/// What a motor was told and what it said.
+/// What a motor was sent and what it answered.
 #[derive(Clone, Default)]
 #[expect(clippy::struct_excessive_bools, reason = "each is a fact of its own")]
 pub(crate) struct Axis {
@@ -180,7 +180,7 @@ impl World {
         }
     }
 
-    /// Waits until the motors have answered, and arms them, with somebody holding the joints until they hold themselves.
+    /// Waits until the motors have answered, and arms them, with the joints held from outside until they hold themselves.
     ///
     /// # Panics
     /// When they are not armed within a second.
@@ -198,10 +198,10 @@ impl World {
         panic!("not armed: {:?}, {:?}", self.bus.state(), self.notices);
     }
 
-    /// Does what a line says.
+    /// Executes a line.
     ///
     /// # Panics
-    /// When it says nothing.
+    /// When it sends nothing.
     pub(crate) fn play(&mut self, line: &str) {
         let words: Vec<&str> = line.split_whitespace().collect();
         let number = |at: usize| words.get(at).and_then(|word| word.parse::<f64>().ok()).expect(line);
@@ -302,7 +302,7 @@ impl World {
         let now = self.now;
         for motor in &mut self.motors {
             motor.tend(now.0);
-            motor.told().for_each(drop);
+            motor.reported().for_each(drop);
         }
         self.turn_brakes();
         if self.away_until.is_some_and(|until| now < until) {
@@ -446,7 +446,7 @@ impl World {
             return if damps { "damp" } else { "hold" };
         }
         match self.bus.state() {
-            // It goes on as it was told last.
+            // It continues as it was commanded last.
             _ if self.judge.axes[motor].is_deaf => "on",
             BusState::Following => "follow",
             BusState::Faulted(_) if self.judge.axes[motor].is_damped => "damp",
@@ -499,7 +499,7 @@ impl Judge {
         let mut wrong = Vec::new();
         if place == 0 && frame.data.starts_with(&[0xff; 7]) {
             (axis.command, axis.is_damped, axis.torque) = (None, false, 0.0);
-            // That with the order, and the first one after the motor says that it is enabled.
+            // That with the order, and the first one after the motor reports that it is enabled.
             axis.enabling = if frame.data[7] == 0xfc { 2 } else { 0 };
             if frame.data[7] == 0xfc && !self.may_move {
                 wrong.push("it is enabled without an arm".to_owned());
@@ -655,7 +655,7 @@ impl Axis {
     }
 }
 
-/// The fault that a notice tells of.
+/// The fault that a notice reports.
 pub(crate) const fn fault_of(notice: &Notice) -> Option<Fault> {
     match notice {
         Notice::Fault(fault) => Some(*fault),

@@ -4,17 +4,20 @@
 #![allow(dead_code, reason = "each who uses it needs a part of it")]
 
 #[path = "motor_spec.rs"]
-mod motor_spec;
+#[allow(clippy::duplicate_mod, reason = "`motor_world` has it too")]
+pub(crate) mod motor_spec;
 
 use std::fs::File;
 use std::io::{Read, Write};
-use std::os::fd::{AsFd, OwnedFd};
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use rapid::action::{ActionSource, MAX_ACTION, NoAction};
+use rapid::bell::Bell;
 use rapid::registry::{CanAdapter, DamiaoSpec, MotorMode, MotorSpec};
 use rapid::time::Stamp;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
@@ -22,7 +25,36 @@ use vbench::emu::can::bus::{self, Bus};
 use vbench::emu::can::damiao::{self, Damiao};
 use vbench::emu::can::slcan::{Heard, Slcan};
 use vbench::emu::order::Order;
-use vbench::emu::told::Told;
+use vbench::emu::reported::Reported;
+
+/// Actions of a test, in the place of the topic.
+#[derive(Debug, Default)]
+pub(crate) struct Hand {
+    bell: Bell,
+    action: Mutex<Option<(Vec<f64>, Stamp)>>,
+}
+
+impl Hand {
+    /// Publishes an action, as of now.
+    pub(crate) fn point(&self, target: &[f64]) {
+        *self.action.lock().expect("whole") = Some((target.to_vec(), Stamp::now()));
+        self.bell.ring();
+    }
+}
+
+impl ActionSource for Hand {
+    fn bell(&self) -> Option<BorrowedFd<'_>> {
+        self.bell.descriptor()
+    }
+
+    fn newest<'a>(&self, action: &'a mut [f64; MAX_ACTION]) -> Result<Option<(&'a [f64], Stamp)>, NoAction> {
+        self.bell.silence();
+        let Some((target, tick)) = self.action.lock().expect("whole").take() else { return Ok(None) };
+        let place = &mut action[..target.len()];
+        place.copy_from_slice(&target);
+        Ok(Some((place, tick)))
+    }
+}
 
 /// The longest that something is waited for.
 pub(crate) const PATIENCE: Duration = Duration::from_mins(2);
@@ -38,8 +70,8 @@ pub(crate) struct Adapter {
 
 struct Shared {
     bus: Bus,
-    /// What motors told, and when.
-    told: Vec<(Stamp, Told)>,
+    /// What motors reported, and when.
+    reported: Vec<(Stamp, Reported)>,
 }
 
 /// How the adapter speaks on its line.
@@ -88,7 +120,7 @@ impl Adapter {
         let motors: Vec<_> = (1..=count)
             .map(|id| bus::MotorSpec::parse(&format!("{id:x}/{:x}/DM4310", id + 0x10)).expect("a motor"))
             .collect();
-        let shared = Arc::new(Mutex::new(Shared { bus: Bus::new(&motors), told: Vec::new() }));
+        let shared = Arc::new(Mutex::new(Shared { bus: Bus::new(&motors), reported: Vec::new() }));
         let pulled = Arc::new(AtomicBool::new(false));
         let thread = std::thread::spawn({
             let (shared, pulled) = (Arc::clone(&shared), Arc::clone(&pulled));
@@ -102,20 +134,23 @@ impl Adapter {
         self.shared.lock().expect("whole").bus.befall(Some(motor), order, Stamp::now().0);
     }
 
-    /// What the motors have told so far, oldest first.
-    pub(crate) fn told(&self) -> Vec<&'static str> {
-        self.shared.lock().expect("whole").told.iter().map(|(_, told)| told.action).collect()
+    /// What the motors have reported so far, oldest first.
+    pub(crate) fn reported(&self) -> Vec<&'static str> {
+        self.shared.lock().expect("whole").reported.iter().map(|(_, reported)| reported.action).collect()
     }
 
-    /// How often the motors told this.
+    /// How often the motors reported this.
     pub(crate) fn count(&self, action: &str) -> usize {
-        self.told().iter().filter(|told| **told == action).count()
+        self.reported().iter().filter(|reported| **reported == action).count()
     }
 
-    /// When a motor told this first, after `since`.
-    pub(crate) fn told_at(&self, motor: u16, action: &str, since: Stamp) -> Option<Stamp> {
+    /// When a motor reported this first, after `since`.
+    pub(crate) fn reported_at(&self, motor: u16, action: &str, since: Stamp) -> Option<Stamp> {
         let shared = self.shared.lock().expect("whole");
-        let mut of = shared.told.iter().filter(|(_, told)| told.action == action && told.fields["motor"] == motor);
+        let mut of = shared
+            .reported
+            .iter()
+            .filter(|(_, reported)| reported.action == action && reported.fields["motor"] == motor);
         of.find(|(at, _)| *at >= since).map(|(at, _)| *at)
     }
 
@@ -124,15 +159,17 @@ impl Adapter {
     pub(crate) fn wait_until_off(&self, motors: &[u16]) {
         let begun = Instant::now();
         while !motors.iter().all(|motor| self.is_off(*motor)) {
-            assert!(begun.elapsed() < PATIENCE, "of {motors:?} one was not turned off: {:?}", self.told());
+            assert!(begun.elapsed() < PATIENCE, "of {motors:?} one was not turned off: {:?}", self.reported());
             std::thread::sleep(Duration::from_millis(2));
         }
     }
 
     /// It was enabled, and turned off after that.
     fn is_off(&self, motor: u16) -> bool {
-        let told = &self.shared.lock().expect("whole").told;
-        let last = |action| told.iter().rposition(|(_, told)| told.action == action && told.fields["motor"] == motor);
+        let reported = &self.shared.lock().expect("whole").reported;
+        let last = |action| {
+            reported.iter().rposition(|(_, reported)| reported.action == action && reported.fields["motor"] == motor)
+        };
         last("motor_enabled").is_some_and(|enabled| last("motor_disabled").is_some_and(|off| off > enabled))
     }
 }
@@ -164,13 +201,13 @@ fn serve(master: OwnedFd, mut speech: Speech, shared: &Mutex<Shared>, pulled: &A
                 let count = line.read(&mut piece).unwrap_or(0);
                 speech.hear(&piece[..count], &mut shared.bus, &mut answers);
             } else if ready.contains(PollFlags::HUP) {
-                // Nobody has it open: it may be opened again.
+                // No one has it open: it may be opened again.
                 std::thread::sleep(Duration::from_millis(1));
             }
             shared.bus.tend(Stamp::now().0);
             let now = Stamp::now();
-            let told: Vec<_> = shared.bus.told().map(|told| (now, told)).collect();
-            shared.told.extend(told);
+            let reported: Vec<_> = shared.bus.reported().map(|reported| (now, reported)).collect();
+            shared.reported.extend(reported);
         }
         // A reader that does not read is its own loss.
         let _ = line.write_all(&answers);

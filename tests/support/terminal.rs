@@ -31,6 +31,7 @@ impl OnTerminal {
         session
             .current_dir(place.folder.path())
             .env("HOME", place.folder.path())
+            .env("RAPID_INSTANCE", &place.instance)
             .env("TERM", "xterm")
             .env("RAPID_FAULT", fault);
         let child = session.stdin(open()).stdout(open()).stderr(open()).spawn().expect("setsid runs rapid");

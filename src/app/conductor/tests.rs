@@ -2,9 +2,10 @@ use std::fs::File;
 use std::io;
 
 use tokio::sync::mpsc;
-use tokio::task::JoinHandle;
+use tokio_util::sync::CancellationToken;
 
 use super::super::Signals;
+use super::super::streaming::Streaming;
 use super::*;
 use crate::bus::TopicId;
 use crate::interlocks::Watched;
@@ -53,7 +54,7 @@ impl Sink for Lost {
 struct Bench {
     conductor: Conductor,
     running: Running,
-    keys: mpsc::UnboundedSender<Asked>,
+    keys: mpsc::UnboundedSender<Request>,
     board: Arc<Board>,
     out: tempfile::TempDir,
 }
@@ -65,7 +66,7 @@ impl Bench {
         let out = tempfile::tempdir().unwrap();
         let config = RecorderConfig { sink: Box::new(sink), ..RecorderConfig::new(registry, Arc::clone(&board)) };
         let recorder = Recorder::spawn(Quiet, config).unwrap();
-        let (keys, asked) = mpsc::unbounded_channel();
+        let (keys, requests) = mpsc::unbounded_channel();
         let episode = EpisodeRequest {
             out: out.path().to_owned(),
             task: "test".to_owned(),
@@ -76,7 +77,6 @@ impl Bench {
         let conductor = Conductor {
             events: board.events(),
             board: Arc::clone(&board),
-            writer_ended: recorder.ended(),
             recorder,
             episode,
             record,
@@ -84,20 +84,23 @@ impl Bench {
             begin_episode: record,
         };
         let running = Running {
-            autopilot: None,
-            rig: never(),
+            inference: None,
+            discovery: idle_stage(),
+            recording: idle_stage(),
+            streaming: Streaming {
+                stage: idle_stage(),
+                ending: CancellationToken::new(),
+                closed: CancellationToken::new(),
+                release: CancellationToken::new(),
+                hurry: CancellationToken::new(),
+            },
             permission: Arc::default(),
             watched: Watched::begin(&Registry::builtin(), &Arc::default(), &board).unwrap(),
-            rig_ending: CancellationToken::new(),
-            rig_ended: CancellationToken::new(),
-            rig_stop: CancellationToken::new(),
-            hurry: CancellationToken::new(),
             mask_ended: CancellationToken::new(),
             kind: Screen::Monitor,
-            screen: Some(never()),
-            screen_stop: CancellationToken::new(),
+            screen: idle_stage(),
             signals: Signals::listen().unwrap(),
-            asked,
+            requests,
         };
         Self { conductor, running, keys, board, out }
     }
@@ -111,8 +114,8 @@ impl Bench {
     }
 }
 
-fn never<T: Send + 'static>() -> JoinHandle<T> {
-    tokio::spawn(std::future::pending())
+fn idle_stage() -> Stage {
+    Stage::start("idle", |_| std::future::pending())
 }
 
 /// Waits until the file being recorded, if any, is as it should be.
@@ -129,18 +132,18 @@ async fn until(board: &Board, what: &str, holds: impl Fn(Option<&str>) -> bool) 
     }
 }
 
-/// Lets everything else do what it can: the clock of the tests goes on when nobody has anything to do.
+/// Lets everything else do what it can: the clock of the tests advances when no task has work.
 async fn idle() {
     tokio::time::sleep(2 * SETTLE_LIMIT).await;
 }
 
 #[tokio::test(start_paused = true)]
-async fn keys_that_come_while_an_episode_ends_are_obeyed_one_after_the_other() {
+async fn keys_pressed_while_an_episode_ends_are_obeyed_one_after_the_other() {
     let mut bench = Bench::new(false, None, |file| Box::new(file));
     let keys = async {
         let press = async |count: usize| {
             for _ in 0..count {
-                bench.keys.send(Asked::ToggleRecording(Stamp::now())).unwrap();
+                bench.keys.send(Request::ToggleRecording(Stamp::now())).unwrap();
             }
         };
         press(1).await;
@@ -150,7 +153,7 @@ async fn keys_that_come_while_an_episode_ends_are_obeyed_one_after_the_other() {
         idle().await;
         press(1).await;
         until(&bench.board, "the end of the second", |file| file.is_none()).await;
-        bench.keys.send(Asked::Quit).unwrap();
+        bench.keys.send(Request::Quit).unwrap();
     };
     let (outcome, ()) = tokio::join!(bench.conductor.conduct(&mut bench.running), keys);
     outcome.unwrap();
@@ -165,10 +168,10 @@ async fn a_key_while_devices_settle_begins_the_one_episode() {
     let silent = Registry::builtin().devices[0].id;
     bench.board.set_slot(silent, SlotState::Opening, Epoch(1), "");
     let keys = async {
-        bench.keys.send(Asked::ToggleRecording(Stamp::now())).unwrap();
+        bench.keys.send(Request::ToggleRecording(Stamp::now())).unwrap();
         until(&bench.board, "an episode", |file| file.is_some()).await;
         idle().await;
-        bench.keys.send(Asked::Quit).unwrap();
+        bench.keys.send(Request::Quit).unwrap();
     };
     let (outcome, ()) = tokio::join!(bench.conductor.conduct(&mut bench.running), keys);
     outcome.unwrap();
@@ -214,8 +217,8 @@ async fn an_end_among_missed_events_ends_the_run_all_the_same() {
         bench.board.announce(ended(error));
         flood(&bench.board);
         let conducted = tokio::time::timeout(PATIENCE, bench.conductor.conduct(&mut bench.running)).await;
-        let said = conducted.expect("an end").err().map(|error| error.to_string());
-        assert_eq!(said.as_deref(), error.map(|_| "a.mcap: torn"));
+        let error_text = conducted.expect("an end").err().map(|error| error.to_string());
+        assert_eq!(error_text.as_deref(), error.map(|_| "a.mcap: torn"));
     }
 }
 
@@ -236,11 +239,11 @@ async fn an_end_that_came_while_the_run_ended_is_found_before_and_after_missed_e
 }
 
 /// Begins an episode and ends it at its first moment; its file.
-async fn moment(board: &Board, keys: &mpsc::UnboundedSender<Asked>) -> PathBuf {
-    keys.send(Asked::ToggleRecording(Stamp::now())).unwrap();
+async fn moment(board: &Board, keys: &mpsc::UnboundedSender<Request>) -> PathBuf {
+    keys.send(Request::ToggleRecording(Stamp::now())).unwrap();
     until(board, "an episode", |file| file.is_some()).await;
     let file = board.snapshot().recording.unwrap().file;
-    keys.send(Asked::ToggleRecording(Stamp(0))).unwrap();
+    keys.send(Request::ToggleRecording(Stamp(0))).unwrap();
     when(board, "an offer", |snapshot| snapshot.short_episode.is_some()).await;
     assert_eq!(board.snapshot().short_episode.unwrap().file, file);
     file
@@ -264,20 +267,20 @@ async fn the_last_episode_is_dropped_when_asked_for_and_no_other() {
         let foreign = first.with_file_name("notes.mcap");
         std::fs::write(&foreign, "precious").unwrap();
         for file in [&first, &foreign] {
-            bench.keys.send(Asked::DropEpisode(file.clone())).unwrap();
+            bench.keys.send(Request::DropEpisode(file.clone())).unwrap();
         }
         // What is asked for is done in turn: both were refused when this one has begun.
         let third = moment(&bench.board, &bench.keys).await;
         assert!(first.exists() && foreign.exists() && second.exists());
-        bench.keys.send(Asked::DropEpisode(third.clone())).unwrap();
+        bench.keys.send(Request::DropEpisode(third.clone())).unwrap();
         when(&bench.board, "its file is gone", |snapshot| snapshot.last_episode.is_none()).await;
         assert!(!third.exists() && bench.board.snapshot().short_episode.is_none());
         // One that is asked for when the next has begun.
         let fourth = moment(&bench.board, &bench.keys).await;
-        bench.keys.send(Asked::ToggleRecording(Stamp::now())).unwrap();
-        bench.keys.send(Asked::DropEpisode(fourth.clone())).unwrap();
-        bench.keys.send(Asked::ToggleRecording(Stamp::now())).unwrap();
-        bench.keys.send(Asked::Quit).unwrap();
+        bench.keys.send(Request::ToggleRecording(Stamp::now())).unwrap();
+        bench.keys.send(Request::DropEpisode(fourth.clone())).unwrap();
+        bench.keys.send(Request::ToggleRecording(Stamp::now())).unwrap();
+        bench.keys.send(Request::Quit).unwrap();
         fourth
     };
     let (outcome, fourth) = tokio::join!(bench.conductor.conduct(&mut bench.running), keys);

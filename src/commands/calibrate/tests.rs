@@ -11,8 +11,8 @@ fn registry(latency: &str) -> Registry {
 const ESTIMATE: Estimate =
     Estimate { latency_ms: 48.26, uncertainty_ms: 0.83, correlation: 0.987, contrast: 131.4, pictures: 571, flips: 57 };
 
-fn printed(estimate: Estimate, light: &Chosen, delay_ms: u64, stands: &str) -> String {
-    let registry = registry(stands);
+fn printed(estimate: Estimate, light: &Chosen, delay_ms: u64, current: &str) -> String {
+    let registry = registry(current);
     let spec = &registry.devices[0];
     let mut out = Vec::new();
     let measured = Measured::new(spec, light, Duration::from_millis(delay_ms), estimate);
@@ -21,14 +21,14 @@ fn printed(estimate: Estimate, light: &Chosen, delay_ms: u64, stands: &str) -> S
 }
 
 #[test]
-fn the_result_says_what_is_in_it_and_which_line_to_write() {
+fn the_result_names_what_it_includes_and_the_line_to_write() {
     assert_eq!(
         printed(ESTIMATE, &Chosen::Terminal, 0, "0ms"),
         "cam: latency 48.3 ms ± 0.8 ms (95 %)\n  \
            571 pictures, 57 changes of the light\n  \
            correlation 0.99, contrast 131 of 255\n  \
-           It includes what the terminal and its screen take to show a change, often 10\n  \
-           to 40 ms. Give that with --light-delay if you know it; with --led it is not there.\n\n\
+           It includes the latency of the terminal and its screen, often 10 to 40 ms. Give it\n  \
+           with --light-delay if you know it, or avoid it with --led.\n\n\
          In /etc/rapid/devices.toml, under [device.cam]:\n\n    \
              latency = \"48ms\"\n"
     );
@@ -36,13 +36,13 @@ fn the_result_says_what_is_in_it_and_which_line_to_write() {
     assert!(matches!(&led, Chosen::Led(folder) if folder.as_os_str() == "/sys/class/leds/ACT"));
     let text = printed(ESTIMATE, &led, 0, "36500us");
     assert!(
-        text.contains("what the LED takes") && text.contains("latency = \"48ms\"  # instead of 36.5ms\n"),
+        text.contains("the latency of the LED") && text.contains("latency = \"48ms\"  # instead of 36.5ms\n"),
         "{text}"
     );
 }
 
 #[test]
-fn what_the_light_is_late_by_is_taken_off_and_nothing_below_zero_is_written() {
+fn the_delay_of_the_light_is_subtracted_and_no_negative_latency_is_written() {
     let text = printed(ESTIMATE, &Chosen::Terminal, 15, "0ms");
     assert!(
         text.contains("latency 33.3 ms") && text.contains("15.0 ms of the light") && text.contains("\"33ms\""),

@@ -33,7 +33,7 @@ pid = "000a"
 port = "1-4"
 node = "serial"
 bit = 3
-[device.tof.serial]
+[device.tof.tty]
 channels = 1
 "#;
 
@@ -83,13 +83,13 @@ const WRIST: (u16, u16) = (0x046d, 0x0825);
 const TWIN: (u16, u16) = (0x2bc5, 0x0501);
 
 #[test]
-fn what_matches_says_by_which_rule_and_what_is_missing_is_named() {
+fn matches_name_their_rule_and_missing_devices_are_listed() {
     let attached = [video(0, WRIST, Some("CAM00A1"), "1-2"), video(2, TWIN, None, "1-3"), tty("1-4")];
     assert_snapshot!(text(Entries::Of(&registry()), &attached));
 }
 
 #[test]
-fn what_does_not_match_says_why() {
+fn mismatches_give_a_reason() {
     let attached = [
         video(0, WRIST, Some("CAM00B7"), "1-2"),
         video(2, WRIST, None, "1-3"),
@@ -100,7 +100,7 @@ fn what_does_not_match_says_why() {
 }
 
 #[test]
-fn a_third_unit_of_two_entries_waits_and_says_for_what() {
+fn a_third_unit_of_two_entries_waits_with_a_reason() {
     let attached = [video(0, TWIN, None, "1-1"), video(2, TWIN, None, "1-2"), video(4, TWIN, None, "1-3")];
     let text = text(Entries::Of(&registry()), &attached);
     let waiting = text.split_once("/dev/video4").unwrap().1;
@@ -116,17 +116,17 @@ fn a_second_node_of_a_camera_is_not_used() {
 }
 
 #[test]
-fn without_a_registry_what_is_plugged_is_still_told() {
+fn without_a_registry_plugged_devices_are_still_listed() {
     let attached = [video(0, WRIST, Some("CAM00A1"), "1-2")];
     let none = text(Entries::NoFile, &attached);
     assert!(none.contains("/dev/video0") && none.contains("there is no registry; write a devices.toml"), "{none}");
     let wrong = text(Entries::Wrong, &attached);
-    assert!(wrong.contains("/dev/video0") && wrong.contains("the registry cannot be used"), "{wrong}");
+    assert!(wrong.contains("/dev/video0") && wrong.contains("the registry is invalid"), "{wrong}");
     assert_eq!(text(Entries::NoFile, &[]), "No camera and no serial device is plugged in.\n");
 }
 
 #[test]
-fn json_tells_plugged_and_missing_apart() {
+fn json_distinguishes_plugged_and_missing() {
     let source = SimSource::Serial { channels: 1, hz: 100, seed: 1 };
     let sim = DeviceNode::Sim(Arc::new(SimDevice::new("tof", source, crate::time::Stamp(0))));
     let attached = [attachment(sim, usb((0x2e8a, 0x000a), None, "1-4", None)), video(0, WRIST, None, "1-2")];

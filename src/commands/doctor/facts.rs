@@ -1,34 +1,33 @@
-//! What is the case on a machine, as far as the doctor asks.
+//! Facts gathered about the host.
 //!
-//! Collecting reads files below a root folder, `/` but for tests, and opens no device.
+//! Invariant: collecting reads files below a root folder (`/` except in tests) and opens no device.
 
 use std::collections::BTreeMap;
 use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
+#[cfg(feature = "motors")]
 use crate::driver::can::netlink;
 
-use super::usb::{UsbDevice, devices};
-
-/// See the module's comment. Whatever cannot be read is `None` or missing.
+/// Facts about the host. Those that cannot be read are `None` or missing.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(super) struct Facts {
     /// USB devices, root hubs included, in the order of their ports.
     pub(super) usb: Vec<UsbDevice>,
     /// Nodes of USB devices that programs open.
     pub(super) nodes: Vec<Node>,
-    /// Who runs this.
+    /// The user of this process.
     pub(super) user: User,
-    /// Is a udev daemon there?
+    /// Whether a udev daemon runs.
     pub(super) udev_runs: bool,
     /// The installed rules, if there are any.
     pub(super) rules: Option<String>,
-    /// Highest real-time priority that may be asked for.
+    /// Highest permitted real-time priority.
     pub(super) realtime: Option<u64>,
     /// Memory that may be locked, bytes; `u64::MAX` without a limit.
     pub(super) locked_memory: Option<u64>,
-    /// Shared memory: size and what is free, bytes.
+    /// Shared memory: size and free space, bytes.
     pub(super) shared_memory: Option<(u64, u64)>,
     /// Where episodes would be written.
     pub(super) disk: Option<Disk>,
@@ -49,7 +48,7 @@ pub(super) struct Node {
     pub(super) subsystem: &'static str,
     /// The USB device, by its port.
     pub(super) port: String,
-    /// May it be read and written by who runs this?
+    /// Whether the user may read and write it.
     pub(super) is_open_to_us: bool,
     /// Its group, by name or number.
     pub(super) group: String,
@@ -57,10 +56,10 @@ pub(super) struct Node {
     pub(super) mode: u32,
 }
 
-/// Who runs this.
+/// The user of this process.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub(super) struct User {
-    /// Everything is allowed.
+    /// The user is root.
     pub(super) is_root: bool,
     /// Groups, by name.
     pub(super) groups: Vec<String>,
@@ -69,13 +68,13 @@ pub(super) struct User {
 /// The disk of the folder for episodes.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Disk {
-    /// The folder that was looked at.
+    /// The folder that was tested.
     pub(super) folder: PathBuf,
-    /// What may still be written, bytes.
+    /// Free space, bytes.
     pub(super) free: u64,
     /// Its size, bytes.
     pub(super) size: u64,
-    /// What it took a second when tried, bytes; or why it could not be tried.
+    /// Measured write rate, bytes per second; or why it could not be measured.
     pub(super) rate: Result<f64, String>,
 }
 
@@ -86,17 +85,17 @@ pub(super) struct Interface {
     pub(super) name: String,
     /// `up`, `down` or `unknown`
     pub(super) state: String,
-    /// Bits a second; not in sysfs, see [`ask_can`].
+    /// Bits per second; not in sysfs, see [`ask_can`].
     pub(super) bitrate: Option<u32>,
     /// It left the bus after too many errors.
     pub(super) bus_off: bool,
-    /// Frames that wait in the kernel at most.
+    /// Length of the kernel's transmit queue, frames.
     pub(super) queue: Option<u64>,
     /// The USB device, by its port.
     pub(super) port: Option<String>,
 }
 
-/// Reads everything but the disk, which must be tried.
+/// Reads everything except the disk, whose rate must be measured.
 #[must_use]
 pub(super) fn collect(root: &Path) -> Facts {
     let usb = devices(root);
@@ -130,8 +129,8 @@ pub(super) fn word(path: &Path) -> Option<String> {
 
 /// Size and free space of the file system at `path`, bytes.
 pub(super) fn space(path: &Path) -> Option<(u64, u64)> {
-    let said = rustix::fs::statvfs(path).ok()?;
-    Some((said.f_blocks.saturating_mul(said.f_frsize), said.f_bavail.saturating_mul(said.f_frsize)))
+    let stat = rustix::fs::statvfs(path).ok()?;
+    Some((stat.f_blocks.saturating_mul(stat.f_frsize), stat.f_bavail.saturating_mul(stat.f_frsize)))
 }
 
 /// Names of the entries of a folder, sorted.
@@ -201,7 +200,8 @@ fn limits(root: &Path) -> (Option<u64>, Option<u64>) {
     (soft("Max realtime priority"), soft("Max locked memory"))
 }
 
-/// Asks the kernel for what sysfs does not say of CAN interfaces.
+/// Queries the kernel for properties of CAN interfaces that are not in sysfs.
+#[cfg(feature = "motors")]
 pub(super) fn ask_can(interfaces: &mut [Interface]) {
     for interface in interfaces {
         if let Ok(seen) = netlink::look(&interface.name) {
@@ -226,4 +226,74 @@ fn interfaces(root: &Path, usb: &[UsbDevice]) -> Vec<Interface> {
         })
     };
     names(&class).iter().filter_map(can).collect()
+}
+
+/// A USB device of `/sys/bus/usb/devices`. Names there: `usb1` is a root hub, `1-2.3` the device in port 3 of the hub in
+/// port 2 of bus 1; names with a colon are interfaces.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub(super) struct UsbDevice {
+    /// Its port: `1-2.3`, or `usb1` for a root hub.
+    pub(super) port: String,
+    /// Bus.
+    pub(super) bus: u32,
+    /// Negotiated speed, Mbit/s.
+    pub(super) mbit: f64,
+    /// Vendor id.
+    pub(super) vid: u16,
+    /// Product id.
+    pub(super) pid: u16,
+    /// Product string.
+    pub(super) product: Option<String>,
+    /// Serial number.
+    pub(super) serial: Option<String>,
+    /// It is a hub.
+    pub(super) is_hub: bool,
+    /// The kernel may suspend it while it is unused.
+    pub(super) autosuspends: bool,
+}
+
+impl UsbDevice {
+    /// Whether it is a root hub, that is a bus.
+    #[must_use]
+    pub(super) fn is_root(&self) -> bool {
+        self.port.starts_with("usb")
+    }
+
+    /// Number of hubs above it, without the root hub.
+    #[must_use]
+    pub(super) fn depth(&self) -> usize {
+        self.port.matches('.').count()
+    }
+
+    /// Sort key: bus, then the numbers of its ports.
+    fn order(&self) -> (u32, Vec<u32>) {
+        let ports = self.port.split_once('-').map_or("", |(_, ports)| ports);
+        (self.bus, ports.split('.').filter_map(|port| port.parse().ok()).collect())
+    }
+}
+
+/// All devices below `root`, in the order of their ports.
+pub(super) fn devices(root: &Path) -> Vec<UsbDevice> {
+    let folder = root.join("sys/bus/usb/devices");
+    let mut found: Vec<_> =
+        names(&folder).iter().filter(|name| !name.contains(':')).filter_map(|name| device(&folder, name)).collect();
+    found.sort_by_key(UsbDevice::order);
+    found
+}
+
+fn device(folder: &Path, name: &str) -> Option<UsbDevice> {
+    let read = |file: &str| word(&folder.join(name).join(file));
+    let id = |file: &str| u16::from_str_radix(&read(file)?, 16).ok();
+    Some(UsbDevice {
+        port: name.to_owned(),
+        bus: read("busnum")?.parse().ok()?,
+        mbit: read("speed")?.parse().ok().filter(|mbit: &f64| mbit.is_finite())?,
+        vid: id("idVendor")?,
+        pid: id("idProduct")?,
+        product: read("product"),
+        serial: read("serial"),
+        // USB 2.0, table 11-15.
+        is_hub: read("bDeviceClass").as_deref() == Some("09"),
+        autosuspends: read("power/control").as_deref() == Some("auto"),
+    })
 }

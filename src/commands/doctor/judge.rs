@@ -1,42 +1,47 @@
-//! From what is the case on a machine to what is wrong with it, and what to do.
+//! From facts about the host to findings, with a fix for each problem.
+//!
+//! Whether the cameras of one bus fit into its bandwidth: a camera reserves bandwidth for isochronous transfers when it is
+//! started; the kernel refuses it if too little is left. The reservation depends on the camera's firmware: it is estimated
+//! here by the size of its pictures. For compressed pictures only an upper limit is known.
 //!
 //! Pure: facts and registry in, findings out.
 
+use std::fmt;
 use std::path::PathBuf;
 
 use serde::Serialize;
 
-use super::bandwidth::{self, Wish};
-use super::facts::{Facts, Node};
-use super::machine;
-use super::usb::UsbDevice;
-use crate::registry::{Assigner, Attachment, DeviceNode, DeviceSpec, NodeSpec, Opens, Registry, UsbIdentity};
+use super::facts::{Facts, Node, UsbDevice};
+use crate::registry::{
+    Assigner, Attachment, CameraSpec, DeviceNode, DeviceSpec, NodeSpec, Opens, PixelFormat, Registry, UsbIdentity,
+};
+use crate::text;
 
 /// A camera that runs slower than this, Mbit/s, is in the wrong port or on a bad cable.
 const SLOWEST: f64 = 480.0;
 
-/// How bad it is.
+/// Severity of a finding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(super) enum Level {
-    /// As it should be.
+    /// In order.
     Ok,
-    /// It works, and may surprise.
+    /// Works, with limitations.
     Warn,
     /// Something will not work.
     Bad,
 }
 
-/// Something that was looked at.
+/// The result of one check.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub(super) struct Finding {
-    /// How bad it is.
+    /// Severity.
     pub(super) level: Level,
-    /// What it is about: one word.
+    /// Its subject, in one word.
     pub(super) about: &'static str,
-    /// What is the case.
+    /// The observation.
     pub(super) what: String,
-    /// What to do, a command where there is one.
+    /// What to do, a command if possible.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) fix: Option<String>,
 }
@@ -55,7 +60,7 @@ impl Finding {
     }
 }
 
-/// Everything there is to say. `rules` is what `rapid artifacts` would write.
+/// All findings. `rules` are the rules that `rapid artifacts` would write.
 #[must_use]
 pub(super) fn judge(facts: &Facts, registry: Option<&Registry>, rules: Option<&str>) -> Vec<Finding> {
     let entries = registry.map(|registry| registry.devices.as_slice()).unwrap_or_default();
@@ -65,16 +70,15 @@ pub(super) fn judge(facts: &Facts, registry: Option<&Registry>, rules: Option<&s
     found.extend(speeds(&plugged));
     found.extend(serials(&facts.usb, entries));
     found.extend(nodes(facts, entries, &plugged));
-    found.extend(machine::udev(facts, rules));
+    found.extend(udev(facts, rules));
     found.extend(suspending(&plugged));
-    found.extend(machine::can(facts, entries, &plugged));
-    found.extend(machine::limits(facts, registry));
-    found.extend(machine::disk(facts, registry));
+    found.extend(can(facts, entries, &plugged));
+    found.extend(limits(facts, registry));
+    found.extend(disk(facts, registry));
     found
 }
 
-/// Entries with the USB device that they mean, of those that are plugged in, as a rig that starts now would assign
-/// them.
+/// Entries with the connected USB device that matches, as a rig that starts now would assign them.
 #[must_use]
 pub(super) fn plugged<'a>(
     registry: Option<&'a Registry>,
@@ -83,21 +87,21 @@ pub(super) fn plugged<'a>(
     let Some(registry) = registry else { return Vec::new() };
     let mut assigner = Assigner::new(registry);
     let mut units: Vec<&UsbDevice> = usb.iter().collect();
-    // In the order in which hot-plug tells them at a start.
+    // In the order in which hot-plug reports them at the start.
     units.sort_by(|a, b| a.port.cmp(&b.port));
     for unit in units {
         for node in nodes_of(unit) {
             assigner.attach(&node);
         }
     }
-    let meant = |entry: &'a DeviceSpec| {
+    let matching = |entry: &'a DeviceSpec| {
         let attached = assigner.attached_as(entry.id)?;
         Some((entry, usb.iter().find(|unit| unit.port == attached.unit.place())?))
     };
-    registry.devices.iter().filter_map(meant).collect()
+    registry.devices.iter().filter_map(matching).collect()
 }
 
-/// A node of each kind: whether the device has it is another question.
+/// A node of each kind, whether or not the device has it.
 fn nodes_of(unit: &UsbDevice) -> [Attachment; 4] {
     let usb = UsbIdentity {
         vid: unit.vid,
@@ -134,59 +138,59 @@ pub(super) fn megabytes(bytes: f64) -> String {
     format!("{:.1} MB/s", bytes / 1e6)
 }
 
-/// Which cameras share a bus, and whether they fit.
+/// The cameras of each bus, and whether their bandwidth fits.
 fn buses(facts: &Facts, plugged: &[(&DeviceSpec, &UsbDevice)]) -> Vec<Finding> {
     let mut found = Vec::new();
     let roots = facts.usb.iter().filter(|device| device.is_root());
     for root in roots {
-        // What runs slower has a finding of its own, and takes next to nothing behind its hub.
+        // Slower devices have their own finding, and use little bandwidth behind their hub.
         let of_the_bus = |device: &UsbDevice| device.bus == root.bus && device.mbit >= SLOWEST;
-        let wishes: Vec<Wish> = plugged
+        let loads: Vec<CameraLoad> = plugged
             .iter()
             .filter(|(_, device)| of_the_bus(device))
             .filter_map(|(entry, _)| {
                 let NodeSpec::Camera(camera) = &entry.node else { return None };
-                Some(Wish { name: entry.name.clone(), camera: camera.clone(), max_bytes: entry.max_bytes })
+                Some(CameraLoad { name: entry.name.clone(), camera: camera.clone(), max_bytes: entry.max_bytes })
             })
             .collect();
-        if !wishes.is_empty() {
-            found.push(bus(root.bus, root.mbit, &wishes));
+        if !loads.is_empty() {
+            found.push(bus(root.bus, root.mbit, &loads));
         }
     }
     found
 }
 
-fn bus(bus: u32, mbit: f64, wishes: &[Wish]) -> Finding {
-    let names = wishes.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
-    let estimated = wishes.iter().any(Wish::is_estimated);
-    let most = if estimated { "at most (estimated: the largest pictures that MJPG may give) " } else { "" };
-    let (taken, budget) = (bandwidth::taken(wishes, mbit), bandwidth::budget(mbit));
+fn bus(bus: u32, mbit: f64, loads: &[CameraLoad]) -> Finding {
+    let names = loads.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
+    let estimated = loads.iter().any(CameraLoad::is_estimated);
+    let most = if estimated { "at most (estimated from the largest MJPG pictures) " } else { "" };
+    let (taken, budget) = (taken(loads, mbit), budget(mbit));
     let what = format!("bus {bus} carries {names}: {most}{} of {}", megabytes(taken), megabytes(budget));
-    let lower = bandwidth::fitting(wishes, mbit);
+    let lower = fitting(loads, mbit);
     let fix = match &lower {
         Some(lower) if lower.is_empty() => return Finding::ok("bandwidth", what),
         Some(lower) => {
             let lower = lower.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
-            format!("this would fit: {lower}; or plug one of them into a port of another bus")
+            format!("use {lower}; or plug one of them into a port of another bus")
         }
         None => "plug one of them into a port of another bus".to_owned(),
     };
-    // What is only estimated may fit all the same.
+    // An estimate is an upper limit: it may still fit.
     if estimated { Finding::warn("bandwidth", what, fix) } else { Finding::bad("bandwidth", what, fix) }
 }
 
-/// Cameras that run slower than cameras do.
+/// Cameras at a USB speed too slow for pictures.
 fn speeds(plugged: &[(&DeviceSpec, &UsbDevice)]) -> Vec<Finding> {
     let slow =
         plugged.iter().filter(|(entry, device)| matches!(entry.node, NodeSpec::Camera(_)) && device.mbit < SLOWEST);
     let say = |(entry, device): &(&DeviceSpec, &UsbDevice)| {
         let what = format!("[device.{}] runs at {} Mbit/s, too slow for pictures", entry.name, device.mbit);
-        Finding::bad("speed", what, format!("another cable, port or hub: it is at port {}", device.port))
+        Finding::bad("speed", what, format!("use another cable, port or hub: it is at port {}", device.port))
     };
     slow.map(say).collect()
 }
 
-/// Units that say the same serial number cannot be told apart by it.
+/// Units with the same serial number cannot be distinguished by it.
 fn serials(usb: &[UsbDevice], entries: &[DeviceSpec]) -> Vec<Finding> {
     let mut found = Vec::new();
     for (at, device) in usb.iter().enumerate().filter(|(_, device)| !device.is_hub) {
@@ -202,17 +206,17 @@ fn serials(usb: &[UsbDevice], entries: &[DeviceSpec]) -> Vec<Finding> {
             continue;
         }
         let what = format!(
-            "{} units of {:04x}:{:04x} say the serial number {serial:?}, at ports {}",
+            "{} units of {:04x}:{:04x} have the serial number {serial:?}, at ports {}",
             ports.len(),
             device.vid,
             device.pid,
             ports.join(", ")
         );
-        let meant = entries.iter().find(|entry| {
+        let entry = entries.iter().find(|entry| {
             let usb = entry.identity.usb();
             usb.is_some_and(|usb| (usb.vid, usb.pid) == (device.vid, device.pid) && usb.serial.as_ref() == Some(serial))
         });
-        found.push(match meant {
+        found.push(match entry {
             Some(entry) => {
                 let fix =
                     format!("in [device.{}] write port = {:?} instead of the serial number", entry.name, device.port);
@@ -224,7 +228,7 @@ fn serials(usb: &[UsbDevice], entries: &[DeviceSpec]) -> Vec<Finding> {
     found
 }
 
-/// Can the nodes of the entries that are plugged in be opened?
+/// Whether the nodes of connected entries can be opened.
 fn nodes(facts: &Facts, entries: &[DeviceSpec], plugged: &[(&DeviceSpec, &UsbDevice)]) -> Vec<Finding> {
     let mut found = Vec::new();
     let mut open = 0;
@@ -274,7 +278,7 @@ fn nodes(facts: &Facts, entries: &[DeviceSpec], plugged: &[(&DeviceSpec, &UsbDev
         wanted.into_iter().filter(|group| !facts.user.groups.iter().any(|own| own == group)).collect();
     if !lacking.is_empty() {
         let what = format!(
-            "this user is not in the group {}: only who sits at the machine may open the devices",
+            "this user is not in the group {}: only a user with a local session may open the devices",
             lacking.join(", ")
         );
         found.push(Finding::warn(
@@ -295,9 +299,387 @@ fn suspending(plugged: &[(&DeviceSpec, &UsbDevice)]) -> Vec<Finding> {
         }
         seen.push(&device.port);
         let what =
-            format!("[device.{}] may be suspended by the kernel while nobody reads it, and wakes late", entry.name);
+            format!("[device.{}] may be suspended by the kernel while it is not read, and wakes up late", entry.name);
         let fix = format!("echo on | sudo tee /sys/bus/usb/devices/{}/power/control", device.port);
         found.push(Finding::warn("suspend", what, fix));
     }
     found
+}
+
+pub(super) fn udev(facts: &Facts, rules: Option<&str>) -> Vec<Finding> {
+    const INSTALL: &str = "sudo rapid artifacts --install";
+    let mut found = Vec::new();
+    if !facts.udev_runs {
+        let what = "no udev daemon runs: plugged devices are not detected";
+        found.push(Finding::bad("udev", what, "sudo systemctl start systemd-udevd"));
+    }
+    match (&facts.rules, rules) {
+        (_, None) => {}
+        (None, Some(_)) => {
+            let what = "the udev rules are not installed: no stable names /dev/rapid/NAME";
+            found.push(Finding::warn("udev", what, INSTALL));
+        }
+        (Some(installed), Some(rules)) if installed != rules => {
+            found.push(Finding::warn("udev", "the installed udev rules differ from those of this registry", INSTALL));
+        }
+        (Some(_), Some(_)) => found.push(Finding::ok("udev", "the udev rules are those of this registry")),
+    }
+    found
+}
+
+/// CAN interfaces: up, and with a queue that holds a burst.
+pub(super) fn can(facts: &Facts, entries: &[DeviceSpec], plugged: &[(&DeviceSpec, &UsbDevice)]) -> Vec<Finding> {
+    /// A burst of commands to a whole arm; the kernel's default of 10 loses some of it (ENOBUFS).
+    const LEAST_QUEUE: u64 = 64;
+    let mut found = Vec::new();
+    for interface in &facts.can {
+        let entry =
+            plugged.iter().find(|(_, device)| Some(&device.port) == interface.port.as_ref()).map(|(entry, _)| entry);
+        let bitrate =
+            entry.and_then(|entry| if let NodeSpec::Can(can) = &entry.node { Some(can.bitrate) } else { None });
+        let name = &interface.name;
+        if entry.is_none() && !entries.is_empty() {
+            continue;
+        }
+        if interface.bus_off {
+            let what = format!("{name} has left the bus after too many errors");
+            let fix = format!("check wiring, termination and bit rate; then sudo ip link set {name} type can restart");
+            found.push(Finding::bad("can", what, fix));
+        } else if interface.state == "down" {
+            let fix = format!("sudo ip link set {name} up type can bitrate {}", bitrate.unwrap_or(1_000_000));
+            found.push(Finding::warn(
+                "can",
+                format!("{name} is down; rapid brings it up only if it is permitted to"),
+                fix,
+            ));
+        } else if let (Some(own), Some(wished)) = (interface.bitrate, bitrate)
+            && own != wished
+        {
+            let what = format!("{name} runs at {own} bit/s, and its entry declares {wished}");
+            let fix = format!(
+                "sudo ip link set {name} down && sudo ip link set {name} up type can bitrate {wished}; or correct the entry"
+            );
+            found.push(Finding::bad("can", what, fix));
+        } else {
+            found.push(Finding::ok("can", format!("{name} is up")));
+        }
+        if let Some(queue) = interface.queue.filter(|queue| *queue < LEAST_QUEUE) {
+            let what = format!("{name} queues {queue} frames at most: a burst of commands does not fit");
+            found.push(Finding::warn("can", what, format!("sudo ip link set {name} txqueuelen 256")));
+        }
+    }
+    found
+}
+
+pub(super) fn limits(facts: &Facts, registry: Option<&Registry>) -> Vec<Finding> {
+    /// libusb programs with cameras need more than the kernel's default of 16 MB.
+    const USBFS_MB: u64 = 64;
+    /// Clock sources of x86 and ARM machines that are read without a system call.
+    const FAST_CLOCKS: [&str; 4] = ["tsc", "arch_sys_counter", "kvm-clock", "hyperv_clocksource_tsc_page"];
+    let mut found = Vec::new();
+    match facts.realtime {
+        Some(0) if !facts.user.is_root => {
+            let what = "real-time priority is not permitted: under load the mask's period of 2 ms becomes irregular";
+            let fix = "echo \"$USER - rtprio 80\" | sudo tee /etc/security/limits.d/rapid.conf, and log in again";
+            found.push(Finding::warn("limits", what, fix));
+        }
+        Some(_) => found.push(Finding::ok("limits", "real-time priority is permitted")),
+        None => {}
+    }
+    if let Some(locked) = facts.locked_memory {
+        let shown = if locked == u64::MAX { "no limit".to_owned() } else { text::size(locked) };
+        found.push(Finding::ok("limits", format!("memory that may be locked: {shown}; rapid locks none")));
+    }
+    if let (Some((size, free)), Some(registry)) = (facts.shared_memory, registry) {
+        let wanted = registry.rig.memory_budget;
+        let what = format!(
+            "/dev/shm has {} free of {}, and memory_budget is {}",
+            text::size(free),
+            text::size(size),
+            text::size(wanted)
+        );
+        found.push(if free < wanted {
+            let size = (wanted + (size - free.min(size))).div_ceil(1 << 20) + 64;
+            Finding::bad(
+                "memory",
+                what,
+                format!("sudo mount -o remount,size={size}M /dev/shm; or lower memory_budget under [rig]"),
+            )
+        } else {
+            Finding::ok("memory", what)
+        });
+    }
+    if let Some(clock) = &facts.clock {
+        found.push(if FAST_CLOCKS.contains(&clock.as_str()) {
+            Finding::ok("clock", format!("the kernel's clock source is {clock}"))
+        } else {
+            let what = format!("the kernel's clock source is {clock}, slow to read");
+            Finding::warn("clock", what, "see `journalctl -k -b | grep -i clocksource` for why it is not tsc")
+        });
+    }
+    let programs = registry.is_some_and(|registry| {
+        registry
+            .devices
+            .iter()
+            .any(|entry| matches!(&entry.node, NodeSpec::Process(process) if process.opens == Opens::Usb))
+    });
+    if let Some(mb) = facts.usbfs_mb.filter(|mb| programs && *mb != 0 && *mb < USBFS_MB) {
+        let what = format!("programs that read USB devices themselves share {mb} MB for transfers");
+        let fix = "echo 256 | sudo tee /sys/module/usbcore/parameters/usbfs_memory_mb";
+        found.push(Finding::warn("usbfs", what, fix));
+    }
+    found
+}
+
+/// Whether the disk is fast and large enough for the devices.
+pub(super) fn disk(facts: &Facts, registry: Option<&Registry>) -> Vec<Finding> {
+    /// Shorter than a session.
+    const SHORT: f64 = 1800.0;
+    let Some(disk) = &facts.disk else { return Vec::new() };
+    let folder = text::plain(&disk.folder.display().to_string()).into_owned();
+    let mut found = Vec::new();
+    let entries = registry.map(|registry| registry.devices.as_slice()).unwrap_or_default();
+    // `sum` of no terms is -0.0.
+    let wanted = entries.iter().filter_map(most).fold(0.0, |sum, most| sum + most);
+    let unknown = entries.iter().filter(|entry| most(entry).is_none());
+    let unknown = unknown.map(|entry| format!("[device.{}]", entry.name)).collect::<Vec<_>>().join(", ");
+    match &disk.rate {
+        Err(error) => {
+            found.push(Finding::bad(
+                "disk",
+                format!("{folder} cannot be written to: {error}"),
+                "choose another folder with --out",
+            ));
+        }
+        Ok(rate) => {
+            let (took, needed) = (megabytes(*rate), megabytes(wanted));
+            let what = if unknown.is_empty() {
+                format!("{folder} took {took}; the devices send at most {needed} (estimated)")
+            } else {
+                format!("{folder} took {took}; the devices send {needed} (estimated) and what {unknown} may send")
+            };
+            found.push(if *rate < wanted {
+                Finding::warn("disk", what, "record on a faster disk: --out DIR")
+            } else {
+                Finding::ok("disk", what)
+            });
+        }
+    }
+    let usual = (1_u64 << 30).min(disk.size / 20);
+    let reserve = registry.and_then(|registry| registry.rig.disk_reserve).unwrap_or(usual);
+    let room = disk.free.saturating_sub(reserve);
+    let seconds = if wanted > 0.0 { room as f64 / wanted } else { f64::INFINITY };
+    let lasts = match seconds.is_finite() {
+        true if unknown.is_empty() => format!(", {:.0} min of everything at most", seconds / 60.0),
+        true => format!(", {:.0} min without {unknown}", seconds / 60.0),
+        false => String::new(),
+    };
+    let what = format!("{} free besides the reserve of {}{lasts}", text::size(room), text::size(reserve));
+    found.push(if room == 0 {
+        Finding::bad("disk", what, "remove or move recordings, or choose another folder with --out")
+    } else if seconds < SHORT {
+        Finding::warn("disk", what, "remove or move recordings, or choose another folder with --out")
+    } else {
+        Finding::ok("disk", what)
+    });
+    found
+}
+
+/// Highest data rate of a device, bytes per second; `None` if only the device, or its program, knows its rate.
+fn most(entry: &DeviceSpec) -> Option<f64> {
+    match &entry.node {
+        NodeSpec::Camera(camera) => {
+            let load = CameraLoad { name: String::new(), camera: camera.clone(), max_bytes: entry.max_bytes };
+            Some(load.bytes_per_second())
+        }
+        NodeSpec::Serial(serial) => Some(f64::from(serial.baud) / 10.0),
+        NodeSpec::Can(can) => Some(f64::from(can.bitrate) / 8.0),
+        NodeSpec::Lan(lan) => Some(f64::from(lan.picture()?.fps) * entry.max_bytes as f64),
+        NodeSpec::Process(_) => None,
+    }
+}
+
+/// Payload that isochronous transfers of one high-speed bus carry at most, bytes a second: 80 % of 480
+/// Mbit/s (USB 2.0, 5.6.4), of which 38 bytes a transaction of 1024 are overhead (5.6.3).
+const HIGH_SPEED: f64 = 0.8 * 60e6 * 1024.0 / 1062.0;
+/// Of one endpoint: three transactions of 1024 bytes in each of 8000 microframes (5.6.3).
+const ONE_ENDPOINT: f64 = 3.0 * 1024.0 * 8000.0;
+/// Of a full-speed bus, and of one endpoint: 1023 bytes a millisecond (5.6.3).
+const FULL_SPEED: f64 = 1023.0 * 1000.0;
+/// Of a bus of 5 Gbit/s: 500 MB/s remain of its coding, 80 % of them for payload.
+const SUPER_SPEED: f64 = 0.8 * 500e6;
+
+/// Rates and sizes that cameras usually offer, largest first.
+const RATES: [u32; 7] = [60, 30, 25, 20, 15, 10, 5];
+const SIZES: [(u32, u32); 6] = [(1920, 1080), (1280, 720), (800, 600), (640, 480), (352, 288), (320, 240)];
+
+/// A camera and its configured format.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct CameraLoad {
+    /// Entry.
+    pub(super) name: String,
+    /// Format.
+    pub(super) camera: CameraSpec,
+    /// Largest picture of a compressed format, bytes.
+    pub(super) max_bytes: usize,
+}
+
+impl CameraLoad {
+    /// Bytes per second; for compressed pictures an upper limit.
+    #[must_use]
+    pub(super) fn bytes_per_second(&self) -> f64 {
+        let camera = &self.camera;
+        let pixels = f64::from(camera.width) * f64::from(camera.height);
+        let picture = match camera.format {
+            PixelFormat::Yuyv => 2.0 * pixels,
+            PixelFormat::Grey => pixels,
+            PixelFormat::Mjpg => self.max_bytes as f64,
+        };
+        picture * f64::from(camera.fps)
+    }
+
+    /// Upper limit of its reservation: one endpoint.
+    fn reserves(&self, mbit: f64) -> f64 {
+        if self.is_estimated() { self.bytes_per_second().min(endpoint(mbit)) } else { self.bytes_per_second() }
+    }
+
+    /// Whether only an upper limit is known.
+    #[must_use]
+    pub(super) fn is_estimated(&self) -> bool {
+        self.camera.format == PixelFormat::Mjpg
+    }
+
+    /// Lowers the rate or, if it is low already, the size by one step; false if there is none.
+    fn lower(&mut self) -> bool {
+        /// Below this, a smaller picture is better than a lower rate.
+        const SLOW: u32 = 15;
+        let CameraSpec { width, height, fps, .. } = self.camera;
+        let slower = RATES.into_iter().find(|rate| *rate < fps && *rate >= SLOW);
+        let pixels = |(width, height): (u32, u32)| u64::from(width) * u64::from(height);
+        let smaller = SIZES.into_iter().find(|size| pixels(*size) < pixels((width, height)));
+        let slowest = RATES.into_iter().find(|rate| *rate < fps);
+        match (slower, smaller, slowest) {
+            (Some(rate), ..) | (None, None, Some(rate)) => self.camera.fps = rate,
+            (None, Some(size), _) => {
+                self.max_bytes = usize::try_from(self.max_bytes as u64 * pixels(size) / pixels((width, height)).max(1))
+                    .unwrap_or(self.max_bytes);
+                (self.camera.width, self.camera.height) = size;
+            }
+            (None, None, None) => return false,
+        }
+        true
+    }
+}
+
+impl fmt::Display for CameraLoad {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let CameraSpec { width, height, fps, format, .. } = &self.camera;
+        write!(f, "[device.{}] {width}x{height}@{fps} {format}", self.name)
+    }
+}
+
+/// Payload a second that cameras on a bus of this speed can have together.
+#[must_use]
+pub(super) fn budget(mbit: f64) -> f64 {
+    match mbit {
+        mbit if mbit >= 5000.0 => SUPER_SPEED * (mbit / 5000.0),
+        mbit if mbit >= 480.0 => HIGH_SPEED,
+        _ => FULL_SPEED,
+    }
+}
+
+/// And one of them.
+#[must_use]
+pub(super) fn endpoint(mbit: f64) -> f64 {
+    match mbit {
+        mbit if mbit >= 5000.0 => budget(mbit),
+        mbit if mbit >= 480.0 => ONE_ENDPOINT,
+        _ => FULL_SPEED,
+    }
+}
+
+/// What the cameras of one bus of this speed take of it, bytes a second.
+#[must_use]
+pub(super) fn taken(loads: &[CameraLoad], mbit: f64) -> f64 {
+    loads.iter().map(|load| load.reserves(mbit)).sum()
+}
+
+/// Settings that fit a bus of this speed: the most demanding camera gives way first. Only those that
+/// change; `None` if nothing fits.
+#[must_use]
+pub(super) fn fitting(loads: &[CameraLoad], mbit: f64) -> Option<Vec<CameraLoad>> {
+    let mut tried = loads.to_vec();
+    let fits = |loads: &[CameraLoad]| {
+        taken(loads, mbit) <= budget(mbit) && loads.iter().all(|load| load.reserves(mbit) <= endpoint(mbit))
+    };
+    while !fits(&tried) {
+        let most = tried.iter_mut().max_by(|a, b| a.bytes_per_second().total_cmp(&b.bytes_per_second()))?;
+        if !most.lower() {
+            return None;
+        }
+    }
+    Some(tried.into_iter().zip(loads).filter(|(now, load)| now != *load).map(|(now, _)| now).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn load(width: u32, height: u32, fps: u32, format: PixelFormat) -> CameraLoad {
+        let camera = CameraSpec { width, height, fps, format, controls: Vec::new() };
+        CameraLoad { name: "cam".into(), camera, max_bytes: 2 * (width * height) as usize }
+    }
+
+    #[test]
+    fn what_fits_a_bus() {
+        use PixelFormat::{Grey, Mjpg, Yuyv};
+        let said = |loads: &[CameraLoad], mbit: f64| match fitting(loads, mbit) {
+            None => "nothing fits".to_owned(),
+            Some(lower) => lower.iter().map(ToString::to_string).collect::<Vec<_>>().join(", "),
+        };
+        for (loads, mbit, expected) in [
+            (vec![load(640, 480, 30, Yuyv)], 480.0, ""),
+            (vec![load(640, 480, 30, Yuyv); 2], 480.0, ""),
+            (
+                vec![load(640, 480, 30, Yuyv), load(640, 480, 50, Grey), load(640, 480, 60, Grey)],
+                480.0,
+                "[device.cam] 640x480@30 GREY",
+            ),
+            // More than one endpoint carries, though the bus would.
+            (vec![load(1280, 720, 30, Yuyv)], 480.0, "[device.cam] 800x600@15 YUYV"),
+            (vec![load(1280, 720, 30, Grey)], 480.0, "[device.cam] 1280x720@25 GREY"),
+            // What a compressed picture takes is not known: it reserves an endpoint at the most.
+            (vec![load(1920, 1080, 30, Mjpg)], 480.0, ""),
+            (vec![load(320, 240, 30, Yuyv)], 12.0, "[device.cam] 320x240@5 YUYV"),
+            (vec![load(640, 480, 60, Yuyv); 4], 5000.0, ""),
+        ] {
+            assert_eq!(said(&loads, mbit), expected, "{loads:?} at {mbit}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn what_is_said_to_fit_does(
+            cameras in proptest::collection::vec((1_u32..4000, 1_u32..3000, 1_u32..200, 0_usize..3), 1..6),
+            mbit in prop::sample::select(vec![1.5, 12.0, 480.0, 5000.0, 10_000.0]),
+        ) {
+            let format = |at: usize| PixelFormat::WORDS[at].1;
+            let loads: Vec<CameraLoad> = cameras
+                .iter()
+                .enumerate()
+                .map(|(at, (width, height, fps, which))| CameraLoad {
+                    name: format!("cam{at}"), ..load(*width, *height, *fps, format(*which))
+                })
+                .collect();
+            if let Some(lower) = fitting(&loads, mbit) {
+                let now: Vec<CameraLoad> = loads
+                    .iter()
+                    .map(|load| lower.iter().find(|lower| lower.name == load.name).unwrap_or(load).clone())
+                    .collect();
+                prop_assert!(taken(&now, mbit) <= budget(mbit));
+            }
+        }
+    }
 }

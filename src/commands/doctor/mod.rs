@@ -1,12 +1,9 @@
-//! `rapid doctor`: what on this machine stands in the way of a rig, and what to do about it.
+//! `rapid doctor`: diagnoses this machine, with a fix for each problem.
 //!
-//! `facts` looks, `judge` decides, this writes.
+//! `facts` collects, `judge` decides, this module writes.
 
-mod bandwidth;
 mod facts;
 mod judge;
-mod machine;
-mod usb;
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -14,16 +11,16 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
+use self::facts::UsbDevice;
 use self::facts::{Disk, Facts};
 use self::judge::{Finding, Level};
-use self::usb::UsbDevice;
 use super::Format;
 use crate::folder::{Folder, Links, Missing};
 use crate::registry::Registry;
 use crate::registry::artifacts::{ArtifactKind, artifacts};
 use crate::text;
 
-/// Looks at the machine and says what it finds; true if nothing of it is bad.
+/// Diagnoses the machine and writes the findings; true if none is bad.
 ///
 /// # Errors
 /// When `out` cannot be written to.
@@ -34,16 +31,17 @@ pub fn doctor(
     out: &mut dyn Write,
 ) -> io::Result<bool> {
     let mut facts = facts::collect(Path::new("/"));
+    #[cfg(feature = "motors")]
     facts::ask_can(&mut facts.can);
     facts.disk = disk(episodes);
     report(&facts, registry, format, out)
 }
 
-/// Says what follows from the facts.
+/// Writes the findings that follow from the facts.
 fn report(facts: &Facts, registry: Result<&Registry, &str>, format: Format, out: &mut dyn Write) -> io::Result<bool> {
     let mut findings = Vec::new();
     if let Err(reason) = registry {
-        let fix = Some("rapid check says more; rapid register makes one".to_owned());
+        let fix = Some("rapid check lists the mistakes; rapid register creates a registry".to_owned());
         findings.push(Finding { level: Level::Bad, about: "registry", what: reason.to_owned(), fix });
     }
     let registry = registry.ok();
@@ -97,7 +95,7 @@ fn write_findings(findings: &[Finding], out: &mut dyn Write) -> io::Result<()> {
         }
     }
     let count = |level| findings.iter().filter(|finding| finding.level == level).count();
-    writeln!(out, "\n{} ok, {} to look at, {} bad", count(Level::Ok), count(Level::Warn), count(Level::Bad))
+    writeln!(out, "\n{} ok, {} warnings, {} bad", count(Level::Ok), count(Level::Warn), count(Level::Bad))
 }
 
 fn tree_line(device: &UsbDevice, entries: &[&str]) -> String {
@@ -152,7 +150,7 @@ impl<'a> Line<'a> {
     }
 }
 
-/// The disk of the folder for episodes, or of the folder that it would be made in.
+/// The disk of the folder for episodes, or of its nearest existing parent.
 fn disk(episodes: &Path) -> Option<Disk> {
     let folder = episodes.ancestors().find(|folder| folder.is_dir());
     let folder = folder.map_or_else(|| Path::new(".").to_owned(), Path::to_owned);
@@ -161,7 +159,7 @@ fn disk(episodes: &Path) -> Option<Disk> {
     Some(Disk { folder, free, size, rate })
 }
 
-/// Writes for a moment, as a recording does, and waits for the disk: bytes a second.
+/// Writes for up to 2 s, as a recording does, and syncs: bytes per second.
 fn write_rate(folder: &Path) -> io::Result<f64> {
     const BLOCK: usize = 1 << 20;
     const MOST: usize = 64;
@@ -169,9 +167,9 @@ fn write_rate(folder: &Path) -> io::Result<f64> {
     let folder = Folder::open(folder, Links::Own, Missing::Refused)?;
     let name = format!(".rapid-doctor.{}", std::process::id());
     let mut file = folder.create_new(&name, 0o600)?;
-    // It has no name from here on: whatever happens, nothing is left behind.
+    // The open file has no name from here on, so nothing is left behind.
     folder.remove(&name)?;
-    // Bytes that no file system packs.
+    // Bytes that no file system compresses.
     let block: Vec<u8> = (0..BLOCK as u64).map(|at| (at.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 56) as u8).collect();
     let begun = Instant::now();
     let mut written = 0;

@@ -1,36 +1,34 @@
-//! Taking over the devices of `rapid_driver`.
+//! Importing the devices of `rapid_driver`.
 //!
-//! Its registry says no more of a device than how it is found and what to run. How it is read is seen
-//! at the device, if it is plugged in, or said by `--node`; an entry for which neither tells is written
-//! as a comment.
+//! Its registry contains only how a device is found and what to run. The driver is derived from the device if
+//! it is plugged in, or given by `--node`; an entry without either is written as a comment.
 
 use std::path::Path;
 
 use super::Target;
+use super::fields::free_bit;
 use super::units::{kind, suggested};
-use super::wish::free_bit;
 use crate::driver::camera::query;
 use crate::registry::edit::{NewEntry, Setting};
 use crate::registry::import::{Foreign, devices, layout};
 use crate::registry::{Attachment, DeviceNode, RegistryErrors, UsbIdentity, like_a_name, name_problem, read_file};
 use crate::text;
 
-/// What announces itself by a service type, and what it speaks (`aod321/iPhoneVIO`; OpenGoPro,
-/// "mDNS").
+/// Service types and their protocols (`aod321/iPhoneVIO`; OpenGoPro, "mDNS").
 const PROTOCOLS: [(&str, &str); 2] = [("_iphonevio._tcp", "iphone"), ("_gopro-web._tcp", "gopro")];
 
-/// Why nothing is imported.
+/// Why nothing was imported.
 #[derive(Debug, thiserror::Error)]
 pub enum ImportError {
-    /// A file is wrong.
+    /// A file is invalid.
     #[error("{0}")]
     File(#[from] RegistryErrors),
-    /// It lists nothing.
+    /// It lists no device.
     #[error("{0}: it lists no device")]
     Empty(String),
 }
 
-/// The entries that the devices of `file` become.
+/// The entries for the devices of `file`.
 pub(super) fn read(
     file: &Path,
     order: Option<&Path>,
@@ -52,7 +50,7 @@ pub(super) fn read(
     let mut entries = Vec::new();
     for device in &found {
         let reader = Reader::of(device, node, attached);
-        // A device that is not used yet needs no bit but the one it had.
+        // A device that cannot be used yet keeps its bit, and gets no new one.
         let free = || free_bit(target.registry.as_ref(), &bits).filter(|_| reader.is_ok());
         let bit = position(&device.name).or_else(free);
         bits.extend(bit);
@@ -61,21 +59,21 @@ pub(super) fn read(
     Ok(entries)
 }
 
-/// How a device is read.
+/// The driver of a device, and its settings.
 struct Reader {
     node: String,
     settings: Vec<(String, Setting)>,
 }
 
 impl Reader {
-    /// Otherwise why that is not known.
+    /// The driver and settings of a device, or why they are unknown.
     fn of(device: &Foreign, node: Option<&str>, attached: &[Attachment]) -> Result<Self, String> {
         if let Some(service) = &device.service {
             let Some((_, protocol)) = PROTOCOLS.iter().find(|(known, _)| known == service) else {
-                return Err(format!("it is found by mDNS ({service}), and what it speaks is not known"));
+                return Err(format!("it is found by mDNS ({service}), whose protocol is unknown"));
             };
             let text = |key: &str, value: &str| (format!("lan.{key}"), Setting::Text(value.to_owned()));
-            // Its pictures are large and few: by their pixels they would be given most of the shared memory.
+            // Its pictures are large and few: sized by their pixels they would use most of the shared memory.
             let size = (*protocol == "iphone").then(|| ("max_bytes".to_owned(), Setting::Text("2MiB".to_owned())));
             return Ok(Self {
                 node: "lan".to_owned(),
@@ -99,17 +97,17 @@ impl Reader {
             }
             (_, Some(node)) => Ok(Self { node: node.to_owned(), settings: Vec::new() }),
             (_, None) => {
-                Err("how it is read is not known: plug it in and import again, give --node, or complete it".to_owned())
+                Err("its driver is unknown: plug it in and import again, give --node, or complete the entry".to_owned())
             }
         }
     }
 }
 
 fn entry(device: &Foreign, bit: Option<u8>, reader: Result<Reader, String>) -> NewEntry {
-    let ours = if name_problem(&device.name).is_none() { None } else { like_a_name(&device.name) };
-    let name = ours.clone().unwrap_or_else(|| device.name.clone());
+    let renamed = if name_problem(&device.name).is_none() { None } else { like_a_name(&device.name) };
+    let name = renamed.clone().unwrap_or_else(|| device.name.clone());
     let mut comments = Vec::new();
-    if ours.is_some() {
+    if renamed.is_some() {
         comments.push(format!("rapid_driver called it {:?}.", text::plain(&device.name)));
     }
     for (key, command) in &device.commands {
@@ -123,8 +121,7 @@ fn entry(device: &Foreign, bit: Option<u8>, reader: Result<Reader, String>) -> N
     let mut put = |key: &str, value: Option<Setting>| keys.extend(value.map(|value| (key.to_owned(), value)));
     put("vid", device.usb.map(|(vid, _)| Setting::Text(format!("{vid:04x}"))));
     put("pid", device.usb.map(|(_, pid)| Setting::Text(format!("{pid:04x}"))));
-    let key = if node == "serial" { "serial_number" } else { "serial" };
-    put(key, device.serial.clone().map(Setting::Text));
+    put("serial", device.serial.clone().map(Setting::Text));
     put("node", Some(Setting::Text(node)));
     put("bit", bit.map(|bit| Setting::Whole(bit.into())));
     keys.extend(settings);

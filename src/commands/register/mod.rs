@@ -1,33 +1,38 @@
-//! `rapid register` and `rapid unregister`: an entry of `devices.toml` for what is plugged in.
+//! `rapid register` and `rapid unregister`: entries of `devices.toml` for connected devices.
 //!
-//! What is not given is asked, if there is somebody to ask; the text that comes out is what the parser
-//! takes, or nothing is written.
+//! Missing values are asked for on a terminal.
+//!
+//! Invariant: nothing is written that the parser rejects.
+//! Invariant: the file is replaced atomically, and only if it has not changed since it was read.
 
-mod ask;
+mod fields;
 mod import;
-mod sample;
 pub mod units;
-mod wish;
-mod write;
 
-use std::io::{self, Write};
-use std::path::PathBuf;
+use std::io::{self, BufRead, Write};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use serde::Serialize;
+use tokio::time::{Instant, timeout_at};
 
-use self::units::unregistered;
-use self::wish::{Meant, choose, comments, free_bit, identity, name, node, settings, slot};
-use super::Format;
+use self::fields::{Selection, choose, comments, free_bit, identity, name, node, settings, slot};
+use self::units::{lines_look_like, unregistered};
 use super::artifacts::ArtifactsError;
+use super::{Format, artifacts};
 use crate::cli::{RegisterArgs, UnregisterArgs};
-use crate::folder::FolderError;
+use crate::driver::serial::Serial;
+use crate::driver::{Driver, DriverError};
+use crate::folder::{Folder, FolderError, Links, Missing, Sync};
 use crate::registry::edit::{self, EditError, NewEntry, Setting};
-use crate::registry::{Attachment, RegistryErrors};
+use crate::registry::{
+    Attachment, DeviceNode, DeviceSpec, Framing, Loaded, NodeSpec, Parse, Registry, RegistryErrors, SerialSpec,
+    read_file,
+};
+use crate::sample::Encoding;
 use crate::text;
 
-pub use ask::Dialogue;
 pub use import::ImportError;
-pub use write::Target;
 
 /// Why nothing was registered.
 #[derive(Debug, thiserror::Error)]
@@ -38,28 +43,28 @@ pub enum RegisterError {
     /// A key cannot be written.
     #[error("{0}")]
     Edit(#[from] EditError),
-    /// Something is not given and there is nobody to ask.
-    #[error("{} must be given: this is no terminal where it could be asked", .0.join(", "))]
+    /// A value is missing and there is no terminal to ask on.
+    #[error("{} must be given: there is no terminal to ask on", .0.join(", "))]
     Missing(Vec<&'static str>),
-    /// Several units are meant.
-    #[error("several units that are plugged in are meant: name one with --serial or --port{}", .0.iter().flat_map(|unit| ["\n  ", unit]).collect::<String>())]
+    /// Several units match.
+    #[error("several connected units match: name one with --serial or --port{}", .0.iter().flat_map(|unit| ["\n  ", unit]).collect::<String>())]
     Several(Vec<String>),
-    /// The answers ended.
+    /// The input ended before an answer.
     #[error("no answer: nothing was written")]
     Ended,
-    /// Another entry would get another bit.
+    /// The bit of another entry would change.
     #[error(
-        "taking out [device.{name}] would move {moved}, and a policy is trained on bits\n    fix: write the bits of \
-         these entries down first (`rapid check` says which have none)"
+        "removing [device.{name}] would move {moved}, and a policy is trained on bits\n    fix: give these \
+         entries a `bit` first (`rapid check` lists those without)"
     )]
     BitsMove {
         /// The entry.
         name: String,
-        /// Which bits, for people.
+        /// Which entries, and their bits.
         moved: String,
     },
-    /// Somebody else wrote the file meanwhile.
-    #[error("{}: it has changed since it was read; nothing was written, start again", .0.display())]
+    /// Another program changed the file meanwhile.
+    #[error("{}: it has changed since it was read; nothing was written: run the command again", .0.display())]
     Changed(PathBuf),
     /// The file cannot be read or written.
     #[error("{}: {error}", path.display())]
@@ -72,8 +77,8 @@ pub enum RegisterError {
     /// The folder of the file cannot be used.
     #[error(transparent)]
     Folder(#[from] FolderError),
-    /// The registry is written, and what follows from it is not.
-    #[error("the registry is written, and what follows from it is not: {0}")]
+    /// The registry is written, its artifacts are not.
+    #[error("the registry is written, its artifacts are not: {0}")]
     Artifacts(#[from] ArtifactsError),
     /// The file to import.
     #[error(transparent)]
@@ -84,7 +89,7 @@ pub enum RegisterError {
 }
 
 impl RegisterError {
-    /// Was it asked for something that cannot be?
+    /// Whether the arguments are at fault.
     #[must_use]
     pub const fn is_bad_argument(&self) -> bool {
         !matches!(
@@ -94,18 +99,10 @@ impl RegisterError {
     }
 }
 
-/// What is done with a text.
-#[derive(Debug, Clone, Copy)]
-struct Manner {
-    format: Format,
-    dry_run: bool,
-    yes: bool,
-}
-
-/// Registers what `args` and the answers say.
+/// Registers a device from `args` and the answers.
 ///
 /// # Errors
-/// When something is missing or the parser does not take the entry: then nothing is written.
+/// When a value is missing or the parser rejects the entry; nothing is written then.
 pub async fn register(
     target: &Target,
     attached: &[Attachment],
@@ -115,15 +112,14 @@ pub async fn register(
     out: &mut dyn Write,
 ) -> Result<(), RegisterError> {
     let units = unregistered(target.registry.as_ref(), attached);
-    let manner = Manner { format, dry_run: args.dry_run, yes: args.yes };
     if let Some(file) = &args.import {
         let entries = import::read(file, args.layout.as_deref(), args.node.as_deref(), attached, target)?;
-        return commit(target, &entries, talk.as_mut(), manner, out);
+        return commit(target, &entries, talk.as_mut(), args, format, out);
     }
     let unit = match choose(&units, args, talk.as_mut(), format, out)? {
-        Meant::Nothing => return Ok(()),
-        Meant::NotPlugged => None,
-        Meant::Unit(unit) => Some(unit),
+        Selection::Nothing => return Ok(()),
+        Selection::NotPlugged => None,
+        Selection::Unit(unit) => Some(unit),
     };
     let unit = unit.as_deref();
     let name = name(target.registry.as_ref(), unit, args, talk.as_mut())?;
@@ -133,39 +129,36 @@ pub async fn register(
     let (vid, pid) = (unit.map(|unit| unit.usb.vid).or(args.vid), unit.map(|unit| unit.usb.pid).or(args.pid));
     entry.keys.extend(vid.map(|vid| text("vid", format!("{vid:04x}"))));
     entry.keys.extend(pid.map(|pid| text("pid", format!("{pid:04x}"))));
-    let reads_lines = node == "serial" || args.set.iter().any(|(key, _)| key.starts_with("serial."));
-    for (key, value) in identity(unit, args, talk.as_mut())? {
-        // Beside a table of the serial line the key has another name.
-        let key = if key == "serial" && reads_lines { "serial_number" } else { key };
-        entry.keys.push(text(key, value));
-    }
+    entry.keys.extend(identity(unit, args, talk.as_mut())?.into_iter().map(|(key, value)| text(key, value)));
     entry.keys.push(text("node", node.clone()));
     entry.keys.extend(slot(args, talk.as_mut())?.map(|slot| text("slot", slot)));
     let bit = args.bit.or_else(|| free_bit(target.registry.as_ref(), &[]));
     entry.keys.extend(bit.map(|bit| ("bit".to_owned(), Setting::Whole(bit.into()))));
     entry.keys.extend(settings(unit, &node, args, talk.as_mut()).await?);
-    entry.keys.extend(args.set.iter().map(|(key, value)| (key.clone(), Setting::Typed(value.clone()))));
+    // `serial.` is the old name of that table.
+    let named = |key: &str| key.strip_prefix("serial.").map_or_else(|| key.to_owned(), |key| format!("tty.{key}"));
+    entry.keys.extend(args.set.iter().map(|(key, value)| (named(key), Setting::Typed(value.clone()))));
     if let Some(node) = unit.and_then(|unit| unit.node(&node).or_else(|| unit.nodes.first()))
         && (args.test || talk.is_some())
     {
-        let parsed = target.parse(&edit::append(target.base(), std::slice::from_ref(&entry))?);
+        let parsed = target.parse(&edit::append(&target.base(), std::slice::from_ref(&entry))?);
         let parsed = parsed.map_err(RegisterError::Refused)?;
         if let Some(spec) = parsed.registry.named(&entry.name) {
-            let said = sample::look(spec, &node.node).await;
+            let report = read(spec, &node.node).await;
             match (talk.as_mut(), format) {
-                (Some(talk), _) => talk.say(&said)?,
-                (None, Format::Text) => writeln!(out, "{}", text::plain(&said))?,
+                (Some(talk), _) => talk.say(&report)?,
+                (None, Format::Text) => writeln!(out, "{}", text::plain(&report))?,
                 (None, Format::Json) => {}
             }
         }
     }
-    commit(target, &[entry], talk.as_mut(), manner, out)
+    commit(target, &[entry], talk.as_mut(), args, format, out)
 }
 
-/// Takes an entry out.
+/// Removes an entry.
 ///
 /// # Errors
-/// When there is no such entry, or what is left would be no registry.
+/// When there is no such entry, or the rest would be no valid registry.
 pub fn unregister(
     target: &Target,
     args: &UnregisterArgs,
@@ -173,7 +166,7 @@ pub fn unregister(
     format: Format,
     out: &mut dyn Write,
 ) -> Result<(), RegisterError> {
-    let new = edit::remove(&target.text, &args.name)?;
+    let new = edit::remove(&edit::renamed(&target.text), &args.name)?;
     let left = target.parse(&new).map_err(RegisterError::Refused)?.registry;
     let before = target.registry.as_ref().map(|registry| registry.devices.as_slice()).unwrap_or_default();
     let moved: Vec<String> = before
@@ -186,14 +179,14 @@ pub fn unregister(
         return Err(RegisterError::BitsMove { name: args.name.clone(), moved: moved.join(", ") });
     }
     if let Some(mut talk) = talk.filter(|_| !args.yes && !args.dry_run)
-        && !talk.agrees(&format!("Take [device.{}] out of {}", args.name, target.path.display()))?
+        && !talk.agrees(&format!("Remove [device.{}] from {}", args.name, target.path.display()))?
     {
         talk.say("Nothing was written.")?;
         return Ok(());
     }
-    let mut said = Vec::new();
+    let mut written_files = Vec::new();
     if !args.dry_run {
-        target.write(&new, &left, &mut said)?;
+        target.write(&new, &left, &mut written_files)?;
     }
     match format {
         Format::Json => {
@@ -203,8 +196,8 @@ pub fn unregister(
         }
         Format::Text if args.dry_run => out.write_all(new.as_bytes())?,
         Format::Text => {
-            out.write_all(&said)?;
-            writeln!(out, "[device.{}] is no entry any more", args.name)?;
+            out.write_all(&written_files)?;
+            writeln!(out, "removed [device.{}]", args.name)?;
         }
     }
     Ok(())
@@ -215,32 +208,33 @@ fn commit(
     target: &Target,
     entries: &[NewEntry],
     talk: Option<&mut Dialogue<'_>>,
-    manner: Manner,
+    args: &RegisterArgs,
+    format: Format,
     out: &mut dyn Write,
 ) -> Result<(), RegisterError> {
-    let new = edit::append(target.base(), entries)?;
+    let new = edit::append(&target.base(), entries)?;
     let parsed = target.parse(&new).map_err(RegisterError::Refused)?;
     let written: Vec<String> = entries.iter().map(edit::written).collect::<Result<_, _>>()?;
     let shown = written.join("\n");
-    if let Some(talk) = talk.filter(|_| !manner.yes && !manner.dry_run) {
+    if let Some(talk) = talk.filter(|_| !args.yes && !args.dry_run) {
         talk.say(&format!("\n{shown}"))?;
         if !talk.agrees(&format!("Add this to {}", target.path.display()))? {
             talk.say("Nothing was written.")?;
             return Ok(());
         }
-    } else if manner.format == Format::Text {
+    } else if format == Format::Text {
         for line in shown.lines() {
             writeln!(out, "{}", text::plain(line))?;
         }
     }
-    let mut said = Vec::new();
-    if !manner.dry_run {
-        target.write(&new, &parsed.registry, &mut said)?;
+    let mut written_files = Vec::new();
+    if !args.dry_run {
+        target.write(&new, &parsed.registry, &mut written_files)?;
     }
-    if manner.format == Format::Text {
-        out.write_all(&said)?;
-        if !manner.dry_run {
-            writeln!(out, "for the stable names: sudo rapid artifacts --install")?;
+    if format == Format::Text {
+        out.write_all(&written_files)?;
+        if !args.dry_run {
+            writeln!(out, "for stable device names: sudo rapid artifacts --install")?;
         }
         return Ok(());
     }
@@ -252,7 +246,7 @@ fn commit(
             bit: spec.map(|spec| spec.id.bit()),
             file: target.path.to_string_lossy().into_owned(),
             entry: text,
-            dry_run: manner.dry_run,
+            dry_run: args.dry_run,
         };
         writeln!(out, "{}", text::json(&line).map_err(io::Error::from)?)?;
     }
@@ -268,6 +262,228 @@ struct Registered<'a> {
     file: String,
     entry: &'a str,
     dry_run: bool,
+}
+
+/// A dialogue in plain lines: works on any terminal, over ssh, and in a test.
+pub struct Dialogue<'a> {
+    /// Answers.
+    pub input: &'a mut dyn BufRead,
+    /// Questions.
+    pub out: &'a mut dyn Write,
+}
+
+impl Dialogue<'_> {
+    /// Prints one or several lines.
+    fn say(&mut self, line: &str) -> io::Result<()> {
+        for line in line.split('\n') {
+            writeln!(self.out, "{}", text::plain(line))?;
+        }
+        self.out.flush()
+    }
+
+    /// Asks until `take` accepts the answer; an empty line is the default.
+    fn ask<T>(
+        &mut self,
+        question: &str,
+        default: Option<&str>,
+        mut take: impl FnMut(&str) -> Result<T, String>,
+    ) -> Result<T, RegisterError> {
+        /// Longer than any answer.
+        const LONGEST: u64 = 4096;
+        loop {
+            let shown = default.map_or_else(String::new, |default| format!(" [{default}]"));
+            write!(self.out, "{}{}: ", text::plain(question), text::plain(&shown))?;
+            self.out.flush()?;
+            let mut line = Vec::new();
+            if io::Read::take(&mut *self.input, LONGEST).read_until(b'\n', &mut line)? == 0 {
+                writeln!(self.out)?;
+                return Err(RegisterError::Ended);
+            }
+            let line = String::from_utf8_lossy(&line);
+            let answer = match (line.trim(), default) {
+                ("", Some(default)) => default,
+                (answer, _) => answer,
+            };
+            match take(answer) {
+                Ok(taken) => return Ok(taken),
+                Err(why) => self.say(&format!("  {why}"))?,
+            }
+        }
+    }
+
+    /// Yes or no; an empty line is yes.
+    fn agrees(&mut self, question: &str) -> Result<bool, RegisterError> {
+        self.ask(question, Some("y"), |answer| match answer.to_lowercase().as_str() {
+            "y" | "yes" => Ok(true),
+            "n" | "no" => Ok(false),
+            _ => Err("enter y or n".to_owned()),
+        })
+    }
+}
+
+/// The first lines of a new `devices.toml`.
+const FIRST_LINES: &str = "\
+# The devices of this rig, declared here and nowhere else. `rapid check` lists mistakes, `rapid artifacts`
+# writes the udev rules.
+";
+
+/// The registry to be changed.
+#[derive(Debug)]
+pub struct Target {
+    /// The file.
+    pub path: PathBuf,
+    /// Its text; empty if it does not exist yet.
+    pub text: String,
+    /// The parsed text; `None` while no device is registered.
+    pub registry: Option<Registry>,
+}
+
+impl Target {
+    /// Reads the file at `path`, which may be missing: it is created later.
+    ///
+    /// # Errors
+    /// When it cannot be read or is already invalid.
+    pub fn read(path: PathBuf) -> Result<Self, RegistryErrors> {
+        if !path.exists() {
+            return Ok(Self { path, text: String::new(), registry: None });
+        }
+        let text = read_file(&path, "name another with --config FILE")?;
+        let registry = match Registry::parse(&text, Some(&path)) {
+            Ok(loaded) => Some(loaded.registry),
+            // It has settings for all devices, and no device yet.
+            Err(_) if edit::has_no_entries(&text) => None,
+            Err(wrong) => return Err(wrong),
+        };
+        Ok(Self { path, text, registry })
+    }
+
+    /// The text that a new entry is added to.
+    fn base(&self) -> String {
+        if self.text.is_empty() { FIRST_LINES.to_owned() } else { edit::renamed(&self.text) }
+    }
+
+    /// Parses `new` as the text of the file.
+    fn parse(&self, new: &str) -> Result<Loaded, RegistryErrors> {
+        Registry::parse(new, Some(&self.path))
+    }
+
+    /// Writes this text to the file, and the artifacts beside it.
+    fn write(&self, new: &str, registry: &Registry, out: &mut dyn Write) -> Result<(), RegisterError> {
+        let io = |error| RegisterError::File { path: self.path.clone(), error };
+        // A symbolic link to the file is kept.
+        let path = if self.path.exists() { self.path.canonicalize().map_err(io)? } else { self.path.clone() };
+        let parent = path.parent().filter(|parent| *parent != Path::new("")).unwrap_or(Path::new("."));
+        let name = path.file_name().unwrap_or_default();
+        let folder = Folder::open(parent, Links::Own, Missing::Last)?;
+        let (mode, owner) = match folder.open_file(name).and_then(|file| file.metadata()) {
+            Ok(found) => {
+                use std::os::unix::fs::MetadataExt;
+                (found.mode() & 0o777, Some((found.uid(), found.gid())))
+            }
+            Err(_) => (0o644, None),
+        };
+        let now = if owner.is_some() { std::fs::read_to_string(&path).map_err(io)? } else { String::new() };
+        if now != self.text {
+            return Err(RegisterError::Changed(self.path.clone()));
+        }
+        folder.replace(name, new.as_bytes(), mode, Sync::Wait).map_err(io)?;
+        if let Some((user, group)) = owner.filter(|_| rustix::process::geteuid().is_root()) {
+            // A user's file keeps its owner when root changes it.
+            let (user, group) = (rustix::fs::Uid::from_raw(user), rustix::fs::Gid::from_raw(group));
+            let flags = rustix::fs::AtFlags::SYMLINK_NOFOLLOW;
+            rustix::fs::chownat(folder.descriptor(), name, Some(user), Some(group), flags).map_err(|e| io(e.into()))?;
+        }
+        writeln!(out, "wrote {}", self.path.display())?;
+        Ok(artifacts::write(registry, &parent.join("udev"), out)?)
+    }
+}
+
+/// How long a device is read.
+const READING: Duration = Duration::from_secs(2);
+/// A device that takes longer to open has failed.
+const OPENING: Duration = Duration::from_secs(5);
+/// Samples that are enough.
+const ENOUGH: u32 = 200;
+/// Lines of a serial device that are examined.
+const LINES: usize = 20;
+
+/// Opens the device as a rig would, reads for up to 2 s and describes the samples.
+async fn read(spec: &DeviceSpec, node: &DeviceNode) -> String {
+    if let NodeSpec::Process(_) = spec.node {
+        return "Test: skipped, the program of the entry reads it; test it with `rapid --headless`.".to_owned();
+    }
+    let opened = tokio::time::timeout(OPENING, Driver::open(spec, node)).await;
+    let mut driver = match opened.unwrap_or_else(|_| Err(DriverError::Retry("it does not open".to_owned()))) {
+        Ok(driver) => driver,
+        Err(error) => return format!("Test: {}: {error}", node.label()),
+    };
+    let description = driver.description();
+    let begun = Instant::now();
+    let mut stats = SampleStats::default();
+    while stats.samples < ENOUGH {
+        match timeout_at(begun + READING, driver.read()).await {
+            Err(_) => break,
+            Ok(Ok(reading)) => stats.take(reading.encoding, reading.bytes, (reading.width, reading.height)),
+            Ok(Err(error)) => return format!("Test: {description}: {error}"),
+        }
+    }
+    format!("Test: {description}: {}", stats.describe(begun.elapsed()))
+}
+
+#[derive(Default)]
+struct SampleStats {
+    samples: u32,
+    bytes: u64,
+    first: String,
+}
+
+impl SampleStats {
+    fn take(&mut self, encoding: Encoding, bytes: &[u8], (width, height): (u32, u32)) {
+        if self.samples == 0 {
+            self.first = match encoding {
+                Encoding::F64 => {
+                    let (numbers, _) = bytes.as_chunks::<8>();
+                    let shown: Vec<_> =
+                        numbers.iter().take(6).map(|n| format!("{:.4}", f64::from_le_bytes(*n))).collect();
+                    let more = if numbers.len() > shown.len() { ", ..." } else { "" };
+                    format!("first values {}{more}", shown.join(", "))
+                }
+                Encoding::Bytes => {
+                    format!("first bytes {:?}", String::from_utf8_lossy(bytes.get(..40).unwrap_or(bytes)))
+                }
+                _ => format!("{width}x{height} pixels"),
+            };
+        }
+        self.samples += 1;
+        self.bytes += bytes.len() as u64;
+    }
+
+    fn describe(&self, elapsed: Duration) -> String {
+        if self.samples == 0 {
+            return format!("it sent nothing in {}", text::about(elapsed));
+        }
+        let hz = f64::from(self.samples) / elapsed.as_secs_f64().max(1e-3);
+        let size = text::size(self.bytes / u64::from(self.samples));
+        format!("{} samples, {} per second, {size} each, {}", self.samples, text::hertz(hz), self.first)
+    }
+}
+
+/// Listens to a serial device for up to 2 s; returns the settings to parse its lines, if it sends lines.
+async fn listen(path: &Path, baud: u32) -> Result<Option<Vec<(String, Setting)>>, DriverError> {
+    /// Long enough for a line of a thousand numbers.
+    const LONGEST_LINE: usize = 16 << 10;
+    let raw = SerialSpec { baud, framing: Framing::Line, parse: Parse::Raw, channels: 0 };
+    let opened = tokio::time::timeout(OPENING, Serial::open(&raw, path, LONGEST_LINE)).await;
+    let mut driver = opened.unwrap_or_else(|_| Err(DriverError::Retry("it does not open".to_owned())))?;
+    let end = Instant::now() + READING;
+    let mut lines = Vec::new();
+    while lines.len() < LINES {
+        match timeout_at(end, driver.read()).await {
+            Err(_) => break,
+            Ok(reading) => lines.push(reading?.bytes.to_vec()),
+        }
+    }
+    Ok(lines_look_like(&lines))
 }
 
 #[cfg(test)]

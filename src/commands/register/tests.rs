@@ -82,10 +82,10 @@ fn the_dialogue_asks_until_the_answers_make_an_entry() {
     done.unwrap();
     for expected in [
         "  2  1209:0002  port 1-5  no serial",
-        "a number from 1 to 2",
+        "enter a number from 1 to 2",
         "\"Bad Name\" cannot be a modality's name",
-        "[device.motor_state] is an entry already",
-        "By port or any [port]: ",
+        "[device.motor_state] already exists",
+        "Identify by port or any [port]: ",
         "one of front, tip, top, bottom, none",
         "Test: ",
         "first values",
@@ -96,7 +96,7 @@ fn the_dialogue_asks_until_the_answers_make_an_entry() {
     let text = bench.text();
     assert!(text.starts_with(BUILTIN));
     let entry = "\n# Force [2J Sensor [device.evil]\n[device.force]\nvid = \"1209\"\npid = \"0002\"\nport = \"1-5\"\n\
-        node = \"serial\"\nslot = \"tip\"\nbit = 3\n\n[device.force.serial]\nparse = \"csv\"\nchannels = 2\n";
+        node = \"serial\"\nslot = \"tip\"\nbit = 3\n\n[device.force.tty]\nparse = \"csv\"\nchannels = 2\n";
     assert_eq!(text.strip_prefix(BUILTIN), Some(entry));
     assert!(bench.folder.path().join("udev/descriptors/force.yaml").exists());
     assert_eq!(Registry::parse(&text, None).unwrap().registry.devices.len(), 4);
@@ -118,11 +118,11 @@ fn without_the_last_yes_nothing_is_written() {
     }
     let (said, done) = bench.register("", &[], Some(""));
     done.unwrap();
-    assert!(said.contains("nothing is plugged in"), "{said}");
+    assert!(said.contains("No unregistered device is plugged in"), "{said}");
 }
 
 #[test]
-fn without_anybody_to_ask_what_is_missing_is_named() {
+fn non_interactive_runs_list_the_missing_fields() {
     let bench = Bench::new();
     let attached = [serial_line(Some("F1"), "1-4"), serial_line(Some("F2"), "1-5")];
     for (words, expected) in [
@@ -139,7 +139,7 @@ fn without_anybody_to_ask_what_is_missing_is_named() {
         ("--vid 1209 --pid 2 --serial F2 --name force --bit 1", "bit 1 is already taken"),
         ("--vid 1209 --pid 2 --serial F2 --name force --slot middle", "unknown slot \"middle\""),
         ("--vid 1209 --pid 2 --serial F2 --name force --node camrea", "did you mean \"camera\"?"),
-        ("--vid 1209 --pid 2 --serial F2 --name force --set serial.baudrate=9600", "unknown key \"baudrate\""),
+        ("--vid 1209 --pid 2 --serial F2 --name force --set tty.baudrate=9600", "unknown key \"baudrate\""),
         ("--vid 1209 --pid 2 --port nonsense --name force --node camera", "is not a USB port path"),
     ] {
         let error = bench.register(words, &attached, None).1.unwrap_err();
@@ -207,11 +207,11 @@ fn devices_of_rapid_driver_become_entries_or_comments() {
     assert!(!added.contains('\u{1b}'));
     for expected in [
         "# rapid_driver called it \"Force-L\".\n# rapid_driver ran on_attach: python3 force.py;  [2J rm -rf /\n[device.force_l]\n",
-        "serial_number = \"F1\"\nnode = \"serial\"\nbit = 4\n",
-        "# Not in use: how it is read is not known",
+        "serial = \"F1\"\nnode = \"serial\"\nbit = 4\n",
+        "# Not in use: its driver is unknown",
         "# [device.unknown]\n# vid = \"0001\"\n",
         "# bit = 5\n",
-        "# Not in use: it is found by mDNS (_radio._tcp), and what it speaks is not known",
+        "# Not in use: it is found by mDNS (_radio._tcp), whose protocol is unknown",
         "[device.phone.lan]\nprotocol = \"iphone\"\nmdns = \"_iphonevio._tcp\"\n",
     ] {
         assert!(added.contains(expected), "{expected:?} in {added}");

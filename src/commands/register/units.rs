@@ -1,26 +1,26 @@
-//! What is plugged in and no entry means, and what an entry for it would say.
+//! Connected units without an entry, and suggested settings for them.
 //!
-//! Pure, but for looks at sysfs that tell a hub from a device and a CAN adapter from a network card.
+//! Pure, except for reads of sysfs that distinguish hubs from devices and CAN adapters from network cards.
 
 use crate::driver::camera::{CameraInfo, Rate, Rates, Size};
 use crate::registry::edit::Setting;
 use crate::registry::scenario::{SimSource, TaskPart};
 use crate::registry::{Assigner, Assignment, Attachment, DeviceNode, PixelFormat, Registry, UsbIdentity};
 
-/// A USB device and those of its nodes that no entry reads.
+/// A USB device and its nodes that no entry reads.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Candidate {
-    /// What it says it is.
+    /// Its identity, as reported by the device.
     pub usb: UsbIdentity,
-    /// Its nodes, those with data before the USB device itself.
+    /// Its nodes, those with data first, then the USB device itself.
     pub nodes: Vec<Attachment>,
     /// Another unit of this model is plugged in or registered.
     pub has_twin: bool,
-    /// Its serial number tells it from every other unit plugged in.
+    /// Its serial number, if it is unique among connected units and printable.
     pub own_serial: Option<String>,
 }
 
-/// Units that could be registered, in the order of their ports; those that offer data first.
+/// Units that could be registered, in the order of their ports; those with data nodes first.
 #[must_use]
 pub fn unregistered(registry: Option<&Registry>, attached: &[Attachment]) -> Vec<Candidate> {
     let mut assigner = registry.map(Assigner::new);
@@ -30,10 +30,10 @@ pub fn unregistered(registry: Option<&Registry>, attached: &[Attachment]) -> Vec
         .collect();
     let mut units: Vec<Candidate> = Vec::new();
     for (at, node) in attached.iter().enumerate() {
-        // Only devices that an entry asks for are looked for on the network.
+        // On the network, only devices of entries are searched for.
         let Some(usb) = node.unit.usb() else { continue };
         let same = |other: &Attachment| other.unit.usb().is_some_and(|other| same_unit(other, usb));
-        // One entry reads one node of a kind: a second camera node of the same unit is no news.
+        // An entry reads one node of a kind: a second camera node of the same unit is ignored.
         let is_read = attached
             .iter()
             .zip(&taken)
@@ -76,13 +76,13 @@ fn is_usb(node: &DeviceNode) -> bool {
     matches!(node, DeviceNode::Usb(_))
 }
 
-/// Every hub is a USB device, and none is a sensor (USB 2.0, table 11-15: class 9).
+/// Hubs are USB devices too, but no sensors (USB 2.0, table 11-15: class 9).
 fn is_hub(node: &Attachment) -> bool {
     is_usb(&node.node)
         && std::fs::read_to_string(node.syspath.join("bDeviceClass")).is_ok_and(|class| class.trim() == "09")
 }
 
-/// The word for `node` in an entry that reads this node; `None` where only a program can.
+/// The value of `node` in an entry that reads this node; `None` if only a program can.
 #[must_use]
 pub fn kind(attachment: &Attachment) -> Option<&'static str> {
     /// `ARPHRD_CAN` of `linux/if_arp.h`.
@@ -156,12 +156,12 @@ fn camera_settings(width: u32, height: u32, fps: u32, format: &str) -> Vec<(Stri
 fn serial_settings(parse: &str, channels: usize) -> Vec<(String, Setting)> {
     let channels = i64::try_from(channels).unwrap_or(i64::MAX);
     vec![
-        ("serial.parse".to_owned(), Setting::Text(parse.to_owned())),
-        ("serial.channels".to_owned(), Setting::Whole(channels)),
+        ("tty.parse".to_owned(), Setting::Text(parse.to_owned())),
+        ("tty.channels".to_owned(), Setting::Whole(channels)),
     ]
 }
 
-/// What most rigs want: compressed pictures before others, a size near 640x480, a rate near 30.
+/// A mode that suits most rigs: compressed pictures if possible, a size near 640x480, a rate near 30 Hz.
 fn best(camera: &CameraInfo) -> Option<(u32, u32, u32, &'static str)> {
     let order = |fourcc: &str| PixelFormat::WORDS.iter().position(|(word, _)| *word == fourcc);
     let size = |size: &Size| match *size {
@@ -176,22 +176,22 @@ fn best(camera: &CameraInfo) -> Option<(u32, u32, u32, &'static str)> {
     Some((width, height, fps(rates), PixelFormat::WORDS.get(format)?.0))
 }
 
-/// The whole rate that is nearest to 30 pictures a second.
+/// The integer rate nearest to 30 Hz.
 fn fps(rates: &Rates) -> u32 {
-    const WISHED: u32 = 30;
+    const PREFERRED: u32 = 30;
     let near =
-        |rate: &Rate| (1..=1000).min_by_key(|fps| (f64::from(*fps) - rate.hz()).abs().to_bits()).unwrap_or(WISHED);
+        |rate: &Rate| (1..=1000).min_by_key(|fps| (f64::from(*fps) - rate.hz()).abs().to_bits()).unwrap_or(PREFERRED);
     match rates {
-        Rates::List(rates) => rates.iter().map(near).min_by_key(|fps| fps.abs_diff(WISHED)).unwrap_or(WISHED),
-        Rates::Range { slowest, fastest } => WISHED.clamp(near(slowest), near(fastest).max(near(slowest))),
+        Rates::List(rates) => rates.iter().map(near).min_by_key(|fps| fps.abs_diff(PREFERRED)).unwrap_or(PREFERRED),
+        Rates::Range { slowest, fastest } => PREFERRED.clamp(near(slowest), near(fastest).max(near(slowest))),
     }
 }
 
-/// How the lines that a serial device sends are read: all of them numbers with commas between, or all
-/// of them JSON; `None` if they look like neither.
+/// Settings to parse the lines of a serial device: all comma-separated numbers, or all JSON; `None` if
+/// neither.
 #[must_use]
 pub fn lines_look_like(lines: &[Vec<u8>]) -> Option<Vec<(String, Setting)>> {
-    // The first may have been cut at its beginning.
+    // The start of the first line may be missing.
     let whole: Vec<&str> = lines.iter().skip(1).filter_map(|line| std::str::from_utf8(line).ok()).collect();
     let first = whole.first()?;
     let same = |count: &dyn Fn(&str) -> Option<usize>| {

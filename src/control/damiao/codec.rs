@@ -121,7 +121,7 @@ pub fn velocity(slave: u16, dq: f64) -> Result<CanFrame, NotFinite> {
     Ok(CanFrame::standard(slave.saturating_add(VELOCITY), join(single(dq)?, [0; 4])))
 }
 
-/// What a motor may be told beside a command.
+/// Orders to a motor beside a command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Order {
     /// Turn on.

@@ -2,7 +2,7 @@
 //!
 //! Invariant: nothing is computed with them. A motor is asked for its ranges, which anybody may have
 //! changed; these are what its answer is compared with, so that a wrong `type` or a motor that was set
-//! up otherwise is told. Source: the tables of the public drivers `DM_CAN.py` and of `LeRobot`.
+//! up otherwise is reported. Source: the tables of the public drivers `DM_CAN.py` and of `LeRobot`.
 
 use super::codec::Ranges;
 use crate::registry::MotorKind;

@@ -29,7 +29,7 @@ fn a_target_is_reached_when_the_next_is_due() {
 }
 
 #[test]
-fn a_pause_says_nothing_of_the_rate_and_a_hold_ends_the_line() {
+fn a_pause_does_not_change_the_rate_and_a_hold_ends_interpolation() {
     let mut line = Interpolator::new(1);
     line.head_for(&[1.0], at(0), &[0.0], at(0));
     line.head_for(&[1.0], at(50), &[0.0], at(50));

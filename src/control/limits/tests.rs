@@ -5,7 +5,7 @@ use proptest::prelude::*;
 use super::*;
 
 #[test]
-fn what_is_beyond_the_range_is_its_end() {
+fn values_beyond_the_range_are_clamped() {
     let mut limits = Limits::new(-1.0, 2.0, 1.0);
     for (target, value, is_beyond) in [
         (0.0, 0.0, false),
@@ -35,7 +35,7 @@ fn limits_that_are_none_allow_nothing() {
 }
 
 #[test]
-fn who_is_beyond_the_range_stays_or_comes_back() {
+fn a_joint_beyond_its_range_holds_or_returns() {
     let limits = Limits::new(-1.0, 2.0, 1.0);
     for (before, wanted, next) in
         [(3.0, 4.0, 3.0), (3.0, 0.0, 2.5), (-2.0, -3.0, -2.0), (2.0, 3.0, 2.0), (0.0, 9.0, 0.5)]

@@ -17,7 +17,7 @@ use crate::time::Stamp;
 const ARM_WITHIN: Duration = Duration::from_secs(1);
 /// ...and more cycles: to read a parameter takes one, to set it another, and answers may take several.
 const ARM_CYCLES: u32 = 40;
-/// Motors that have not told their parameters after this are told of.
+/// Motors that have not reported their parameters after this are named in a notice.
 const PROBE_WITHIN: Duration = Duration::from_secs(1);
 /// For this long no other program may have commanded a motor that is armed.
 const ONE_MASTER: Duration = Duration::from_secs(1);
@@ -107,7 +107,7 @@ impl MotorBus {
         }
     }
 
-    /// Asks motors that are off for their parameters. Says whether all have told them.
+    /// Asks motors that are off for their parameters. Returns whether all have reported them.
     fn ask(&mut self) -> bool {
         for motor in &mut self.motors {
             if matches!(motor.phase, Phase::Off { .. }) && motor.is_off() {

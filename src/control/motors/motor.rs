@@ -2,11 +2,11 @@
 //!
 //! | phase    | sent each cycle                        | until                                   |
 //! |----------|----------------------------------------|-----------------------------------------|
-//! | Off      | disable, then refresh                  | it said that it is not enabled          |
+//! | Off      | disable, then refresh                  | it reported that it is not enabled      |
 //! | Asked    | read or write of a parameter, refresh  | all parameters are as they are to be    |
 //! | Probed   | refresh                                | the bus is armed                        |
 //! | Clearing | clear error, refresh                   | it reports no fault                     |
-//! | Enabling | enable, then a command to stay         | it said that it is enabled              |
+//! | Enabling | enable, then a command to stay         | it reported that it is enabled          |
 //! | On       | a command                              | the bus is disarmed, or has a fault     |
 //! | Kept     | damping, or the last command           | the bus is disarmed, or it has a fault  |
 //!
@@ -46,11 +46,11 @@ const COOLER: f64 = 5.0;
 /// See the module's comment.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Phase {
-    /// To be disabled; `told` once a frame was sent.
+    /// To be disabled; `told` is set once a frame was sent.
     Off {
         told: bool,
     },
-    /// Asked for `PROBE[at]`, or told to set it, from what it was.
+    /// Asked for `PROBE[at]`, or ordered to set it, from what it was.
     Asked {
         at: usize,
         setting: Option<Value>,
@@ -99,7 +99,7 @@ pub(super) struct Motor {
     pub(super) seen: Stamp,
     /// It came after the last sample.
     pub(super) is_new: bool,
-    /// What it said of itself since it was last told to turn off.
+    /// What it reported of itself since it was last ordered to turn off.
     pub(super) status: Option<MotorStatus>,
     /// The first frame since its last answer.
     asked: Option<Stamp>,
@@ -119,9 +119,9 @@ pub(super) struct Motor {
     differs: bool,
     /// The fault that it has latched and that was reported: an arm after that clears it.
     pub(super) named: Option<MotorStatus>,
-    /// That it does not answer was told.
+    /// That it does not answer was reported.
     pub(super) missed: bool,
-    /// It was told to turn on, or said that it is on, and has not said since it was told to turn off that
+    /// It was ordered to turn on, or reported that it is on, and has not reported since it was ordered to turn off that
     /// it is not.
     pub(super) may_be_on: bool,
 }
@@ -181,7 +181,7 @@ impl Motor {
         matches!(self.phase, Phase::Kept(_))
     }
 
-    /// It is being told to turn off for the last time.
+    /// It is being ordered to turn off for the last time.
     pub(super) const fn stop(&mut self) {
         if !matches!(self.phase, Phase::Off { told: true }) {
             self.phase = Phase::Off { told: true };
@@ -189,7 +189,7 @@ impl Motor {
         }
     }
 
-    /// It was told to turn off, and said since that it is not enabled.
+    /// It was ordered to turn off, and has since reported that it is not enabled.
     pub(super) fn is_off(&self) -> bool {
         match self.phase {
             Phase::Off { told } => told && self.status.is_some_and(|status| status != MotorStatus::Enabled),
@@ -250,7 +250,7 @@ impl Motor {
         ]
     }
 
-    /// Goes on to be enabled, once its parameters are read: faults are cleared before. Until it is, its
+    /// Enables it once its parameters are read: faults are cleared before. Until it is, its
     /// command is where it is.
     ///
     /// # Errors
@@ -294,7 +294,7 @@ impl Motor {
                 self.phase = Phase::On;
             }
         } else if self.phase == Phase::On {
-            // It waits for the others, and somebody may lean on it.
+            // It waits for the others, and a person may lean on it.
             *command = limits.slew(*command, self.bound(*command, limits), passed);
         }
         Ok(())
@@ -321,7 +321,7 @@ impl Motor {
             Phase::Off { told } => {
                 send(Order::Disable.frame(slave));
                 if !told {
-                    // What it said before is no answer to this.
+                    // An earlier report is no answer to this.
                     self.status = None;
                 }
                 self.phase = Phase::Off { told: true };

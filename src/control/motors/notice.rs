@@ -1,4 +1,4 @@
-//! What a bus of motors tells, for the log and for events; in words: `words`.
+//! Notices of a bus of motors, for the log and for events; their text: `words`.
 
 use super::fault::{Fault, Part, Strange};
 use super::words::Words;
@@ -29,7 +29,7 @@ pub enum BusState {
 /// Why motors were disabled without a fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Reason {
-    /// Somebody asked for it.
+    /// It was requested.
     Asked,
     /// No action came for too long.
     Deadman,
@@ -55,7 +55,7 @@ pub enum Refusal {
     },
 }
 
-/// What happened on a bus of motors. Each is told once when it begins, not again while it lasts.
+/// What happened on a bus of motors. Each is reported once when it begins, not again while it lasts.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Notice {
     /// All motors have answered: their state is known from now on.

@@ -93,7 +93,7 @@ fn a_motor_that_is_found_enabled_is_disabled() {
 }
 
 #[test]
-fn motors_without_power_are_waited_for_and_told_of_once() {
+fn unpowered_motors_are_awaited_and_reported_once() {
     let mut world = World::new(spec(vec![motor(1, 0x11, MIT), motor(2, 0x12, MIT)]));
     world.sims[1].silent = true;
     world.run(1000);
@@ -164,7 +164,7 @@ fn answers_that_take_several_cycles_are_understood() {
 }
 
 #[test]
-fn motors_that_share_an_id_to_answer_with_are_told_apart() {
+fn motors_with_a_shared_feedback_id_are_distinguished() {
     for masters in [[0, 0], [0x11, 0x11], [0x15, 0x16]] {
         let mut world = World::new(spec(vec![motor(5, masters[0], MIT), motor(0x16, masters[1], MIT)]));
         (world.sims[0].q, world.sims[1].q) = (0.5, -0.5);
@@ -210,7 +210,7 @@ fn frames_of_others_change_nothing_and_are_counted() {
 }
 
 #[test]
-fn notices_that_nobody_takes_are_lost_and_counted() {
+fn unread_notices_are_dropped_and_counted() {
     let mut world = World::ready();
     let order = |world: &mut World, times| {
         for _ in 0..times {

@@ -1,27 +1,35 @@
-//! A V4L2 node: opening it and the ioctls that set it up.
+//! A V4L2 node: opening it, the ioctls that set it up, and the kernel's buffers, mapped into our memory: queue, dequeue,
+//! give back.
+//!
+//! The v4l crate's streams are not used: dropping one panics when the device answers with anything
+//! but ENODEV, and its `next` queues a buffer twice after an interruption.
+//!
+//! Invariant: at most one buffer is lent; while it is, the kernel does not write into it.
 //!
 //! Invariant: the descriptor is close-on-exec; no child process keeps a camera busy.
 
 use std::ffi::c_void;
-use std::io;
-use std::mem;
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd};
 use std::path::Path;
+use std::ptr::NonNull;
+use std::{io, mem};
 
 use rustix::fs::{Mode as FileMode, OFlags};
 use v4l::v4l_sys::{
-    V4L2_CAP_DEVICE_CAPS, V4L2_CAP_STREAMING, V4L2_CAP_TIMEPERFRAME, V4L2_CAP_VIDEO_CAPTURE, V4L2_CTRL_FLAG_DISABLED,
-    V4L2_CTRL_FLAG_NEXT_CTRL, V4L2_CTRL_FLAG_READ_ONLY, v4l2_buf_type_V4L2_BUF_TYPE_VIDEO_CAPTURE, v4l2_capability,
-    v4l2_control, v4l2_ctrl_type_V4L2_CTRL_TYPE_BOOLEAN, v4l2_ctrl_type_V4L2_CTRL_TYPE_INTEGER,
+    V4L2_BUF_FLAG_ERROR, V4L2_BUF_FLAG_TIMESTAMP_MASK, V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC, V4L2_CAP_DEVICE_CAPS,
+    V4L2_CAP_STREAMING, V4L2_CAP_TIMEPERFRAME, V4L2_CAP_VIDEO_CAPTURE, V4L2_CTRL_FLAG_DISABLED,
+    V4L2_CTRL_FLAG_NEXT_CTRL, V4L2_CTRL_FLAG_READ_ONLY, v4l2_buf_type_V4L2_BUF_TYPE_VIDEO_CAPTURE, v4l2_buffer,
+    v4l2_capability, v4l2_control, v4l2_ctrl_type_V4L2_CTRL_TYPE_BOOLEAN, v4l2_ctrl_type_V4L2_CTRL_TYPE_INTEGER,
     v4l2_ctrl_type_V4L2_CTRL_TYPE_INTEGER_MENU, v4l2_ctrl_type_V4L2_CTRL_TYPE_MENU, v4l2_field_V4L2_FIELD_NONE,
-    v4l2_format, v4l2_query_ext_ctrl, v4l2_streamparm,
+    v4l2_format, v4l2_memory_V4L2_MEMORY_MMAP, v4l2_query_ext_ctrl, v4l2_requestbuffers, v4l2_streamparm,
 };
 use v4l::v4l2::{self, vidioc};
 
 use super::super::DriverError;
-use super::format::{Agreed, ControlInfo, Rate, fourcc};
+use super::format::{Agreed, ControlInfo, Frame, Rate, fourcc};
 use crate::provenance::KernelDriver;
 use crate::registry::CameraSpec;
+use crate::time::Stamp;
 
 /// `V4L2_BUF_TYPE_VIDEO_CAPTURE`.
 pub(super) const CAPTURE: u32 = v4l2_buf_type_V4L2_BUF_TYPE_VIDEO_CAPTURE;
@@ -72,7 +80,7 @@ impl Node {
         let has_own = capability.capabilities & V4L2_CAP_DEVICE_CAPS != 0;
         let able = if has_own { capability.device_caps } else { capability.capabilities };
         if able & V4L2_CAP_VIDEO_CAPTURE == 0 || able & V4L2_CAP_STREAMING == 0 {
-            // It did when hot-plug told of it. Cameras that are plugged and pulled quickly are given each other's
+            // It did when hot-plug reported it. Cameras that are plugged and pulled quickly are given each other's
             // numbers: what has this path by now is another one, and the removal of the first is on its way.
             return Err(DriverError::Retry(format!(
                 "{} does not capture pictures (a camera's second node carries metadata only): use its first node",
@@ -282,12 +290,162 @@ fn busy(path: &Path) -> DriverError {
     DriverError::Retry(format!("{shown} is held by another program: end it (`fuser {shown}` names it)"))
 }
 
+/// One lent, one being filled, two waiting: what a reader may be late by at 30 frames a second is
+/// 100 ms.
+const BUFFERS: u32 = 4;
+const MEMORY: u32 = v4l2_memory_V4L2_MEMORY_MMAP;
+
+/// A streaming node and its buffers.
+#[derive(Debug)]
+pub(super) struct Ring {
+    // Before the node: a mapping is undone before the descriptor closes.
+    buffers: Vec<Mapping>,
+    node: Node,
+    lent: Option<Lent>,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Lent {
+    index: u32,
+    bytes_used: usize,
+}
+
+impl Ring {
+    /// Asks for buffers, maps them, queues them and starts the stream.
+    pub(super) fn start(node: Node) -> io::Result<Self> {
+        let mut request =
+            v4l2_requestbuffers { count: BUFFERS, type_: CAPTURE, memory: MEMORY, ..v4l2_requestbuffers::zeroed() };
+        node.ioctl(vidioc::VIDIOC_REQBUFS, &mut request)?;
+        // With one buffer the camera would stop while it is lent.
+        if request.count < 2 {
+            return Err(io::Error::from(io::ErrorKind::OutOfMemory));
+        }
+        let mut ring = Self { buffers: Vec::new(), node, lent: None };
+        for index in 0..request.count {
+            let mut buffer = buffer(index);
+            ring.node.ioctl(vidioc::VIDIOC_QUERYBUF, &mut buffer)?;
+            ring.buffers.push(Mapping::new(&ring.node, &buffer)?);
+            ring.queue(index)?;
+        }
+        // STREAMON takes the buffer type as an int.
+        ring.node.ioctl(vidioc::VIDIOC_STREAMON, &mut CAPTURE.cast_signed())?;
+        Ok(ring)
+    }
+
+    /// Returns the lent buffer to the kernel.
+    pub(super) fn give_back(&mut self) -> io::Result<()> {
+        match self.lent.take() {
+            Some(lent) => self.queue(lent.index),
+            None => Ok(()),
+        }
+    }
+
+    /// Takes the oldest filled buffer; `WouldBlock` if there is none.
+    pub(super) fn dequeue(&mut self) -> io::Result<Frame> {
+        self.give_back()?;
+        let mut filled = buffer(0);
+        self.node.ioctl(vidioc::VIDIOC_DQBUF, &mut filled)?;
+        self.lent = Some(Lent { index: filled.index, bytes_used: filled.bytesused as usize });
+        let is_monotonic = filled.flags & V4L2_BUF_FLAG_TIMESTAMP_MASK == V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC;
+        let stamp = || {
+            let seconds = u64::try_from(filled.timestamp.tv_sec).ok()?;
+            let micros = u64::try_from(filled.timestamp.tv_usec).ok()?;
+            Some(Stamp(seconds.checked_mul(1_000_000_000)?.checked_add(micros.checked_mul(1_000)?)?))
+        };
+        Ok(Frame {
+            sequence: filled.sequence,
+            bytes_used: filled.bytesused as usize,
+            is_damaged: filled.flags & V4L2_BUF_FLAG_ERROR != 0,
+            stamp: if is_monotonic { stamp() } else { None },
+        })
+    }
+
+    /// The bytes of the lent buffer, as many as the kernel wrote.
+    pub(super) fn lent(&self) -> &[u8] {
+        let Some(lent) = self.lent else { return &[] };
+        self.buffers.get(lent.index as usize).map_or(&[], |mapping| mapping.bytes(lent.bytes_used))
+    }
+
+    pub(super) fn is_gone(&self) -> bool {
+        self.node.is_gone()
+    }
+
+    fn queue(&self, index: u32) -> io::Result<()> {
+        self.node.ioctl(vidioc::VIDIOC_QBUF, &mut buffer(index))
+    }
+}
+
+impl AsRawFd for Ring {
+    fn as_raw_fd(&self) -> RawFd {
+        self.node.as_raw_fd()
+    }
+}
+
+impl Drop for Ring {
+    fn drop(&mut self) {
+        // Refused by a node whose device is gone; nothing is left to stop then.
+        let _ = self.node.ioctl(vidioc::VIDIOC_STREAMOFF, &mut CAPTURE.cast_signed());
+    }
+}
+
+fn buffer(index: u32) -> v4l2_buffer {
+    v4l2_buffer { index, type_: CAPTURE, memory: MEMORY, ..v4l2_buffer::zeroed() }
+}
+
+/// A kernel buffer in our address space.
+#[derive(Debug)]
+struct Mapping {
+    start: NonNull<c_void>,
+    length: usize,
+}
+
+// SAFETY: the mapping is plain memory, owned by this value alone and not tied to a thread.
+unsafe impl Send for Mapping {}
+// SAFETY: a shared reference only reads the memory; the kernel writes into a buffer only while it is
+// queued, and `Ring` hands out bytes only of the one that is not.
+unsafe impl Sync for Mapping {}
+
+impl Mapping {
+    fn new(node: &Node, buffer: &v4l2_buffer) -> io::Result<Self> {
+        let length = buffer.length as usize;
+        // SAFETY: for MMAP buffers QUERYBUF fills `offset`, and any bits are a valid integer.
+        let offset = unsafe { buffer.m.offset };
+        // SAFETY: a new mapping at an address of the kernel's choice touches no memory of ours;
+        // the kernel checks length and offset against its buffer.
+        let start = unsafe {
+            v4l2::mmap(
+                std::ptr::null_mut(),
+                length,
+                libc::PROT_READ | libc::PROT_WRITE,
+                libc::MAP_SHARED,
+                node.as_raw_fd(),
+                libc::off_t::from(offset),
+            )?
+        };
+        let start = NonNull::new(start).ok_or_else(|| io::Error::from(io::ErrorKind::OutOfMemory))?;
+        Ok(Self { start, length })
+    }
+
+    fn bytes(&self, used: usize) -> &[u8] {
+        // SAFETY: `start` is a live mapping of `length` bytes until this value is dropped, the
+        // slice is no longer, and the kernel does not write into a buffer that is not queued.
+        unsafe { std::slice::from_raw_parts(self.start.cast::<u8>().as_ptr(), used.min(self.length)) }
+    }
+}
+
+impl Drop for Mapping {
+    fn drop(&mut self) {
+        // SAFETY: the mapping is ours, its slices borrow from this value and so are gone.
+        let _ = unsafe { v4l2::munmap(self.start.as_ptr(), self.length) };
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn what_to_do_next_follows_from_the_error() {
+    fn the_next_step_depends_on_the_error() {
         let path = Path::new("/dev/video7");
         let of = |errno| open_error(path, &io::Error::from_raw_os_error(errno));
         for errno in [libc::ENOENT, libc::ENODEV, libc::ENXIO] {
@@ -301,7 +459,7 @@ mod tests {
     }
 
     #[test]
-    fn a_node_that_is_not_there_is_gone_and_one_that_is_no_camera_says_so() {
+    fn a_missing_node_is_gone_and_a_non_camera_is_reported() {
         assert!(matches!(Node::open(Path::new("/dev/no-such-video")), Err(DriverError::Gone)));
         let node = Node::open(Path::new("/dev/null")).unwrap();
         assert!(!node.is_gone());

@@ -203,7 +203,7 @@ impl Tender {
     }
 
     /// Sets every line. What one is, is published before it is set otherwise and right after that, not once all are; and
-    /// what it is to be is asked anew for each, because the one before may have taken seconds. Those come first that are
+    /// the wanted state is read again for each, because the one before may have taken seconds. Those come first that are
     /// open and to be engaged.
     fn tend(&mut self) {
         let Self { lines, shared, state, guard, .. } = self;
@@ -236,7 +236,7 @@ impl Tender {
 
 impl Drop for Tender {
     fn drop(&mut self) {
-        // After a panic nobody drives them any more.
+        // After a panic no thread drives them.
         if std::thread::panicking() {
             self.shared.publish(UNKNOWN);
         }

@@ -6,7 +6,7 @@
 //! zeros, 8 bytes of data, zero. From it: `AA`, command, a byte with length (6 bits), IDE and RTR, identifier as
 //! u32, 8 bytes of data, `55`. Numbers are little endian.
 //!
-//! There is no check sum, and data may look like a head or a tail: where 16 bytes are no message, the search goes on
+//! There is no check sum, and data may look like a head or a tail: where 16 bytes are no message, the search continues
 //! one byte later.
 //!
 //! Invariant: no bytes make the decoder panic, and it holds less than one message of them.

@@ -266,7 +266,7 @@ impl Line {
 
 impl Drop for Line {
     fn drop(&mut self) {
-        // The adapter would go on filling the line for nobody. It may be gone by now.
+        // The adapter would keep filling the line without a reader. It may be gone by now.
         if matches!(self.codec, Codec::Slcan(_)) {
             let _ = self.put(slcan::Command::Close.encode().bytes());
         }

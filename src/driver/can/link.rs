@@ -22,7 +22,10 @@ use crate::driver::DriverError;
 use crate::registry::{CanAdapter, CanSpec, DeviceNode};
 use crate::time::Stamp;
 
-/// An interface that goes down tells it by an error without anything to read.
+/// What else a thread that waits for the bus can be woken by: orders from two places, and actions.
+pub const BELLS: usize = 3;
+
+/// An interface that goes down reports an error without anything to read.
 const INTEREST: Interest = Interest::READABLE.add(Interest::ERROR);
 
 /// Why a frame cannot be sent or received, by what to do next.
@@ -174,7 +177,21 @@ impl Link {
     /// [`LinkError::BusOff`] when the controller says so, after which the link may still be used; the
     /// others end the link.
     pub fn recv_until(&mut self, deadline: Stamp, frame: &mut CanFrame) -> Result<Option<Arrival>, LinkError> {
+        self.recv_unless_rung(deadline, frame, [const { None }; BELLS])
+    }
+
+    /// As [`Self::recv_until`], until one of `bells` can be read.
+    ///
+    /// # Errors
+    /// As [`Self::recv_until`].
+    pub fn recv_unless_rung(
+        &mut self,
+        deadline: Stamp,
+        frame: &mut CanFrame,
+        bells: [Option<BorrowedFd<'_>>; BELLS],
+    ) -> Result<Option<Arrival>, LinkError> {
         let mut hung_up = false;
+        let mut is_rung = false;
         loop {
             while let Some(arrival) = self.try_recv(frame)? {
                 if !frame.error {
@@ -188,26 +205,36 @@ impl Link {
                 return Err(LinkError::Gone);
             }
             let left = deadline.since(Stamp::now());
-            if left.is_zero() {
+            if is_rung || left.is_zero() {
                 return Ok(None);
             }
-            hung_up = self.wait(left)?;
+            (hung_up, is_rung) = self.wait(left, bells)?;
         }
     }
 
-    /// Waits for bytes from the adapter, or room to it where some wait. Says whether it hung up.
-    fn wait(&mut self, longest: Duration) -> Result<bool, LinkError> {
-        let mut wished = PollFlags::IN;
+    /// Waits for bytes from the adapter, for room to it where some wait, or for a bell. Returns whether the adapter hung
+    /// up, and whether a bell rang.
+    fn wait(&mut self, longest: Duration, bells: [Option<BorrowedFd<'_>>; BELLS]) -> Result<(bool, bool), LinkError> {
+        let mut interest = PollFlags::IN;
         let unsent = matches!(self, Self::Slcan(line) | Self::Damiao(line) if line.has_unsent());
-        wished.set(PollFlags::OUT, unsent);
+        interest.set(PollFlags::OUT, unsent);
         let timeout = Timespec {
             tv_sec: longest.as_secs().try_into().unwrap_or(i64::MAX),
             tv_nsec: longest.subsec_nanos().into(),
         };
-        let mut fds = [PollFd::new(self, wished)];
-        let found = match poll(&mut fds, Some(&timeout)) {
-            Ok(_) => fds[0].revents(),
-            Err(rustix::io::Errno::INTR) => PollFlags::empty(),
+        let adapter = self.as_fd();
+        // In the place of a bell that is not there the link stands again, and is asked for nothing.
+        let [first, second, third] = bells.map(|bell| match bell {
+            Some(bell) => PollFd::from_borrowed_fd(bell, PollFlags::IN),
+            None => PollFd::from_borrowed_fd(adapter, PollFlags::empty()),
+        });
+        let mut polled = [PollFd::from_borrowed_fd(adapter, interest), first, second, third];
+        let (found, is_rung) = match poll(&mut polled, Some(&timeout)) {
+            Ok(_) => {
+                let [first, rest @ ..] = &polled;
+                (first.revents(), rest.iter().any(|bell| bell.revents().contains(PollFlags::IN)))
+            }
+            Err(rustix::io::Errno::INTR) => (PollFlags::empty(), false),
             Err(error) => return Err(LinkError::Retry(format!("waiting for the bus: {error}"))),
         };
         if unsent && found.contains(PollFlags::OUT) {
@@ -216,8 +243,8 @@ impl Link {
                 Self::Socket(_) => {}
             }
         }
-        // A socket tells by POLLERR that the next read says why; only a hang-up says nothing more.
-        Ok(found.intersects(PollFlags::HUP | PollFlags::NVAL))
+        // POLLERR on a socket means that the next read returns the cause; a hang-up has no more to read.
+        Ok((found.intersects(PollFlags::HUP | PollFlags::NVAL), is_rung))
     }
 
     /// Frames that were lost before they could be received, since the last call: by the controller, by
@@ -229,7 +256,7 @@ impl Link {
         }
     }
 
-    /// Frames that the adapter took and said it did not send, since the last call.
+    /// Frames that the adapter accepted and reported as not sent, since the last call.
     pub fn take_refused(&mut self) -> u64 {
         match self {
             Self::Socket(_) => 0,

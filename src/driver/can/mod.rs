@@ -20,7 +20,7 @@ mod socket;
 use crate::registry::{CanAdapter, NodeSpec, Registry};
 
 /// Has the kernel load what CAN sockets need, if an entry needs one, so that the first plug does not wait for
-/// that. Returns at once; what is wrong is said when an adapter is opened.
+/// that. Returns at once; what is wrong is reported when an adapter is opened.
 pub fn prepare(registry: &Registry) {
     let is_socket = |node: &NodeSpec| matches!(node, NodeSpec::Can(can) if can.adapter == CanAdapter::SocketCan);
     if registry.devices.iter().any(|device| is_socket(&device.node)) {

@@ -1,9 +1,9 @@
 //! A bus of motors: its state as samples, and its commands.
 //!
-//! Thread `control` owns the adapter. It keeps the beat of the motors and runs [`MotorBus`], which decides;
-//! here, on the runtime, is only who reads its samples and passes on what it is told.
+//! Thread `control` owns the adapter. It keeps the beat of the motors, runs [`MotorBus`], which decides, and waits on the
+//! topic of actions itself; here, on the runtime, is only the reading of its samples.
 //!
-//! Invariant: whatever ends the driver, the motors are told to turn off: see `beat`.
+//! Invariant: whatever ends the driver, the motors are ordered to turn off: see `beat`.
 
 mod beat;
 mod powered;
@@ -11,7 +11,6 @@ mod tally;
 
 use std::io;
 use std::sync::Arc;
-use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
 use std::thread::JoinHandle;
 
 use tokio::sync::mpsc;
@@ -19,7 +18,7 @@ use tokio::sync::mpsc;
 use super::claim::Claim;
 use super::guard::Guard;
 use super::link::{Link, LinkError};
-use crate::action::{ActuatorNotice, Order};
+use crate::action::{ActionSource, ActuatorNotice, Order};
 use crate::control::motors::SAMPLE_VALUES;
 use crate::driver::{DriverError, Reading, unblock};
 use crate::panics::CONTROL_THREAD;
@@ -27,8 +26,7 @@ use crate::permission::Attended;
 use crate::provenance::{Format, Negotiated};
 use crate::registry::{CanSpec, DamiaoSpec, DeviceNode, MAX_MOTORS};
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
-use crate::time::Stamp;
-use beat::{Beat, Sample, Shared, Target};
+use beat::{Beat, Sample, Shared};
 use powered::Powered;
 pub use tally::Punctuality;
 
@@ -36,8 +34,6 @@ pub use tally::Punctuality;
 const SAMPLES: usize = 256;
 /// Notices that may wait, beside those that thread `control` keeps; they are read every few milliseconds.
 const NOTICES: usize = 64;
-/// Actions that may wait; they are taken every cycle.
-const TARGETS: usize = 64;
 
 /// See the module's comment.
 #[derive(Debug)]
@@ -46,8 +42,7 @@ pub struct Motors {
     hz: u32,
     axes: usize,
     samples: mpsc::Receiver<Sample>,
-    notices: mpsc::Receiver<ActuatorNotice>,
-    targets: SyncSender<Target>,
+    notices: Option<mpsc::Receiver<ActuatorNotice>>,
     shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
     payload: [u8; MAX_MOTORS * SAMPLE_VALUES * 8],
@@ -92,9 +87,8 @@ impl Motors {
         let description = format!("{}, {} motors at {} Hz", powered.description(), spec.motors.len(), spec.hz);
         let (told, samples) = mpsc::channel(SAMPLES);
         let (tell, notices) = mpsc::channel(NOTICES);
-        let (targets, asked) = sync_channel(TARGETS);
         let shared = Arc::<Shared>::default();
-        let beat = Beat::new(powered, spec, asked, told, tell, Arc::clone(&shared));
+        let beat = Beat::new(powered, spec, told, tell, Arc::clone(&shared));
         let thread = std::thread::Builder::new().name(CONTROL_THREAD.to_owned()).spawn(move || beat.run());
         let thread = thread.map_err(|error| DriverError::Retry(format!("no thread for the motors: {error}")))?;
         Ok(Self {
@@ -102,8 +96,7 @@ impl Motors {
             hz: spec.hz,
             axes: spec.motors.len(),
             samples,
-            notices,
-            targets,
+            notices: Some(notices),
             shared,
             thread: Some(thread),
             payload: [0; MAX_MOTORS * SAMPLE_VALUES * 8],
@@ -131,28 +124,19 @@ impl Motors {
         })
     }
 
-    /// Where the motors are to go: a number each, rad or rad/s, as of `tick`.
-    ///
-    /// # Errors
-    /// When there are not as many numbers as motors, or thread `control` does not take it.
-    pub fn command(&mut self, target: &[f64], tick: Stamp) -> Result<(), DriverError> {
-        if target.len() != self.axes {
-            return Err(DriverError::Retry(format!("it takes {} numbers, not {}", self.axes, target.len())));
-        }
-        self.targets.try_send(Target::new(target, tick)).map_err(|error| match error {
-            TrySendError::Full(_) => DriverError::Retry("thread `control` is behind".to_owned()),
-            TrySendError::Disconnected(_) => self.shared.reason(),
-        })
-    }
-
     /// Carries out these orders from now on. Thread `control` takes them itself: none waits for another thread.
     pub fn attend(&mut self, orders: &Arc<Attended>) {
         // They are the same for as long as the adapter is open.
         let _ = self.shared.attended.set(Arc::clone(orders));
     }
 
-    /// Lets the motors move, or stops them, with the next cycle. There is room for it however many actions
-    /// wait.
+    /// Follows these actions from now on: a number for each motor, rad or rad/s. Thread `control` waits for them itself.
+    pub fn follow(&mut self, actions: Arc<dyn ActionSource>) {
+        // As above.
+        let _ = self.shared.actions.set(actions);
+    }
+
+    /// Lets the motors move with the next cycle, or stops them at once.
     ///
     /// # Errors
     /// When thread `control` has ended.
@@ -164,9 +148,9 @@ impl Motors {
         Ok(())
     }
 
-    /// What happened since the last call.
-    pub fn take_notice(&mut self) -> Option<ActuatorNotice> {
-        self.notices.try_recv().ok()
+    /// What happens from now on; at the first call.
+    pub fn notices(&mut self) -> Option<mpsc::Receiver<ActuatorNotice>> {
+        self.notices.take()
     }
 
     /// Turns the motors off and waits until they say so, for a tenth of a second at most.
@@ -203,7 +187,7 @@ impl Motors {
     fn stop(&mut self) {
         self.shared.ask();
         if let Some(thread) = self.thread.take() {
-            // Its panic has been told by the channel that it closed.
+            // The channel that it closed has reported its panic.
             let _ = thread.join();
         }
     }

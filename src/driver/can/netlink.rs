@@ -29,7 +29,7 @@ pub struct Interface {
     pub bus_off: bool,
     /// It returns to the bus by itself after this many ms; 0 is never.
     pub restart_ms: Option<u32>,
-    /// Errors of sending and of receiving that its controller counts, where it tells.
+    /// Errors of sending and of receiving that its controller counts, where it reports them.
     pub errors: Option<(u16, u16)>,
 }
 
@@ -74,7 +74,7 @@ pub fn look(name: &str) -> Result<Interface, LinkError> {
     interface.details().map(|details| read(&details)).map_err(|error| refusal(name, &error))
 }
 
-/// The index of the interface `name`, by which it is told from a later one of that name.
+/// The index of the interface `name`, which distinguishes it from a later one of that name.
 pub(super) fn index(name: &str) -> Option<u32> {
     Some(CanInterface::open(name).ok()?.details().ok()?.index)
 }
@@ -82,7 +82,7 @@ pub(super) fn index(name: &str) -> Option<u32> {
 /// An interface that is up.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Ready {
-    /// By which it is told from a later one of the same name.
+    /// Distinguishes it from a later one of the same name.
     pub(super) index: u32,
     /// It returns from bus-off by itself.
     pub(super) restarts: bool,
@@ -103,7 +103,7 @@ pub(super) fn bring_up(name: &str, bitrate: u32) -> Result<Ready, LinkError> {
         Need::Up if stays_down(details.index) => return Err(set_down(name)),
         Need::Up => {}
         Need::Anew => {
-            tracing::warn!(interface = name, ?state.bitrate, wished = bitrate, "the interface is set up anew");
+            tracing::warn!(interface = name, ?state.bitrate, wished = bitrate, "the interface is set up again");
             interface.bring_down().map_err(|error| not_set(name, bitrate, &state, &error))?;
         }
     }

@@ -4,7 +4,7 @@
 //! `Z0`/`Z1` time stamps, `t`/`T`/`r`/`R` frames; each line ends with CR. The adapter answers CR for done, BEL for
 //! refused, `z` or `Z` and CR for a frame that was taken.
 //!
-//! A frame begins with a letter that is no hexadecimal digit: with such a letter a line begins anew, so that
+//! A frame begins with a letter that is no hexadecimal digit: with such a letter a new line begins, so that
 //! whatever stood before it costs no frame but its own.
 //!
 //! Invariant: no bytes make the decoder panic, and it holds at most [`LONGEST`] of them.
@@ -18,7 +18,7 @@ pub const LONGEST: usize = 31;
 const CR: u8 = b'\r';
 const BEL: u8 = 0x07;
 
-/// What the host tells the adapter besides frames.
+/// Commands of the host to the adapter besides frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Command {
     /// Leave the bus.

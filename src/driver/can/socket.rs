@@ -97,7 +97,7 @@ impl Socket {
         match error.raw_os_error() {
             Some(libc::EAGAIN | libc::EINTR | libc::ENOBUFS) => None,
             Some(libc::ENODEV | libc::ENXIO) => Some(LinkError::Gone),
-            // The interface went down: with its adapter, or by somebody's order.
+            // The interface went down: with its adapter, or by an operator's command.
             Some(libc::ENETDOWN) if netlink::index(&self.name) != Some(self.index) => Some(LinkError::Gone),
             Some(libc::ENETDOWN) => {
                 netlink::was_set_down(self.index);
@@ -139,7 +139,7 @@ pub(super) fn load() {
     // SAFETY: plain numbers.
     let socket = unsafe { libc::socket(libc::PF_CAN, libc::SOCK_RAW | libc::SOCK_CLOEXEC, libc::CAN_RAW) };
     if socket >= 0 {
-        // SAFETY: it was just opened, and nobody else has it.
+        // SAFETY: it was just opened and has no other owner.
         drop(unsafe { OwnedFd::from_raw_fd(socket) });
     }
 }

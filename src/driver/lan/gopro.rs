@@ -9,31 +9,35 @@
 //! The camera gives itself 172.2X.1YZ.51 and its host an address in the same network, XYZ being the last
 //! digits of its serial number.
 //!
-//! Invariant: a task speaks with the camera; whoever reads or tells it something never waits for it.
+//! What must outlive a connection to a camera, and the run, is in `gopro/SERIAL.json` in the state directory ([`Books`]):
+//! that its shutter is ours, for which episode, and which clips are still to be fetched. SERIAL is the camera's serial
+//! number; without one the name of its entry. Of a clip only the path of its note is kept: whoever moves or removes an
+//! episode with its note is not sent the clip.
+//!
+//! Invariant: a task talks to the camera; readers and senders of requests never wait for it.
 //! Invariant: however the connection or the run ends, the shutter that is ours and the clips that are to be fetched are
-//! known to whoever opens the camera next (`books`).
+//! known to whoever opens the camera next ([`Books`]).
 
 mod answer;
-mod books;
 mod camera;
 mod clip;
 
 use std::net::Ipv4Addr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use serde::{Deserialize, Serialize};
 use tokio::sync::{mpsc, watch};
 use tokio::time::sleep;
 use tokio_util::task::AbortOnDropHandle;
 
-use self::answer::State;
-use self::books::Books;
+use self::answer::{Name, State};
 use self::camera::{Camera, Pace, Told};
 use self::clip::Clip;
 use super::http;
 use super::place::{Place, Server};
 use crate::driver::{DriverError, Reading};
-use crate::folder::state_directory;
+use crate::folder::{Folder, Links, Missing, Sync, read_text, state_directory};
 use crate::sample::Encoding;
 use crate::time::Stamp;
 
@@ -183,6 +187,121 @@ pub(super) fn fuzz(bytes: &[u8]) {
         assert_eq!(clip.target().parent(), Some(std::path::Path::new("/a")), "a clip leaves its folder");
         let name = &clip.name;
         assert!(name.folder.bytes().chain(name.file.bytes()).all(|byte| byte.is_ascii_graphic() && byte != b'/'));
+    }
+}
+
+/// Some thousands of notes.
+const LARGEST: u64 = 1 << 20;
+
+/// The shutter that was started for an episode.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+struct Shutter {
+    /// The file that the episode will be.
+    episode: PathBuf,
+    before: Before,
+}
+
+/// The newest clip on the card before the shutter was started: the one that it made is another.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Before {
+    /// There was none.
+    Nothing,
+    Clip(Name),
+    /// It was not known, and why: no clip can be identified as the episode's.
+    Unknown(String),
+}
+
+/// See the module's comment.
+#[derive(Debug, Default)]
+struct Books {
+    /// `None` where there is no folder for it.
+    file: Option<PathBuf>,
+    pages: Pages,
+    is_said: bool,
+}
+
+#[derive(Debug, Default, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
+struct Pages {
+    shutter: Option<Shutter>,
+    notes: Vec<PathBuf>,
+}
+
+impl Books {
+    /// Those of the camera of this name, a plain one, below the state directory.
+    async fn open(state: Option<&Path>, name: &str) -> Self {
+        let Some(file) = state.map(|state| state.join("gopro").join(format!("{name}.json"))) else {
+            return Self::default();
+        };
+        let path = file.clone();
+        let pages = tokio::task::spawn_blocking(move || {
+            let text = read_text(&path, LARGEST).ok()?;
+            let read = serde_json::from_str(&text);
+            read.inspect_err(
+                |error| tracing::warn!(%error, "{} was not written by rapid and is replaced", path.display()),
+            )
+            .ok()
+        });
+        Self { file: Some(file), pages: pages.await.ok().flatten().unwrap_or_default(), is_said: false }
+    }
+
+    const fn shutter(&self) -> Option<&Shutter> {
+        self.pages.shutter.as_ref()
+    }
+
+    async fn set_shutter(&mut self, shutter: Option<Shutter>) {
+        if self.pages.shutter != shutter {
+            self.pages.shutter = shutter;
+            self.save().await;
+        }
+    }
+
+    /// Notes of the clips that are still to be fetched.
+    fn notes(&self) -> &[PathBuf] {
+        &self.pages.notes
+    }
+
+    async fn remember(&mut self, note: PathBuf) {
+        if !self.pages.notes.contains(&note) {
+            self.pages.notes.push(note);
+            self.save().await;
+        }
+    }
+
+    async fn forget(&mut self, note: &Path) {
+        let before = self.pages.notes.len();
+        self.pages.notes.retain(|kept| kept != note);
+        if self.pages.notes.len() != before {
+            self.save().await;
+        }
+    }
+
+    /// Is it on the disk, so that another run continues with it?
+    const fn are_kept(&self) -> bool {
+        self.file.is_some() && !self.is_said
+    }
+
+    async fn save(&mut self) {
+        let Some(file) = self.file.clone() else { return };
+        let pages = self.pages.clone();
+        let write = move || {
+            let text = serde_json::to_vec_pretty(&pages)?;
+            let folder = file.parent().unwrap_or(Path::new("."));
+            let folder = Folder::open(folder, Links::Own, Missing::All)?;
+            let name = file.file_name().unwrap_or_default();
+            if pages == Pages::default() {
+                let _ = folder.remove(name);
+                return Ok(());
+            }
+            // Whoever loses the power loses the camera, too.
+            folder.replace(name, &text, 0o600, Sync::Skip)
+        };
+        let saved = tokio::task::spawn_blocking(write).await.unwrap_or_else(|error| Err(std::io::Error::other(error)));
+        if let (Err(error), false) = (&saved, self.is_said) {
+            tracing::warn!(%error, "what the camera still has for us is known to this run alone");
+        }
+        self.is_said = saved.is_err();
     }
 }
 

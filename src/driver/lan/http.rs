@@ -8,8 +8,8 @@ use hyper::client::conn::http1;
 use hyper::header::{CONNECTION, HOST, HeaderMap, HeaderName, RANGE};
 use hyper::{Request, StatusCode};
 use hyper_util::rt::TokioIo;
-use tokio::task::JoinHandle;
 use tokio::time::timeout;
+use tokio_util::task::AbortOnDropHandle;
 
 use super::place::Server;
 use crate::driver::DriverError;
@@ -24,17 +24,8 @@ pub(super) struct Reply {
     pub(super) status: StatusCode,
     headers: HeaderMap,
     body: Incoming,
-    _connection: Connection,
-}
-
-/// The task that carries the bytes of a connection, ended with it.
-#[derive(Debug)]
-struct Connection(JoinHandle<()>);
-
-impl Drop for Connection {
-    fn drop(&mut self) {
-        self.0.abort();
-    }
+    /// The task that carries the bytes of the connection, ended with this.
+    _connection: AbortOnDropHandle<()>,
 }
 
 /// Asks for `path`, from byte `from` on if that is not 0.
@@ -50,8 +41,8 @@ pub(super) async fn get(server: &Server, path: &str, from: u64, limit: Duration)
             .handshake(TokioIo::new(stream))
             .await
             .map_err(odd)?;
-        let connection = Connection(tokio::spawn(async move {
-            // Whoever reads the body is told.
+        let connection = AbortOnDropHandle::new(tokio::spawn(async move {
+            // The reader of the body gets the error.
             let _ = connection.await;
         }));
         let mut request = Request::get(path).header(HOST, server.address.to_string()).header(CONNECTION, "close");

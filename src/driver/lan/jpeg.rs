@@ -39,7 +39,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_frame_header_tells_the_size() {
+    fn the_frame_header_gives_the_size() {
         let comment = [0xff, 0xfe, 0, 4, b'h', b'i'];
         let frame = [0xff, 0xc0, 0, 17, 8, 1, 0xe0, 2, 0x80, 3];
         let tables = [0xff, 0xc4, 0, 3, 0];

@@ -4,13 +4,12 @@
 //! an address that was found. Sockets are bound to the interface where there is one, so that a device
 //! behind an adapter is never mistaken for another with the same address elsewhere.
 //!
-//! Nobody tells that a device on the network is gone: every wait here has an end, and what is heard is
+//! Nothing reports that a device on the network is gone: every wait here has an end, and what is heard is
 //! noted in the node for whoever keeps its lease (`hotplug::lan`).
 //!
 //! Invariant: what a server sends is bounded: headers, bodies, pictures, packets, and the time they take.
 //! Invariant: only the device the entry means is listened to.
 
-mod carrier;
 mod gopro;
 mod http;
 mod iphone;
@@ -25,10 +24,10 @@ use std::time::Duration;
 use super::{DriverError, Reading};
 use crate::provenance::{Format, Negotiated};
 use crate::registry::{DeviceNode, DeviceSpec, LanFind, LanPicture, LanProtocol, LanSpec};
-use carrier::Carrier;
+use place::Carrier;
 use place::Place;
 
-/// A camera or a phone that sends nothing whole for this long is connected to anew. Six of these and the
+/// A camera or a phone that sends nothing whole for this long is reconnected. Six of these and the
 /// delays between them fit into the minute in which five restarts are allowed.
 const PATIENCE: Duration = Duration::from_secs(5);
 
@@ -83,7 +82,8 @@ impl Lan {
             }
         };
         let (description, format) = describe(lan, &at);
-        let negotiated = Negotiated { card: protocol.card(), bus: Some(at), format, ..Negotiated::default() };
+        let card = if let Protocol::Gopro(gopro) = &protocol { gopro.card() } else { None };
+        let negotiated = Negotiated { card, bus: Some(at), format, ..Negotiated::default() };
         Ok(Self { protocol, carrier: Carrier::of(node), description, negotiated })
     }
 
@@ -115,9 +115,8 @@ impl Lan {
     /// # Errors
     /// When the device does not take it.
     pub fn record(&mut self, episode: Option<std::path::PathBuf>) -> Result<(), DriverError> {
-        match &mut self.protocol {
-            Protocol::Gopro(gopro) => gopro.record(episode),
-            Protocol::Mjpeg(_) | Protocol::Udp(_) | Protocol::Iphone(_) => {}
+        if let Protocol::Gopro(gopro) = &self.protocol {
+            gopro.record(episode);
         }
         Ok(())
     }
@@ -139,16 +138,6 @@ impl Lan {
     #[must_use]
     pub fn negotiated(&self) -> Negotiated {
         self.negotiated.clone()
-    }
-}
-
-impl Protocol {
-    /// What the device says it is, if it says so.
-    fn card(&self) -> Option<String> {
-        match self {
-            Self::Gopro(gopro) => gopro.card(),
-            Self::Mjpeg(_) | Self::Udp(_) | Self::Iphone(_) => None,
-        }
     }
 }
 

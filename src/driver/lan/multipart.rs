@@ -57,7 +57,7 @@ pub(super) struct Multipart {
     head: usize,
     length: Option<usize>,
     body: Vec<u8>,
-    /// The part was told, and `body` begins anew.
+    /// The part was handed over, and `body` begins again.
     told: bool,
     largest: usize,
 }

@@ -1,14 +1,12 @@
 //! Where a device is reached: an interface, an address, or both.
 
-use std::ffi::CStr;
-use std::fmt;
-use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
+use std::{fmt, fs, io};
 
 use tokio::net::{TcpListener, TcpSocket, TcpStream};
-use tokio::time::timeout;
+use tokio::time::{Interval, MissedTickBehavior, interval, timeout};
 
 use crate::driver::DriverError;
 use crate::registry::{DeviceNode, Heard, own_side};
@@ -114,10 +112,9 @@ impl Place {
     /// The address of ours on the interface for which `wanted` is true.
     pub(super) fn own_address(&self, wanted: impl Fn(Ipv4Addr) -> bool) -> Option<Ipv4Addr> {
         let interface = self.interface.as_deref()?;
-        addresses()
-            .into_iter()
-            .find(|(name, address)| name == interface && wanted(*address))
-            .map(|(_, address)| address)
+        let of_it = if_addrs::get_if_addrs().ok()?.into_iter().filter(|own| own.name == interface);
+        let addresses = of_it.filter_map(|own| if let IpAddr::V4(address) = own.ip() { Some(address) } else { None });
+        addresses.into_iter().find(|address| wanted(*address))
     }
 
     fn socket(&self, family: IpAddr) -> io::Result<TcpSocket> {
@@ -170,30 +167,103 @@ pub(super) fn port_error(port: u16, error: &io::Error) -> DriverError {
     }
 }
 
-/// Every IPv4 address of ours, with the name of its interface.
-fn addresses() -> Vec<(String, Ipv4Addr)> {
-    let mut first: *mut libc::ifaddrs = std::ptr::null_mut();
-    // SAFETY: the pointer is written by the call, and given back below.
-    if unsafe { libc::getifaddrs(&raw mut first) } != 0 {
-        return Vec::new();
+/// How often it is looked at.
+const EVERY: Duration = Duration::from_millis(100);
+
+/// The link of a network adapter: whether a cable, or the device, is at its other end. The adapter itself stays plugged
+/// in when that goes, so nothing else reports it.
+#[derive(Debug)]
+pub(super) struct Carrier {
+    /// Of an adapter: `1` with a link (Documentation/ABI/testing/sysfs-class-net, `carrier`).
+    file: Option<PathBuf>,
+    /// Adapters that never tell are believed to have one.
+    was_up: bool,
+    beat: Interval,
+}
+
+impl Carrier {
+    /// That of the adapter at `node`, if it is one.
+    pub(super) fn of(node: &DeviceNode) -> Self {
+        let file = match node {
+            DeviceNode::Net(interface) => Some(PathBuf::from("/sys/class/net").join(interface).join("carrier")),
+            _ => None,
+        };
+        Self::watching(file)
     }
-    let mut found = Vec::new();
-    let mut next = first;
-    // SAFETY: the list is the kernel's until it is freed; its links are valid or null.
-    while let Some(entry) = unsafe { next.as_ref() } {
-        next = entry.ifa_next;
-        // SAFETY: an address is null or one of the family that it says.
-        let Some(address) = (unsafe { entry.ifa_addr.as_ref() }) else { continue };
-        if i32::from(address.sa_family) != libc::AF_INET {
-            continue;
+
+    fn watching(file: Option<PathBuf>) -> Self {
+        let mut beat = interval(EVERY);
+        beat.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        Self { file, was_up: false, beat }
+    }
+
+    /// Is it known to be down?
+    pub(super) fn is_down(&self) -> bool {
+        self.file.as_ref().is_some_and(|file| matches!(fs::read(file).as_deref(), Ok([b'0', ..])))
+    }
+
+    /// Waits until it is up, or the adapter is gone. Cancel-safe.
+    pub(super) async fn up(&mut self) {
+        let Some(file) = &self.file else { return };
+        loop {
+            self.beat.tick().await;
+            match fs::read(file) {
+                Ok(told) if told.starts_with(b"1") => return,
+                Err(error) if error.kind() == io::ErrorKind::NotFound => return,
+                // Of an interface that is down nothing is known.
+                _ => {}
+            }
         }
-        // SAFETY: of this family it is a `sockaddr_in`, which may lie unaligned; the name ends in a zero.
-        let (address, name) =
-            unsafe { (entry.ifa_addr.cast::<libc::sockaddr_in>().read_unaligned(), CStr::from_ptr(entry.ifa_name)) };
-        let address = Ipv4Addr::from(u32::from_be(address.sin_addr.s_addr));
-        found.push((name.to_string_lossy().into_owned(), address));
     }
-    // SAFETY: from getifaddrs, freed once.
-    unsafe { libc::freeifaddrs(first) };
-    found
+
+    /// Waits until it is lost, after it was there. Cancel-safe.
+    pub(super) async fn lost(&mut self) {
+        let Some(file) = &self.file else { return std::future::pending().await };
+        loop {
+            self.beat.tick().await;
+            match fs::read(file).ok().as_deref() {
+                Some([b'1', ..]) => self.was_up = true,
+                Some([b'0', ..]) if self.was_up => return,
+                // An interface that is down or gone has none to report; the latter is reported by others.
+                _ => {}
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tokio::time::timeout;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn a_link_that_is_down_is_waited_for() {
+        let file = tempfile::NamedTempFile::new().expect("file");
+        fs::write(file.path(), "0\n").expect("written");
+        let mut carrier = Carrier::watching(Some(file.path().to_owned()));
+        assert!(carrier.is_down());
+        assert!(timeout(Duration::from_millis(350), carrier.up()).await.is_err(), "it is down");
+        fs::write(file.path(), "1\n").expect("written");
+        carrier.up().await;
+        assert!(!carrier.is_down());
+        // The adapter is unplugged meanwhile.
+        fs::write(file.path(), "0\n").expect("written");
+        file.close().expect("removed");
+        carrier.up().await;
+        assert!(!carrier.is_down() && !Carrier::watching(None).is_down());
+    }
+
+    #[tokio::test]
+    async fn only_a_link_that_was_there_is_lost() {
+        let file = tempfile::NamedTempFile::new().expect("file");
+        fs::write(file.path(), "0\n").expect("written");
+        let mut carrier = Carrier::watching(Some(file.path().to_owned()));
+        assert!(timeout(Duration::from_millis(350), carrier.lost()).await.is_err(), "it never was there");
+        fs::write(file.path(), "1\n").expect("written");
+        assert!(timeout(Duration::from_millis(350), carrier.lost()).await.is_err(), "it is there");
+        fs::write(file.path(), "0\n").expect("written");
+        carrier.lost().await;
+        assert!(timeout(Duration::from_millis(350), Carrier::watching(None).lost()).await.is_err());
+    }
 }

@@ -2,7 +2,7 @@
 //! came, without its IP and UDP headers.
 //!
 //! A packet's time is the moment the kernel took it from the network (`SO_TIMESTAMPNS`, socket(7)). What
-//! the kernel had to drop because nobody read (`SO_RXQ_OVFL`), and packets larger than the entry permits,
+//! the kernel had to drop because they were not read in time (`SO_RXQ_OVFL`), and packets larger than the entry permits,
 //! are counted as lost.
 //!
 //! Invariant: nothing is allocated for a packet.
@@ -10,9 +10,10 @@
 use std::io;
 use std::mem::{size_of, zeroed};
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
-use std::os::fd::{AsRawFd, FromRawFd, OwnedFd};
+use std::os::fd::{AsRawFd, OwnedFd};
 use std::time::Duration;
 
+use rustix::net::{AddressFamily, SocketFlags, SocketType};
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 use tokio::task::coop::consume_budget;
@@ -153,42 +154,17 @@ fn stamp(kernel: Option<u64>, now: Stamp, wall: u64) -> (Stamp, u32) {
 
 fn bind(place: &Place, port: u16) -> io::Result<OwnedFd> {
     let own = SocketAddr::new(own_side(place.peer()), port);
-    let family = if own.is_ipv6() { libc::AF_INET6 } else { libc::AF_INET };
-    let kind = libc::SOCK_DGRAM | libc::SOCK_NONBLOCK | libc::SOCK_CLOEXEC;
-    // SAFETY: takes no pointers.
-    let descriptor = unsafe { libc::socket(family, kind, 0) };
-    if descriptor < 0 {
-        return Err(io::Error::last_os_error());
-    }
-    // SAFETY: just opened, and ours alone.
-    let socket = unsafe { OwnedFd::from_raw_fd(descriptor) };
+    let family = if own.is_ipv6() { AddressFamily::INET6 } else { AddressFamily::INET };
+    let flags = SocketFlags::NONBLOCK | SocketFlags::CLOEXEC;
+    let socket = rustix::net::socket_with(family, SocketType::DGRAM, flags, None)?;
     set(&socket, libc::SO_TIMESTAMPNS, 1)?;
     set(&socket, libc::SO_RXQ_OVFL, 1)?;
     set(&socket, libc::SO_RCVBUF, BACKLOG)?;
     if let Some(interface) = place.interface() {
         set_bytes(&socket, libc::SO_BINDTODEVICE, interface.as_bytes())?;
     }
-    let port = port.to_be();
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "2 and 10")]
-    let family = family as libc::sa_family_t;
-    let result = match own.ip() {
-        IpAddr::V6(own) => {
-            // SAFETY: all zeroes are a valid address.
-            let mut address: libc::sockaddr_in6 = unsafe { zeroed() };
-            (address.sin6_family, address.sin6_port, address.sin6_addr.s6_addr) = (family, port, own.octets());
-            // SAFETY: a pointer to an address of this family and size, for the call.
-            unsafe { libc::bind(descriptor, (&raw const address).cast(), length_of::<libc::sockaddr_in6>()) }
-        }
-        IpAddr::V4(own) => {
-            // SAFETY: all zeroes are a valid address.
-            let mut address: libc::sockaddr_in = unsafe { zeroed() };
-            (address.sin_family, address.sin_port) = (family, port);
-            address.sin_addr.s_addr = u32::from_ne_bytes(own.octets());
-            // SAFETY: a pointer to an address of this family and size, for the call.
-            unsafe { libc::bind(descriptor, (&raw const address).cast(), length_of::<libc::sockaddr_in>()) }
-        }
-    };
-    if result == 0 { Ok(socket) } else { Err(io::Error::last_os_error()) }
+    rustix::net::bind(&socket, &own)?;
+    Ok(socket)
 }
 
 fn length_of<T>() -> libc::socklen_t {
@@ -274,7 +250,7 @@ mod tests {
 
     /// Of UDP and of TCP.
     #[tokio::test]
-    async fn a_socket_is_bound_to_what_the_entry_says() {
+    async fn a_socket_is_bound_to_the_configured_address() {
         let (any, any_v6) = ([0; 4].into(), [0; 16].into());
         for (host, expected) in [
             ("127.0.0.1", None),

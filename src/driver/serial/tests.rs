@@ -33,7 +33,7 @@ fn le(values: &[f64]) -> Vec<u8> {
 }
 
 #[test]
-fn malformed_messages_are_counted_and_the_stream_goes_on() {
+fn malformed_messages_are_counted_and_the_stream_continues() {
     let (found, lost) = decode(
         &spec(Framing::Line, Parse::Csv, 2),
         &[b"9,9,9 first is partial\n1,2\n1\nx,y\n\xff\xfe\n3,4\n5,6\nbad\n"],
@@ -57,7 +57,7 @@ fn fixed_messages_find_their_boundary_again() {
 }
 
 #[test]
-fn errors_say_what_to_do_next() {
+fn errors_name_the_next_step() {
     let missing = open_line(Path::new("/dev/no-such-tty"), 9_600).unwrap_err();
     assert!(matches!(missing, DriverError::Gone), "{missing:?}");
     let error = |number| read_error(&std::io::Error::from_raw_os_error(number));

@@ -1,9 +1,14 @@
-//! Simulated motors: once armed, each is where it was last told to be.
+//! Simulated motors: once armed, each is at its last target.
 
 use std::sync::Arc;
 
+use tokio::sync::mpsc;
+
 use crate::action::{ActuatorNotice, Arming, Order};
 use crate::registry::MOTOR_CHANNELS;
+
+/// Notices that may wait.
+const NOTICES: usize = 16;
 
 /// See the module's comment.
 #[derive(Debug, Default)]
@@ -11,7 +16,7 @@ pub(in crate::driver) struct Joints {
     positions: Vec<f64>,
     is_armed: bool,
     has_moved: bool,
-    notice: Option<ActuatorNotice>,
+    notices: Option<mpsc::Sender<ActuatorNotice>>,
     /// Names of the emergency stops that orders are of.
     stops: Arc<[Arc<str>]>,
 }
@@ -56,14 +61,20 @@ impl Joints {
                 (Arming::Faulted, format!("{}: simulated motors are stopped", trip.text(&self.stops)))
             }
         };
-        self.notice = Some(ActuatorNotice { arming, text, is_problem: arming == Arming::Faulted });
+        if let Some(notices) = &self.notices {
+            // Without room its reader has ended.
+            let _ = notices.try_send(ActuatorNotice { arming, text, is_problem: arming == Arming::Faulted });
+        }
     }
 
-    pub(in crate::driver) fn take_notice(&mut self) -> Option<ActuatorNotice> {
-        self.notice.take()
+    /// What orders lead to from now on.
+    pub(in crate::driver) fn notices(&mut self) -> mpsc::Receiver<ActuatorNotice> {
+        let (notices, receiver) = mpsc::channel(NOTICES);
+        self.notices = Some(notices);
+        receiver
     }
 
-    /// Puts their positions in front of what else a sample says of each, once they were told any.
+    /// Puts their positions in front of the other values of each in a sample, once there was a target.
     pub(super) fn write(&self, payload: &mut [u8]) {
         if !self.has_moved {
             return;
@@ -83,13 +94,14 @@ mod tests {
     #[test]
     fn they_move_when_they_are_armed() {
         let mut joints = Joints::new(2);
+        let mut notices = joints.notices();
         let mut payload = [0; 2 * 8 * MOTOR_CHANNELS];
         let first = |payload: &[u8]| f64::from_le_bytes(payload[..8].try_into().expect("8 bytes"));
         assert!(joints.command(&[1.0, 2.0]) && !joints.command(&[1.0]));
         joints.write(&mut payload);
         assert!(first(&payload).abs() < f64::EPSILON, "not armed");
         joints.order(Order::Arm);
-        assert_eq!(joints.take_notice().map(|notice| notice.arming), Some(Arming::Armed));
+        assert_eq!(notices.try_recv().map(|notice| notice.arming), Ok(Arming::Armed));
         assert!(joints.command(&[1.0, 2.0]));
         joints.write(&mut payload);
         assert!((first(&payload) - 1.0).abs() < f64::EPSILON);
@@ -100,15 +112,17 @@ mod tests {
     }
 
     #[test]
-    fn an_emergency_stop_is_told_where_something_moved() {
+    fn an_emergency_stop_is_reported_if_something_moved() {
         let mut joints = Joints::new(1);
+        let mut notices = joints.notices();
         joints.name_stops(&["pendant".into()].into());
         let trip = Order::Emergency(crate::action::Trip { stop: 0, is_lost: true });
         joints.order(trip);
-        assert_eq!(joints.take_notice(), None);
+        assert!(notices.try_recv().is_err());
         joints.order(Order::Arm);
         joints.order(trip);
-        let notice = joints.take_notice().expect("a notice");
+        assert_eq!(notices.try_recv().map(|notice| notice.arming), Ok(Arming::Armed));
+        let notice = notices.try_recv().expect("a notice");
         assert_eq!((notice.arming, notice.is_problem), (Arming::Faulted, true));
         assert_eq!(notice.text, "emergency stop pendant lost: simulated motors are stopped");
     }

@@ -19,18 +19,10 @@ pub(super) struct Pictures {
     lit: Option<Vec<u8>>,
 }
 
-/// What is in front of a simulated camera.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Scene {
-    /// What its pictures show by themselves.
-    Usual,
-    /// A light that is switched.
-    Light,
-}
-
 impl Pictures {
-    pub(super) fn new(width: u32, height: u32, seed: u64, bytes: usize, scene: Scene) -> Result<Self, DriverError> {
-        let lit = (scene == Scene::Light).then(|| white(width, height)).transpose()?;
+    /// `has_light`: a light that is switched is in front of it.
+    pub(super) fn new(width: u32, height: u32, seed: u64, bytes: usize, has_light: bool) -> Result<Self, DriverError> {
+        let lit = has_light.then(|| white(width, height)).transpose()?;
         let picture = |index| Ok(fill(encode(width, height, seed, index)?, bytes, seed, index));
         let encoded = (0..PICTURES).map(picture).collect::<Result<_, DriverError>>()?;
         Ok(Self { width, height, seed, encoded, lit })

@@ -8,14 +8,14 @@ fn device(source: SimSource) -> Arc<SimDevice> {
 
 #[test]
 fn the_grid_does_not_drift_and_first_after_is_the_next_point() {
-    let grid = Grid { begun: Stamp(1_000), rate: 30 };
-    assert_eq!(grid.stamp(30_000_000), Stamp(1_000 + 1_000_000 * 1_000_000_000));
+    let grid = Grid::new(Stamp(1_000), 30.0);
+    assert_eq!(grid.tick(30_000_000), Stamp(1_000 + 1_000_000 * 1_000_000_000));
     for point in [0, 1, 2, 3, 29, 30, 31, 1_000_003] {
-        let stamp = grid.stamp(point);
-        assert_eq!(grid.first_after(stamp), point + 1);
-        assert_eq!(grid.first_after(Stamp(stamp.0 - 1)), point);
+        let stamp = grid.tick(point);
+        assert_eq!(first_after(grid, stamp), point + 1);
+        assert_eq!(first_after(grid, Stamp(stamp.0 - 1)), point);
     }
-    assert_eq!(grid.first_after(Stamp(0)), 0);
+    assert_eq!(first_after(grid, Stamp(0)), 0);
 }
 
 #[test]
@@ -118,7 +118,7 @@ fn impossible_pictures_are_refused() {
 }
 
 #[tokio::test]
-async fn simulated_motors_are_where_they_were_told_to_be() {
+async fn simulated_motors_reach_the_commanded_position() {
     let text = "[device.arm]\nvid = \"1d50\"\npid = \"606f\"\nnode = \"can\"\n[device.arm.can]\nprotocol = \"damiao\"\n\
                 motors = [{ name = \"a\", slave = 1, type = \"DM4310\", kp = 1, kd = 0.1, position = [-1, 1] },\n\
                           { name = \"b\", slave = 2, type = \"DM4310\", kp = 1, kd = 0.1, position = [-1, 1] }]\n";
@@ -138,7 +138,7 @@ async fn simulated_motors_are_where_they_were_told_to_be() {
 }
 
 #[tokio::test]
-async fn what_sends_bytes_sends_them_as_the_real_one_does() {
+async fn simulated_byte_streams_match_the_real_device() {
     let text = "[device.bus]\nvid = \"1d50\"\npid = \"606f\"\nnode = \"can\"\n[device.bus.can]\nprotocol = \"raw\"\n\
                 [device.lidar]\nnode = \"lan\"\n[device.lidar.lan]\nprotocol = \"udp\"\nport = 2368\nhost = \"10.0.0.9\"\n";
     let registry = crate::registry::Registry::parse(text, None).unwrap().registry;

@@ -17,8 +17,8 @@ use std::time::Duration;
 use mdns_sd::{Receiver, ResolvedService, ScopedIp, ServiceDaemon, ServiceEvent, ServiceInfo};
 use tokio::time::{MissedTickBehavior, interval};
 
-use super::super::Witness;
-use super::link::Link;
+use super::super::UnplugSource;
+use super::watch::Link;
 use super::watch::{LOOK_EVERY, Watch};
 use crate::registry::LanSpec;
 use crate::time::Stamp;
@@ -38,13 +38,7 @@ const VIO_SERVER: &str = "_vioserver._tcp.local.";
 
 /// The thread that speaks mDNS, which ends with this.
 pub(super) struct Browser {
-    daemon: Option<ServiceDaemon>,
-}
-
-impl std::fmt::Debug for Browser {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Browser").finish_non_exhaustive()
-    }
+    daemon: ServiceDaemon,
 }
 
 /// An entry that is found by a service.
@@ -85,7 +79,7 @@ impl Browser {
                 tracing::error!(%error, port, "phones are not told where to connect to");
             }
         }
-        Some(Self { daemon: Some(daemon) })
+        Some(Self { daemon })
     }
 
     /// Looks after the entries of a service.
@@ -93,7 +87,6 @@ impl Browser {
         let domain = format!("{service}.local.");
         let daemon = self.daemon.clone();
         async move {
-            let Some(daemon) = daemon else { return };
             match daemon.browse(&domain) {
                 Ok(events) => {
                     Service { domain, wanted, known: BTreeMap::new(), cut: BTreeMap::new() }.run(&daemon, events).await;
@@ -107,9 +100,7 @@ impl Browser {
 impl Drop for Browser {
     fn drop(&mut self) {
         // Says goodbye for what was announced; nobody waits for it.
-        if let Some(daemon) = self.daemon.take() {
-            let _ = daemon.shutdown();
-        }
+        let _ = self.daemon.shutdown();
     }
 }
 
@@ -191,7 +182,7 @@ impl Service {
                 address.set_port(wanted.port.unwrap_or(address.port()));
                 address
             };
-            let kept = wanted.watch.address().filter(|kept| found.addresses.iter().any(|found| at(found) == *kept));
+            let kept = wanted.watch.address.filter(|kept| found.addresses.iter().any(|found| at(found) == *kept));
             // Announcements come in parts: an address that is good enough stays.
             let Some(address) = kept.or_else(|| found.addresses.first().map(at)) else { continue };
             let Some(wanted) = self.wanted.get_mut(index) else { continue };
@@ -207,15 +198,15 @@ impl Service {
         self.known.remove(full);
         self.cut.remove(full);
         for wanted in self.wanted.iter_mut().filter(|wanted| wanted.current.as_deref() == Some(full)) {
-            let witness = wanted.witness(now);
+            let source = wanted.source(now);
             wanted.asked = None;
             // Announcements get lost in the air; what the driver hears says more.
-            if witness == Witness::Lease && wanted.watch.is_sending(wanted.watch.length(), now) {
-                tracing::debug!(device = wanted.watch.entry(), "its announcement expired, but it is heard");
+            if source == UnplugSource::Lease && wanted.watch.is_sending(wanted.watch.length, now) {
+                tracing::debug!(device = wanted.watch.entry, "its announcement expired, but it is heard");
                 continue;
             }
             wanted.current = None;
-            wanted.watch.gone(witness, now).await;
+            wanted.watch.gone(source, now).await;
         }
         self.assign(None, now).await;
     }
@@ -224,7 +215,7 @@ impl Service {
     async fn look(&mut self, now: Stamp) -> Vec<(String, Duration)> {
         let mut questions = Vec::new();
         for wanted in &mut self.wanted {
-            let length = wanted.watch.length();
+            let length = wanted.watch.length;
             let announced = wanted.current.as_ref().and_then(|full| self.known.get_key_value(full));
             if let (Some((full, found)), true) = (announced, wanted.watch.is_there()) {
                 let is_due = wanted.asked.is_none_or(|asked| now.since(asked) >= length + PAUSE);
@@ -241,7 +232,7 @@ impl Service {
                 && let Some(full) = wanted.current.take()
                 && self.known.contains_key(&full)
             {
-                self.cut.insert(full, wanted.watch.link());
+                self.cut.insert(full, wanted.watch.link.clone());
             }
         }
         let before = self.cut.len();
@@ -255,10 +246,10 @@ impl Service {
 
 impl Wanted {
     /// Who says that its device is gone: an answer that did not come, or a goodbye.
-    fn witness(&self, now: Stamp) -> Witness {
+    fn source(&self, now: Stamp) -> UnplugSource {
         match self.asked {
-            Some(asked) if now.since(asked).abs_diff(self.watch.length()) <= MARGIN => Witness::Lease,
-            _ => Witness::Goodbye,
+            Some(asked) if now.since(asked).abs_diff(self.watch.length) <= MARGIN => UnplugSource::Lease,
+            _ => UnplugSource::Goodbye,
         }
     }
 }

@@ -12,7 +12,7 @@ use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpStream, UdpSocket};
 use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
 
-use super::super::Witness;
+use super::super::UnplugSource;
 use super::watch::{LOOK_EVERY, Watch};
 use crate::registry::{Heard, Probe, own_side};
 use crate::time::Stamp;
@@ -43,12 +43,12 @@ pub(super) async fn watch(mut watch: Watch, server: SocketAddr, asked: SocketAdd
                 match answered {
                     Answer::Here => watch.found(server, None, now).await,
                     // A server that takes one connection refuses the next, while its driver has the one.
-                    Answer::Nobody if watch.is_sending(watch.length(), now) => {}
-                    Answer::Nobody => watch.gone(Witness::Lease, now).await,
+                    Answer::Nobody if watch.is_sending(watch.length, now) => {}
+                    Answer::Nobody => watch.gone(UnplugSource::Lease, now).await,
                     Answer::Silence => {}
                 }
                 let driver_has_port = probe == Probe::Udp && watch.is_there();
-                answer = Box::pin(next(watch.heard(), driver_has_port, probe, asked));
+                answer = Box::pin(next(watch.heard.clone(), driver_has_port, probe, asked));
             }
             _ = look.tick() => watch.look(Stamp::now()).await,
         }

@@ -5,8 +5,8 @@ use std::path::Path;
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 
-use super::files::hexadecimal;
 use super::{Bundle, POLICY_FILE};
+use crate::text::hexadecimal;
 
 /// The text of a valid `policy.json`: two cameras of 96x96, of which one is tactile, and an arm of
 /// four numbers; 10 DDIM steps.

@@ -1,13 +1,13 @@
 //! Tensors of a graph whose numbers lie in other files: a bundle has none, for its SHA-256 would not cover them.
 //!
-//! A tensor can stand in many places of a model: as an initializer, sparse or not, of the graph or of a subgraph,
+//! A tensor can be in many places of a model: as an initializer, sparse or not, of the graph or of a subgraph,
 //! in an attribute of a node, in a function, in what is there for training. All of them are looked at. Field numbers
 //! are those of [`onnx.proto`](https://github.com/onnx/onnx/blob/v1.20.0/onnx/onnx.proto).
 //!
 //! Invariant: what cannot be read to its end is refused: another reader might find more in it.
 //! Invariant: the work grows with the number of fields; no nesting makes it recurse.
 
-use crate::episode_format::wire::{Proto, protobuf, whole_protobuf};
+use crate::episode::wire::{Proto, protobuf, whole_protobuf};
 
 /// Largest number of a field; a reader of 32-bit keys would take a larger one for another.
 const LAST_FIELD: u64 = (1 << 29) - 1;
@@ -59,7 +59,7 @@ const OUTPUT: u64 = 2;
 
 /// Why a graph is refused.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) enum Refused {
+pub(super) enum GraphError {
     /// It is not a model of ONNX, from its beginning to its end.
     NoModel,
     /// The numbers of a tensor lie in another file.
@@ -72,16 +72,16 @@ pub(super) enum Refused {
 }
 
 /// Do all numbers of this model lie in it?
-pub(super) fn check(model: &[u8]) -> Result<(), Refused> {
+pub(super) fn check(model: &[u8]) -> Result<(), GraphError> {
     let (at, mark) = ORT_MARK;
     if model.get(at..).is_some_and(|rest| rest.starts_with(mark)) {
-        return Err(Refused::NoModel);
+        return Err(GraphError::NoModel);
     }
     let mut left: Vec<(Kind, &[u8], &[u8])> = vec![(Kind::Model, model, b"")];
     while let Some((kind, message, node)) = left.pop() {
         let node = if kind == Kind::Node { last(message, OUTPUT) } else { node };
         for field in whole_protobuf(message) {
-            let Some((number @ 1..=LAST_FIELD, value)) = field else { return Err(Refused::NoModel) };
+            let Some((number @ 1..=LAST_FIELD, value)) = field else { return Err(GraphError::NoModel) };
             let inside = PARTS.iter().find(|(whole, part, _)| (*whole, *part) == (kind, number));
             match (inside, value) {
                 (Some((_, _, part)), Proto::Bytes(bytes)) => left.push((*part, bytes, node)),
@@ -95,19 +95,19 @@ pub(super) fn check(model: &[u8]) -> Result<(), Refused> {
     Ok(())
 }
 
-/// Either the flag or the name of a file, whatever the other holds.
+/// Either the flag or the name of a file is enough.
 fn is_external(number: u64, value: Proto<'_>) -> bool {
     number == EXTERNAL_DATA || (number == DATA_LOCATION && value.number() != 0)
 }
 
-fn external(tensor: &[u8], node: &[u8]) -> Refused {
+fn external(tensor: &[u8], node: &[u8]) -> GraphError {
     let name = last(tensor, NAME);
     let name = if name.is_empty() { node } else { name };
     // `StringStringEntryProto`: key 1, value 2.
     let entries = protobuf(tensor).filter(|(number, _)| *number == EXTERNAL_DATA).map(|(_, entry)| entry.bytes());
     let location = entries.filter(|entry| last(entry, 1) == b"location").last().map(|entry| last(entry, 2));
     let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-    Refused::External { tensor: text(name), file: text(location.unwrap_or_default()) }
+    GraphError::External { tensor: text(name), file: text(location.unwrap_or_default()) }
 }
 
 /// The bytes of the last field of this number.

@@ -1,21 +1,31 @@
-//! The files of a bundle: `policy.json` and the graphs, whose bytes are what it says they are.
+//! The files of a bundle: `policy.json`, and the graphs, whose SHA-256 it gives. The program carries one bundle,
+//! `models/tactile-id` of the repository as it was when the program was built.
+//!
+//! Invariant: the hash of the bundle inside is that of the folder it was made from, so that a recording names the same
+//! policy either way.
 
 use std::fs::File;
 use std::io::{self, Read};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
 
-use super::external::{self, Refused};
-use super::inside;
-use super::parse::parse;
+use super::external::{self, GraphError};
 use super::read::Problems;
 use super::spec::{Bundle, BundleErrors, GraphFile};
+use super::validate::parse;
+use crate::text;
 
 /// The file that makes a folder a bundle.
 pub const POLICY_FILE: &str = "policy.json";
 /// It is a few kilobytes, provenance included.
 const MAX_POLICY_BYTES: u64 = 4 << 20;
+
+const POLICY: &str = include_str!("../../../models/tactile-id/policy.json");
+static ENCODER: &[u8] = include_bytes!("../../../models/tactile-id/encoder.onnx");
+static DENOISER: &[u8] = include_bytes!("../../../models/tactile-id/denoiser.onnx");
+/// Its folder, in messages and recordings.
+const LABEL: &str = "inside rapid";
 
 /// Which of the two graphs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -66,12 +76,26 @@ impl Bundle {
         problems.check()?;
         let mut bundle = Self::parse(&text, &label)?;
         folder.clone_into(&mut bundle.folder);
-        let mut problems = Problems::new(&label);
+        bundle.with_verified_graphs(&label)
+    }
+
+    /// The policy inside the program.
+    ///
+    /// # Errors
+    /// When the program was built with a policy that is none.
+    pub fn inside() -> Result<Self, BundleErrors> {
+        let mut bundle = Self::parse(POLICY, LABEL)?;
+        (bundle.folder, bundle.inside) = (PathBuf::from(LABEL), true);
+        bundle.with_verified_graphs(LABEL)
+    }
+
+    fn with_verified_graphs(self, label: &str) -> Result<Self, BundleErrors> {
+        let mut problems = Problems::new(label);
         for graph in [Graph::Encoder, Graph::Denoiser] {
-            bundle.verified(graph, &mut problems);
+            self.verified(graph, &mut problems);
         }
         problems.check()?;
-        Ok(bundle)
+        Ok(self)
     }
 
     /// Reads the text of a `policy.json`; `file` is how it is named in messages. The bundle's folder
@@ -85,11 +109,11 @@ impl Bundle {
         hasher.update(text.as_bytes());
         hasher.update(bundle.encoder.sha256.as_bytes());
         hasher.update(bundle.denoiser.sha256.as_bytes());
-        bundle.hash = hexadecimal(&hasher.finalize());
+        bundle.hash = text::hexadecimal(&hasher.finalize());
         Ok(bundle)
     }
 
-    /// The bytes of a graph: those that were hashed, whatever has become of the file since the
+    /// The bytes of a graph: those that were hashed, even if the file has changed since the
     /// bundle was loaded.
     ///
     /// # Errors
@@ -102,11 +126,11 @@ impl Bundle {
     }
 
     /// The bytes of a graph, if they are those that are meant and nothing of it lies elsewhere; empty otherwise.
-    pub(super) fn verified(&self, graph: Graph, problems: &mut Problems) -> Vec<u8> {
+    fn verified(&self, graph: Graph, problems: &mut Problems) -> Vec<u8> {
         let file = self.graph(graph);
         let mut bytes = Vec::new();
         let read = if self.inside {
-            bytes.extend_from_slice(inside::graph(graph));
+            bytes.extend_from_slice(if graph == Graph::Encoder { ENCODER } else { DENOISER });
             Ok(bytes.len())
         } else {
             open(&self.folder.join(&file.file)).and_then(|mut open| open.read_to_end(&mut bytes))
@@ -158,7 +182,7 @@ fn open(path: &Path) -> io::Result<File> {
 
 /// What is wrong with the bytes of a graph, and the fix.
 fn wrong(file: &GraphFile, bytes: &[u8]) -> Option<(String, String)> {
-    let (name, found) = (&file.file, hexadecimal(&Sha256::digest(bytes)));
+    let (name, found) = (&file.file, text::hexadecimal(&Sha256::digest(bytes)));
     if found != file.sha256 {
         let message = format!("{name} has the SHA-256 {found}, policy.json says {}", file.sha256);
         let fix = "copy the whole bundle again: this graph is not the one that belongs to it";
@@ -166,24 +190,15 @@ fn wrong(file: &GraphFile, bytes: &[u8]) -> Option<(String, String)> {
     }
     let again = format!("then write the new SHA-256 of {name} here");
     match external::check(bytes).err()? {
-        Refused::NoModel => Some((
+        GraphError::NoModel => Some((
             format!("{name} is not an ONNX model"),
             format!("export it again, as ONNX and not in onnxruntime's own format; {again}"),
         )),
-        Refused::External { tensor, file } => Some((
+        GraphError::External { tensor, file } => Some((
             format!(
                 "{name}: the numbers of tensor \"{tensor}\" lie in another file, \"{file}\", which no SHA-256 covers"
             ),
             format!("store them in the graph: onnx.save(onnx.load(\"{name}\"), \"{name}\") in Python; {again}"),
         )),
     }
-}
-
-pub(super) fn hexadecimal(bytes: &[u8]) -> String {
-    use std::fmt::Write;
-    bytes.iter().fold(String::new(), |mut text, byte| {
-        // Writing to a String does not fail.
-        let _ = write!(text, "{byte:02x}");
-        text
-    })
 }

@@ -1,23 +1,23 @@
-//! Reading JSON objects by name, with every problem noted under its key.
+//! A part of `policy.json` to a type that derives `Deserialize`, with every mistake reported under its path.
 //!
-//! A getter returns `None` both for a key that is absent and for one whose value was wrong; either
-//! has been reported, where it is one: the reader goes on, so that one look finds all problems, and
-//! the result is thrown away if there were any.
+//! serde stops at the first mistake. So that one reading reports all of them, a wrong value is replaced by the
+//! example of its key (see [`KEYS`]) and the part is read again; the result of such a reading is thrown away.
 //!
 //! Invariant: text taken from the file is shown without control characters.
 
-#![expect(clippy::option_option, reason = "`None` is a value that was wrong, `Some(None)` one that is null")]
+use std::fmt;
 
-use std::ops::{Range, RangeInclusive};
-
+use serde::Deserialize;
+use serde::de::{DeserializeOwned, Deserializer, Error as _, MapAccess, SeqAccess, Visitor};
 use serde_json::{Map, Value};
+use serde_path_to_error::Segment;
 
 use super::spec::BundleErrors;
 use crate::registry::{Diagnostic, did_you_mean};
 use crate::text;
 
-/// A file with more problems than this is not one of ours; nobody reads on.
-const MOST_PROBLEMS: usize = 500;
+/// Problems reported of one file; one with more was not written by an exporter of policies.
+const MOST_PROBLEMS: usize = 100;
 
 /// The problems found so far.
 #[derive(Debug)]
@@ -31,12 +31,17 @@ impl Problems {
         Self { file: text::plain(file).into_owned(), found: Vec::new() }
     }
 
-    /// Notes a problem of the object `entry`; of the whole file if that is empty.
+    /// Reports a problem at the path `entry`; of the whole file if that is empty.
     pub(super) fn report(&mut self, entry: &str, message: impl AsRef<str>, fix: impl AsRef<str>) {
         self.report_at((0, 0), entry, message.as_ref(), fix.as_ref());
     }
 
-    /// Notes a problem at a line and column, both from 1.
+    /// Reports that the value at the path `entry` is wrong; the fix is what to write there.
+    pub(super) fn wrong(&mut self, entry: &str, message: impl AsRef<str>) {
+        self.report(entry, message, fix_at(entry));
+    }
+
+    /// Reports a problem at a line and column, both from 1.
     pub(super) fn report_at(&mut self, (line, column): (usize, usize), entry: &str, message: &str, fix: &str) {
         if self.found.len() < MOST_PROBLEMS {
             self.found.push(Diagnostic {
@@ -50,286 +55,399 @@ impl Problems {
         }
     }
 
+    /// Reports a problem of the whole file, unless there are problems already.
+    pub(super) fn report_first(&mut self, message: &str, fix: &str) {
+        if self.found.is_empty() {
+            self.report("", message, fix);
+        }
+    }
+
     /// `Err` with all problems so far, if there are any.
     pub(super) fn check(self) -> Result<(), BundleErrors> {
         if self.found.is_empty() { Ok(()) } else { Err(BundleErrors { diagnostics: self.found }) }
     }
 }
 
-/// A key and what to write there.
-pub(super) type Key = (&'static str, &'static str);
-
-/// An object, and where it stands.
-#[derive(Debug, Clone)]
-pub(super) struct Object<'v> {
-    /// `action.limits`; empty for the file itself.
-    pub(super) entry: String,
-    map: &'v Map<String, Value>,
-    keys: &'static [Key],
+/// Reads the object `value` at the path `entry`. `None` if anything in it is wrong, and it is reported.
+pub(super) fn read<T: DeserializeOwned>(entry: &str, value: &Value, problems: &mut Problems) -> Option<T> {
+    let keys = object(entry, value, problems)?;
+    read_part(entry, "", Value::Object(keys), problems)
 }
 
-impl<'v> Object<'v> {
-    /// `value` as an object that has no other keys than `keys`.
-    pub(super) fn new(entry: String, value: &'v Value, keys: &'static [Key], problems: &mut Problems) -> Option<Self> {
-        let Value::Object(map) = value else {
-            let message = format!("must be an object, but is {}", kind(value));
-            problems.report(&entry, message, format!("write {{...}} with {}", names(keys).join(", ")));
-            return None;
+/// Reads an object whose key `tag` names the variant of `T` that its other keys describe.
+pub(super) fn read_tagged<T: DeserializeOwned>(
+    entry: &str,
+    tag: &str,
+    value: &Value,
+    problems: &mut Problems,
+) -> Option<T> {
+    let mut keys = object(entry, value, problems)?;
+    match keys.remove(tag) {
+        Some(Value::String(variant)) => {
+            // As serde tags enums by itself: in this form it keeps the path to what is wrong.
+            let tagged = Value::Object(Map::from_iter([(variant, Value::Object(keys))]));
+            return read_part(entry, tag, tagged, problems);
+        }
+        Some(_) => problems.wrong(&join(entry, tag), "must be text"),
+        None => problems.wrong(&join(entry, tag), "is missing"),
+    }
+    None
+}
+
+/// serde takes a list for a struct as well.
+fn object(entry: &str, value: &Value, problems: &mut Problems) -> Option<Map<String, Value>> {
+    let object = Map::deserialize(value);
+    object.map_err(|error| problems.wrong(entry, plain(&error.to_string()))).ok()
+}
+
+fn read_part<T: DeserializeOwned>(entry: &str, tag: &str, mut value: Value, problems: &mut Problems) -> Option<T> {
+    let mut is_whole = true;
+    while problems.found.len() < MOST_PROBLEMS {
+        let error = match serde_path_to_error::deserialize(&value) {
+            Ok(read) => return is_whole.then_some(read),
+            Err(error) => error,
         };
-        for given in map.keys().filter(|given| keys.iter().all(|(name, _)| name != given)) {
-            let fix = did_you_mean(given, &names(keys), "the keys here are");
-            problems.report(&entry, format!("unknown key \"{given}\""), fix);
+        is_whole = false;
+        let mistake = Mistake::new(entry, tag, &error);
+        problems.report(&mistake.entry, &mistake.message, &mistake.fix);
+        if mistake.repair(&mut value).is_none() {
+            break;
         }
-        Some(Self { entry, map, keys })
     }
+    None
+}
 
-    /// Where the value of `name` stands.
-    pub(super) fn path(&self, name: &str) -> String {
-        if self.entry.is_empty() { name.to_owned() } else { format!("{}.{name}", self.entry) }
-    }
+/// An error of serde, for people.
+struct Mistake {
+    /// The path of its key.
+    entry: String,
+    message: String,
+    fix: String,
+    /// From the part that is read to the key or the value.
+    path: Vec<Segment>,
+    /// A valid value of the key; `None` if there is none.
+    example: Option<Value>,
+}
 
-    pub(super) fn has(&self, name: &str) -> bool {
-        self.map.contains_key(name)
-    }
-
-    /// The value of `name`, which must be there.
-    pub(super) fn value(&self, name: &str, problems: &mut Problems) -> Option<&'v Value> {
-        let value = self.map.get(name);
-        if value.is_none() {
-            problems.report(&self.entry, format!("{name} is missing"), self.fix(name));
+impl Mistake {
+    fn new(entry: &str, tag: &str, error: &serde_path_to_error::Error<serde_json::Error>) -> Self {
+        let mut path: Vec<Segment> = error.path().iter().cloned().collect();
+        let cause = error.inner().to_string();
+        // The name that the message is about, and after it those that are known.
+        let names: Vec<&str> = cause.split('`').skip(1).step_by(2).collect();
+        let (name, known) = names.split_first().map_or(("", [].as_slice()), |(name, known)| (*name, known));
+        let mut known = known.to_vec();
+        let is_missing = cause.starts_with("missing field");
+        if is_missing {
+            path.push(Segment::Map { key: name.to_owned() });
         }
-        value
-    }
-
-    /// Notes that the value of `name` is wrong.
-    pub(super) fn report(&self, name: &str, message: &str, problems: &mut Problems) {
-        let space = if message.starts_with('[') { "" } else { " " };
-        problems.report(&self.entry, format!("{name}{space}{message}"), self.fix(name));
-    }
-
-    fn fix(&self, name: &str) -> String {
-        let what = self.keys.iter().find(|(key, _)| *key == name).map_or("", |(_, what)| what);
-        format!("write \"{name}\": {what}")
-    }
-
-    fn wrong_kind(&self, name: &str, wanted: &str, value: &Value, problems: &mut Problems) {
-        self.report(name, &format!("must be {wanted}, but is {}", kind(value)), problems);
-    }
-
-    /// The object under `name`.
-    pub(super) fn object(&self, name: &str, keys: &'static [Key], problems: &mut Problems) -> Option<Object<'v>> {
-        Object::new(self.path(name), self.value(name, problems)?, keys, problems)
-    }
-
-    /// The same where it may be null.
-    pub(super) fn object_or_null(
-        &self,
-        name: &str,
-        keys: &'static [Key],
-        problems: &mut Problems,
-    ) -> Option<Option<Object<'v>>> {
-        let value = self.value(name, problems)?;
-        if value.is_null() { Some(None) } else { Object::new(self.path(name), value, keys, problems).map(Some) }
-    }
-
-    /// The elements of the list under `name`.
-    pub(super) fn list(&self, name: &str, problems: &mut Problems) -> Option<&'v [Value]> {
-        let value = self.value(name, problems)?;
-        if let Value::Array(list) = value {
-            return Some(list);
-        }
-        self.wrong_kind(name, "a list", value, problems);
-        None
-    }
-
-    /// A text that can be shown and is not empty.
-    pub(super) fn text(&self, name: &str, problems: &mut Problems) -> Option<String> {
-        match self.value(name, problems)? {
-            Value::String(text) => match unfit(text) {
-                Some(unfit) => self.report(name, unfit, problems),
-                None => return Some(text.clone()),
-            },
-            value => self.wrong_kind(name, "text", value, problems),
-        }
-        None
-    }
-
-    /// `true` or `false`.
-    pub(super) fn flag(&self, name: &str, problems: &mut Problems) -> Option<bool> {
-        let value = self.value(name, problems)?;
-        if let Value::Bool(flag) = value {
-            return Some(*flag);
-        }
-        self.wrong_kind(name, "true or false", value, problems);
-        None
-    }
-
-    /// One of `words`.
-    pub(super) fn word<T: Copy>(&self, name: &str, words: &[(&str, T)], problems: &mut Problems) -> Option<T> {
-        let value = self.value(name, problems)?;
-        let Value::String(given) = value else {
-            self.wrong_kind(name, "text", value, problems);
-            return None;
-        };
-        let found = words.iter().find(|(word, _)| word == given).map(|(_, meaning)| *meaning);
-        if found.is_none() {
-            let known: Vec<&str> = words.iter().map(|(word, _)| *word).collect();
-            let fix = did_you_mean(given, &known, "write one of");
-            problems.report(&self.entry, format!("unknown {name} \"{given}\""), fix);
-        }
-        found
-    }
-
-    /// The same where it may be null.
-    pub(super) fn word_or_null<T: Copy>(
-        &self,
-        name: &str,
-        words: &[(&str, T)],
-        problems: &mut Problems,
-    ) -> Option<Option<T>> {
-        if self.map.get(name).is_some_and(Value::is_null) {
-            return Some(None);
-        }
-        self.word(name, words, problems).map(Some)
-    }
-
-    /// A whole number within `range`.
-    pub(super) fn integer(&self, name: &str, range: RangeInclusive<usize>, problems: &mut Problems) -> Option<usize> {
-        let value = self.value(name, problems)?;
-        let Value::Number(number) = value else {
-            self.wrong_kind(name, "a whole number", value, problems);
-            return None;
-        };
-        let found = number.as_u64().and_then(|number| usize::try_from(number).ok()).filter(|n| range.contains(n));
-        if found.is_none() {
-            let wanted = if number.is_f64() { "is no whole number".to_owned() } else { within(&range) };
-            self.report(name, &format!("= {number} {wanted}"), problems);
-        }
-        found
-    }
-
-    /// A number within `range`.
-    pub(super) fn number(&self, name: &str, range: RangeInclusive<f64>, problems: &mut Problems) -> Option<f64> {
-        let value = self.value(name, problems)?;
-        let Some(number) = value.as_f64() else {
-            self.wrong_kind(name, "a number", value, problems);
-            return None;
-        };
-        if range.contains(&number) {
-            return Some(number);
-        }
-        self.report(name, &format!("= {number} {}", within(&range)), problems);
-        None
-    }
-
-    /// `len` numbers that an f32 can hold, if their number is known.
-    pub(super) fn numbers(&self, name: &str, len: Option<usize>, problems: &mut Problems) -> Option<Vec<f32>> {
-        let list = self.list(name, problems)?;
-        let mut whole = true;
-        if let Some(len) = len.filter(|len| *len != list.len()) {
-            let dimensions = if len == 1 { "dimension" } else { "dimensions" };
-            self.report(name, &format!("has {} numbers for {len} {dimensions}", list.len()), problems);
-            whole = false;
-        }
-        let mut numbers = Vec::with_capacity(list.len());
-        for (at, value) in list.iter().enumerate() {
-            #[expect(clippy::cast_possible_truncation, reason = "what becomes infinite is refused")]
-            match value.as_f64().map(|number| number as f32) {
-                Some(number) if number.is_finite() => numbers.push(number),
-                Some(_) => {
-                    self.report(name, &format!("[{at}] = {value} is beyond the range of a 32-bit float"), problems);
-                    whole = false;
-                }
-                None => {
-                    self.report(name, &format!("[{at}] must be a number, but is {}", kind(value)), problems);
-                    whole = false;
-                }
+        let mut place = path.iter().fold(entry.to_owned(), |place, segment| match segment {
+            Segment::Seq { index } => format!("{place}[{index}]"),
+            Segment::Enum { .. } => place,
+            segment => join(&place, &segment.to_string()),
+        });
+        let key = find(&place);
+        let mut fix = key.map_or_else(|| EXPORT.to_owned(), Key::fix);
+        let mut example = key.and_then(|key| serde_json::from_str(key.example).ok());
+        let message = if is_missing {
+            "is missing".to_owned()
+        } else if cause.starts_with("unknown field") {
+            if !tag.is_empty() && place == join(entry, name) {
+                known.insert(0, tag);
             }
-        }
-        whole.then_some(numbers)
-    }
-
-    /// Texts that can be shown, none of them empty.
-    pub(super) fn texts(&self, name: &str, problems: &mut Problems) -> Option<Vec<String>> {
-        let list = self.list(name, problems)?;
-        let mut texts = Vec::with_capacity(list.len());
-        for (at, value) in list.iter().enumerate() {
-            match value {
-                Value::String(text) => match unfit(text) {
-                    Some(unfit) => self.report(name, &format!("[{at}] {unfit}"), problems),
-                    None => texts.push(text.clone()),
-                },
-                value => self.report(name, &format!("[{at}] must be text, but is {}", kind(value)), problems),
+            (fix, example) = (did_you_mean(name, &known, "the keys here are"), None);
+            "unknown key".to_owned()
+        } else if cause.starts_with("unknown variant") {
+            fix = did_you_mean(name, &known, "write one of");
+            if path.iter().all(|segment| matches!(segment, Segment::Enum { .. })) {
+                (place, example) = (join(&place, tag), None);
             }
-        }
-        (texts.len() == list.len()).then_some(texts)
+            format!("unknown value \"{name}\"")
+        } else {
+            plain(&cause)
+        };
+        Self { entry: place, message, fix, path, example }
     }
 
-    /// A list of whole numbers within `range`, `len` of them.
-    pub(super) fn integers(
-        &self,
-        name: &str,
-        len: usize,
-        range: RangeInclusive<usize>,
-        problems: &mut Problems,
-    ) -> Option<Vec<usize>> {
-        let list = self.list(name, problems)?;
-        let read = |value: &Value| value.as_u64().and_then(|number| usize::try_from(number).ok());
-        let numbers: Option<Vec<usize>> = list.iter().map(|value| read(value).filter(|n| range.contains(n))).collect();
-        let numbers = numbers.filter(|numbers| numbers.len() == len);
-        if numbers.is_none() {
-            let (least, most) = range.into_inner();
-            let wanted = if len == 1 { "a whole number".to_owned() } else { format!("{len} whole numbers") };
-            self.report(name, &format!("must be a list of {wanted} from {least} to {most}"), problems);
+    /// Removes the key from `value`, or gives it the example. `None` where that is not possible.
+    fn repair(self, value: &mut Value) -> Option<()> {
+        let mut path = self.path;
+        let last = path.pop()?;
+        let mut at = value;
+        for segment in &path {
+            at = match segment {
+                Segment::Seq { index } => at.get_mut(index)?,
+                Segment::Map { key } | Segment::Enum { variant: key } => at.get_mut(key)?,
+                Segment::Unknown => return None,
+            };
         }
-        numbers
-    }
-
-    /// `[height, width]`, or null.
-    pub(super) fn size_or_null(&self, name: &str, problems: &mut Problems) -> Option<Option<[usize; 2]>> {
-        if self.map.get(name).is_some_and(Value::is_null) {
-            return Some(None);
+        match (last, self.example) {
+            (Segment::Seq { index }, Some(example)) => {
+                let example = example.get(0).cloned().unwrap_or(example);
+                let replaced = std::mem::replace(at.get_mut(index)?, example.clone());
+                // An example that is refused itself would be refused for ever.
+                (replaced != example).then_some(())
+            }
+            (Segment::Map { key }, Some(example)) => {
+                let replaced = at.as_object_mut()?.insert(key, example.clone());
+                (replaced != Some(example)).then_some(())
+            }
+            (Segment::Map { key }, None) => at.as_object_mut()?.remove(&key).map(|_| ()),
+            _ => None,
         }
-        let size = self.integers(name, 2, 1..=super::parse::MAX_SIDE, problems)?;
-        Some(<[usize; 2]>::try_from(size).ok())
-    }
-
-    /// `[begin, end]`, end not included, not empty.
-    pub(super) fn slice(&self, name: &str, problems: &mut Problems) -> Option<Range<usize>> {
-        let ends = self.integers(name, 2, 0..=super::parse::MAX_VALUES, problems)?;
-        if ends[0] < ends[1] {
-            return Some(ends[0]..ends[1]);
-        }
-        self.report(name, &format!("= [{}, {}] is empty", ends[0], ends[1]), problems);
-        None
     }
 }
 
-pub(super) fn names(keys: &[Key]) -> Vec<&'static str> {
-    keys.iter().map(|(name, _)| *name).collect()
+/// The path `entry`, and `name` in it.
+fn join(entry: &str, name: &str) -> String {
+    let point = if entry.is_empty() || name.is_empty() { "" } else { "." };
+    format!("{entry}{point}{name}")
 }
 
-/// Why a text cannot be a name that is shown.
-fn unfit(given: &str) -> Option<&'static str> {
-    match given {
-        "" => Some("is empty"),
-        given if text::plain(given) != given => Some("holds control characters"),
-        _ => None,
+/// serde's words for a value of the wrong type or length, without those of Rust.
+fn plain(cause: &str) -> String {
+    if let Some((found, expected)) =
+        cause.strip_prefix("invalid length ").and_then(|cause| cause.split_once(", expected an array of length "))
+    {
+        return format!("has {found} entries instead of {expected}");
+    }
+    let wrong = cause.strip_prefix("invalid type: ").or_else(|| cause.strip_prefix("invalid value: "));
+    let Some((found, expected)) = wrong.and_then(|cause| cause.rsplit_once(", expected ")) else {
+        return cause.to_owned();
+    };
+    let expected = match expected {
+        "a string" => "text".to_owned(),
+        "a boolean" => "true or false".to_owned(),
+        "f64" | "f32" => "a number".to_owned(),
+        "i64" => "a whole number".to_owned(),
+        "a sequence" => "a list".to_owned(),
+        "a map" => "an object".to_owned(),
+        "unit" => "null".to_owned(),
+        expected => expected.replace("an array of length", "a list of"),
+    };
+    let found = match found {
+        "sequence" => "a list".to_owned(),
+        "map" => "an object".to_owned(),
+        found => found
+            .replace("string", "text")
+            .replace("floating point", "the decimal number")
+            .replace("integer", "the number")
+            .replace('`', ""),
+    };
+    format!("must be {expected}, but is {found}")
+}
+
+/// A value without duplicate keys: a `serde_json::Value` would silently keep the last.
+pub(super) struct Strict(pub(super) Value);
+
+impl<'de> Deserialize<'de> for Strict {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        deserializer.deserialize_any(Reader)
     }
 }
 
-fn within<T: std::fmt::Debug>(range: &RangeInclusive<T>) -> String {
-    format!("is not within {:?} and {:?}", range.start(), range.end())
+struct Reader;
+
+impl<'de> Visitor<'de> for Reader {
+    type Value = Strict;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("a JSON value")
+    }
+
+    fn visit_unit<E>(self) -> Result<Strict, E> {
+        Ok(Strict(Value::Null))
+    }
+
+    fn visit_bool<E>(self, value: bool) -> Result<Strict, E> {
+        Ok(Strict(value.into()))
+    }
+
+    fn visit_u64<E>(self, value: u64) -> Result<Strict, E> {
+        Ok(Strict(value.into()))
+    }
+
+    fn visit_i64<E>(self, value: i64) -> Result<Strict, E> {
+        Ok(Strict(value.into()))
+    }
+
+    fn visit_f64<E>(self, value: f64) -> Result<Strict, E> {
+        Ok(Strict(value.into()))
+    }
+
+    fn visit_str<E>(self, value: &str) -> Result<Strict, E> {
+        Ok(Strict(value.into()))
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<Strict, A::Error> {
+        let mut values = Vec::new();
+        while let Some(Strict(value)) = list.next_element()? {
+            values.push(value);
+        }
+        Ok(Strict(Value::Array(values)))
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut entries: A) -> Result<Strict, A::Error> {
+        let mut map = Map::new();
+        while let Some((key, Strict(value))) = entries.next_entry::<String, Strict>()? {
+            if map.contains_key(&key) {
+                return Err(A::Error::custom(format!("duplicate key \"{key}\"")));
+            }
+            map.insert(key, value);
+        }
+        Ok(Strict(Value::Object(map)))
+    }
 }
 
-fn kind(value: &Value) -> &'static str {
-    match value {
-        Value::Null => "null",
-        Value::Bool(_) => "true or false",
-        Value::Number(number) if number.is_f64() => "a decimal number",
-        Value::Number(_) => "a number",
-        Value::String(_) => "text",
-        Value::Array(_) => "a list",
-        Value::Object(_) => "an object",
+/// The fix for a path without a key here.
+const EXPORT: &str = "export the bundle again";
+
+/// A key and its value.
+#[derive(Debug, Clone, Copy)]
+struct Key {
+    /// The end of its path, without the numbers of list elements.
+    path: &'static str,
+    what: &'static str,
+    /// A value that is accepted there, as JSON.
+    example: &'static str,
+}
+
+impl Key {
+    /// What to write.
+    fn fix(&self) -> String {
+        match self.path.rsplit('.').next().unwrap_or_default() {
+            "[]" | "" => format!("write {}", self.what),
+            name => format!("write \"{name}\": {}", self.what),
+        }
+    }
+}
+
+/// The fix for the value at a path such as `observations[0].shape`.
+fn fix_at(path: &str) -> String {
+    find(path).map_or_else(|| EXPORT.to_owned(), Key::fix)
+}
+
+/// The key of the longest end of `path`.
+fn find(path: &str) -> Option<&'static Key> {
+    let path: Vec<&str> = path.split('.').collect();
+    let names = |is_element: bool| {
+        let name = |part: &&str| part.split('[').next().unwrap_or_default().to_owned();
+        let mut names: Vec<String> = path.iter().map(name).collect();
+        if is_element && path.last().is_some_and(|last| last.ends_with(']')) {
+            names.push("[]".to_owned());
+        }
+        names
+    };
+    [names(true), names(false)].iter().find_map(|names| {
+        (0..names.len()).find_map(|from| {
+            let end = names.get(from..).unwrap_or_default().join(".");
+            KEYS.iter().find(|key| key.path == end)
+        })
+    })
+}
+
+macro_rules! keys {
+    ($($path:literal: $what:literal, $example:literal;)*) => {
+        &[$(Key { path: $path, what: $what, example: $example }),*]
+    };
+}
+
+#[rustfmt::skip]
+const KEYS: &[Key] = keys! {
+    "": "an object: {\"format\": \"rapid-policy/1\", \"name\": .., ..}", "{}";
+    "format": "\"rapid-policy/1\"", "\"rapid-policy/1\"";
+    "name": "the name of the policy, as text", "\"policy\"";
+    "mask_aware": "true if it was trained with modalities left out, else false", "true";
+    "n_obs_steps": "how many observations a chunk is computed from, 1 to 64", "1";
+    "horizon": "how many actions a chunk has, 1 to 1024", "16";
+    "n_action_steps": "how many of them are executed before the next chunk, 1 to horizon - action_start", "1";
+    "action_start": "the index in a chunk of the action of the last observation's tick: n_obs_steps - 1 (LeRobot) or 0 (UMI)", "0";
+    "control_hz": "actions a second, 0.1 to 1000", "10";
+    "max_observation_age_ms": "how old an observation may be, 1 to 60000 ms", "100";
+    "observations": "a list of what the policy observes, at least one", "[]";
+    "observations.[]": "an object with key, kind, modality, required, shape and normalization", "{}";
+    "mask": "{\"input\": .., \"order\": [..], \"absent\": \"zero_embedding\"}, or null if it has no mask input", "null";
+    "action": "an object: what the policy moves", "{}";
+    "scheduler": "an object: the diffusion process, in the words of diffusers", "{}";
+    "graphs": "{\"encoder\": {\"file\": .., \"sha256\": ..}, \"denoiser\": {..}}", "{}";
+    "training": "an object with whatever is worth knowing about the training; it may be {}", "{}";
+
+    "key": "the name of the encoder's input, as text", "\"key\"";
+    "kind": "\"image\" or \"vector\"; this program knows no other", "\"image\"";
+    "modality": "the name of the device in devices.toml", "\"modality\"";
+    "required": "true if the policy must not run without it, else false", "true";
+    "shape": "[3, height, width] after resize and crop, sides from 1 to 8192; of a vector [how many numbers, 1 to 4096]", "[3, 96, 96]";
+    "color": "\"rgb\" or \"bgr\"", "\"rgb\"";
+    "resize": "[height, width] that pictures are resized to, or null", "[96, 96]";
+    "crop": "[height, width] of the middle that is kept after the resize, or null", "[96, 96]";
+    "operation": "\"diff_to_reference\" or null", "null";
+    "down_sample_steps": "1, or leave it out: observations are one tick of the control grid apart", "1";
+    "rotation": "null, or leave it out: a policy whose values are rotated does not run here", "null";
+    "observations.slice": "[begin, end] of the sample's numbers, end not included; leave it out for all of them", "[0, 1]";
+
+    "observations.normalization": "{\"mode\": \"min_max\", \"min\": [..], \"max\": [..]}, or mode \"mean_std\" or \"identity\"", "{}";
+    "mode": "\"min_max\", \"mean_std\" or \"identity\"", "\"identity\"";
+    "min": "the smallest values, one number per dimension", "[0]";
+    "max": "the largest values, one number per dimension, each above its min", "[1]";
+    "mean": "the means, one number per dimension", "[0]";
+    "std": "the standard deviations, one number per dimension, none below 0, with eps above 0", "[1]";
+    "eps": "what is added to each std, from 0 to 1; leave it out for 0", "0";
+    "action.normalization": "a list of {\"slice\": [begin, end], \"mode\": ..} that cover every value once", "[]";
+    "action.normalization.[]": "{\"slice\": [begin, end], \"mode\": ..}", "{}";
+    "normalization.slice": "[begin, end] of the action's values, end not included", "[0, 1]";
+
+    "input": "the name of the encoder's mask input", "\"mask\"";
+    "order": "the modality of each element of the mask, each once", "[]";
+    "absent": "\"zero_embedding\"", "\"zero_embedding\"";
+
+    "actuator": "the name of the device in devices.toml that is moved", "\"actuator\"";
+    "action.shape": "[how many values, 1 to 1024]", "[1]";
+    "names": "a name for each value of an action", "[\"name\"]";
+    "units": "the unit of each value of an action, \"1\" for none", "[\"1\"]";
+    "representation": "\"absolute\"", "\"absolute\"";
+    "limits": "{\"min\": [..], \"max\": [..]}, beyond which no action goes", "{}";
+    "limits.min": "the smallest values that may be executed, one number per dimension", "[0]";
+    "limits.max": "the largest values that may be executed, none below its min", "[1]";
+
+    "type": "\"DDIM\" or \"DDPM\"", "\"DDIM\"";
+    "num_train_timesteps": "steps of the forward process, 1 to 10000", "100";
+    "beta_schedule": "\"squaredcos_cap_v2\", \"linear\" or \"scaled_linear\"", "\"linear\"";
+    "beta_start": "the first beta, 0.000001 to 0.999", "0.1";
+    "beta_end": "the last beta, up to 0.999 and not below beta_start", "0.1";
+    "prediction_type": "\"epsilon\", \"sample\" or \"v_prediction\"", "\"sample\"";
+    "clip_sample": "true or false", "true";
+    "clip_sample_range": "a number, 0.000001 to 1000", "1";
+    "set_alpha_to_one": "true or false", "true";
+    "steps_offset": "a whole number from 0, small enough that no timestep reaches num_train_timesteps", "0";
+    "timestep_spacing": "\"leading\", \"trailing\" or \"linspace\"", "\"leading\"";
+    "num_inference_steps": "how many timesteps are visited, 1 to num_train_timesteps", "1";
+
+    "encoder": "{\"file\": \"encoder.onnx\", \"sha256\": ..}", "{}";
+    "denoiser": "{\"file\": \"denoiser.onnx\", \"sha256\": ..}", "{}";
+    "file": "the name of a file in the bundle's folder, without a path", "\"a\"";
+    "sha256": "the 64 hexadecimal digits that sha256sum prints for the file", "\"0000000000000000000000000000000000000000000000000000000000000000\"";
+};
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn examples_are_json() {
+        for key in KEYS {
+            serde_json::from_str::<serde_json::Value>(key.example)
+                .unwrap_or_else(|error| panic!("{}: {error}", key.path));
+        }
+    }
+
+    #[test]
+    fn the_longest_end_of_a_path_is_found() {
+        let found = |path| find(path).map(|key| key.path);
+        assert_eq!(found("action.limits.max[2]"), Some("limits.max"));
+        assert_eq!(found("observations[2].normalization.max[2]"), Some("max"));
+        assert_eq!(found("action.normalization[0]"), Some("action.normalization.[]"));
+        assert_eq!(found("observations[0].shape[1]"), Some("shape"));
+        assert_eq!(found(""), Some(""));
+        assert_eq!(found("none.of.these"), None);
     }
 }

@@ -1,4 +1,4 @@
-//! What `policy.json` says once it has been checked.
+//! The contents of `policy.json`, checked.
 //!
 //! Invariant: every number is finite and within the range its comment states; every length agrees
 //! with every other.
@@ -7,9 +7,11 @@ use std::ops::Range;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
+use super::file;
 use crate::registry::Diagnostic;
+use crate::status::What;
 
 /// A checked bundle.
 #[derive(Debug, Clone, PartialEq)]
@@ -18,13 +20,13 @@ pub struct Bundle {
     pub folder: PathBuf,
     /// It is the one inside the program.
     pub inside: bool,
-    /// SHA-256 over the bytes of `policy.json` and the hashes of both graphs as they stand in it,
+    /// SHA-256 over the bytes of `policy.json` and the hashes of both graphs as it gives them,
     /// encoder first; lower-case hexadecimal. Names in a recording what has run.
     pub hash: String,
     /// `name`: what the bundle calls itself.
     pub name: String,
-    /// `mask_aware`: trained with modalities left out, so that it can go on without one. One that
-    /// was not gains nothing from zeros in place of what is missing.
+    /// `mask_aware`: trained with modalities left out, so that it can run without one. One that
+    /// was not gains nothing from zeros in place of a missing modality.
     pub mask_aware: bool,
     /// `n_obs_steps`, To: observations a chunk is computed from, `1..=64`. Step i of To is tick
     /// k - (To - 1) + i of the control grid.
@@ -55,6 +57,21 @@ pub struct Bundle {
     pub denoiser: GraphFile,
     /// `training`: where the bundle comes from, free in form.
     pub training: serde_json::Value,
+}
+
+impl Bundle {
+    /// The event that it begins, on the onnxruntime called `library`.
+    #[must_use]
+    pub fn begins(&self, library: String, dry_run: bool) -> What {
+        What::Policy {
+            policy: self.name.clone(),
+            folder: self.folder.clone(),
+            hash: self.hash.clone(),
+            library,
+            hz: self.control_hz,
+            dry_run,
+        }
+    }
 }
 
 /// One of `observations`.
@@ -111,7 +128,7 @@ pub struct VectorSpec {
 }
 
 /// Order of the channels.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ColorOrder {
     /// Red first.
@@ -121,7 +138,7 @@ pub enum ColorOrder {
 }
 
 /// What is done to a picture before it is normalised.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Operation {
     /// `(v - ref) / 2 + 0.5`, with v and ref in 0..1; ref is the first picture of that modality in
@@ -130,26 +147,32 @@ pub enum Operation {
 }
 
 /// How numbers are mapped to the range a network was trained on, one entry per dimension.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-#[serde(tag = "mode", rename_all = "snake_case")]
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Normalization {
     /// `(v - min) / (max - min) * 2 - 1`.
     MinMax {
         /// Smallest values.
+        #[serde(deserialize_with = "file::numbers")]
         min: Vec<f32>,
         /// Largest values, each above the smallest.
+        #[serde(deserialize_with = "file::numbers")]
         max: Vec<f32>,
     },
     /// `(v - mean) / (std + eps)`.
     MeanStd {
         /// Means.
+        #[serde(deserialize_with = "file::numbers")]
         mean: Vec<f32>,
         /// Standard deviations, at least 0; with `eps` added above 0.
+        #[serde(deserialize_with = "file::numbers")]
         std: Vec<f32>,
         /// At least 0; 0 if the file gives none.
+        #[serde(default)]
         eps: f32,
     },
     /// `v`.
+    #[serde(deserialize_with = "file::no_keys")]
     Identity,
 }
 
@@ -205,20 +228,24 @@ pub struct SliceNormalization {
 
 /// `scheduler`: the diffusion process the denoiser was trained with, in the words of the
 /// `diffusers` library, and how it is run backwards.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct SchedulerSpec {
     /// `type`.
-    #[serde(rename = "type")]
+    #[serde(rename = "type", deserialize_with = "file::word")]
     pub kind: SchedulerKind,
     /// Steps of the forward process, `1..=10000`.
+    #[serde(deserialize_with = "file::whole::<_, 1, 10_000>")]
     pub num_train_timesteps: usize,
     /// How the noise grows.
+    #[serde(deserialize_with = "file::word")]
     pub beta_schedule: BetaSchedule,
     /// First beta, `1e-6..=0.999`; not used by `squaredcos_cap_v2`.
     pub beta_start: f64,
     /// Last beta, within the same and not below the first; not used by `squaredcos_cap_v2`.
     pub beta_end: f64,
     /// What the denoiser predicts.
+    #[serde(deserialize_with = "file::word")]
     pub prediction_type: PredictionType,
     /// Is the predicted clean sample clipped?
     pub clip_sample: bool,
@@ -227,15 +254,18 @@ pub struct SchedulerSpec {
     /// DDIM: is the last step's alpha 1 rather than that of timestep 0?
     pub set_alpha_to_one: bool,
     /// Added to every timestep with `leading` spacing.
+    #[serde(deserialize_with = "file::whole::<_, 0, 10_000>")]
     pub steps_offset: usize,
     /// Which timesteps are visited.
+    #[serde(deserialize_with = "file::word")]
     pub timestep_spacing: TimestepSpacing,
     /// How many are visited, `1..=num_train_timesteps`.
+    #[serde(deserialize_with = "file::whole::<_, 1, 10_000>")]
     pub num_inference_steps: usize,
 }
 
 /// How a sample is taken from one timestep to the one before.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum SchedulerKind {
     /// Deterministic (Song et al., "Denoising Diffusion Implicit Models", eta = 0).
     #[serde(rename = "DDIM")]
@@ -247,7 +277,7 @@ pub enum SchedulerKind {
 }
 
 /// How the noise of the forward process grows.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum BetaSchedule {
     /// Cosine (Nichol and Dhariwal), betas capped at 0.999.
@@ -260,7 +290,7 @@ pub enum BetaSchedule {
 }
 
 /// What a denoiser predicts.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PredictionType {
     /// The noise.
@@ -272,7 +302,7 @@ pub enum PredictionType {
 }
 
 /// Which timesteps are visited.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum TimestepSpacing {
     /// From 0 up in strides of the integer T / n.
@@ -284,11 +314,14 @@ pub enum TimestepSpacing {
 }
 
 /// One of `graphs`.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct GraphFile {
     /// `file`: its name in the bundle's folder.
+    #[serde(deserialize_with = "file::file_name")]
     pub file: String,
     /// `sha256` of its bytes, lower-case hexadecimal.
+    #[serde(deserialize_with = "file::sha256")]
     pub sha256: String,
 }
 

@@ -1,5 +1,5 @@
-//! A bundle against its files, its rig and its graphs. What the file itself says is tested in
-//! `tests/bundle.rs`.
+//! A bundle against its files, its rig and its graphs. The contents of the file are tested in
+//! `tests/library/bundle.rs`.
 
 use super::example::{POLICY, write, write_changed};
 use super::*;
@@ -13,7 +13,7 @@ fn bundle() -> Bundle {
     Bundle::parse(POLICY, "policy.json").unwrap_or_else(|errors| panic!("{errors}"))
 }
 
-fn told<T: std::fmt::Debug>(result: Result<T, BundleErrors>) -> Vec<String> {
+fn problems<T: std::fmt::Debug>(result: Result<T, BundleErrors>) -> Vec<String> {
     result.unwrap_err().diagnostics.iter().map(|found| format!("{found}").replacen("policy.json: ", "", 1)).collect()
 }
 
@@ -43,20 +43,20 @@ fn graphs_that_are_not_those_of_the_file_are_refused() {
     let bundle = write(folder.path(), ONE, TWO);
     std::fs::write(folder.path().join("encoder.onnx"), b"One").unwrap();
     std::fs::remove_file(folder.path().join("denoiser.onnx")).unwrap();
-    let errors = told(Bundle::load(folder.path()));
+    let errors = problems(Bundle::load(folder.path()));
     assert_eq!(errors.len(), 2);
     assert!(errors[0].contains("[graphs.encoder] encoder.onnx has the SHA-256 "), "{}", errors[0]);
     assert!(errors[1].contains("[graphs.denoiser] denoiser.onnx cannot be read: No such file"), "{}", errors[1]);
-    assert_eq!(told(bundle.read_graph(Graph::Encoder)).len(), 1, "changed after it was loaded");
+    assert_eq!(problems(bundle.read_graph(Graph::Encoder)).len(), 1, "changed after it was loaded");
     // Only files are read: a pipe would have us wait.
     std::fs::create_dir(folder.path().join("denoiser.onnx")).unwrap();
-    assert!(told(Bundle::load(folder.path()))[1].contains("it is not a file"));
+    assert!(problems(Bundle::load(folder.path()))[1].contains("it is not a file"));
 }
 
 #[test]
-fn a_folder_that_is_no_bundle_is_told_so() {
+fn a_folder_without_a_bundle_is_an_error_with_its_fix() {
     let folder = tempfile::tempdir().unwrap();
-    let errors = told(Bundle::load(folder.path()));
+    let errors = problems(Bundle::load(folder.path()));
     assert!(errors[0].contains("No such file"), "{}", errors[0]);
     assert!(errors[0].contains("fix: name the folder of a policy bundle"), "{}", errors[0]);
 }
@@ -73,7 +73,7 @@ fn registry(cam: &str, arm: &str) -> Registry {
 }
 
 const CAM: &str = "width = 96\nheight = 96";
-const ARM: &str = "node = \"serial\"\n[device.arm.serial]\nchannels = 4";
+const ARM: &str = "node = \"serial\"\n[device.arm.tty]\nchannels = 4";
 
 #[test]
 fn a_rig_with_all_of_it_is_accepted() {
@@ -82,7 +82,7 @@ fn a_rig_with_all_of_it_is_accepted() {
     let mut resized = bundle();
     let ObservationInput::Image(image) = &mut resized.observations[0].input else { panic!("an image") };
     image.resize = Some([96, 96]);
-    let large = registry("width = 640\nheight = 480", "node = \"serial\"\n[device.arm.serial]\nchannels = 9");
+    let large = registry("width = 640\nheight = 480", "node = \"serial\"\n[device.arm.tty]\nchannels = 9");
     resized.check_registry(&large).unwrap();
     let ObservationInput::Image(image) = &mut resized.observations[0].input else { panic!("an image") };
     (image.resize, image.crop) = (None, Some([96, 96]));
@@ -90,12 +90,12 @@ fn a_rig_with_all_of_it_is_accepted() {
 }
 
 #[test]
-fn every_difference_from_the_rig_is_told() {
+fn every_difference_from_the_rig_is_reported() {
     let mut strange = bundle();
     strange.observations[1].modality = "tactile_tpi".to_owned();
-    let serial = "node = \"serial\"\n[device.arm.serial]\nchannels = 3";
+    let serial = "node = \"serial\"\n[device.arm.tty]\nchannels = 3";
     assert_eq!(
-        told(strange.check_registry(&registry("width = 640\nheight = 480", serial))),
+        problems(strange.check_registry(&registry("width = 640\nheight = 480", serial))),
         [
             "[observations[0]] wants pictures of 96x96 (height x width), but \"cam_wrist\" gives 480x640\n    \
              fix: set width = 96 and height = 96 in devices.toml, or \"resize\": [96, 96] here",
@@ -108,26 +108,26 @@ fn every_difference_from_the_rig_is_told() {
     whole.observations[0].modality = "arm".to_owned();
     let ObservationInput::Vector(vector) = &mut whole.observations[2].input else { panic!("a vector") };
     vector.slice = None;
-    let raw = "node = \"serial\"\n[device.arm.serial]\nparse = \"raw\"";
-    let told_raw = told(whole.check_registry(&registry(CAM, raw)));
+    let raw = "node = \"serial\"\n[device.arm.tty]\nparse = \"raw\"";
+    let raw = problems(whole.check_registry(&registry(CAM, raw)));
     assert_eq!(
-        told_raw,
+        raw,
         [
-            "[observations[0]] wants pictures, but the device \"arm\" gives bytes that nobody looks into\n    \
+            "[observations[0]] wants pictures, but the device \"arm\" gives bytes without a known structure\n    \
              fix: give [device.arm] in devices.toml a device that gives pictures",
-            "[observations[2]] wants numbers, but the device \"arm\" gives bytes that nobody looks into\n    \
+            "[observations[2]] wants numbers, but the device \"arm\" gives bytes without a known structure\n    \
              fix: give [device.arm] in devices.toml a device that gives numbers",
         ]
     );
-    let five = "node = \"serial\"\n[device.arm.serial]\nchannels = 5";
-    let told_five = told(whole.check_registry(&registry(CAM, five)));
-    assert!(told_five[1].starts_with("[observations[2]] wants 4 numbers, but \"arm\" gives 5"), "{}", told_five[1]);
+    let five = "node = \"serial\"\n[device.arm.tty]\nchannels = 5";
+    let five = problems(whole.check_registry(&registry(CAM, five)));
+    assert!(five[1].starts_with("[observations[2]] wants 4 numbers, but \"arm\" gives 5"), "{}", five[1]);
 }
 
 #[test]
 fn the_actuator_must_be_there_and_take_as_many_values() {
     bundle().check_actuators(&[("other", 2), ("arm", 4)]).unwrap();
-    let one = |actuators| told(bundle().check_actuators(actuators)).remove(0);
+    let one = |actuators| problems(bundle().check_actuators(actuators)).remove(0);
     assert!(one(&[("arm", 6)]).starts_with("[action] has 4 values, but \"arm\" takes 6"));
     assert!(one(&[("arn", 4)]).ends_with("fix: did you mean \"arn\"?"));
     assert!(one(&[]).contains("fix: no device there takes actions: add motors behind a CAN adapter"));
@@ -171,7 +171,7 @@ fn graphs_as_described_are_accepted() {
 }
 
 #[test]
-fn every_difference_from_the_graphs_is_told() {
+fn every_difference_from_the_graphs_is_reported() {
     let (mut encoder, mut denoiser) = graphs();
     encoder.inputs[0].dims = vec![None, Some(3)];
     encoder.inputs[1].name = "stat".to_owned();
@@ -180,9 +180,9 @@ fn every_difference_from_the_graphs_is_told() {
     denoiser.inputs[1].element = Element::F32;
     denoiser.inputs[2].dims = vec![None, Some(200)];
     denoiser.outputs.push(tensor("extra", Element::F32, &[1]));
-    let first_lines: Vec<String> = told(bundle().check_graphs(&encoder, &denoiser))
+    let first_lines: Vec<String> = problems(bundle().check_graphs(&encoder, &denoiser))
         .iter()
-        .map(|told| told.lines().next().unwrap_or_default().to_owned())
+        .map(|problem| problem.lines().next().unwrap_or_default().to_owned())
         .collect();
     assert_eq!(
         first_lines,
@@ -200,6 +200,6 @@ fn every_difference_from_the_graphs_is_told() {
         ]
     );
     denoiser.outputs.clear();
-    let told = told(bundle().check_graphs(&graphs().0, &denoiser));
-    assert!(told.last().unwrap().contains("denoiser.onnx has no output, f32 [B, 16, 4] is expected"), "{told:?}");
+    let found = problems(bundle().check_graphs(&graphs().0, &denoiser));
+    assert!(found.last().unwrap().contains("denoiser.onnx has no output, f32 [B, 16, 4] is expected"), "{found:?}");
 }

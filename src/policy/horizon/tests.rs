@@ -35,8 +35,8 @@ fn registry() -> Registry {
     Registry::parse(&text, None).unwrap_or_else(|errors| panic!("{errors}")).registry
 }
 
-fn executor() -> Executor {
-    Executor::new(&bundle(), &registry(), WithoutMask::Hold)
+fn queue() -> ActionQueue {
+    ActionQueue::new(&bundle(), &registry(), WithoutMask::Hold)
 }
 
 #[expect(clippy::cast_precision_loss, reason = "small numbers")]
@@ -45,219 +45,219 @@ fn chunk(observed: u64) -> Vec<f32> {
 }
 
 /// The first value of the action of `tick`, or why there is none.
-fn at(executor: &mut Executor, tick: u64, situation: Situation) -> Result<f32, HoldReason> {
-    let step = executor.step(tick, situation);
+fn at(queue: &mut ActionQueue, tick: u64, situation: Situation) -> Result<f32, HoldReason> {
+    let step = queue.step(tick, situation);
     step.action.map(|action| action[0]).ok_or_else(|| step.hold.unwrap())
 }
 
-/// One tick in which whatever is asked is answered at once.
-fn lockstep(executor: &mut Executor, tick: u64, situation: Situation) -> Result<f32, HoldReason> {
-    if executor.wants_observation(tick, situation) {
-        executor.take(tick, &chunk(tick)).unwrap();
+/// One tick in which each request is answered at once.
+fn lockstep(queue: &mut ActionQueue, tick: u64, situation: Situation) -> Result<f32, HoldReason> {
+    if queue.wants_observation(tick, situation) {
+        queue.take(tick, &chunk(tick)).unwrap();
     }
-    at(executor, tick, situation)
+    at(queue, tick, situation)
 }
 
 #[test]
 fn answered_at_once_every_chunk_is_executed_for_n_action_steps() {
-    let mut executor = executor();
-    let values: Vec<f32> = (0..7).map(|tick| lockstep(&mut executor, tick, FRESH).unwrap()).collect();
+    let mut queue = queue();
+    let values: Vec<f32> = (0..7).map(|tick| lockstep(&mut queue, tick, FRESH).unwrap()).collect();
     assert_eq!(values, [1.0, 2.0, 3.0, 301.0, 302.0, 303.0, 601.0]);
-    let counts = executor.counts();
+    let counts = queue.counts();
     assert_eq!((counts.requests, counts.chunks, counts.actions, counts.holds, counts.late_chunks), (3, 3, 7, 0, 0));
 }
 
 #[test]
 fn the_old_chunk_bridges_the_time_until_the_new_one_is_there() {
-    let mut executor = executor();
-    assert!(executor.wants_observation(0, FRESH));
-    assert_eq!(at(&mut executor, 0, FRESH), Err(HoldReason::Waiting));
-    assert_eq!(executor.take(0, &chunk(0)), Ok(0), "one tick is what computing takes");
-    assert!(!executor.wants_observation(1, FRESH));
-    assert_eq!(at(&mut executor, 1, FRESH), Ok(2.0));
-    assert_eq!(at(&mut executor, 2, FRESH), Ok(3.0));
-    assert!(executor.wants_observation(3, FRESH));
-    assert_eq!(at(&mut executor, 3, FRESH), Ok(4.0), "beyond n_action_steps");
-    assert!(!executor.wants_observation(4, FRESH), "one is with the policy");
-    assert_eq!(at(&mut executor, 4, FRESH), Ok(5.0));
-    assert_eq!(executor.take(3, &chunk(3)), Ok(1), "late, and used from the action of the tick");
-    let step = executor.step(5, FRESH);
+    let mut queue = queue();
+    assert!(queue.wants_observation(0, FRESH));
+    assert_eq!(at(&mut queue, 0, FRESH), Err(HoldReason::Waiting));
+    assert_eq!(queue.take(0, &chunk(0)), Ok(0), "one tick is what computing takes");
+    assert!(!queue.wants_observation(1, FRESH));
+    assert_eq!(at(&mut queue, 1, FRESH), Ok(2.0));
+    assert_eq!(at(&mut queue, 2, FRESH), Ok(3.0));
+    assert!(queue.wants_observation(3, FRESH));
+    assert_eq!(at(&mut queue, 3, FRESH), Ok(4.0), "beyond n_action_steps");
+    assert!(!queue.wants_observation(4, FRESH), "one is with the policy");
+    assert_eq!(at(&mut queue, 4, FRESH), Ok(5.0));
+    assert_eq!(queue.take(3, &chunk(3)), Ok(1), "late, and used from the action of the tick");
+    let step = queue.step(5, FRESH);
     assert_eq!((step.action, step.index, step.chunk_age_ticks), (Some(&[303.0, 0.5][..]), Some(3), Some(2)));
-    let counts = executor.counts();
+    let counts = queue.counts();
     assert_eq!((counts.late_chunks, counts.skipped_actions, counts.holds, counts.held_ticks), (1, 1, 1, 1));
 }
 
 #[test]
-fn a_chunk_with_a_number_that_is_none_is_dropped_whole() {
+fn a_chunk_with_nan_or_infinity_is_dropped_whole() {
     for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
-        let mut executor = executor();
-        lockstep(&mut executor, 0, FRESH).unwrap();
+        let mut queue = queue();
+        lockstep(&mut queue, 0, FRESH).unwrap();
         for tick in 1..=4 {
-            if executor.wants_observation(tick, FRESH) {
+            if queue.wants_observation(tick, FRESH) {
                 let mut values = chunk(tick);
                 *values.last_mut().unwrap() = bad;
-                assert_eq!(executor.take(tick, &values), Err(Refused::NotFinite));
+                assert_eq!(queue.take(tick, &values), Err(ChunkError::NotFinite));
             }
-            assert_eq!(at(&mut executor, tick, FRESH), Ok((1 + tick) as f32), "the old one goes on");
+            assert_eq!(at(&mut queue, tick, FRESH), Ok((1 + tick) as f32), "the old one continues");
         }
-        assert_eq!(at(&mut executor, 5, FRESH), Err(HoldReason::Unusable), "as long as it lasts");
-        assert_eq!(executor.counts().not_finite_chunks, 2, "asked again at the next tick");
-        assert_eq!(lockstep(&mut executor, 6, FRESH), Ok(601.0));
+        assert_eq!(at(&mut queue, 5, FRESH), Err(HoldReason::Unusable), "as long as it lasts");
+        assert_eq!(queue.counts().not_finite_chunks, 2, "asked again at the next tick");
+        assert_eq!(lockstep(&mut queue, 6, FRESH), Ok(601.0));
     }
 }
 
 #[test]
 fn a_chunk_of_another_length_or_tick_is_not_used() {
-    let mut executor = executor();
-    assert_eq!(executor.take(0, &chunk(0)), Err(Refused::Unasked));
-    assert!(executor.wants_observation(0, FRESH));
-    assert_eq!(executor.take(7, &chunk(7)), Err(Refused::Unasked));
-    assert_eq!(executor.in_flight(), Some(0));
-    assert_eq!(executor.take(0, &chunk(0)[1..]), Err(Refused::Length));
-    assert_eq!(executor.in_flight(), None);
-    let counts = executor.counts();
+    let mut queue = queue();
+    assert_eq!(queue.take(0, &chunk(0)), Err(ChunkError::Unasked));
+    assert!(queue.wants_observation(0, FRESH));
+    assert_eq!(queue.take(7, &chunk(7)), Err(ChunkError::Unasked));
+    assert_eq!(queue.in_flight, Some(0));
+    assert_eq!(queue.take(0, &chunk(0)[1..]), Err(ChunkError::Length));
+    assert_eq!(queue.in_flight, None);
+    let counts = queue.counts();
     assert_eq!((counts.unasked_chunks, counts.wrong_length_chunks, counts.chunks), (2, 1, 0));
 }
 
 #[test]
 fn a_request_that_fails_is_made_again() {
-    let mut executor = executor();
-    assert!(executor.wants_observation(0, FRESH));
-    executor.failed(1);
-    assert!(!executor.wants_observation(0, FRESH));
-    executor.failed(0);
-    assert_eq!(at(&mut executor, 0, FRESH), Err(HoldReason::Unusable));
-    assert_eq!(lockstep(&mut executor, 1, FRESH), Ok(101.0));
-    assert_eq!(executor.counts().failed_requests, 1);
+    let mut queue = queue();
+    assert!(queue.wants_observation(0, FRESH));
+    queue.failed(1);
+    assert!(!queue.wants_observation(0, FRESH));
+    queue.failed(0);
+    assert_eq!(at(&mut queue, 0, FRESH), Err(HoldReason::Unusable));
+    assert_eq!(lockstep(&mut queue, 1, FRESH), Ok(101.0));
+    assert_eq!(queue.counts().failed_requests, 1);
 }
 
 #[test]
 fn a_chunk_of_which_no_action_is_left_is_dropped() {
-    let mut executor = executor();
-    assert!(executor.wants_observation(0, FRESH));
+    let mut queue = queue();
+    assert!(queue.wants_observation(0, FRESH));
     for tick in 0..5 {
-        assert_eq!(at(&mut executor, tick, FRESH), Err(HoldReason::Waiting));
+        assert_eq!(at(&mut queue, tick, FRESH), Err(HoldReason::Waiting));
     }
-    assert_eq!(executor.take(0, &chunk(0)), Err(Refused::Expired));
-    assert_eq!(executor.counts().expired_chunks, 1);
+    assert_eq!(queue.take(0, &chunk(0)), Err(ChunkError::Expired));
+    assert_eq!(queue.counts().expired_chunks, 1);
     // With one tick less its last action would have been executed.
-    let mut executor = self::executor();
-    assert!(executor.wants_observation(0, FRESH));
+    let mut queue = self::queue();
+    assert!(queue.wants_observation(0, FRESH));
     for tick in 0..4 {
-        assert_eq!(at(&mut executor, tick, FRESH), Err(HoldReason::Waiting));
+        assert_eq!(at(&mut queue, tick, FRESH), Err(HoldReason::Waiting));
     }
-    assert_eq!(executor.take(0, &chunk(0)), Ok(3));
-    assert_eq!(at(&mut executor, 4, FRESH), Ok(5.0));
-    assert_eq!(executor.counts().skipped_actions, 3);
+    assert_eq!(queue.take(0, &chunk(0)), Ok(3));
+    assert_eq!(at(&mut queue, 4, FRESH), Ok(5.0));
+    assert_eq!(queue.counts().skipped_actions, 3);
 }
 
 #[test]
-fn values_beyond_the_limits_are_executed_at_the_limits_and_told_once_a_chunk() {
-    let mut executor = executor();
+fn values_beyond_the_limits_are_clamped_and_reported_once_a_chunk() {
+    let mut queue = queue();
     for tick in [0, 3] {
-        assert!(executor.wants_observation(tick, FRESH));
+        assert!(queue.wants_observation(tick, FRESH));
         let mut values = chunk(tick);
         values[3] = 1.5;
         values[4] = -7.0;
-        executor.take(tick, &values).unwrap();
-        let step = executor.step(tick, FRESH);
+        queue.take(tick, &values).unwrap();
+        let step = queue.step(tick, FRESH);
         assert_eq!((step.action.unwrap()[1], step.clamped_is_news), (1.0, true));
-        let step = executor.step(tick + 1, FRESH);
+        let step = queue.step(tick + 1, FRESH);
         assert_eq!((step.action, step.clamped_is_news), (Some(&[0.0, 0.5][..]), false));
-        let step = executor.step(tick + 2, FRESH);
+        let step = queue.step(tick + 2, FRESH);
         assert_eq!((step.action.unwrap()[1], step.clamped_is_news), (0.5, false));
     }
-    assert_eq!(executor.counts().clamped_actions, 4);
+    assert_eq!(queue.counts().clamped_actions, 4);
 }
 
 #[test]
-fn of_an_old_observation_no_chunk_is_asked_for() {
-    let mut executor = executor();
-    lockstep(&mut executor, 0, FRESH).unwrap();
+fn an_old_observation_requests_no_chunk() {
+    let mut queue = queue();
+    lockstep(&mut queue, 0, FRESH).unwrap();
     for tick in 1..=4 {
-        assert_eq!(lockstep(&mut executor, tick, OLD), Ok((1 + tick) as f32), "the chunk there is goes on");
+        assert_eq!(lockstep(&mut queue, tick, OLD), Ok((1 + tick) as f32), "the current chunk continues");
     }
-    assert_eq!(lockstep(&mut executor, 5, OLD), Err(HoldReason::ObservationOld));
+    assert_eq!(lockstep(&mut queue, 5, OLD), Err(HoldReason::ObservationOld));
     let none = Situation { observation_age: None, ..FRESH };
-    assert_eq!(lockstep(&mut executor, 6, none), Err(HoldReason::ObservationOld));
-    assert_eq!(executor.counts().old_observations, 4);
-    assert_eq!(lockstep(&mut executor, 7, FRESH), Ok(701.0));
+    assert_eq!(lockstep(&mut queue, 6, none), Err(HoldReason::ObservationOld));
+    assert_eq!(queue.counts().old_observations, 4);
+    assert_eq!(lockstep(&mut queue, 7, FRESH), Ok(701.0));
 }
 
 #[test]
-fn without_a_required_modality_it_holds_at_once_and_forgets_what_it_had() {
-    let mut executor = executor();
-    lockstep(&mut executor, 0, FRESH).unwrap();
-    assert!(!executor.wants_observation(1, seen(NO_CAM)));
-    let step = executor.step(1, seen(NO_CAM));
+fn without_a_required_modality_it_holds_at_once_and_drops_its_chunk() {
+    let mut queue = queue();
+    lockstep(&mut queue, 0, FRESH).unwrap();
+    assert!(!queue.wants_observation(1, seen(NO_CAM)));
+    let step = queue.step(1, seen(NO_CAM));
     assert_eq!((step.action, step.hold, step.missing), (None, Some(HoldReason::RequiredMissing), Some("cam_wrist")));
     assert!(step.hold_is_news);
-    assert!(!executor.step(2, seen(NO_CAM)).hold_is_news);
+    assert!(!queue.step(2, seen(NO_CAM)).hold_is_news);
     // It is back, and the chunk of tick 0 has actions for tick 3.
-    assert!(executor.wants_observation(3, FRESH));
-    assert_eq!(at(&mut executor, 3, FRESH), Err(HoldReason::Waiting));
-    executor.take(3, &chunk(3)).unwrap();
-    assert_eq!(at(&mut executor, 4, FRESH), Ok(302.0));
-    assert_eq!((executor.counts().holds, executor.counts().held_ticks), (1, 3));
+    assert!(queue.wants_observation(3, FRESH));
+    assert_eq!(at(&mut queue, 3, FRESH), Err(HoldReason::Waiting));
+    queue.take(3, &chunk(3)).unwrap();
+    assert_eq!(at(&mut queue, 4, FRESH), Ok(302.0));
+    assert_eq!((queue.counts().holds, queue.counts().held_ticks), (1, 3));
 }
 
 #[test]
-fn what_was_asked_before_a_hold_is_not_executed_after_it() {
-    let mut executor = executor();
-    lockstep(&mut executor, 0, FRESH).unwrap();
+fn a_request_from_before_a_hold_is_not_executed_after_it() {
+    let mut queue = queue();
+    lockstep(&mut queue, 0, FRESH).unwrap();
     for tick in 1..3 {
-        assert!(lockstep(&mut executor, tick, FRESH).is_ok());
+        assert!(lockstep(&mut queue, tick, FRESH).is_ok());
     }
-    assert!(executor.wants_observation(3, FRESH));
-    assert!(at(&mut executor, 3, FRESH).is_ok());
-    assert_eq!(at(&mut executor, 4, seen(NO_CAM)), Err(HoldReason::RequiredMissing));
-    assert_eq!(executor.take(3, &chunk(3)), Err(Refused::BeforeHold));
-    assert_eq!(executor.counts().before_hold_chunks, 1);
-    assert_eq!(lockstep(&mut executor, 5, FRESH), Ok(501.0));
+    assert!(queue.wants_observation(3, FRESH));
+    assert!(at(&mut queue, 3, FRESH).is_ok());
+    assert_eq!(at(&mut queue, 4, seen(NO_CAM)), Err(HoldReason::RequiredMissing));
+    assert_eq!(queue.take(3, &chunk(3)), Err(ChunkError::BeforeHold));
+    assert_eq!(queue.counts().before_hold_chunks, 1);
+    assert_eq!(lockstep(&mut queue, 5, FRESH), Ok(501.0));
 }
 
 #[test]
-fn a_modality_that_leaves_while_it_waits_begins_the_wait_anew() {
-    let mut executor = executor();
-    assert!(executor.wants_observation(0, FRESH));
-    assert_eq!(at(&mut executor, 0, FRESH), Err(HoldReason::Waiting));
-    assert_eq!(at(&mut executor, 1, seen(NO_CAM)), Err(HoldReason::RequiredMissing));
-    assert_eq!(at(&mut executor, 2, FRESH), Err(HoldReason::Waiting));
-    assert_eq!(executor.take(0, &chunk(0)), Err(Refused::BeforeHold));
-    assert_eq!(lockstep(&mut executor, 3, FRESH), Ok(301.0));
+fn a_modality_that_leaves_during_a_wait_restarts_the_wait() {
+    let mut queue = queue();
+    assert!(queue.wants_observation(0, FRESH));
+    assert_eq!(at(&mut queue, 0, FRESH), Err(HoldReason::Waiting));
+    assert_eq!(at(&mut queue, 1, seen(NO_CAM)), Err(HoldReason::RequiredMissing));
+    assert_eq!(at(&mut queue, 2, FRESH), Err(HoldReason::Waiting));
+    assert_eq!(queue.take(0, &chunk(0)), Err(ChunkError::BeforeHold));
+    assert_eq!(lockstep(&mut queue, 3, FRESH), Ok(301.0));
 }
 
 #[test]
-fn without_an_optional_modality_it_goes_on_if_it_knows_the_mask() {
-    let mut executor = executor();
+fn without_an_optional_modality_a_mask_aware_policy_continues() {
+    let mut queue = queue();
     for tick in 0..10 {
-        assert!(lockstep(&mut executor, tick, seen(NO_TIP)).is_ok());
+        assert!(lockstep(&mut queue, tick, seen(NO_TIP)).is_ok());
     }
-    assert_eq!(executor.counts().holds, 0);
+    assert_eq!(queue.counts().holds, 0);
 }
 
 #[test]
-fn a_policy_that_does_not_know_the_mask_holds_unless_told_to_go_on() {
+fn a_policy_that_is_not_mask_aware_holds_unless_configured_to_continue() {
     let unaware = Bundle { mask_aware: false, ..bundle() };
-    let mut executor = Executor::new(&unaware, &registry(), WithoutMask::Hold);
-    lockstep(&mut executor, 0, FRESH).unwrap();
-    let step = executor.step(1, seen(NO_TIP));
+    let mut queue = ActionQueue::new(&unaware, &registry(), WithoutMask::Hold);
+    lockstep(&mut queue, 0, FRESH).unwrap();
+    let step = queue.step(1, seen(NO_TIP));
     assert_eq!((step.hold, step.missing), (Some(HoldReason::NotMaskAware), Some("tactile_tip")));
-    assert_eq!(lockstep(&mut executor, 2, FRESH), Ok(201.0), "it is back");
+    assert_eq!(lockstep(&mut queue, 2, FRESH), Ok(201.0), "it is back");
 
-    let mut executor = Executor::new(&unaware, &registry(), WithoutMask::GoOn);
-    assert_eq!(lockstep(&mut executor, 0, seen(NO_TIP)), Ok(1.0));
-    assert_eq!(at(&mut executor, 1, seen(NO_CAM)), Err(HoldReason::RequiredMissing), "required all the same");
+    let mut queue = ActionQueue::new(&unaware, &registry(), WithoutMask::GoOn);
+    assert_eq!(lockstep(&mut queue, 0, seen(NO_TIP)), Ok(1.0));
+    assert_eq!(at(&mut queue, 1, seen(NO_CAM)), Err(HoldReason::RequiredMissing), "required all the same");
 }
 
 #[test]
 fn the_longest_ticks_do_no_harm() {
-    let mut executor = executor();
-    lockstep(&mut executor, 0, FRESH).unwrap();
-    assert!(executor.wants_observation(u64::MAX, FRESH));
-    assert_eq!(executor.take(u64::MAX, &chunk(0)), Ok(0));
-    assert_eq!(at(&mut executor, u64::MAX, FRESH), Ok(1.0));
-    assert!(at(&mut executor, 0, FRESH).is_err(), "a tick before the chunk's observation");
+    let mut queue = queue();
+    lockstep(&mut queue, 0, FRESH).unwrap();
+    assert!(queue.wants_observation(u64::MAX, FRESH));
+    assert_eq!(queue.take(u64::MAX, &chunk(0)), Ok(0));
+    assert_eq!(at(&mut queue, u64::MAX, FRESH), Ok(1.0));
+    assert!(at(&mut queue, 0, FRESH).is_err(), "a tick before the chunk's observation");
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -291,12 +291,12 @@ fn event() -> impl Strategy<Value = Event> {
 
 proptest! {
     #[test]
-    fn whatever_happens_only_actions_of_the_tick_and_of_after_the_hold_are_executed(
+    fn only_actions_of_the_tick_and_from_after_the_hold_are_ever_executed(
         aware in any::<bool>(),
         events in prop::collection::vec(event(), 1..120),
     ) {
         let bundle = Bundle { mask_aware: aware, ..bundle() };
-        let mut executor = Executor::new(&bundle, &registry(), WithoutMask::Hold);
+        let mut queue = ActionQueue::new(&bundle, &registry(), WithoutMask::Hold);
         let (mut tick, mut asked) = (0, None);
         let mut held_from: Option<u64> = None;
         let mut holding = false;
@@ -304,12 +304,12 @@ proptest! {
             match event {
                 Event::Tick(situation, by) => {
                     tick += by;
-                    if executor.wants_observation(tick, situation) {
+                    if queue.wants_observation(tick, situation) {
                         prop_assert_eq!(asked, None, "at most one is in flight");
                         prop_assert_eq!(situation.observation_age, FRESH.observation_age);
                         asked = Some(tick);
                     }
-                    let step = executor.step(tick, situation);
+                    let step = queue.step(tick, situation);
                     prop_assert_eq!(step.action.is_some(), step.hold.is_none());
                     let Some(action) = step.action else {
                         held_from = if holding { held_from } else { Some(tick) };
@@ -327,26 +327,26 @@ proptest! {
                 }
                 Event::Answer(Answer::Stranger(observed)) => {
                     if asked != Some(observed) {
-                        prop_assert_eq!(executor.take(observed, &chunk(observed)), Err(Refused::Unasked));
+                        prop_assert_eq!(queue.take(observed, &chunk(observed)), Err(ChunkError::Unasked));
                     }
                 }
                 Event::Answer(answer) => {
                     let Some(observed) = asked.take() else { continue };
                     match answer {
-                        Answer::Good => _ = executor.take(observed, &chunk(observed)),
+                        Answer::Good => _ = queue.take(observed, &chunk(observed)),
                         Answer::Bad => {
                             let mut values = chunk(observed);
                             values[3] = f32::NAN;
-                            prop_assert_eq!(executor.take(observed, &values), Err(Refused::NotFinite));
+                            prop_assert_eq!(queue.take(observed, &values), Err(ChunkError::NotFinite));
                         }
                         Answer::Short => {
-                            prop_assert_eq!(executor.take(observed, &[0.0]), Err(Refused::Length));
+                            prop_assert_eq!(queue.take(observed, &[0.0]), Err(ChunkError::Length));
                         }
-                        Answer::Never | Answer::Stranger(_) => executor.failed(observed),
+                        Answer::Never | Answer::Stranger(_) => queue.failed(observed),
                     }
                 }
             }
-            prop_assert_eq!(executor.in_flight(), asked);
+            prop_assert_eq!(queue.in_flight, asked);
         }
         prop_assert_eq!(bundle.n_action_steps as u64, STEPS);
     }
@@ -354,17 +354,17 @@ proptest! {
 
 /// In training one of several pictures was always there: what the policy does without any is not in its training.
 #[test]
-fn without_any_picture_it_holds_and_without_one_of_two_it_goes_on() {
+fn without_any_picture_it_holds_and_without_one_of_two_it_continues() {
     const NO_PICTURE: PhysicalMask = PhysicalMask(0b100);
     let mut bundle = bundle();
     bundle.observations[0].required = false;
-    let mut executor = Executor::new(&bundle, &registry(), WithoutMask::Hold);
-    assert_eq!(lockstep(&mut executor, 0, seen(NO_CAM)), Ok(1.0));
-    assert_eq!(lockstep(&mut executor, 1, seen(NO_TIP)), Ok(101.0));
-    assert!(!executor.wants_observation(2, seen(NO_PICTURE)));
-    let step = executor.step(2, seen(NO_PICTURE));
+    let mut queue = ActionQueue::new(&bundle, &registry(), WithoutMask::Hold);
+    assert_eq!(lockstep(&mut queue, 0, seen(NO_CAM)), Ok(1.0));
+    assert_eq!(lockstep(&mut queue, 1, seen(NO_TIP)), Ok(101.0));
+    assert!(!queue.wants_observation(2, seen(NO_PICTURE)));
+    let step = queue.step(2, seen(NO_PICTURE));
     assert_eq!((step.hold, step.missing), (Some(HoldReason::NoPicture), Some("cam_wrist")));
-    assert_eq!(lockstep(&mut executor, 3, seen(NO_CAM)), Ok(301.0));
-    let mut executor = Executor::new(&bundle, &registry(), WithoutMask::GoOn);
-    assert_eq!(lockstep(&mut executor, 0, seen(NO_PICTURE)), Ok(1.0));
+    assert_eq!(lockstep(&mut queue, 3, seen(NO_CAM)), Ok(301.0));
+    let mut queue = ActionQueue::new(&bundle, &registry(), WithoutMask::GoOn);
+    assert_eq!(lockstep(&mut queue, 0, seen(NO_PICTURE)), Ok(1.0));
 }

@@ -2,7 +2,7 @@
 //!
 //! onnxruntime needs the C++ library. The machine's own is taken where there is one, so that its updates count; else
 //! that which the program carries, packed by `build.rs`. glibc knows a loaded library by its name inside the file
-//! (`DT_SONAME`), so that onnxruntime finds it under whatever name it was loaded.
+//! (`DT_SONAME`), so that onnxruntime finds it under any name.
 //!
 //! Invariant: what is loaded here stays loaded.
 
@@ -106,18 +106,18 @@ mod tests {
 
     #[test]
     fn what_a_machine_lacks_is_named_with_its_package() {
-        let said = |text: &str| cause(text).to_string();
+        let shown = |text: &str| cause(text).to_string();
         let none = ": cannot open shared object file: No such file or directory";
         assert_eq!(
-            said(&format!("libstdc++.so.6{none}")),
+            shown(&format!("libstdc++.so.6{none}")),
             "it needs libstdc++.so.6, which this machine does not have: apt install libstdc++6 on Debian and Ubuntu"
         );
         assert_eq!(
-            said(&format!("libcudart.so.12{none}")),
+            shown(&format!("libcudart.so.12{none}")),
             "it needs libcudart.so.12, which this machine does not have"
         );
-        assert!(said(&format!("/proc/self/fd/9{none}")).contains("/proc is not mounted"));
-        assert_eq!(said("x.so: invalid ELF header"), "it cannot be loaded: x.so: invalid ELF header");
+        assert!(shown(&format!("/proc/self/fd/9{none}")).contains("/proc is not mounted"));
+        assert_eq!(shown("x.so: invalid ELF header"), "it cannot be loaded: x.so: invalid ELF header");
     }
 
     #[test]

@@ -68,7 +68,7 @@ fn plain_resize(pixels: &[u8], size: [usize; 2], resized: [usize; 2], wanted: [u
 
 proptest! {
     #[test]
-    fn resizing_and_cropping_are_what_their_definition_says(
+    fn resizing_and_cropping_follow_their_definition(
         size in (1..12_usize, 1..12_usize), resized in (1..12_usize, 1..12_usize),
         cropped in (1..12_usize, 1..12_usize), pixels in proptest::collection::vec(any::<u8>(), 144),
     ) {
@@ -158,13 +158,13 @@ fn the_first_picture_is_the_reference_until_a_new_episode() {
         preprocessor.write(&picture(Encoding::Grey, [2, 2], &[grey; 4]), &mut out).unwrap();
         out[5]
     };
-    assert!(!preprocessor.reference().unwrap().is_taken());
+    assert!(!preprocessor.reference().unwrap().taken);
     close(&[write(&mut preprocessor, 51), write(&mut preprocessor, 255)], &[0.0, 0.8], 1e-6);
     close(&[write(&mut preprocessor, 0)], &[-0.2], 1e-6);
     // A damaged picture does not become the reference.
     preprocessor.reference().unwrap().reset();
     assert!(preprocessor.write(&picture(Encoding::Mjpeg, [2, 2], b"no picture"), &mut [0.0; 12]).is_err());
-    assert!(!preprocessor.reference().unwrap().is_taken());
+    assert!(!preprocessor.reference().unwrap().taken);
     close(&[write(&mut preprocessor, 255), write(&mut preprocessor, 0)], &[0.0, -1.0], 1e-6);
 }
 
@@ -185,7 +185,7 @@ fn normalisation_is_by_channel() {
 }
 
 #[test]
-fn what_does_not_suit_is_refused_in_plain_words() {
+fn unsuitable_pictures_are_refused_with_their_reason() {
     let grey = vec![9; 6];
     let whole = jpeg(&vec![90; 3 * 16 * 16], [16, 16]);
     let cases: [(Picture<'_>, &str); 7] = [

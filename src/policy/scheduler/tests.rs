@@ -114,7 +114,7 @@ fn scaled_linear_betas_are_the_squares_of_evenly_spaced_roots() {
 }
 
 #[test]
-fn what_cannot_be_run_is_refused() {
+fn unsupported_schedulers_are_rejected() {
     let spec = example();
     assert_eq!(Scheduler::new(&spec, 0), Err(SchedulerError::Steps { steps: 0, train: 100 }));
     assert_eq!(Scheduler::new(&spec, 101), Err(SchedulerError::Steps { steps: 101, train: 100 }));

@@ -5,18 +5,20 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use super::super::configuration;
-use super::super::metadata::POLICY;
-use super::super::walk::{Walked, op};
-use super::super::wire::{Fields, protobuf, whole_protobuf};
-use super::channel::Channel;
-use super::doubts::{Counted, Missing};
-use super::judge::{Ending, Judge, without_metadata};
+use super::super::metadata::{CONFIGURATION, POLICY};
+use super::super::quality::Tally;
+use super::super::verdict::Missing;
+use super::judge::{Ending, Judge, Numbers, without_metadata};
 use super::policy::Gathered;
-use super::{EventReport, Inspection, Judgement, MaskEdge, ModalityReport, TopicReport};
-use super::{state, units};
+use super::state::{self, Counted};
+use super::units;
+use super::{EventReport, Inspection, Judgement, Lateness, MaskEdge, ModalityReport, TopicReport};
 use crate::action::ACTION_TOPIC;
-use crate::episode_format::{ABOUT, EVENT_TOPIC, FAILED, FRAME_TOPIC, Failed, LOG_TOPIC, RECOVERED, SUMMARY, Writer};
+use crate::episode::decode::{Content, FrameSlot, Kind, Scratch};
+use crate::episode::encode::EventText;
+use crate::episode::reader::{Attachment, Channel, Entry, Item, Message};
+use crate::episode::record_iter::Integrity;
+use crate::episode::{ABOUT, EVENT_TOPIC, FAILED, FRAME_TOPIC, Failed, LOG_TOPIC, RECOVERED, SUMMARY, Writer};
 use crate::mask::{MASK_TOPIC, PhysicalMask};
 use crate::modality::ModalityId;
 
@@ -32,7 +34,8 @@ const MAX_EVENT: usize = 64 << 10;
 /// See the module's comment.
 #[derive(Debug, Default)]
 pub(super) struct Collected {
-    channels: BTreeMap<u16, Channel>,
+    topics: BTreeMap<u16, TopicCounter>,
+    scratch: Scratch,
     about: BTreeMap<String, String>,
     summary: BTreeMap<String, String>,
     recovered: BTreeMap<String, String>,
@@ -46,48 +49,40 @@ pub(super) struct Collected {
     /// Events that a device was plugged in or out.
     plugs: usize,
     /// Time and value of the first mask and of every change.
-    masks: Vec<(u64, u64)>,
+    masks: Vec<(u64, PhysicalMask)>,
     /// Frames in which each bit is valid and stale.
     slots: BTreeMap<u8, (u64, u64)>,
     events: Vec<(u64, EventReport)>,
-    /// Absent until the file has said that it is an episode of ours.
+    /// `None` until metadata of an episode of rapid have been read.
     judge: Option<Judge>,
-    /// Of those, what `opened` says as JSON.
+    /// Time and JSON of the events `opened`.
     opened: Vec<(u64, String)>,
     policy: Gathered,
 }
 
 impl Collected {
     /// Takes a record; one that cannot be understood is counted.
-    pub(super) fn record(&mut self, opcode: u8, record: &[u8]) {
-        let fields = Fields(record);
-        // `None` is a record that is shorter than it says, or has no channel.
-        let read = match opcode {
-            op::CHANNEL => self.channel(fields),
-            op::METADATA => self.metadata(fields),
-            op::MESSAGE => self.message(fields),
-            op::ATTACHMENT => self.attachment(fields),
-            _ => Some(()),
-        };
-        self.counted.unread += u64::from(read.is_none());
+    pub(super) fn take(&mut self, item: Item<'_>) {
+        match item {
+            Item::Channel(channel) => {
+                self.is_ours |= [MASK_TOPIC, FRAME_TOPIC, EVENT_TOPIC, LOG_TOPIC].contains(&channel.topic.as_str());
+                // The summary repeats the channels.
+                self.topics.entry(channel.id).or_insert_with(|| TopicCounter::new(channel));
+            }
+            Item::Message(message) => self.message(&message),
+            Item::Other(Entry::Metadata { name, map }) => self.metadata(name, map),
+            Item::Other(Entry::Attachment(attachment)) => self.attachment(&attachment),
+            Item::Other(_) => {}
+            Item::Unreadable => self.counted.unread += 1,
+        }
     }
 
-    fn channel(&mut self, mut fields: Fields<'_>) -> Option<()> {
-        let (id, _schema) = (fields.u16()?, fields.u16()?);
-        let (topic, _encoding) = (fields.string()?, fields.string()?);
-        let mut metadata = fields.map()?;
-        let of = metadata.get("bit").and_then(|bit| bit.parse().ok()).and_then(ModalityId::new);
-        self.is_ours |= [MASK_TOPIC, FRAME_TOPIC, EVENT_TOPIC, LOG_TOPIC].contains(&topic);
-        // The summary repeats the channels.
-        let known = self.channels.entry(id);
-        known.or_insert_with(|| Channel::new(topic.to_owned(), of, metadata.remove("modality")));
-        Some(())
-    }
-
-    fn metadata(&mut self, mut fields: Fields<'_>) -> Option<()> {
-        let name = fields.string()?;
+    fn metadata(&mut self, name: &str, map: Option<BTreeMap<String, String>>) {
         self.is_ours |= [ABOUT, SUMMARY, RECOVERED].contains(&name);
-        let map = fields.map()?;
+        let Some(map) = map else {
+            self.counted.unread += 1;
+            return;
+        };
         match name {
             ABOUT => {
                 self.counted.abouts += 1;
@@ -104,48 +99,45 @@ impl Collected {
             RECOVERED => self.recovered = map,
             _ => {}
         }
-        Some(())
     }
 
     /// The registry, whose text the metadata before it repeat.
-    fn attachment(&mut self, mut fields: Fields<'_>) -> Option<()> {
-        let _times = (fields.u64()?, fields.u64()?);
-        let (name, _media_type) = (fields.string()?, fields.string()?);
-        let count = fields.u64()?;
-        let data = fields.bytes(count)?;
-        if name == "devices.toml" && self.counted.attached.is_none() {
-            self.counted.attached = Some(self.about.get("registry").is_some_and(|text| text.as_bytes() == data));
+    fn attachment(&mut self, attachment: &Attachment<'_>) {
+        if attachment.name == "devices.toml" && self.counted.attached.is_none() {
+            let is_same = |text: &String| *text.as_bytes() == *attachment.data;
+            self.counted.attached = Some(self.about.get("registry").is_some_and(is_same));
         }
-        Some(())
     }
 
-    fn message(&mut self, mut fields: Fields<'_>) -> Option<()> {
-        let (id, sequence) = (fields.u16()?, fields.u32()?);
-        let (captured, received) = (fields.u64()?, fields.u64()?);
-        let channel = self.channels.get_mut(&id)?;
-        channel.count(sequence, captured, received);
+    fn message(&mut self, message: &Message<'_>) {
+        let (channel, at) = (message.channel, message.log_time);
+        if let Some(topic) = self.topics.get_mut(&channel.id) {
+            topic.count(message.sequence, at, message.publish_time);
+        }
         self.counted.messages += 1;
-        self.first = Some(self.first.map_or(captured, |first| first.min(captured)));
-        self.last = self.last.max(captured);
-        let is_whole = !fields.0.is_empty() && whole_protobuf(fields.0).all(|field| field.is_some());
-        if self.judge.is_some() && !is_whole {
+        self.first = Some(self.first.map_or(at, |first| first.min(at)));
+        self.last = self.last.max(at);
+        let mut scratch = std::mem::take(&mut self.scratch);
+        let content = message.content(&mut scratch).filter(|_| !message.data.is_empty());
+        if self.judge.is_some() && content.is_none() {
             self.counted.unread += 1;
         }
-        if let (Some(id), Some(judge)) = (channel.id, &mut self.judge) {
-            let bytes = judge.sample(id, sequence, captured, received, fields.0);
-            self.counted.empty += u64::from(bytes == 0);
+        if let (Some(id), Some(judge)) = (channel.bit, &mut self.judge) {
+            let sample = if let Some(Content::Sample(sample)) = content { Some(sample) } else { None };
+            judge.sample(id, message, sample);
+            self.counted.empty += u64::from(sample.is_none_or(|sample| sample.payload.is_empty()));
         }
-        match channel.topic.as_str() {
-            MASK_TOPIC => self.mask(captured, fields.0),
-            FRAME_TOPIC => self.frame(captured, fields.0),
-            EVENT_TOPIC => self.event(captured, fields.0),
-            _ => {}
+        self.counted.frames += u64::from(channel.kind == Kind::Frame);
+        match content {
+            Some(Content::Mask(mask)) => self.mask(at, mask),
+            Some(Content::Frame(slots)) => self.frame(at, slots),
+            Some(Content::Event(event)) => self.event(at, &event, message.data.len()),
+            Some(Content::Sample(_) | Content::Other) | None => {}
         }
-        Some(())
+        self.scratch = scratch;
     }
 
-    fn mask(&mut self, at: u64, message: &[u8]) {
-        let mask = protobuf(message).filter(|(field, _)| *field == 2).last().map_or(0, |(_, value)| value.number());
+    fn mask(&mut self, at: u64, mask: PhysicalMask) {
         if self.masks.last().is_some_and(|(_, last)| *last == mask) {
             return;
         }
@@ -155,78 +147,61 @@ impl Collected {
         }
         self.masks.push((at, mask));
         if let Some(judge) = &mut self.judge {
-            judge.mask(at, PhysicalMask(mask));
+            judge.mask(at, mask);
         }
     }
 
-    fn frame(&mut self, at: u64, message: &[u8]) {
+    fn frame(&mut self, at: u64, slots: &[FrameSlot]) {
         self.counted.last_frame = self.counted.last_frame.max(at);
-        self.counted.frames += 1;
         if let Some(judge) = &mut self.judge {
-            judge.frame(message);
+            judge.frame(slots);
         }
-        for (_, slot) in protobuf(message).filter(|(field, _)| *field == 4) {
-            let (mut bit, mut valid, mut stale) = (0, 0, 0);
-            for (field, value) in protobuf(slot.bytes()) {
-                match field {
-                    1 => bit = value.number(),
-                    2 => valid = u64::from(value.number() != 0),
-                    3 => stale = u64::from(value.number() != 0),
-                    _ => {}
-                }
-            }
-            if let Some(id) = u8::try_from(bit).ok().and_then(ModalityId::new) {
-                let slot = self.slots.entry(id.bit()).or_default();
-                *slot = (slot.0 + valid, slot.1 + stale);
-            }
+        for slot in slots {
+            let count = self.slots.entry(slot.id.bit()).or_default();
+            *count = (count.0 + u64::from(slot.valid), count.1 + u64::from(slot.stale));
         }
     }
 
-    fn event(&mut self, at: u64, message: &[u8]) {
-        if message.len() > MAX_EVENT {
+    fn event(&mut self, at: u64, event: &EventText<'_>, bytes: usize) {
+        if bytes > MAX_EVENT {
             self.counted.unread += 1;
             return;
         }
-        let mut event = EventReport { at: 0.0, kind: String::new(), device: String::new(), text: String::new() };
-        for (field, value) in protobuf(message) {
-            match field {
-                2 => event.kind = value.text(),
-                3 => event.device = value.text(),
-                4 => event.text = value.text(),
-                5 if event.kind == "opened" && self.event_bytes < MAX_EVENT_BYTES => {
-                    self.event_bytes += EVENT + value.bytes().len();
-                    self.opened.push((at, value.text()));
-                }
-                5 if event.kind == "publisher" => {
-                    if let Some(judge) = &mut self.judge {
-                        judge.publisher(&value.text());
-                    }
-                }
-                5 if Gathered::takes(&event.kind) => self.policy.event(at, &event.kind, &value.text()),
-                _ => {}
+        let EventText { kind, device, text, json } = *event;
+        match kind {
+            "opened" if self.event_bytes < MAX_EVENT_BYTES => {
+                self.event_bytes += EVENT + json.len();
+                self.opened.push((at, json.to_owned()));
             }
+            _ if Gathered::takes(kind) => self.policy.event(at, kind, json),
+            _ => {}
         }
-        if let (Some(judge), "attach" | "detach") = (&mut self.judge, event.kind.as_str()) {
-            self.plugs += 1;
-            if self.plugs <= MAX_EVENTS {
-                judge.plugged(&event.device, at, event.kind == "attach");
-            } else {
-                self.counted.unjudged += 1;
+        match (&mut self.judge, kind) {
+            (Some(judge), "publisher") => judge.publisher(json),
+            (Some(judge), "attach" | "detach") => {
+                self.plugs += 1;
+                if self.plugs <= MAX_EVENTS {
+                    judge.plugged(device, at, kind == "attach");
+                } else {
+                    self.counted.unjudged += 1;
+                }
             }
+            _ => {}
         }
         if self.events.len() < MAX_EVENTS && self.event_bytes < MAX_EVENT_BYTES {
-            self.event_bytes += EVENT + message.len();
-            self.events.push((at, event));
+            self.event_bytes += EVENT + bytes;
+            let (kind, device, text) = (kind.to_owned(), device.to_owned(), text.to_owned());
+            self.events.push((at, EventReport { at: 0.0, kind, device, text }));
         }
     }
 
     /// What was gathered, as a report on the file at `path`.
-    pub(super) fn report(mut self, path: &Path, size: u64, walked: Walked, failed: Option<Failed>) -> Inspection {
+    pub(super) fn report(mut self, path: &Path, size: u64, integrity: Integrity, failed: Option<Failed>) -> Inspection {
         let recorded = failed.as_ref().map_or(size, |failed| failed.at);
         let failed = failed.map(|failed| failed.why).or_else(|| self.recovered.get(FAILED).cloned());
         let said = |map: &BTreeMap<String, String>, key: &str| map.get(key).cloned().unwrap_or_default();
         let begin_ns = said(&self.about, "begin_wall_ns").parse().ok().or(self.first).unwrap_or(0);
-        let is_ours = walked.writer == Writer::Rapid || self.is_ours || failed.is_some();
+        let is_ours = integrity.writer == Writer::Rapid || self.is_ours || failed.is_some();
         let told = said(&self.summary, "duration_s").parse().ok().filter(|seconds: &f64| seconds.is_finite());
         let seconds = told.unwrap_or_else(|| from(begin_ns, self.last)).max(0.0);
         let mut events = std::mem::take(&mut self.events);
@@ -243,40 +218,34 @@ impl Collected {
             std::mem::take(&mut self.policy).report(end_ns, [self.summary.get(POLICY), self.about.get(POLICY)]);
         let (mut modalities, topics) = self.topics(begin_ns, seconds);
         let missing = |name| topics.iter().filter(|topic| topic.topic == name).map(|topic| topic.missing).sum();
-        self.counted.missing = Missing {
-            actions: missing(ACTION_TOPIC),
-            masks: missing(MASK_TOPIC),
-            events: missing(EVENT_TOPIC),
-            frames: missing(FRAME_TOPIC),
-        };
+        self.counted.missing =
+            Missing { actions: missing(ACTION_TOPIC), masks: missing(MASK_TOPIC), events: missing(EVENT_TOPIC) };
+        self.counted.missing_frames = missing(FRAME_TOPIC);
         let repaired = state::repaired(&self.recovered);
         let (repaired, failed) = (repaired.as_deref(), failed.as_deref());
         let (about, summary, counted) = (&self.about, &self.summary, self.counted);
-        let damage = &state::damage(&walked);
-        let ending = Ending { file: walked, seconds, about, summary, repaired, failed, damage, counted };
+        let damage = &state::damage(&integrity);
+        let ending = Ending { file: integrity, seconds, about, summary, repaired, failed, damage, counted };
         let verdict = match &judge {
             Some(judge) => Judgement::Episode(judge.judge(&mut modalities, &ending)),
             // What is damaged and has no name of its writer may be an episode.
-            None if !is_ours && (walked.sound || walked.writer == Writer::Another) => Judgement::NotOurs,
+            None if !is_ours && (integrity.sound || integrity.writer == Writer::Another) => Judgement::NotOurs,
             None => Judgement::Episode(without_metadata(&ending)),
         };
         let (modules, present_at_begin) = configured(&self.about);
         let count = modalities.len();
-        let mask = self
-            .masks
-            .iter()
-            .map(|(at, mask)| MaskEdge { at: from(begin_ns, *at), mask: PhysicalMask(*mask).hex(count) });
+        let mask = self.masks.iter().map(|(at, mask)| MaskEdge { at: from(begin_ns, *at), mask: mask.hex(count) });
         Inspection {
             file: path.to_owned(),
             bytes: size,
-            end: walked.end,
+            end: integrity.end,
             verdict,
             // A verdict from before it failed is void.
             recorded_verdict: state::recorded_verdict(&self.summary).filter(|_| failed.is_none()),
-            unread_bytes: walked.unread(recorded),
-            damaged_chunks: walked.damaged_chunks,
-            left_out: walked.left_out,
-            ordered_messages: walked.ordered_messages,
+            unread_bytes: integrity.unread(recorded),
+            damaged_chunks: integrity.damaged_chunks,
+            left_out: integrity.left_out,
+            ordered_messages: integrity.ordered_messages,
             recovered: self.recovered,
             software: said(&self.about, "software"),
             commit: said(&self.about, "commit"),
@@ -306,7 +275,7 @@ impl Collected {
 
     fn topics(&mut self, begin_ns: u64, seconds: f64) -> (Vec<ModalityReport>, Vec<TopicReport>) {
         let (mut modalities, mut topics) = (Vec::new(), Vec::new());
-        for channel in std::mem::take(&mut self.channels).into_values() {
+        for channel in std::mem::take(&mut self.topics).into_values() {
             let topic = channel.report();
             let Some(id) = channel.id else {
                 topics.push(topic);
@@ -336,7 +305,7 @@ impl Collected {
         let mut since = None;
         for (at, mask) in &self.masks {
             let at = from(begin_ns, *at).clamp(0.0, seconds);
-            match (PhysicalMask(*mask).contains(id), since) {
+            match (mask.contains(id), since) {
                 (true, None) => since = Some(at),
                 (false, Some(begin)) => {
                     spans.push((begin, at));
@@ -352,7 +321,7 @@ impl Collected {
 }
 
 /// Seconds from one wall time to another, negative if it lies before.
-pub(super) fn from(begin_ns: u64, at_ns: u64) -> f64 {
+fn from(begin_ns: u64, at_ns: u64) -> f64 {
     let distance = begin_ns.abs_diff(at_ns) as f64 / 1e9;
     if at_ns < begin_ns { -distance } else { distance }
 }
@@ -365,10 +334,70 @@ fn configured(about: &BTreeMap<String, String>) -> (Vec<String>, Option<BTreeSet
         present: BTreeSet<String>,
     }
     let json = |key: &str| about.get(key).map(String::as_str).unwrap_or_default();
-    if let Ok(known) = serde_json::from_str::<Configuration>(json(configuration::KEY)) {
+    if let Ok(known) = serde_json::from_str::<Configuration>(json(CONFIGURATION)) {
         return (known.modules, Some(known.present));
     }
     // Written before there were configurations: what was attached.
     let serials = serde_json::from_str::<BTreeMap<String, Option<String>>>(json("serials")).ok();
     (Vec::new(), serials.map(|serials| serials.into_keys().collect()))
+}
+
+/// A channel and what came on it; memory is fixed, however many messages there are.
+#[derive(Debug, Default)]
+struct TopicCounter {
+    topic: String,
+    /// The modality, if it is one's, and its name.
+    id: Option<ModalityId>,
+    modality: Option<String>,
+    messages: u64,
+    first: u64,
+    previous: u64,
+    latest: u64,
+    longest_gap: u64,
+    numbers: Numbers,
+    /// Receipt minus capture. Absent without messages: a file may define thousands of channels.
+    lateness: Option<Tally>,
+}
+
+impl TopicCounter {
+    fn new(channel: &Channel) -> Self {
+        let (topic, modality) = (channel.topic.clone(), channel.modality.clone());
+        Self { topic, id: channel.bit, modality, ..Self::default() }
+    }
+
+    fn count(&mut self, sequence: u32, captured: u64, received: u64) {
+        if self.messages == 0 {
+            (self.first, self.latest) = (captured, captured);
+        } else {
+            self.longest_gap = self.longest_gap.max(captured.saturating_sub(self.previous));
+        }
+        self.messages += 1;
+        self.numbers.take(sequence);
+        self.previous = captured;
+        self.first = self.first.min(captured);
+        self.latest = self.latest.max(captured);
+        self.lateness.get_or_insert_with(Tally::default).push(received.saturating_sub(captured));
+    }
+
+    fn report(&self) -> TopicReport {
+        let span = from(self.first, self.latest);
+        let hz = if self.messages > 1 && span > 0.0 { (self.messages - 1) as f64 / span } else { 0.0 };
+        // A frame waits for its deadline, always as long.
+        let lateness = self.lateness.as_ref().filter(|_| self.topic != FRAME_TOPIC).and_then(Lateness::of);
+        TopicReport {
+            topic: self.topic.clone(),
+            messages: self.messages,
+            hz,
+            missing: self.numbers.missing,
+            longest_gap: self.longest_gap as f64 / 1e9,
+            lateness,
+        }
+    }
+}
+
+impl Lateness {
+    /// Of the times of a tally; `None` without any.
+    pub(super) fn of(times: &Tally) -> Option<Self> {
+        times.spread().map(|spread| Self { p50: spread.p50, p99: spread.p99, max: spread.max })
+    }
 }

@@ -15,23 +15,29 @@ use serde_json::{Map, Value};
 use super::super::publishers::Publishers;
 use super::super::quality::{Frames, Measured, Measures, Quality, Seen, Spread};
 use super::super::session::SETTLE;
-use super::super::verdict::{Facts, FileState, Finding, Judged, Losses, judge};
-use super::super::walk::Walked;
-use super::super::wire::{Proto, protobuf};
+use super::super::verdict::{Facts, FileState, Judged, Losses, Missing, judge};
 use super::ModalityReport;
-use super::doubts::{self, Counted};
-use super::registered::{Registered, listed, registered};
-use super::state::{self, file_state};
-use crate::episode_format::{ABOUT, SUMMARY};
+use super::state::{self, Counted, file_state};
+use crate::episode::decode::{FrameSlot, Sample};
+use crate::episode::reader::Message;
+use crate::episode::record_iter::Integrity;
+use crate::episode::{ABOUT, SUMMARY};
 use crate::mask::PhysicalMask;
-use crate::modality::{MAX_MODALITIES, ModalityId};
+use crate::modality::{MAX_MODALITIES, ModalityId, ModalityKind};
+use crate::registry::{Registry, VerdictSpec};
+use crate::sample::Encoding;
 use crate::status::{Grade, Verdict};
+
+/// No registry is longer; the text of a hostile file may be.
+const LONGEST_REGISTRY: usize = 1 << 20;
+/// Patience with a modality that the registry gives none.
+const STALL_AFTER: Duration = Duration::from_millis(500);
 
 /// How a file came to its end.
 #[derive(Debug)]
 pub(super) struct Ending<'a> {
     /// What was found in it.
-    pub(super) file: Walked,
+    pub(super) file: Integrity,
     /// Length of the episode, seconds.
     pub(super) seconds: f64,
     /// What it states about itself at its beginning.
@@ -48,25 +54,41 @@ pub(super) struct Ending<'a> {
     pub(super) counted: Counted,
 }
 
+/// Numbers of samples as they come, of which a message holds the lower 32 bits, and how many are missing.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Numbers {
+    next: Option<u32>,
+    pub(super) missing: u64,
+}
+
+impl Numbers {
+    pub(super) fn take(&mut self, number: u32) {
+        // Numbers wrap after 32 bits; a step of more than half of that goes backwards.
+        let step = self.next.map_or(0, |next| number.wrapping_sub(next));
+        self.missing += u64::from(if step <= u32::MAX / 2 { step } else { 0 });
+        self.next = Some(number.wrapping_add(1));
+    }
+}
+
 /// Measures an episode while its file is read.
 #[derive(Debug)]
 pub(super) struct Judge {
     measures: Measures,
     begin_ns: u64,
     /// The registered modalities, ascending by bit.
-    modalities: Vec<Registered>,
+    modalities: Vec<Measured>,
     /// The limits are not those of the registry in the file, which is not understood.
     usual_limits: bool,
     /// Names of the modalities that every episode has to have.
     expect: Vec<String>,
     /// Next number of each modality, and how many are missing.
-    numbers: Vec<(Option<u32>, u64)>,
+    numbers: Vec<Numbers>,
     /// By the events of the file.
     publishers: Publishers,
 }
 
 impl Judge {
-    /// A judge of the episode whose metadata say this; `None` if it is none of ours.
+    /// A judge of the episode with these metadata; `None` if rapid did not record it.
     pub(super) fn of(about: &BTreeMap<String, String>) -> Option<Self> {
         let number = |key: &str| about.get(key)?.parse::<u64>().ok();
         let begin_ns = number("begin_wall_ns")?;
@@ -75,16 +97,16 @@ impl Judge {
             Some((modalities, expect)) => (modalities, expect, false),
             None => (listed(about)?, Vec::new(), true),
         };
-        let all: Vec<Measured> = modalities.iter().map(|modality| modality.measured.clone()).collect();
-        let latency = Duration::from_nanos(all.iter().map(|measured| measured.latency_ns).max().unwrap_or(0));
+        let latency = Duration::from_nanos(modalities.iter().map(|measured| measured.latency_ns).max().unwrap_or(0));
         let window = Duration::from_nanos(number("sync_window_ns")?);
         let wait = window.saturating_add(SETTLE).saturating_add(latency);
-        let measures = Measures::new(&all, Frames { begin_ns, hz, window, wait });
-        let numbers = vec![(None, 0); MAX_MODALITIES];
+        let measures = Measures::new(&modalities, Frames { begin_ns, hz, window, wait });
+        let numbers = vec![Numbers::default(); MAX_MODALITIES];
         let publishers = Publishers::default();
         let mut judge = Self { measures, begin_ns, modalities, usual_limits, expect, numbers, publishers };
-        for (device, _) in objects(about, "serials") {
-            judge.plugged(&device, begin_ns, true);
+        let serials = about.get("serials").and_then(|text| serde_json::from_str::<Map<String, Value>>(text).ok());
+        for device in serials.unwrap_or_default().keys() {
+            judge.plugged(device, begin_ns, true);
         }
         Some(judge)
     }
@@ -92,7 +114,7 @@ impl Judge {
     /// Takes that a device was plugged in, or out.
     pub(super) fn plugged(&mut self, device: &str, at_ns: u64, there: bool) {
         if let Some(known) = self.modalities.iter().find(|known| known.name == device) {
-            self.measures.plugged(known.measured.id, at_ns, there);
+            self.measures.plugged(known.id, at_ns, there);
         }
     }
 
@@ -101,41 +123,21 @@ impl Judge {
         self.publishers.event(json);
     }
 
-    /// Takes the message of a sample; how many bytes it has.
-    pub(super) fn sample(
-        &mut self,
-        id: ModalityId,
-        sequence: u32,
-        captured: u64,
-        received: u64,
-        message: &[u8],
-    ) -> usize {
-        if let Some((next, missing)) = self.numbers.get_mut(id.index()) {
-            // Numbers wrap after 32 bits; a step of more than half of that goes backwards.
-            let step = next.map_or(0, |next| sequence.wrapping_sub(next));
-            *missing += u64::from(if step <= u32::MAX / 2 { step } else { 0 });
-            *next = Some(sequence.wrapping_add(1));
-        }
-        // The bytes are field 2, of a RawImage field 6; a CompressedImage has its format in field 3.
-        let (mut payload, mut jpeg): (&[u8], bool) = (&[], false);
-        for (field, value) in protobuf(message) {
-            match (field, value) {
-                (2 | 6, Proto::Bytes(bytes)) => payload = bytes,
-                (3, Proto::Bytes(format)) => jpeg = format == b"jpeg",
-                _ => {}
-            }
+    /// Takes the message of a sample; `None`: its content cannot be read.
+    pub(super) fn sample(&mut self, id: ModalityId, message: &Message<'_>, sample: Option<Sample<'_>>) {
+        if let Some(numbers) = self.numbers.get_mut(id.index()) {
+            numbers.take(message.sequence);
         }
         let seen = Seen {
-            seq: sequence.into(),
-            capture_ns: captured,
-            recv_ns: received,
+            seq: message.sequence.into(),
+            capture_ns: message.log_time,
+            recv_ns: message.publish_time,
             flagged: false,
-            jpeg,
-            payload,
+            jpeg: sample.is_some_and(|sample| sample.encoding == Encoding::Mjpeg),
+            payload: sample.map_or(&[], |sample| sample.payload),
             repeated: None,
         };
         self.measures.sample(id, &seen);
-        payload.len()
     }
 
     /// Takes a mask.
@@ -143,24 +145,12 @@ impl Judge {
         self.measures.mask(at_ns, mask);
     }
 
-    /// Takes the message of a frame.
-    pub(super) fn frame(&mut self, message: &[u8]) {
+    /// Takes a tick of the frame index.
+    pub(super) fn frame(&mut self, slots: &[FrameSlot]) {
         // As in the recorder: masks of the time of a frame lie before it.
         self.measures.settle();
-        let slots = protobuf(message).filter(|(field, _)| *field == 4).filter_map(|(_, slot)| {
-            let (mut bit, mut valid, mut present, mut age) = (0, false, false, 0);
-            for (field, value) in protobuf(slot.bytes()) {
-                match field {
-                    1 => bit = value.number(),
-                    2 => valid = value.number() != 0,
-                    4 => age = value.zigzag(),
-                    6 => present = value.number() != 0,
-                    _ => {}
-                }
-            }
-            Some((ModalityId::new(u8::try_from(bit).ok()?)?, present, valid.then_some(age)))
-        });
-        self.measures.frame(slots);
+        let of = |slot: &FrameSlot| (slot.id, slot.present, slot.valid.then_some(slot.age_ns));
+        self.measures.frame(slots.iter().map(of));
     }
 
     /// Between the earliest and the latest sample of a frame, ms.
@@ -173,19 +163,19 @@ impl Judge {
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saturates, as wanted")]
         let end_ns = self.begin_ns.saturating_add((ending.seconds * 1e9).round() as u64);
         let counted = Recorded::of(ending.summary);
-        let qualities: Vec<(&Registered, Quality)> =
+        let qualities: Vec<(&Measured, Quality)> =
             self.modalities.iter().filter_map(|known| Some((known, self.quality(known, &counted, end_ns)?))).collect();
         for report in modalities.iter_mut() {
-            let of_it = |known: &Registered| known.measured.id.bit() == report.bit;
+            let of_it = |known: &Measured| known.id.bit() == report.bit;
             let Some((_, quality)) = qualities.iter().find(|(known, _)| of_it(known)) else { continue };
             report.topic.hz = quality.hz.unwrap_or(0.0);
             report.topic.longest_gap = quality.longest_gap;
-            report.topic.missing = self.numbers.get(usize::from(report.bit)).map_or(0, |(_, missing)| *missing);
+            report.topic.missing = self.numbers.get(usize::from(report.bit)).map_or(0, |numbers| numbers.missing);
             report.quality = Some(*quality);
         }
         let judged: Vec<Judged<'_>> = qualities
             .iter()
-            .map(|(known, quality)| Judged { name: &known.name, quality, limits: known.measured.limits })
+            .map(|(known, quality)| Judged { name: &known.name, quality, limits: known.limits })
             .collect();
         // Of a file that lacks something the recorder did not count all that is missing.
         let is_complete = counted.count("messages") == Some(ending.counted.messages) && ending.repaired.is_none();
@@ -193,16 +183,19 @@ impl Judge {
             let recorded = counted.count(key);
             if is_complete { recorded.unwrap_or(numbers) } else { recorded.unwrap_or(0).max(numbers) }
         };
+        let missing = ending.counted.missing;
         let publishers = self.publishers.clone().or_summed_up(ending.summary);
         let mut findings = self.not_judged(modalities, ending);
         findings.extend(counted.differences(&qualities, ending));
         let facts = Facts {
             publishers: publishers.list(),
             modalities: &judged,
-            masks_dropped: count("masks_dropped", ending.counted.missing.masks),
-            actions_dropped: count("actions_dropped", ending.counted.missing.actions),
+            missing: Missing {
+                masks: count("masks_dropped", missing.masks),
+                actions: count("actions_dropped", missing.actions),
+                events: count("events_missed", missing.events),
+            },
             expect: &self.expect,
-            events_missed: count("events_missed", ending.counted.missing.events),
             seconds: ending.seconds,
             // A repaired file's summary counts what is there.
             losses: if counted.count("lost").is_some() && is_complete { Losses::Apart } else { Losses::Together },
@@ -213,10 +206,10 @@ impl Judge {
     }
 
     /// What a modality was like: what the file holds, and what the recorder alone could count.
-    fn quality(&self, known: &Registered, counted: &Recorded<'_>, end_ns: u64) -> Option<Quality> {
-        let id = known.measured.id;
+    fn quality(&self, known: &Measured, counted: &Recorded<'_>, end_ns: u64) -> Option<Quality> {
+        let id = known.id;
         let mut quality = self.measures.quality(id, end_ns)?;
-        let missing = self.numbers.get(id.index()).map_or(0, |(_, missing)| *missing);
+        let missing = self.numbers.get(id.index()).map_or(0, |numbers| numbers.missing);
         let recorded = |key: &str| counted.of_modality(&known.name, key);
         quality.lost = recorded("lost").unwrap_or(0);
         quality.dropped = recorded("dropped").unwrap_or(missing);
@@ -231,22 +224,20 @@ impl Judge {
     }
 
     /// What of the file could not be judged.
-    fn not_judged(&self, channels: &[ModalityReport], ending: &Ending<'_>) -> Vec<Finding> {
+    fn not_judged(&self, channels: &[ModalityReport], ending: &Ending<'_>) -> Vec<String> {
         let mut findings = Vec::new();
         if self.usual_limits {
-            findings.push(Finding::suspect(
-                "this version does not understand the registry in the file: judged by the usual limits",
-            ));
+            let reason = "this version does not understand the registry in the file: judged by the usual limits";
+            findings.push(reason.to_owned());
         }
-        findings.extend(doubts::of(ending));
-        findings.extend(state::findings(ending));
-        let has_channel = |known: &&Registered| !channels.iter().any(|of| of.bit == known.measured.id.bit());
+        findings.extend(state::doubts(ending));
+        let has_channel = |known: &&Measured| !channels.iter().any(|of| of.bit == known.id.bit());
         for known in self.modalities.iter().filter(has_channel) {
-            findings.push(Finding::suspect(format!("{}: the file has no channel for it", known.name)));
+            findings.push(format!("{}: the file has no channel for it", known.name));
         }
-        let is_known = |of: &&ModalityReport| !self.modalities.iter().any(|known| known.measured.id.bit() == of.bit);
+        let is_known = |of: &&ModalityReport| !self.modalities.iter().any(|known| known.id.bit() == of.bit);
         for channel in channels.iter().filter(is_known) {
-            findings.push(Finding::suspect(format!("{}: not in the registry of the file", channel.name)));
+            findings.push(format!("{}: not in the registry of the file", channel.name));
         }
         findings
     }
@@ -285,7 +276,7 @@ impl<'a> Recorded<'a> {
     }
 
     /// In what a finished file is not what its recorder counted.
-    fn differences(&self, qualities: &[(&Registered, Quality)], ending: &Ending<'_>) -> Vec<Finding> {
+    fn differences(&self, qualities: &[(&Measured, Quality)], ending: &Ending<'_>) -> Vec<String> {
         // Without a summary the file is not whole, and that which a repair wrote counts what is there: it has no verdict.
         if self.summary.is_empty() || ending.repaired.is_some() && !self.summary.contains_key("verdict") {
             return Vec::new();
@@ -295,8 +286,7 @@ impl<'a> Recorded<'a> {
         let mut same = |recorded: Option<u64>, counted: u64, key: &str, what: &str| match recorded {
             None => missing.push(key.to_owned()),
             Some(recorded) if recorded != counted => {
-                let reason = format!("the recorder wrote {recorded} {what}, the file has {counted}");
-                findings.push(Finding::suspect(reason));
+                findings.push(format!("the recorder wrote {recorded} {what}, the file has {counted}"));
             }
             Some(_) => {}
         };
@@ -324,14 +314,34 @@ impl<'a> Recorded<'a> {
         }
         if !missing.is_empty() {
             let missing = missing.join(", ");
-            findings.push(Finding::suspect(format!("its record {SUMMARY:?} does not have {missing}")));
+            findings.push(format!("its record {SUMMARY:?} does not have {missing}"));
         }
         findings
     }
 }
 
-/// The entries of an object that `about` holds as JSON; none if it is none.
-fn objects(about: &BTreeMap<String, String>, key: &str) -> impl Iterator<Item = (String, Value)> + use<> {
-    let object = about.get(key).and_then(|text| serde_json::from_str::<Map<String, Value>>(text).ok());
-    object.unwrap_or_default().into_iter()
+/// The modalities by the registry in the file, and the names of those that it expects.
+fn registered(about: &BTreeMap<String, String>) -> Option<(Vec<Measured>, Vec<String>)> {
+    let text = about.get("registry").filter(|text| text.len() <= LONGEST_REGISTRY)?;
+    let registry = Registry::parse(text, None).ok()?.registry;
+    // Nothing is reserved: how large payloads are, a file is not believed.
+    Some((Measured::all(&registry), registry.rig.expect))
+}
+
+/// The modalities by their list, where this version does not understand the registry.
+fn listed(about: &BTreeMap<String, String>) -> Option<Vec<Measured>> {
+    let list: Vec<Value> = serde_json::from_str(about.get("modalities")?).ok()?;
+    let measured = |entry: &Value| {
+        let name = entry.get("name")?.as_str()?.to_owned();
+        let id = ModalityId::new(u8::try_from(entry.get("bit")?.as_u64()?).ok()?)?;
+        let kind: ModalityKind = serde_json::from_value(entry.get("kind")?.clone()).ok()?;
+        // Files of earlier versions have no latencies.
+        let latency_ns = entry.get("latency_ns").and_then(Value::as_u64).unwrap_or(0);
+        Some(Measured { name, id, limits: VerdictSpec::of(kind, STALL_AFTER, None), latency_ns })
+    };
+    let mut modalities: Vec<Measured> = list.iter().map(measured).collect::<Option<_>>()?;
+    modalities.sort_by_key(|modality| modality.id);
+    // A hostile list may name one twice.
+    modalities.dedup_by_key(|modality| modality.id);
+    Some(modalities)
 }

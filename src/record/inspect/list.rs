@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use super::super::episode::PARTIAL;
 use super::render::{clean, colour, grade_colour, size};
-use super::{FileEnd, InspectError, Inspection, Judgement, Paint, inspect};
+use super::{FileEnd, Inspection, Judgement, Paint, ReadError, inspect};
+use crate::episode::partial::PARTIAL;
 use crate::status::Grade;
 use crate::text;
 
@@ -40,14 +40,14 @@ pub struct Listed {
 ///
 /// # Errors
 /// When a folder cannot be read.
-pub fn episodes(paths: &[PathBuf]) -> Result<Vec<PathBuf>, InspectError> {
+pub fn episodes(paths: &[PathBuf]) -> Result<Vec<PathBuf>, ReadError> {
     let mut files = Vec::new();
     for path in paths {
         if !path.is_dir() {
             files.push(path.clone());
             continue;
         }
-        let io = |source| InspectError::Io { path: path.clone(), source };
+        let io = |source| ReadError::Io { path: path.clone(), source };
         let mut inside = Vec::new();
         for entry in std::fs::read_dir(path).map_err(io)? {
             let entry = entry.map_err(io)?.path();
@@ -69,7 +69,7 @@ fn is_episode(path: &Path) -> bool {
     name.extension().is_some_and(|extension| extension == "mcap")
 }
 
-/// What is said of one episode of a list.
+/// One episode of a list.
 #[must_use]
 pub fn list(file: &Path) -> Listed {
     match inspect(file) {

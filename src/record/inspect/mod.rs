@@ -7,14 +7,10 @@
 //! Invariant: GOOD is proven: see [`judge`]. What cannot be read or judged is never GOOD.
 //! Invariant: no file makes this panic, and memory does not grow with what it holds.
 
-mod channel;
 mod collect;
-mod doubts;
 mod judge;
-mod judgement;
 mod list;
 mod policy;
-mod registered;
 mod render;
 mod state;
 #[cfg(test)]
@@ -22,42 +18,26 @@ mod tests;
 mod units;
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::io;
 use std::path::{Path, PathBuf};
 
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 
 use super::quality::{Quality, Spread};
-use super::walk::{Walked, walk};
-use crate::episode_format::{self, Failed, OpenError, ReadAt};
-use crate::status::Verdict;
+use crate::episode::reader::Reader;
+use crate::episode::record_iter::Integrity;
+use crate::episode::{self, Failed, ReadAt};
+use crate::status::{Grade, Sensors, Verdict};
 use crate::text;
 use collect::Collected;
 
-pub use super::walk::{FileEnd, LeftOut};
-pub use judgement::Judgement;
+pub use crate::episode::ReadError;
+pub use crate::episode::record_iter::{FileEnd, LeftOut};
 pub use list::{Listed, episodes, list, render_list};
 pub use policy::{HoldReport, PolicyReport};
 pub use render::{Paint, render};
 
-/// Why a file cannot be inspected.
-#[derive(Debug, thiserror::Error)]
-pub enum InspectError {
-    /// It cannot be read.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// What the system says.
-        source: io::Error,
-    },
-    /// It is a folder, a pipe or a device.
-    #[error("{}: not a file; name an episode, a file that ends in .mcap or .mcap.partial", .0.display())]
-    NotFile(PathBuf),
-    /// It does not begin as an MCAP file does.
-    #[error("{}: not an MCAP file", .0.display())]
-    NotMcap(PathBuf),
-}
+/// Reason of a file that has no verdict.
+const NOT_OURS: &str = "not an episode of rapid";
 
 /// What a file holds.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -72,7 +52,7 @@ pub struct Inspection {
     /// What it is worth, by what it holds.
     #[serde(flatten)]
     pub verdict: Judgement,
-    /// What the recorder said when it was finished.
+    /// The recorder's verdict when it finished the file.
     pub recorded_verdict: Option<Verdict>,
     /// Bytes of it that could not be understood.
     pub unread_bytes: u64,
@@ -84,7 +64,7 @@ pub struct Inspection {
     /// Messages of a chunk that the end of the file cuts, taken without a check value because they were written since this
     /// machine was started.
     pub ordered_messages: u64,
-    /// What a repair said of this file when it made it: the metadata `rapid/recovered`.
+    /// The metadata `rapid/recovered` that a repair wrote into this file.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub recovered: BTreeMap<String, String>,
     /// The program that wrote it, with its version.
@@ -103,11 +83,11 @@ pub struct Inspection {
     pub tags: BTreeMap<String, String>,
     /// Modules that were mounted.
     pub modules: Vec<String>,
-    /// Modalities that were present when it began; unknown in a file that does not say so.
+    /// Modalities that were present when it began; `None` in a file without this information.
     pub present_at_begin: Option<BTreeSet<String>>,
     /// Beginning, ns since 1970.
     pub begin_ns: u64,
-    /// Length in seconds: what the recorder says, else up to the last message.
+    /// Length in seconds: by the recorder, else up to the last message.
     pub seconds: f64,
     /// Messages on all topics.
     pub messages: u64,
@@ -210,34 +190,86 @@ pub struct EventReport {
     pub text: String,
 }
 
-/// Reads a file and says what it holds.
+/// What a file is worth. As JSON `verdict`, which is `null` without one, `reasons` and `sensors`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Judgement {
+    /// It is an episode.
+    Episode(Verdict),
+    /// Another program wrote it, or nothing in it is an episode's.
+    NotOurs,
+    /// It cannot be read, or is no MCAP file; the text is the reason.
+    Unreadable(String),
+}
+
+impl Judgement {
+    /// The verdict, if there is one.
+    #[must_use]
+    pub fn verdict(&self) -> Option<&Verdict> {
+        match self {
+            Self::Episode(verdict) => Some(verdict),
+            Self::NotOurs | Self::Unreadable(_) => None,
+        }
+    }
+
+    /// Its word, if there is one.
+    #[must_use]
+    pub fn grade(&self) -> Option<Grade> {
+        self.verdict().map(|verdict| verdict.grade)
+    }
+
+    /// Why it is not GOOD, or has no verdict.
+    #[must_use]
+    pub fn reasons(&self) -> Vec<&str> {
+        match self {
+            Self::Episode(verdict) => verdict.reasons.iter().map(String::as_str).collect(),
+            Self::NotOurs => vec![NOT_OURS],
+            Self::Unreadable(why) => vec![why],
+        }
+    }
+}
+
+impl Serialize for Judgement {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        #[derive(Serialize)]
+        struct Json<'a> {
+            verdict: Option<Grade>,
+            reasons: Vec<&'a str>,
+            sensors: Option<&'a Sensors>,
+        }
+        let sensors = self.verdict().and_then(|verdict| verdict.sensors.as_ref());
+        Json { verdict: self.grade(), reasons: self.reasons(), sensors }.serialize(serializer)
+    }
+}
+
+/// Reads a file and reports what it holds.
 ///
 /// # Errors
 /// When it cannot be read or is no MCAP file. An unfinished or damaged one is no error.
-pub fn inspect(path: &Path) -> Result<Inspection, InspectError> {
-    let io = |source| InspectError::Io { path: path.to_owned(), source };
-    let (file, size) = episode_format::open(path).map_err(|error| match error {
-        OpenError::Io { path, source } => InspectError::Io { path, source },
-        OpenError::NotFile(path) => InspectError::NotFile(path),
-    })?;
-    inspect_from(file, size, path, episode_format::boot_id())
-        .map_err(io)?
-        .ok_or_else(|| InspectError::NotMcap(path.to_owned()))
+pub fn inspect(path: &Path) -> Result<Inspection, ReadError> {
+    let (file, size) = episode::open(path)?;
+    inspect_from(file, size, path, episode::boot_id())
 }
 
 /// What a file of these bytes, which may be any, holds; `None` if they are no MCAP file.
 #[must_use]
 pub fn inspect_bytes(bytes: &[u8]) -> Option<Inspection> {
-    inspect_from(bytes, bytes.len() as u64, Path::new("bytes.mcap"), None).ok()?
+    inspect_from(bytes, bytes.len() as u64, Path::new("bytes.mcap"), None).ok()
 }
 
-/// `None`: no MCAP file.
-fn inspect_from(file: impl ReadAt, size: u64, path: &Path, boot: Option<String>) -> io::Result<Option<Inspection>> {
-    let failed = Failed::of(&file, size)?;
+fn inspect_from(file: impl ReadAt, size: u64, path: &Path, boot: Option<String>) -> Result<Inspection, ReadError> {
+    let failed = Failed::of(&file, size).map_err(|source| ReadError::Io { path: path.to_owned(), source })?;
     let recorded = failed.as_ref().map_or(size, |failed| failed.at);
     let mut collected = Collected::default();
-    let walked = walk(file, recorded, boot, &mut |opcode, record| collected.record(opcode, record))?;
-    // The recorder's own mark shows that it was an episode, of which nothing is left.
-    let walked = walked.or_else(|| failed.is_some().then(Walked::nothing));
-    Ok(walked.map(|walked| collected.report(path, size, walked, failed)))
+    let integrity = match Reader::new(file, recorded, path, boot) {
+        Ok(mut reader) => {
+            while reader.advance()? {
+                collected.take(reader.item());
+            }
+            reader.integrity()
+        }
+        // The recorder's own mark shows that it was an episode, of which nothing is left.
+        Err(ReadError::NotMcap(_)) if failed.is_some() => Integrity::default(),
+        Err(error) => return Err(error),
+    };
+    Ok(collected.report(path, size, integrity, failed))
 }

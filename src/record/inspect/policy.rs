@@ -1,4 +1,4 @@
-//! What a policy did in an episode, as its events say.
+//! What a policy did in an episode, by its events.
 //!
 //! Invariant: memory is bounded: texts are those of events, which are short, and of few reasons.
 //! Invariant: no text of a file makes this panic; what is not as the recorder writes it is left out.
@@ -17,15 +17,15 @@ const MAX_REASONS: usize = 32;
 /// Latencies kept one by one: an hour of chunks at 18 Hz.
 const MAX_LATENCIES: usize = 1 << 16;
 const OTHER_REASONS: &str = "other reasons";
-/// Digits by which a bundle is told from another.
+/// Digits that distinguish a bundle from another.
 const HASH: usize = 12;
 
 /// What a policy did in an episode.
 #[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct PolicyReport {
-    /// What its bundle calls itself; empty if the file does not say.
+    /// What its bundle calls itself; empty if unknown.
     pub name: String,
-    /// Names the bundle's contents; empty if the file does not say.
+    /// Names the bundle's contents; empty if unknown.
     pub hash: String,
     /// Its actions were not carried out.
     pub dry_run: bool,
@@ -53,7 +53,7 @@ pub struct HoldReport {
 /// The events of a policy, one by one.
 #[derive(Debug, Default)]
 pub(super) struct Gathered {
-    /// What the last event `policy` says.
+    /// From the last event `policy`.
     told: Option<Value>,
     seen: bool,
     late: u64,
@@ -73,7 +73,7 @@ impl Gathered {
         matches!(kind, "policy" | "chunk" | "hold" | "act" | "policy_end")
     }
 
-    /// Takes an event of a policy, with what it says as JSON.
+    /// Takes an event of a policy, as JSON.
     pub(super) fn event(&mut self, at_ns: u64, kind: &str, json: &str) {
         let Ok(said) = serde_json::from_str::<Value>(json) else { return };
         self.seen = true;
@@ -98,7 +98,7 @@ impl Gathered {
         if self.latencies.len() < MAX_LATENCIES {
             self.latencies.push(us);
         }
-        self.all_latencies.get_or_insert_with(Tally::new).push(u64::from(us) * 1000);
+        self.all_latencies.get_or_insert_with(Tally::default).push(u64::from(us) * 1000);
         self.chunks += 1;
         self.late += u64::from(said.get("skipped").and_then(Value::as_u64).is_some_and(|skipped| skipped > 0));
     }
@@ -124,8 +124,8 @@ impl Gathered {
         Some(Lateness { p50: at(50)?, p99: at(99)?, max: at(100)? })
     }
 
-    /// What the policy did until the end of the episode; `None` if there was none. What no event says
-    /// is what the metadata records `policy` say, the best first.
+    /// What the policy did until the end of the episode; `None` if there was none. Without events
+    /// the metadata records `policy` are used, the best first.
     pub(super) fn report(mut self, end_ns: u64, metadata: [Option<&String>; 2]) -> Option<PolicyReport> {
         self.close(end_ns);
         let mut recorded = metadata.into_iter().flatten().filter_map(|text| serde_json::from_str::<Value>(text).ok());
@@ -158,7 +158,7 @@ impl Gathered {
     }
 }
 
-/// What is to be said of a policy, for people; then a line for each reason of its holds.
+/// A policy in words, for people; then a line for each reason of its holds.
 pub(super) fn words(policy: &PolicyReport) -> (Vec<String>, Vec<String>) {
     let or = |text: &str| if text.is_empty() { "?".to_owned() } else { text.to_owned() };
     let hash: String = policy.hash.chars().take(HASH).collect();
@@ -226,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn what_no_event_says_the_metadata_say() {
+    fn without_events_the_metadata_are_used() {
         let record = r#"{"name": "tactile-id", "hash": "ff", "dry_run": true}"#.to_owned();
         let said = gathered(&[(1, "act", "{}")]).report(S, [None, Some(&record)]).unwrap();
         assert_eq!((said.name.as_str(), said.hash.as_str(), said.dry_run), ("tactile-id", "ff", true));

@@ -33,6 +33,20 @@ pub fn render(inspection: &Inspection, width: usize, paint: Paint) -> String {
 }
 
 fn write_all(out: &mut String, inspection: &Inspection, width: usize, paint: Paint) -> std::fmt::Result {
+    write_head(out, inspection, paint)?;
+    let names = inspection.modalities.iter().map(|modality| clean(&modality.name).chars().count());
+    let topics = inspection.topics.iter().map(|topic| clean(&topic.topic).chars().count());
+    let column = names.chain(topics).max().unwrap_or(0).max(8);
+    write_topics(out, inspection, column)?;
+    write_presence(out, inspection, column, width, paint)?;
+    write_units(out, inspection, column, width)?;
+    if let Some(policy) = &inspection.policy {
+        write_policy(out, policy, width)?;
+    }
+    write_events(out, inspection, width)
+}
+
+fn write_head(out: &mut String, inspection: &Inspection, paint: Paint) -> std::fmt::Result {
     let name = inspection.file.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     writeln!(out, "{}  {}", clean(&name), ending(inspection, paint))?;
     for text in inspection.left_out.sentences(inspection.damaged_chunks) {
@@ -66,10 +80,10 @@ fn write_all(out: &mut String, inspection: &Inspection, width: usize, paint: Pai
     if !others.is_empty() {
         writeln!(out, "{}", colour(paint, YELLOW, &others.join(", ")))?;
     }
+    Ok(())
+}
 
-    let names = inspection.modalities.iter().map(|modality| clean(&modality.name).chars().count());
-    let topics = inspection.topics.iter().map(|topic| clean(&topic.topic).chars().count());
-    let column = names.chain(topics).max().unwrap_or(0).max(8);
+fn write_topics(out: &mut String, inspection: &Inspection, column: usize) -> std::fmt::Result {
     writeln!(
         out,
         "\n{:column$} {:>8} {:>7} {:>7} {:>7} {:>17} {:>6}",
@@ -83,7 +97,16 @@ fn write_all(out: &mut String, inspection: &Inspection, width: usize, paint: Pai
     for topic in &inspection.topics {
         write_topic(out, &topic.topic, topic, "", column)?;
     }
+    Ok(())
+}
 
+fn write_presence(
+    out: &mut String,
+    inspection: &Inspection,
+    column: usize,
+    width: usize,
+    paint: Paint,
+) -> std::fmt::Result {
     if let Some(Spread { p50, p95, max, .. }) = inspection.skew {
         writeln!(out, "\nsamples of a frame lie {p50:.1}/{p95:.1}/{max:.1} ms apart (p50/95/max)")?;
     }
@@ -94,7 +117,10 @@ fn write_all(out: &mut String, inspection: &Inspection, width: usize, paint: Pai
         let line = timeline(modality, inspection.seconds, cells, paint);
         writeln!(out, "{:column$} {line} {share:>6}", clean(&modality.name))?;
     }
+    Ok(())
+}
 
+fn write_units(out: &mut String, inspection: &Inspection, column: usize, width: usize) -> std::fmt::Result {
     if !inspection.units.is_empty() {
         writeln!(out, "\nunits")?;
     }
@@ -106,12 +132,11 @@ fn write_all(out: &mut String, inspection: &Inspection, width: usize, paint: Pai
             name.clear();
         }
     }
+    Ok(())
+}
 
-    if let Some(policy) = &inspection.policy {
-        write_policy(out, policy, width)?;
-    }
-
-    // What a policy gave all the time is summed up above.
+fn write_events(out: &mut String, inspection: &Inspection, width: usize) -> std::fmt::Result {
+    // Chunks of a policy are summed up above.
     let events: Vec<_> = inspection.events.iter().filter(|event| event.kind != "chunk").collect();
     if !events.is_empty() {
         writeln!(out, "\nevents")?;
@@ -218,7 +243,7 @@ fn ending(inspection: &Inspection, paint: Paint) -> String {
 fn write_topic(out: &mut String, name: &str, topic: &TopicReport, frames: &str, column: usize) -> std::fmt::Result {
     let late =
         topic.lateness.map_or("-".to_owned(), |Lateness { p50, p99, max }| format!("{p50:.1}/{p99:.1}/{max:.1}"));
-    // Of a handful of messages a rate says nothing.
+    // A handful of messages has no meaningful rate.
     let hz = if topic.messages < 10 { "-".to_owned() } else { format!("{:.2}", topic.hz) };
     writeln!(
         out,

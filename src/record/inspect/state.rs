@@ -1,32 +1,42 @@
-//! The state of a file: whether it is whole, what a repair recorded about it, and what of it is counted.
+//! The state of a file: whether it is whole, what a repair recorded about it, what of it is counted, and what of it is in
+//! doubt.
 
 use std::collections::BTreeMap;
 
+use serde_json::Value;
+
 use super::super::metadata::CUT_SHORT;
-use super::super::verdict::{FileState, Finding};
-use super::super::walk::{FileEnd, LeftOut, Walked};
+use super::super::verdict::{FileState, Missing};
 use super::ModalityReport;
 use super::judge::Ending;
+use crate::episode::own::EpisodeId;
+use crate::episode::record_iter::{FileEnd, Integrity, LeftOut};
+use crate::episode::{ABOUT, SUMMARY};
 use crate::record::Quality;
 use crate::status::{Grade, Verdict};
+use crate::sync::Grid;
 use crate::text;
+use crate::time::Stamp;
+
+/// Ticks are at whole nanoseconds of another clock.
+const ROUNDING: u64 = 1_000;
 
 const UNPROVEN: &str = "check values are missing in it, so that damage would not show";
 
 pub(super) fn file_state<'a>(ending: &Ending<'a>) -> FileState<'a> {
-    let Ending { file: walked, summary, repaired, failed, damage, .. } = ending;
+    let Ending { file: integrity, summary, repaired, failed, damage, .. } = ending;
     if let Some(why) = failed {
         return FileState::Failed(why);
     }
     let cut_short = summary.get(CUT_SHORT);
-    match (walked.end, *repaired) {
+    match (integrity.end, *repaired) {
         (FileEnd::Finished, Some(said)) => FileState::NotWhole(said),
         // A check value that is not right counts as much as a chunk that cannot be read.
-        (FileEnd::Finished, None) if walked.damaged_chunks == 0 && walked.sound => match cut_short {
+        (FileEnd::Finished, None) if integrity.damaged_chunks == 0 && integrity.sound => match cut_short {
             Some(why) => FileState::NotWhole(why),
             // Whoever wrote the footer: what the recorder ends, it sums up.
             None if summary.is_empty() => FileState::NotWhole("the recorder has not finished it"),
-            None if !walked.proven => FileState::NotWhole(UNPROVEN),
+            None if !integrity.proven => FileState::NotWhole(UNPROVEN),
             None => FileState::Whole,
         },
         (FileEnd::Finished, None) => FileState::NotWhole(damage),
@@ -37,38 +47,16 @@ pub(super) fn file_state<'a>(ending: &Ending<'a>) -> FileState<'a> {
 }
 
 /// What of a damaged file is left out, for people.
-pub(super) fn damage(walked: &Walked) -> String {
-    let left_out = walked.left_out.sentences(walked.damaged_chunks);
+pub(super) fn damage(integrity: &Integrity) -> String {
+    let left_out = integrity.left_out.sentences(integrity.damaged_chunks);
     std::iter::once("parts of it are damaged".to_owned()).chain(left_out).collect::<Vec<_>>().join("; ")
-}
-
-/// What is in the file without proof, and what is missing by its own numbers.
-pub(super) fn findings(ending: &Ending<'_>) -> impl Iterator<Item = Finding> + use<> {
-    let (unproven, frames) = (ending.file.ordered_messages, ending.counted.missing.frames);
-    let are = if frames == 1 { "frame is" } else { "frames are" };
-    let said = [
-        (unproven > 0).then(|| unverified(unproven)),
-        (frames > 0).then(|| format!("{frames} {are} not in the file (limit 0)")),
-    ];
-    said.into_iter().flatten().map(Finding::suspect)
 }
 
 /// What a repaired file lacks, by its record `rapid/recovered`; `None`: it has none.
 pub(super) fn repaired(recovered: &BTreeMap<String, String>) -> Option<String> {
     let count = |key: &str| recovered.get(key).and_then(|count| count.parse::<u64>().ok()).unwrap_or(0);
-    let left_out = LeftOut {
-        gaps: count("gaps"),
-        oversized_records: count("oversized_records"),
-        swollen_chunks: count("swollen_chunks"),
-        excess_records: count("excess_records"),
-        repeated_chunks: count("repeated_chunks"),
-        nameless_messages: count("nameless_messages"),
-        unproven_messages: count("unproven_messages"),
-        unproven_bytes: count("unproven_bytes"),
-        other_chunks: count("other_chunks"),
-        bytes_before: count("bytes_before"),
-        bytes_behind: count("bytes_behind"),
-    };
+    let counts = recovered.keys().map(|key| (key.clone(), Value::from(count(key)))).collect();
+    let left_out: LeftOut = serde_json::from_value(Value::Object(counts)).unwrap_or_default();
     let mut said = vec!["it was repaired".to_owned()];
     match recovered.get("end").map(String::as_str) {
         Some("unfinished" | "torn") => said.push("what came last may be missing".to_owned()),
@@ -110,4 +98,85 @@ pub(super) fn recorded_verdict(summary: &BTreeMap<String, String>) -> Option<Ver
     let reasons = serde_json::from_str(summary.get("reasons")?).ok()?;
     let sensors = summary.get("sensors").and_then(|sensors| serde_json::from_str(sensors).ok());
     Some(Verdict { grade, reasons, sensors })
+}
+
+/// What was counted in a file.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Counted {
+    /// Messages on all topics.
+    pub(super) messages: u64,
+    /// Ticks of the frame index, and the time of the latest.
+    pub(super) frames: u64,
+    pub(super) last_frame: u64,
+    /// Records that could not be understood.
+    pub(super) unread: u64,
+    /// Changes of the mask and of what is plugged in that were too many to be judged.
+    pub(super) unjudged: u64,
+    /// Samples of no bytes.
+    pub(super) empty: u64,
+    /// Metadata records at the beginning, and at the end.
+    pub(super) abouts: u64,
+    pub(super) summaries: u64,
+    /// Is the registry attached that its metadata name? Unknown without an attachment.
+    pub(super) attached: Option<bool>,
+    /// Numbers missing between its messages, and between ticks of its frame index.
+    pub(super) missing: Missing,
+    pub(super) missing_frames: u64,
+}
+
+/// What in a file could not be judged, is there without proof, or contradicts something else in it: each is a reason
+/// against GOOD, whatever check values are right.
+pub(super) fn doubts(ending: &Ending<'_>) -> Vec<String> {
+    let Counted { unread, unjudged, empty, abouts, summaries, attached, .. } = ending.counted;
+    let unread = unread.saturating_add(ending.file.left_out.oversized_records);
+    let counted = [
+        (unread, "record", "in the file cannot be understood"),
+        (unjudged, "change", "of the mask or of what is plugged in not judged: there are more than 10,000"),
+        (empty, "sample", "without content"),
+    ];
+    let counted = counted.into_iter().filter(|(count, ..)| *count > 0);
+    let mut said: Vec<String> =
+        counted.map(|(count, what, rest)| format!("{} {rest}", text::counted(count, what))).collect();
+    let twice = [(abouts, ABOUT), (summaries, SUMMARY)].into_iter().filter(|(count, _)| *count > 1);
+    said.extend(twice.map(|(count, name)| format!("it has {count} metadata records {name:?}, of which one is right")));
+    let registry = match attached {
+        Some(true) => None,
+        Some(false) => Some("the registry attached to it is not that of its metadata"),
+        None => Some("the registry is not attached to it"),
+    };
+    said.extend(registry.map(str::to_owned));
+    if ending.file.end == FileEnd::Finished && !ending.file.indexed {
+        said.push("it has no index".to_owned());
+    }
+    let named = EpisodeId::of(ending.about).zip(ending.file.episode);
+    if named.is_some_and(|(metadata, chunks)| metadata != chunks) {
+        said.push("its metadata and its samples are of different episodes".to_owned());
+    }
+    said.extend(length(ending));
+    let (unproven, frames) = (ending.file.ordered_messages, ending.counted.missing_frames);
+    said.extend((unproven > 0).then(|| unverified(unproven)));
+    let are = if frames == 1 { "frame is" } else { "frames are" };
+    said.extend((frames > 0).then(|| format!("{frames} {are} not in the file (limit 0)")));
+    said
+}
+
+/// Is the file as long as its summary states? A recorder that ends an episode writes every frame before its end.
+fn length(ending: &Ending<'_>) -> Option<String> {
+    if ending.repaired.is_some() || ending.summary.contains_key(CUT_SHORT) {
+        return None;
+    }
+    let seconds: f64 = ending.summary.get("duration_s")?.parse().ok()?;
+    let hz: f64 = ending.about.get("observation_hz")?.parse().ok()?;
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saturates, as wanted")]
+    let end = Stamp((seconds * 1e9).round() as u64);
+    let begin: u64 = ending.about.get("begin_wall_ns")?.parse().ok()?;
+    let grid = Grid::new(Stamp(0), hz);
+    let Counted { frames, last_frame, .. } = ending.counted;
+    let last = grid.tick(frames.saturating_sub(1)).0;
+    // The length is rounded, a tick is not.
+    let differs = grid.ticks_before(end).abs_diff(frames) > 1
+        || frames > 0 && last.abs_diff(last_frame.saturating_sub(begin)) > ROUNDING
+        || !hz.is_finite();
+    differs
+        .then(|| format!("its metadata give {seconds} s at {hz} frames a second, which its {frames} frames do not fit"))
 }

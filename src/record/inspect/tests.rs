@@ -3,12 +3,16 @@
 use proptest::prelude::*;
 
 use super::*;
-use crate::episode_format::testing;
+use crate::episode::testing;
+use crate::mask::{PhysicalMask, SizedMask};
 use crate::record::tests::Bench;
-use crate::status::{Chunk, Grade, Sensors, What};
+use crate::status::{Chunk, Grade, Hold, Sensors, What};
 
 fn of(bytes: &[u8]) -> Option<Inspection> {
-    inspect_from(bytes, bytes.len() as u64, Path::new("x.mcap"), episode_format::boot_id()).unwrap()
+    match inspect_from(bytes, bytes.len() as u64, Path::new("x.mcap"), episode::boot_id()) {
+        Err(ReadError::NotMcap(_)) => None,
+        read => Some(read.unwrap()),
+    }
 }
 
 async fn episode() -> (Bench, PathBuf) {
@@ -19,7 +23,7 @@ async fn episode() -> (Bench, PathBuf) {
 }
 
 #[tokio::test]
-async fn a_finished_episode_is_told_as_it_was() {
+async fn a_finished_episode_is_reported_as_recorded() {
     let (_bench, file) = episode().await;
     let said = inspect(&file).unwrap();
     assert_eq!((said.end, said.unread_bytes, said.damaged_chunks), (FileEnd::Finished, 0, 0));
@@ -64,7 +68,7 @@ async fn a_finished_episode_is_told_as_it_was() {
 }
 
 #[tokio::test]
-async fn a_cut_or_damaged_file_is_read_as_far_as_it_goes() {
+async fn a_truncated_or_damaged_file_is_read_up_to_the_damage() {
     let (_bench, file) = episode().await;
     let bytes = std::fs::read(&file).unwrap();
     let whole = of(&bytes).unwrap();
@@ -95,7 +99,7 @@ async fn a_cut_or_damaged_file_is_read_as_far_as_it_goes() {
 }
 
 #[test]
-fn whatever_happened_to_a_file_it_is_told_of() {
+fn any_damaged_file_has_a_report() {
     let config = ProptestConfig { cases: 300, failure_persistence: None, ..ProptestConfig::default() };
     for bytes in testing::layouts().map(testing::episode) {
         proptest!(config.clone(), |(mutations in testing::mutations())| {
@@ -107,7 +111,7 @@ fn whatever_happened_to_a_file_it_is_told_of() {
 }
 
 #[tokio::test]
-async fn a_policy_is_told_of_with_its_bundle_and_its_holds() {
+async fn a_policy_is_reported_with_its_bundle_and_its_holds() {
     let bench = Bench::new();
     let announced = What::Policy {
         policy: "tactile-id".to_owned(),
@@ -121,7 +125,7 @@ async fn a_policy_is_told_of_with_its_bundle_and_its_holds() {
         What::Chunk(Box::new(Chunk {
             tick: 1,
             observed_ns: 0,
-            mask: "0x03".to_owned(),
+            mask: SizedMask { mask: PhysicalMask(3), devices: 2 },
             seed: 0,
             latency_ms,
             used: true,
@@ -135,7 +139,7 @@ async fn a_policy_is_told_of_with_its_bundle_and_its_holds() {
         .half_a_second(
             vec![announced],
             vec![
-                What::Hold { device: "arm".to_owned(), reason: "missing".to_owned() },
+                What::Hold(Hold { device: Some("arm".to_owned()), reason: "missing".to_owned() }),
                 chunk(30.0, 0),
                 chunk(50.0, 2),
                 What::Act { tick: 3 },
@@ -200,14 +204,14 @@ fn chunks_of_other_writers_are_opened_and_their_damage_survived() {
 }
 
 #[test]
-fn what_is_no_mcap_file_is_said() {
+fn other_files_are_reported_as_no_mcap_file() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("x.mcap");
-    assert!(matches!(inspect(&path), Err(InspectError::Io { .. })));
+    assert!(matches!(inspect(&path), Err(ReadError::Io { .. })));
     assert!(inspect(folder.path()).unwrap_err().to_string().contains(": not a file"));
     let pipe = folder.path().join("pipe");
     rustix::fs::mknodat(rustix::fs::CWD, &pipe, rustix::fs::FileType::Fifo, 0o600.into(), 0).unwrap();
-    assert!(matches!(inspect(&pipe), Err(InspectError::NotFile(_))));
+    assert!(matches!(inspect(&pipe), Err(ReadError::NotFile(_))));
     std::fs::write(&path, "no").unwrap();
     let error = inspect(&path).unwrap_err();
     assert!(error.to_string().ends_with("x.mcap: not an MCAP file"));
@@ -311,7 +315,7 @@ fn the_report_on_a_screen() {
                 at: 3.2,
                 kind: "detach".to_owned(),
                 device: "cam_wrist".to_owned(),
-                text: "cam_wrist detached, told by stream".to_owned(),
+                text: "cam_wrist detached, reported by stream".to_owned(),
             },
         ],
     };

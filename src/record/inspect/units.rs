@@ -1,4 +1,4 @@
-//! Which units an episode's samples come from, as its file says.
+//! The units that an episode's samples come from, by its file.
 //!
 //! Invariant: no text of a file makes this panic; what is not as the recorder writes it is left out.
 
@@ -29,7 +29,7 @@ pub(super) fn told(summary: &str, beginning: &str, opened: Vec<(f64, String)>) -
     units
 }
 
-/// What is to be said of an epoch, for people.
+/// An epoch in words, for people.
 pub(super) fn words(epoch: &Value) -> Vec<String> {
     let text = |key: &str| epoch.get(key).and_then(Value::as_str);
     let seconds = |key: &str| epoch.get(key).and_then(Value::as_f64);
@@ -59,7 +59,7 @@ pub(super) fn words(epoch: &Value) -> Vec<String> {
 fn format(format: &Value) -> Option<String> {
     let number = |key: &str| format.get(key).and_then(Value::as_f64);
     if let Some(fourcc) = format.get("fourcc").and_then(Value::as_str) {
-        // Two digits tell 29.97 from 30.
+        // Two digits distinguish 29.97 from 30.
         let rate = number("fps").map_or(String::new(), |fps| format!(" at {} fps", (fps * 100.0).round() / 100.0));
         return Some(format!("{fourcc} {}x{}{rate}", number("width")?, number("height")?));
     }
@@ -75,7 +75,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_epoch_is_a_line_and_what_is_not_told_is_left_out() {
+    fn an_epoch_is_a_line_without_its_unknown_fields() {
         let full = json!({
             "epoch": 2, "from_s": 6.21, "to_s": 9.0, "vid": "046d", "pid": "0825", "serial": "A", "port": "1-2",
             "firmware": "4.18", "driver": {"name": "uvcvideo", "version": "6.1.0"},
@@ -105,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_without_a_summary_is_told_by_its_events() {
+    fn units_of_a_file_without_a_summary_come_from_its_events() {
         let beginning = r#"{"cam": [{"epoch": 1, "from_s": -1.0, "to_s": null}]}"#;
         let opened = r#"{"stamp": 5, "event": "opened", "device": "cam", "bit": 0, "epoch": 2, "serial": "B"}"#;
         let hostile = ["", "[]", "{\"device\": 7}", "nul"];

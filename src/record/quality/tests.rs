@@ -4,7 +4,6 @@ use std::time::Duration;
 
 use proptest::prelude::*;
 
-use super::drift::Drift;
 use super::*;
 use crate::modality::ModalityKind;
 
@@ -21,7 +20,7 @@ fn measures(kind: ModalityKind) -> Measures {
 
 fn measures_at(hz: f64, kind: ModalityKind) -> Measures {
     let limits = VerdictSpec::of(kind, Duration::from_millis(500), Some(30.0));
-    let measured = [Measured { id: id(0), limits, latency_ns: 0 }, Measured { id: id(3), limits, latency_ns: 0 }];
+    let measured = [0, 3].map(|bit| Measured { name: String::new(), id: id(bit), limits, latency_ns: 0 });
     Measures::new(
         &measured,
         Frames { begin_ns: BEGIN, hz, window: Duration::from_millis(25), wait: Duration::from_millis(125) },
@@ -53,12 +52,12 @@ fn a_picture_is_whole_when_it_begins_and_ends_as_one() {
         (b"\0\0\0", false),
         (b"", false),
     ] {
-        assert_eq!(jpeg::is_whole(payload), whole, "{payload:?}");
+        assert_eq!(is_whole_jpeg(payload), whole, "{payload:?}");
     }
 }
 
 #[test]
-fn damaged_is_what_the_driver_flagged_or_what_is_no_whole_picture_and_counts_once() {
+fn damaged_counts_flagged_samples_and_torn_pictures_once() {
     let mut measures = measures(ModalityKind::Image);
     for (n, (flagged, jpeg, payload)) in [
         (false, true, &b"\xff\xd8a\xff\xd9"[..]),
@@ -78,7 +77,7 @@ fn damaged_is_what_the_driver_flagged_or_what_is_no_whole_picture_and_counts_onc
 }
 
 #[test]
-fn plugged_in_is_what_events_tell_and_opening_the_longest_of_it_that_the_mask_lacks() {
+fn plugged_time_comes_from_events_and_opening_is_its_longest_part_outside_the_mask() {
     // Of ten seconds: events (ms, in or out), masks (ms, bit 0), plugged in, longest without the bit.
     type Row<'a> = (&'a [(u64, bool)], &'a [(u64, u64)], u64, u64);
     let table: &[Row<'_>] = &[
@@ -113,9 +112,9 @@ fn plugged_in_is_what_events_tell_and_opening_the_longest_of_it_that_the_mask_la
 }
 
 #[test]
-fn a_number_or_a_time_that_does_not_go_on_is_a_duplicate() {
+fn a_non_increasing_number_or_time_is_a_duplicate() {
     let mut measures = measures(ModalityKind::Scalars);
-    // A new number at an old time, an old number at a new time; a publisher that began anew is none.
+    // A new number at an old time, an old number at a new time; a restarted publisher is none.
     for (seq, at, duplicates) in [(7, 10, 0), (8, 20, 0), (9, 20, 1), (9, 30, 2), (10, 25, 3), (0, 40, 3), (1, 50, 3)] {
         measures.sample(id(0), &seen(seq, at, 1, b""));
         assert_eq!(quality_at(&measures, 100).duplicates, duplicates, "{seq} at {at} ms");
@@ -140,7 +139,7 @@ fn equal_pictures_are_frozen_and_equal_numbers_are_not() {
 }
 
 #[test]
-fn late_is_what_misses_the_deadline_of_the_nearest_tick() {
+fn late_samples_miss_the_deadline_of_the_nearest_tick() {
     // Ticks at 0, 33.3, 66.7 ms; each waits 125 ms.
     for (at, late_by, late) in
         [(0, 125, 0), (0, 126, 1), (16, 109, 0), (16, 110, 1), (17, 141, 0), (17, 142, 1), (60, 131, 0), (60, 132, 1)]
@@ -233,7 +232,7 @@ fn a_clock_that_runs_differently_drifts_and_one_that_is_ahead_is_in_the_future()
 
 #[test]
 fn drift_has_a_fixed_size_and_survives_any_time() {
-    let mut drift = Drift::new();
+    let mut drift = Drift::default();
     for since in [0, 1, 250 * MS, 4000 * MS, u64::MAX, u64::MAX / 2, 0] {
         drift.push(since, i64::MIN);
     }
@@ -241,7 +240,7 @@ fn drift_has_a_fixed_size_and_survives_any_time() {
 }
 
 #[test]
-fn frames_say_how_far_samples_lie_from_their_tick_and_from_one_another() {
+fn frames_give_sample_offsets_from_the_tick_and_their_spread() {
     let mut measures = measures(ModalityKind::Scalars);
     let ms = |ms: i64| Some(ms * 1_000_000);
     for (a, b) in [(ms(5), ms(-5)), (ms(10), ms(10)), (ms(3), None), (None, None)] {
@@ -274,7 +273,7 @@ fn episode() -> impl Strategy<Value = Made> {
 proptest! {
     /// Against the definition: count by count, and gaps millisecond by millisecond.
     #[test]
-    fn measures_are_what_they_are_defined_to_be((samples, masks) in episode()) {
+    fn measures_match_their_definitions((samples, masks) in episode()) {
         let mut measures = measures(ModalityKind::Image);
         for (n, (at, byte, late)) in samples.iter().enumerate() {
             measures.sample(id(0), &seen(n as u64, *at, *late, &[*byte]));
@@ -343,12 +342,12 @@ fn a_frame_at_the_edge_of_a_presence_may_lack_a_sample_and_no_other() {
         for frame in frames.chars() {
             meter.frame(frame != '.', frame == 'v');
         }
-        assert_eq!(meter.frames_missed, missed, "{frames}");
+        assert_eq!(meter.counts.frames_missed, missed, "{frames}");
     }
 }
 
 #[test]
-fn what_waits_for_the_mask_is_bounded_and_judged_all_the_same() {
+fn samples_waiting_for_the_mask_are_bounded_and_judged() {
     let mut measures = measures(ModalityKind::Scalars);
     measures.mask(BEGIN, PhysicalMask(1));
     let mut at = 0;

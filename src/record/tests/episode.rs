@@ -3,7 +3,7 @@
 use super::*;
 
 #[tokio::test]
-async fn an_episode_holds_what_was_captured_and_nothing_else() {
+async fn an_episode_holds_exactly_the_captured_samples() {
     let bench = Bench::new();
     let mut events = bench.board.events();
     let (finished, t0) = bench.one_second().await;
@@ -13,7 +13,7 @@ async fn an_episode_holds_what_was_captured_and_nothing_else() {
         unreachable!()
     };
     assert_eq!((file.as_path(), error, seconds), (finished.as_path(), None, 1.0));
-    // The camera was away and the mask says so; what else happened is told.
+    // The camera was away by the mask; everything else is reported.
     let reasons = ["tof: 1 of 1", "tof: 7 of 1", "raw: 1 of 2 samples damaged (limit 5 %)", "raw: no sample for "];
     assert_eq!(verdict.grade, Grade::Bad);
     for reason in reasons {
@@ -183,7 +183,7 @@ async fn orders_out_of_turn_are_refused_and_a_stop_reports() {
 }
 
 #[tokio::test]
-async fn what_a_device_should_not_send_is_recorded_as_bytes_and_never_lost() {
+async fn unexpected_payloads_are_recorded_as_bytes_and_never_lost() {
     let bench = Bench::new();
     let finished = bench.recorder.start(bench.request(None)).await.unwrap();
     let now = Stamp::now().0;

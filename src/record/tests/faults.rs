@@ -1,7 +1,8 @@
 //! Disks that fail, kills and panics.
 
 use super::*;
-use crate::episode_format::Failed;
+use crate::episode::Failed;
+use crate::episode::recover;
 
 /// A disk of few bytes.
 struct SmallDisk(File, usize);
@@ -40,7 +41,7 @@ async fn a_full_disk_ends_the_episode_and_not_the_recorder() {
         bench.sample(CAM, 1, seq, Stamp::now().0, 0);
     }
     let closed = bench.until_closed(&mut events).await;
-    let sentence = closed.sentence().unwrap().1;
+    let sentence = closed.describe().sentence;
     let What::Episode { file, bytes, error, .. } = closed else { unreachable!() };
     assert_eq!(file, finished.with_extension("mcap.partial"));
     assert_eq!(bytes, 100_000 + Failed::mark("no storage space").len() as u64);
@@ -203,7 +204,7 @@ async fn a_file_that_is_not_on_the_disk_keeps_its_partial_name() {
 }
 
 #[tokio::test]
-async fn a_disk_full_at_the_start_is_said_and_leaves_nothing() {
+async fn a_disk_full_at_the_start_is_an_error_and_leaves_no_file() {
     let bench = Bench::with_sink(|file| Box::new(SmallDisk(file, 0)));
     let mut request = bench.request(None);
     // More than the buffer in front of the disk holds.
@@ -215,7 +216,7 @@ async fn a_disk_full_at_the_start_is_said_and_leaves_nothing() {
 }
 
 #[tokio::test]
-async fn a_partial_file_holds_what_was_flushed() {
+async fn a_partial_file_holds_all_flushed_messages() {
     let bench = Bench::new();
     let finished = bench.recorder.start(bench.request(None)).await.unwrap();
     let partial = finished.with_extension("mcap.partial");
@@ -237,7 +238,7 @@ async fn a_partial_file_holds_what_was_flushed() {
 }
 
 #[tokio::test]
-async fn a_panic_leaves_a_finished_file_and_says_so() {
+async fn a_panic_leaves_a_finished_file_and_is_reported() {
     let bench = Bench::new();
     let mut events = bench.board.events();
     let finished = bench.recorder.start(bench.request(None)).await.unwrap();
@@ -250,7 +251,7 @@ async fn a_panic_leaves_a_finished_file_and_says_so() {
     let What::Episode { file, error, .. } = bench.until_closed(&mut events).await else { unreachable!() };
     assert_eq!(file, finished);
     assert!(error.unwrap().contains("scripted panic"));
-    // Whoever reads the file is told what the recorder said.
+    // A reader of the file sees the recorder's verdict.
     let said = inspect::inspect(&finished).unwrap();
     assert!(said.recorded_verdict.as_ref().unwrap().reasons.iter().any(|said| said.contains("scripted panic")));
     assert_eq!(said.verdict.verdict(), said.recorded_verdict.as_ref());

@@ -27,7 +27,7 @@ async fn until(events: &mut tokio::sync::broadcast::Receiver<Event>, wanted: imp
 }
 
 #[tokio::test]
-async fn a_disk_that_fills_up_is_told_once_and_ends_the_episode_with_a_whole_file() {
+async fn a_full_disk_is_reported_once_and_ends_the_episode_with_a_whole_file() {
     let free = Arc::new(AtomicU64::new(50 * GIB));
     let bench = on_disk(&free);
     let mut events = bench.board.events();
@@ -85,7 +85,7 @@ async fn a_disk_that_does_not_answer_is_written_to() {
 }
 
 #[tokio::test]
-async fn what_was_set_aside_is_given_back() {
+async fn reserved_space_is_released() {
     use std::os::unix::fs::MetadataExt;
     let bench = Bench::new();
     let finished = bench.recorder.start(bench.request(None)).await.unwrap();
@@ -146,7 +146,7 @@ async fn a_folder_whose_name_is_no_utf_8_holds_episodes_like_any_other() {
 }
 
 #[tokio::test]
-async fn a_removed_file_is_said_while_it_is_recorded_and_takes_nobodys_name() {
+async fn a_removed_file_is_reported_while_recording_and_takes_no_other_name() {
     let bench = Bench::new();
     let mut events = bench.board.events();
     let finished = bench.recorder.start(bench.request(None)).await.unwrap();
@@ -178,7 +178,7 @@ async fn a_folder_that_is_moved_and_replaced_is_followed() {
 }
 
 #[tokio::test]
-async fn a_clock_that_is_set_is_an_event_and_no_time_goes_back() {
+async fn a_clock_step_is_an_event_and_times_never_decrease() {
     let set = Arc::new(AtomicI64::new(0));
     let bench = Bench::with(|config| {
         let set = Arc::clone(&set);

@@ -1,12 +1,11 @@
 //! A session on a clock of its own: deadlines, losses, edges.
 
-use super::super::episode::{Closing, EpisodePath};
-use super::super::hole::Hole;
-use super::super::masks::MaskHistory;
+use super::super::episode_path::EpisodePath;
 use super::super::provenance::Attached;
 use super::super::session::{Beginning, Session};
-use super::super::streams::Streams;
+use super::super::streams::{Hole, MaskHistory, Streams};
 use super::*;
+use crate::provenance::UnplugSource;
 use crate::time::WallClock;
 
 /// A session of its own clock, one second after the monotonic clock's zero.
@@ -16,7 +15,7 @@ fn session(folder: &Path, board: &Arc<Board>, masks: &MaskHistory) -> Session {
 
 fn session_of(registry: Registry, folder: &Path, board: &Arc<Board>, masks: &MaskHistory) -> Session {
     let clock = WallClock::with_offset(i128::from(1_700_000_000 * 1000 * MS));
-    let path = EpisodePath::create(folder, "t", clock.wall_ns(Stamp(0))).unwrap();
+    let path = EpisodePath::create(folder, "t", clock.wall_ns(Stamp(0)), &[]).unwrap();
     let beginning = Beginning {
         registry: Arc::new(registry),
         board: Arc::clone(board),
@@ -52,14 +51,14 @@ fn no_mask_is_missing_between_the_one_in_force_and_the_first_of_the_episode() {
         session.mask(&scalars(sequence, capture, capture), PhysicalMask(0b10), sequence, None);
     }
     session.end_at(Stamp(1002 * MS));
-    let report = session.finish(Stamp(1200 * MS), &masks, Closing::default());
+    let report = session.finish(Stamp(1200 * MS), &masks, None, &[]);
     assert_eq!(report.error, None);
     let read = read(&report.file);
     assert_eq!(read.on(crate::mask::MASK_TOPIC).map(|message| message.1).collect::<Vec<_>>(), [5, 6, 7, 8]);
 }
 
 #[test]
-fn what_comes_late_is_recorded_and_what_comes_too_late_belongs_to_no_frame() {
+fn late_samples_are_recorded_and_too_late_ones_belong_to_no_frame() {
     let folder = tempfile::tempdir().unwrap();
     let board = Arc::new(Board::new(&registry()));
     let mut masks = MaskHistory::new();
@@ -81,7 +80,7 @@ fn what_comes_late_is_recorded_and_what_comes_too_late_belongs_to_no_frame() {
     session.sample(id(TOF), &scalars(3, 1099, 1190), &[0; 8], None);
     session.sample(id(TOF), &scalars(4, 1100, 1190), &[0; 8], None);
     assert!(!session.is_over(at(1219)) && session.is_over(at(1220)));
-    let report = session.finish(at(1220), &masks, Closing::default());
+    let report = session.finish(at(1220), &masks, None, &[]);
     assert_eq!((report.error, report.messages), (None, 7), "one sample and two frames more");
     assert!((report.seconds - 0.1).abs() < 1e-9);
 
@@ -117,7 +116,7 @@ fn losses_are_announced_once_a_second_and_counted_all() {
     let hole = Hole { after: Stamp(1500 * MS), before: Stamp(3000 * MS), lost: 0, dropped: u64::MAX };
     session.sample(id(CAM), &scalars(1, 3000, 3000), &[0; 8], Some(hole));
     assert_eq!(session.status(Stamp(0)).dropped, u64::MAX);
-    let report = session.finish(Stamp(3001 * MS), &masks, Closing::default());
+    let report = session.finish(Stamp(3001 * MS), &masks, None, &[]);
     assert_eq!((report.error, report.dropped), (None, u64::MAX));
     let mut said = Vec::new();
     while let Ok(event) = events.try_recv() {
@@ -155,7 +154,7 @@ fn of_a_hole_across_the_beginning_or_the_end_only_the_part_within_counts() {
     // Neither a hole in another time nor one of no length.
     session.sample(id(TOF), &scalars(40, 1300, 1300), &[0; 8], hole(1250, 1300, 10));
     session.sample(id(TOF), &scalars(50, 1300, 1300), &[0; 8], hole(1300, 1300, 10));
-    let report = session.finish(Stamp(1300 * MS), &masks, Closing::default());
+    let report = session.finish(Stamp(1300 * MS), &masks, None, &[]);
     assert_eq!((report.error, report.dropped), (None, 9));
 }
 
@@ -177,7 +176,7 @@ fn a_slow_sensor_makes_its_frame_and_every_frame_waits_for_it() {
     assert_eq!(session.status(at(1444)).messages, 2, "a sample and a mask; the frame not before 1445 ms");
     assert!(!session.is_over(at(1429)) && session.is_over(at(1430)));
     session.advance(at(1445), &masks);
-    let report = session.finish(at(1445), &masks, Closing::default());
+    let report = session.finish(at(1445), &masks, None, &[]);
     assert_eq!((report.error.as_deref(), report.messages, report.seconds), (None, 3, 0.01));
     let read = read(&report.file);
     let frame = &read.on("/rapid/frame").next().unwrap().4;
@@ -190,7 +189,7 @@ fn a_slow_sensor_makes_its_frame_and_every_frame_waits_for_it() {
     assert_eq!(modalities[usize::from(TOF)]["latency_ns"], 300_000_000);
 }
 
-/// What a device that is plugged in says on the board.
+/// The state on the board of a device that is plugged in.
 fn attach(name: &str, bit: u8) -> What {
     let usb = UsbIdentity { port: "1-3".to_owned(), ..UsbIdentity::default() };
     What::Attach {
@@ -216,8 +215,8 @@ async fn a_device_that_is_plugged_in_and_never_sends_is_missed_by_recorder_and_i
         }
         let finished = bench.recorder.start(bench.request(Some(Duration::from_millis(500)))).await.unwrap();
         if before && !missed {
-            let (device, bit, witness) = ("never".to_owned(), id(NEVER), "kernel".to_owned());
-            bench.board.announce(What::Detach { device, bit, witness });
+            let (device, bit, source) = ("never".to_owned(), id(NEVER), UnplugSource::Kernel);
+            bench.board.announce(What::Detach { device, bit, source });
         }
         let t0 = Stamp::now().0;
         for n in 0..45 {
@@ -264,7 +263,7 @@ fn acted(folder: &Path, actions: Arrivals) -> EpisodeReport {
         }
         session.advance(Stamp(ms * MS), &streams.masks);
     }
-    let report = session.finish(Stamp(2200 * MS), &streams.masks, Closing::default());
+    let report = session.finish(Stamp(2200 * MS), &streams.masks, None, &[]);
     assert_eq!((report.error.as_deref(), report.seconds), (None, 1.0));
     report
 }

@@ -5,6 +5,7 @@ use std::io::{Read as _, Seek, SeekFrom};
 use std::time::Instant;
 
 use super::*;
+use crate::episode::recover;
 
 /// How long a condition may take before a test gives up; no requirement.
 const PATIENCE: Duration = Duration::from_secs(30);
@@ -175,7 +176,7 @@ fn an_episode_of_which_nothing_is_left_but_the_reason_is_bad_for_it() {
     let why = "another program cut it while it was recorded: all of it is gone";
     let file = folder.path().join("a_001.mcap.partial");
     for before in [&b""[..], &[0; 100]] {
-        std::fs::write(&file, [before, &crate::episode_format::Failed::mark(why)].concat()).unwrap();
+        std::fs::write(&file, [before, &crate::episode::Failed::mark(why)].concat()).unwrap();
         found_again("nothing is left", why, &file);
     }
 }

@@ -1,4 +1,4 @@
-//! Which figures earn which word, and what is said about them.
+//! Which figures lead to which grade and which reasons.
 
 use std::time::Duration;
 
@@ -35,10 +35,8 @@ fn limits() -> VerdictSpec {
 fn facts<'a>(modalities: &'a [Judged<'a>], file: FileState<'a>) -> Facts<'a> {
     Facts {
         modalities,
-        masks_dropped: 0,
-        actions_dropped: 0,
+        missing: Missing::default(),
         expect: &[],
-        events_missed: 0,
         publishers: &[],
         seconds: 10.0,
         losses: Losses::Apart,
@@ -85,7 +83,7 @@ fn every_check_has_its_words_and_its_two_limits() {
     is(
         |q| q.duplicates = 1,
         Suspect,
-        &["cam: 1 of 210 samples whose number or capture time does not go on (limit 0.1 %)"],
+        &["cam: 1 of 210 samples with a non-increasing sequence number or capture time (limit 0.1 %)"],
     );
     is(|q| q.repeated = 105, Suspect, &["cam: 105 of 210 samples byte for byte the one before (limit 10 %)"]);
     is(
@@ -114,7 +112,7 @@ fn every_check_has_its_words_and_its_two_limits() {
     is(|q| q.clock_ahead = 12.0, Suspect, &["cam: captured up to 12 ms after it was received (limit 10 ms)"]);
     is(|q| q.hz = Some(15.04), Suspect, &["cam: 15.0 samples a second while present, of 30 (limit 90 %)"]);
     is(|q| q.hz = Some(14.9), Bad, &["cam: 14.9 samples a second while present, of 30 (limit 50 %)"]);
-    // The gap tells of the low rate too, unless that is the graver of the two.
+    // The gap implies the low rate, unless that is the graver of the two.
     is(
         |q| (q.longest_gap, q.hz) = (3.0, Some(20.0)),
         Suspect,
@@ -138,8 +136,9 @@ fn every_check_has_its_words_and_its_two_limits() {
 fn an_episode_of_a_moment_is_bad_and_so_many_actions_are_missing() {
     let quality = good();
     let modalities = [Judged { name: "cam", quality: &quality, limits: limits() }];
-    let of = |seconds, actions_dropped| {
-        let said = judge(&Facts { actions_dropped, seconds, ..facts(&modalities, FileState::Whole) });
+    let of = |seconds, actions| {
+        let missing = Missing { actions, ..Missing::default() };
+        let said = judge(&Facts { missing, seconds, ..facts(&modalities, FileState::Whole) });
         (said.grade, said.why())
     };
     assert_eq!(of(0.0, 0), (Grade::Bad, "too short: 0 ms (limit 500 ms)".to_owned()));
@@ -149,7 +148,7 @@ fn an_episode_of_a_moment_is_bad_and_so_many_actions_are_missing() {
 }
 
 #[test]
-fn an_expected_sensor_without_a_sample_is_suspect_and_every_verdict_names_who_is_missing() {
+fn an_expected_sensor_without_samples_is_suspect_and_verdicts_name_missing_ones() {
     let (talks, never) = (good(), Quality { samples: 0, present: 0.0, plugged: 0.0, opening: 0.0, ..good() });
     let of = |name| Judged { name, quality: if name == "cam" { &talks } else { &never }, limits: limits() };
     let modalities = [of("cam"), of("tof"), of("gel")];
@@ -183,7 +182,7 @@ fn a_modality_that_was_there_and_sent_nothing_is_bad_and_one_that_was_not_is_not
     // Plugged in a moment before the end; never plugged in.
     assert_eq!(both(&silent(0.3)).grade, Grade::Good);
     assert_eq!(both(&silent(0.0)).grade, Grade::Good);
-    // Nobody said anything at all.
+    // Without any finding.
     let nobody = verdict_on(&silent(0.0), FileState::Whole);
     assert_eq!((nobody.grade, nobody.why().as_str()), (Grade::Bad, "nothing was received from any modality"));
 }
@@ -222,10 +221,10 @@ fn a_device_that_is_plugged_in_and_does_not_run_is_missed_and_one_that_starts_is
 }
 
 #[test]
-fn the_file_and_what_is_missing_in_it_count_and_the_gravest_comes_first() {
+fn the_file_and_its_losses_count_and_the_gravest_reason_comes_first() {
     let quality = Quality { lost: 5, ..good() };
     let modalities = [Judged { name: "cam", quality: &quality, limits: limits() }];
-    let of = |file| Facts { masks_dropped: 2, events_missed: 1, ..facts(&modalities, file) };
+    let of = |file| Facts { missing: Missing { masks: 2, actions: 0, events: 1 }, ..facts(&modalities, file) };
     let said = judge(&of(FileState::NotWhole("it was recovered")));
     let lost = "cam: 5 of 215 samples lost by the device (limit 1 %)";
     let missing = ["2 publications of the mask are not in the file (limit 0)", "1 event is not in the file (limit 0)"];
@@ -242,7 +241,7 @@ fn the_file_and_what_is_missing_in_it_count_and_the_gravest_comes_first() {
 }
 
 #[test]
-fn a_check_that_is_off_says_nothing() {
+fn a_disabled_check_gives_no_reason() {
     let off = Limits {
         lost: None,
         dropped: None,

@@ -10,6 +10,7 @@
 //! words split at spaces; the one word that comes from outside is `$name`, the name that the interface has
 //! after udev's rules, which the kernel takes without spaces and `/` and which no device chooses.
 
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::Path;
 
@@ -45,21 +46,21 @@ pub(super) fn rules(registry: &Registry) -> String {
             },
         };
     }
-    for (user, chip) in chips(registry) {
-        // A name of a chip as the kernel gives it; any other is a link of somebody's rule.
+    for (chip, users) in chips(registry) {
+        // A name of a chip as the kernel gives it; any other is a link made by an operator's rule.
         let chip = chip.to_str().and_then(|chip| chip.strip_prefix("/dev/gpiochip"));
         if let Some(number) =
             chip.filter(|number| (1..=5).contains(&number.len()) && number.bytes().all(|byte| byte.is_ascii_digit()))
         {
             let rule = format!("SUBSYSTEM==\"gpio\", KERNEL==\"gpiochip{number}\", GROUP=\"gpio\", MODE=\"0660\"");
-            let _ = writeln!(text, "\n# {user}\n{rule}");
+            let _ = writeln!(text, "\n# {}\n{rule}", users.join(", "));
         }
     }
     text
 }
 
-/// GPIO chips, and what each is for.
-fn chips(registry: &Registry) -> impl Iterator<Item = (String, &Path)> {
+/// GPIO chips, and what each is for: several lines of one may be in use.
+fn chips(registry: &Registry) -> BTreeMap<&Path, Vec<String>> {
     let stops = registry.stops.iter().filter_map(|stop| match &stop.input {
         InterlockInput::Gpio(GpioInput { chip, .. }) => Some((format!("stop {}", stop.name), chip.as_path())),
         _ => None,
@@ -69,7 +70,13 @@ fn chips(registry: &Registry) -> impl Iterator<Item = (String, &Path)> {
         _ => None,
     });
     let brakes = buses.flatten().filter_map(|motor| Some((motor, motor.brake.as_ref()?)));
-    stops.chain(brakes.map(|(motor, brake)| (format!("brake of {}", motor.name), brake.chip.as_path())))
+    let mut chips = BTreeMap::<_, Vec<_>>::new();
+    for (user, chip) in
+        stops.chain(brakes.map(|(motor, brake)| (format!("brake of {}", motor.name), brake.chip.as_path())))
+    {
+        chips.entry(chip).or_default().push(user);
+    }
+    chips
 }
 
 /// The matches that single out the node of an entry's unit, or why there are none.
@@ -139,9 +146,7 @@ fn bring_up(usb: &UsbSpec, identity: &str, bitrate: u32) -> String {
 fn subsystem(device: &DeviceSpec) -> &'static str {
     match device.node.opens() {
         Opens::Video => "video4linux",
-        Opens::Tty => "tty",
-        Opens::Usb => "usb",
-        Opens::Net => "net",
+        other => other.word(),
     }
 }
 

@@ -51,7 +51,7 @@ fn a_unit_is_named_by_serial_by_port_or_as_the_only_one_of_its_model() {
         vid = "0002"
         pid = "0002"
         node = "serial"
-        [device.two.serial]
+        [device.two.tty]
         channels = 1
         [device.three]
         vid = "0003"
@@ -145,6 +145,27 @@ fn the_service_may_open_keys_and_gpio_chips_only_where_a_stop_is_one() {
 }
 
 #[test]
+fn a_chip_that_several_lines_are_used_of_has_one_rule() {
+    let motor = |name: &str, slave: u8| {
+        format!(
+            "{{ name = \"{name}\", slave = {slave}, type = \"DM4310\", kp = 1, kd = 1, position = [0, 1], \
+             brake = {{ chip = \"/dev/gpiochip2\", line = {slave}, released = \"high\" }} }}"
+        )
+    };
+    let text = format!(
+        "[device.arm]\nvid = \"2e88\"\npid = \"4603\"\nnode = \"can\"\nbit = 0\n[device.arm.can]\n\
+         protocol = \"damiao\"\nmotors = [{}, {}]\n[stop.door]\nkind = \"emergency\"\n\
+         gpio = {{ chip = \"/dev/gpiochip2\", line = 9, runs_while = \"low\" }}\n",
+        motor("lift", 5),
+        motor("turn", 6)
+    );
+    let rules = text_of(&artifacts(&Registry::parse(&text, None).unwrap().registry), "99-rapid.rules");
+    let rule = "# stop door, brake of lift, brake of turn\nSUBSYSTEM==\"gpio\", KERNEL==\"gpiochip2\"";
+    assert!(rules.contains(rule), "{rules}");
+    assert_eq!(rules.matches("KERNEL==\"gpiochip2\"").count(), 1, "{rules}");
+}
+
+#[test]
 fn the_service_may_open_the_chips_of_brakes_and_the_serial_ports_of_the_board_where_they_are_needed() {
     let arm = |brake: &str| {
         format!(
@@ -177,7 +198,7 @@ fn the_service_may_open_the_chips_of_brakes_and_the_serial_ports_of_the_board_wh
 /// sockets it needs besides those of udev and the journal.
 const KINDS: &[(&str, &str, &[&str])] = &[
     ("camera", "vid = \"1\"\npid = \"1\"\nnode = \"camera\"", &[]),
-    ("serial", "vid = \"2\"\npid = \"1\"\nnode = \"serial\"\n[device.NAME.serial]\nchannels = 1", &[]),
+    ("serial", "vid = \"2\"\npid = \"1\"\nnode = \"serial\"\n[device.NAME.tty]\nchannels = 1", &[]),
     ("program", "vid = \"3\"\npid = \"1\"\nnode = \"program\"", &[]),
     ("hook", "vid = \"4\"\npid = \"1\"\nnode = \"camera\"\non_attach = [\"/bin/true\"]", &[]),
     ("can", "vid = \"5\"\npid = \"1\"\nnode = \"can\"", &["AF_CAN"]),

@@ -25,6 +25,31 @@ fn an_entry_is_added_at_the_end() {
 }
 
 #[test]
+fn the_old_name_of_a_serial_line_s_table_is_replaced_and_nothing_else() {
+    for (old, new) in [
+        ("[device.a]\nserial_number = \"S\"\n[device.a.serial] # here\nbaud = 1\n", Some("[device.a.tty] # here")),
+        ("[device.a]\nserial = { channels = 1 } # here\n", Some("\ntty = { channels = 1 } # here")),
+        ("device.a.serial = { channels = 1 }\n", Some("device.a.tty = {")),
+        ("[ device . \"a\" . \"serial\" ]\n[device.b]\n[device.b.serial]\r\n", Some("[ device . \"a\" . tty ]\n")),
+        // The serial number, another's table, a name that only contains it, a device of that name.
+        ("[device.a]\nserial = \"S\"\n[stop.x.serial]\n[device.serial]\n[device.serial.tty]\n", None),
+        // Dotted keys stay, and are accepted with a warning; both names are an error already.
+        ("[device.a]\nserial.baud = 1\nserial.channels = 2\n", None),
+        ("[device.a.tty]\n[device.a.serial]\n", None),
+        ("[device.a.serial\n", None),
+        ("device = 1", None),
+    ] {
+        let renamed = renamed(old);
+        match new {
+            Some(new) => assert!(renamed.contains(new) && !renamed.contains(".serial]"), "{renamed:?}"),
+            None => assert_eq!(renamed, old),
+        }
+        let restored = renamed.replacen("tty", "serial", usize::MAX);
+        assert_eq!(restored.replace('"', ""), old.replace("tty", "serial").replace('"', ""), "{old:?}");
+    }
+}
+
+#[test]
 fn keys_that_are_none_are_refused() {
     for (first, second, reason) in [
         ("a b", "x", "write letters"),
@@ -68,7 +93,7 @@ camera.width = 1 # dotted
 ";
 
 #[test]
-fn an_entry_goes_with_its_own_comments_and_no_others() {
+fn an_entry_is_removed_with_its_own_comments_only() {
     let left = remove(FILE, "left").unwrap();
     assert_eq!(
         left,
@@ -85,14 +110,14 @@ fn an_entry_goes_with_its_own_comments_and_no_others() {
 }
 
 #[test]
-fn what_is_added_can_be_taken_out_again() {
+fn added_entries_can_be_removed_again() {
     let with = append(FILE, &[entry("cam")]).unwrap();
     assert!(with.starts_with(FILE));
     assert_eq!(remove(&with, "cam").unwrap(), FILE);
 }
 
 #[test]
-fn an_entry_in_two_places_goes_from_both() {
+fn an_entry_in_two_places_is_removed_from_both() {
     let text = "[device.a]\nvid = \"1\"\n\n[device.b]\nvid = \"2\"\n\n[device.a.camera]\nwidth = 1\n";
     assert_eq!(remove(text, "a").unwrap(), "[device.b]\nvid = \"2\"\n");
 }

@@ -42,7 +42,7 @@ fn registry() -> Registry {
         serial_number = "C"
         node = "serial"
         bit = 5
-        [device.both_tty.serial]
+        [device.both_tty.tty]
         channels = 1
     "#;
     Registry::parse(text, None).unwrap().registry
@@ -98,7 +98,7 @@ fn a_serial_number_decides_before_a_port() {
 }
 
 #[test]
-fn a_stranger_of_a_known_model_is_told_what_differs() {
+fn an_unknown_unit_of_a_known_model_names_the_difference() {
     let mut assigner = Assigner::new(&registry());
     let Assignment::Unregistered { reason } = assigner.attach(&video(0, unit(1, Some("B\n"), "1-2"))) else {
         panic!("it must not match");
@@ -153,7 +153,7 @@ fn a_unit_with_a_serial_number_returns_to_its_entry_in_any_port() {
 }
 
 #[test]
-fn twins_with_one_serial_number_do_not_collapse_and_are_told_apart_by_port() {
+fn twins_with_one_serial_number_stay_separate_by_port() {
     let mut assigner = Assigner::new(&registry());
     assert_eq!(assigner.attach(&video(0, unit(2, Some("0001"), "1-5"))), entry(2));
     assert_eq!(assigner.attach(&video(1, unit(2, Some("0001"), "1-4"))), entry(3));
@@ -197,7 +197,7 @@ fn the_nodes_of_a_composite_device_go_to_their_own_entries() {
 }
 
 #[test]
-fn a_node_told_twice_is_one_node_and_a_missed_removal_is_seen() {
+fn a_node_reported_twice_is_one_node_and_a_missed_removal_is_detected() {
     let mut assigner = Assigner::new(&registry());
     let node = video(0, unit(2, None, "1-5"));
     assert_eq!(assigner.attach(&node), entry(2));
@@ -276,7 +276,7 @@ impl Believed {
 
 proptest! {
     #[test]
-    fn what_was_said_is_what_is_true(steps in prop::collection::vec(any_step(), 0..40)) {
+    fn reported_assignments_match_the_state(steps in prop::collection::vec(any_step(), 0..40)) {
         let mut assigner = Assigner::new(&registry());
         let mut believed = Believed::default();
         for step in steps {
@@ -305,7 +305,7 @@ proptest! {
     }
 
     #[test]
-    fn where_units_are_told_apart_only_what_is_plugged_counts(
+    fn with_distinguishable_units_only_plugged_ones_count(
         noise in prop::collection::vec(0_usize..5, 0..12),
         plugged in prop::sample::subsequence(vec![0_usize, 1, 2, 3, 4], 0..=5).prop_shuffle(),
     ) {

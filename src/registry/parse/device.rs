@@ -1,21 +1,21 @@
 //! One `[device.NAME]` table.
+//!
+//! Of what `rapid` reads itself, motors behind a CAN adapter alone move, and each of them is an axis without a table
+//! `[device.NAME.action]`; a program may move what it likes.
 
 use std::path::Path;
 use std::time::Duration;
 
-use toml::de::DeValue;
-
-use super::name::name_problem;
-use super::program::{For, Programs};
+use super::identity::name_problem;
+use super::program::{self, For, Programs};
 use super::verdict::{VerdictTable, Whose};
-use super::{action, can, hooks, identity, lan, motors, node, process, verdict};
+use super::{identity, lan, motors, node, verdict};
+use crate::action::MAX_ACTION;
 use crate::modality::{ModalityId, ModalityKind};
-use crate::registry::diagnostic::did_you_mean;
-use crate::registry::limits::VerdictSpec;
-use crate::registry::section::{At, Problems, Section};
+use crate::registry::section::Section;
+use crate::registry::spec::VerdictSpec;
 use crate::registry::spec::{
-    ActionSpec, CanProtocol, CanSpec, DeviceSpec, Hook, Hooks, IdentitySpec, LanProtocol, LanSpec, Mount, NodeSpec,
-    Opens, WhenStale,
+    ActionSpec, CanProtocol, CanSpec, DeviceSpec, Hook, Hooks, IdentitySpec, LanSpec, Mount, NodeSpec, Opens, WhenStale,
 };
 
 /// Kinds of node this version has a driver for.
@@ -23,32 +23,10 @@ pub(super) const BUILT_IN: [(&str, Kind); 4] =
     [("camera", Kind::Camera), ("serial", Kind::Serial), ("can", Kind::Can), ("lan", Kind::Lan)];
 /// Says that `on_attach` is the program that reads the device.
 const PROCESS: &str = "process";
-const KEYS: [&str; 24] = [
-    "vid",
-    "pid",
-    "serial",
-    "serial_number",
-    "port",
-    "node",
-    "topic",
-    "bit",
-    "slot",
-    "stall_after",
-    "max_bytes",
-    "depth",
-    "when_stale",
-    "latency",
-    "camera",
-    "can",
-    "lan",
-    "process",
-    "verdict",
-    "action",
-    "on_attach",
-    "on_detach",
-    "on_record_start",
-    "on_record_stop",
-];
+/// Keys that say which device an entry means.
+pub(super) const IDENTITY_KEYS: [&str; 5] = ["vid", "pid", "serial", "serial_number", "port"];
+const KEYS: [&str; 9] = ["node", "topic", "bit", "slot", "stall_after", "max_bytes", "depth", "when_stale", "latency"];
+const TABLES: [&str; 7] = ["camera", "tty", "can", "lan", "process", "verdict", "action"];
 
 /// The mask is 64 bits wide.
 const HIGHEST_BIT: i64 = 63;
@@ -75,7 +53,7 @@ pub(super) struct Draft<'a> {
     pub(super) kind: Option<Kind>,
     node: Option<NodeSpec>,
     pub(super) topic: String,
-    pub(super) bit: Option<At<u8>>,
+    pub(super) bit: Option<u8>,
     pub(super) id: Option<ModalityId>,
     pub(super) mount: Option<Mount>,
     stall_after: Duration,
@@ -90,21 +68,17 @@ pub(super) struct Draft<'a> {
     hooks: Hooks,
 }
 
-impl Draft<'_> {
+impl<'d> Draft<'d> {
     /// The entry, with what `[verdict]` says for all; `None` only if a problem with it was reported.
-    pub(super) fn finish(self, rig: &VerdictTable) -> Option<DeviceSpec> {
+    pub(super) fn finish(self, rig: &VerdictTable) -> Option<(Section<'d>, DeviceSpec)> {
         let node = self.node?;
-        let fps = match &node {
-            NodeSpec::Camera(camera) => Some(f64::from(camera.fps)),
-            NodeSpec::Lan(lan) => lan.rate(),
-            _ => None,
-        };
+        let fps = node.picture().map(|picture| f64::from(picture.fps));
         let mut usual = VerdictSpec::of(node.modality_kind(), self.stall_after, fps);
-        if matches!(&node, NodeSpec::Lan(lan) if matches!(lan.protocol, LanProtocol::Gopro { .. })) {
+        if node::is_gopro(&node) {
             // Its samples are looks at its state, once a second, and no observation: its pictures are in the clip.
             (usual.suspect.valid, usual.bad.valid) = (None, None);
         }
-        Some(DeviceSpec {
+        let spec = DeviceSpec {
             verdict: verdict::changed(usual, rig, &self.verdict),
             name: self.name,
             id: self.id?,
@@ -119,7 +93,8 @@ impl Draft<'_> {
             latency: self.latency,
             action: self.action,
             hooks: self.hooks,
-        })
+        };
+        Some((self.section, spec))
     }
 
     /// How many numbers a sample holds, 0 if it holds none; `None` if a problem with the node was reported.
@@ -130,20 +105,6 @@ impl Draft<'_> {
             ModalityKind::Image | ModalityKind::Bytes => 0,
         };
         usize::try_from(count).ok()
-    }
-
-    /// It is moved by a program that reads it as well.
-    pub(super) fn is_moved_by_a_program(&self) -> bool {
-        self.action.is_some() && self.kind == Some(Kind::Process)
-    }
-
-    pub(super) fn default_topic(&self) -> String {
-        default_topic(self.kind, &self.name)
-    }
-
-    /// The key the serial number is written under.
-    pub(super) fn serial_key(&self) -> &'static str {
-        if self.section.has("serial_number") { "serial_number" } else { "serial" }
     }
 
     /// Which node of the unit the entry takes.
@@ -168,67 +129,56 @@ impl Draft<'_> {
             _ => None,
         }
     }
-
-    pub(super) fn is_camera(&self) -> bool {
-        self.kind == Some(Kind::Camera)
-    }
 }
 
 /// Reads one entry.
-pub(super) fn read<'a>(
-    name: &str,
-    section: Section<'a>,
-    programs: Programs<'_>,
-    problems: &mut Problems<'_>,
-) -> Draft<'a> {
-    check_name(name, &section, problems);
-    check_keys(&section, problems);
-    let kind = kind(&section, problems);
-    let identity = identity::identity(kind, &section, problems);
+pub(super) fn read<'a>(name: &str, section: Section<'a>, programs: Programs<'_>) -> Draft<'a> {
+    if let Some((message, fix)) = name_problem(name) {
+        section.report_at(section.at, message, fix);
+    }
+    section.allow(&[&IDENTITY_KEYS[..], &KEYS, &TABLES, &Hooks::KEYS].concat());
+    let kind = kind(&section);
+    let identity = identity::identity(kind, &section);
     let mut heartbeat = None;
     let settings = match kind {
-        Some(Kind::Camera) => Some(NodeSpec::Camera(node::camera(&section, problems))),
-        Some(Kind::Serial) => node::serial(&section, problems).map(NodeSpec::Serial),
-        Some(Kind::Can) => can::can(&section, problems).map(NodeSpec::Can),
-        Some(Kind::Lan) => lan::lan(&section, problems).map(NodeSpec::Lan),
-        Some(Kind::Process) => {
-            process::process(&section, program(&section, programs, problems), problems).map(|(process, silent)| {
-                heartbeat = Some(silent);
-                NodeSpec::Process(process)
-            })
-        }
+        Some(Kind::Camera) => Some(NodeSpec::Camera(node::camera(&section))),
+        Some(Kind::Serial) => node::serial(&section).map(NodeSpec::Serial),
+        Some(Kind::Can) => node::can(&section).map(NodeSpec::Can),
+        Some(Kind::Lan) => lan::lan(&section).map(NodeSpec::Lan),
+        Some(Kind::Process) => node::process(&section, program(&section, programs)).map(|(process, silent)| {
+            heartbeat = Some(silent);
+            NodeSpec::Process(process)
+        }),
         None => None,
     };
     if kind.is_some_and(|kind| kind != Kind::Process) && section.has("process") {
         let message = format!("a built-in node has no table [{}]", section.child("process"));
-        section.report(problems, "process", message, "remove the table, or write node = the name of a program");
+        section.report("process", message, "remove the table, or write node = the name of a program");
     }
     if kind.is_some_and(|kind| kind != Kind::Can) && section.has("can") {
         let message = format!("only a CAN adapter has a table [{}]", section.child("can"));
-        section.report(problems, "can", message, "remove the table, or write node = \"can\"");
+        section.report("can", message, "remove the table, or write node = \"can\"");
     }
-    let topic = topic(&section, problems).unwrap_or_else(|| default_topic(kind, name));
-    let bit = section
-        .integer(problems, "bit", 0..=HIGHEST_BIT)
-        .and_then(|bit| Some(At { at: bit.at, value: u8::try_from(bit.value).ok()? }));
-    let mount = section.choice(problems, "slot", &Mount::WORDS);
-    let when_stale = section.choice(problems, "when_stale", &WhenStale::WORDS).unwrap_or_default();
+    let topic = topic(&section).unwrap_or_else(|| default_topic(kind, name));
+    let bit = section.integer("bit", 0..=HIGHEST_BIT);
+    let mount = section.choice("slot", &Mount::WORDS);
+    let when_stale = section.choice("when_stale", &WhenStale::WORDS).unwrap_or_default();
     let stall = Duration::from_millis(10)..=Duration::from_hours(1);
     let stall_after = heartbeat
-        .or_else(|| section.duration(problems, "stall_after", stall))
+        .or_else(|| section.duration("stall_after", stall))
         .unwrap_or_else(|| node::default_stall(settings.as_ref()));
-    let latency = section.duration(problems, "latency", Duration::ZERO..=LONGEST_LATENCY).unwrap_or_default();
-    let max_bytes = node::max_bytes(&section, settings.as_ref(), problems);
+    let latency = section.duration("latency", Duration::ZERO..=LONGEST_LATENCY).unwrap_or_default();
+    let max_bytes = node::max_bytes(&section, settings.as_ref());
     let action = match &settings {
         Some(NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(damiao), .. })) => {
-            Some(motors::axes(damiao, &section, problems))
+            Some(motors::axes(damiao, &section))
         }
         settings => {
             let moves = settings.as_ref().is_none_or(|node| matches!(node, NodeSpec::Process(_)));
-            action::action(&section, moves || programs.are_nowhere(), problems)
+            action(&section, moves || programs.are_nowhere())
         }
     };
-    let written = section.integer(problems, "depth", 2..=4096).and_then(|depth| u64::try_from(depth.value).ok());
+    let written = section.integer("depth", 2..=4096);
     Draft {
         name: name.to_owned(),
         identity,
@@ -243,76 +193,54 @@ pub(super) fn read<'a>(
         depth_written: written.is_some(),
         when_stale,
         latency,
-        verdict: verdict::read(&section, Whose::Device, problems),
+        verdict: verdict::read(&section, Whose::Device),
         action,
-        hooks: hooks::hooks(&section, attach_is_node(&section), programs, problems),
+        hooks: program::hooks(&section, attach_is_node(&section), programs),
         node: settings,
         section,
     }
 }
 
-fn check_name(name: &str, section: &Section<'_>, problems: &mut Problems<'_>) {
-    if let Some((message, fix)) = name_problem(name) {
-        problems.report(section.at, &section.entry, message, fix);
-    }
-}
-
-fn check_keys(section: &Section<'_>, problems: &mut Problems<'_>) {
-    for (at, key, _) in section.fields() {
-        if KEYS.contains(&key) {
-            continue;
-        }
-        let fix = did_you_mean(key, &KEYS, "known keys here");
-        problems.report(at, &section.entry, format!("unknown key {key:?}"), fix);
-    }
-}
-
-fn kind(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<Kind> {
+fn kind(section: &Section<'_>) -> Option<Kind> {
     if !section.has("node") {
-        section.missing(
-            problems,
-            "node",
-            "write node = \"camera\", \"serial\", \"can\", \"lan\" or the name of a program",
-        );
+        section.missing("node", "write node = \"camera\", \"serial\", \"can\", \"lan\" or the name of a program");
         return None;
     }
-    let text = section.text(problems, "node")?.value;
+    let text = section.text("node")?;
     if text == PROCESS && !section.has("on_attach") {
         let fix = "write node = the name of the program, for example node = \"tactile_publisher\", or add on_attach = \
                    [\"tactile_publisher\", \"argument\"]";
-        section.report(problems, "node", "node \"process\" does not say which program".to_owned(), fix);
-        return None;
+        return section.refuse("node", "node \"process\" does not say which program".to_owned(), fix);
     }
     Some(BUILT_IN.iter().find(|(name, _)| *name == text).map_or(Kind::Process, |(_, kind)| *kind))
 }
 
 /// Is `on_attach` the program that reads the device?
 fn attach_is_node(section: &Section<'_>) -> bool {
-    let is_process = |key: &str, value: &DeValue<'_>| key == "node" && value.as_str() == Some(PROCESS);
-    section.has("on_attach") && section.fields().iter().any(|(_, key, value)| is_process(key, value.get_ref()))
+    section.has("on_attach") && section.word("node") == Some(PROCESS)
 }
 
 /// The program that reads the device: what `node` names, or with `node = "process"` what `on_attach` does.
-fn program(section: &Section<'_>, programs: Programs<'_>, problems: &mut Problems<'_>) -> Option<Hook> {
+fn program(section: &Section<'_>, programs: Programs<'_>) -> Option<Hook> {
     if attach_is_node(section) {
-        return hooks::hook(section, "on_attach", programs, problems);
+        return program::hook(section, "on_attach", programs);
     }
-    let name = section.text(problems, "node")?;
-    let found = programs.find(For::Node, name.value);
-    let program = found.map_err(|(message, fix)| section.report(problems, "node", message, fix)).ok()?;
+    let name = section.text("node")?;
+    let found = programs.find(For::Node, name);
+    let program = found.map_err(|(message, fix)| section.report("node", message, fix)).ok()?;
     Some(Hook { program, args: Vec::new() })
 }
 
-fn default_topic(kind: Option<Kind>, name: &str) -> String {
+pub(super) fn default_topic(kind: Option<Kind>, name: &str) -> String {
     let word = BUILT_IN.iter().find(|(_, built_in)| Some(*built_in) == kind).map(|(word, _)| *word);
     let kind = word.unwrap_or(if kind == Some(Kind::Process) { "process" } else { "device" });
     format!("/rapid/{kind}/{name}")
 }
 
-fn topic(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<String> {
+fn topic(section: &Section<'_>) -> Option<String> {
     /// Longest name of an iceoryx2 service is 255 bytes.
     const LONGEST: usize = 200;
-    let topic = section.text(problems, "topic")?.value;
+    let topic = section.text("topic")?;
     let legal = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '/');
     let (message, fix) = if !topic.starts_with('/') {
         (format!("topic {topic:?} does not begin with `/`"), format!("write {:?}", format!("/{topic}")))
@@ -325,6 +253,45 @@ fn topic(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<String> {
     } else {
         return Some(topic.to_owned());
     };
-    section.report(problems, "topic", message, fix);
-    None
+    section.refuse("topic", message, fix)
+}
+
+const ACTION_KEYS: [&str; 4] = ["names", "units", "min", "max"];
+
+/// Reads the table; `None` without one, or if a problem with it was reported. One of a device that does not `move`
+/// is such a problem.
+pub(super) fn action(section: &Section<'_>, moves: bool) -> Option<ActionSpec> {
+    let table = section.table("action")?;
+    if !moves {
+        let node = section.text("node").unwrap_or_default();
+        let message = format!("node {node:?} takes no actions: nothing would move");
+        let fix = "remove the table; motors behind a CAN adapter are axes without one (protocol = \"damiao\"), and any \
+                   other device is moved by a program (node = its name)";
+        return section.refuse("action", message, fix);
+    }
+    table.allow(&ACTION_KEYS);
+    for key in ACTION_KEYS {
+        table.need(key, &format!("write {key} = a list with one entry an axis"));
+    }
+    // All of them first: every mistake is reported.
+    let (names, units) = (table.texts("names"), table.texts("units"));
+    let (min, max) = (table.numbers("min"), table.numbers("max"));
+    let (names, units, min, max) = (names?, units?, min?, max?);
+    if names.is_empty() || names.len() > MAX_ACTION {
+        let fix = format!("name 1 to {MAX_ACTION} axes");
+        return table.refuse("names", format!("{} axes", names.len()), fix);
+    }
+    for (key, length) in [("units", units.len()), ("min", min.len()), ("max", max.len())] {
+        if length != names.len() {
+            let message = format!("{length} entries for {} axes", names.len());
+            return table.refuse(key, message, "give each axis one entry");
+        }
+    }
+    for (name, (low, high)) in names.iter().zip(min.iter().zip(&max)) {
+        if !(low.is_finite() && high.is_finite() && low < high) {
+            let message = format!("{name} from {low} to {high} is no range");
+            return table.refuse("max", message, "write finite numbers, max above min");
+        }
+    }
+    Some(ActionSpec { names, units, min, max })
 }

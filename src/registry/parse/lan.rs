@@ -3,26 +3,11 @@
 use std::net::IpAddr;
 use std::time::Duration;
 
-use super::device::Draft;
-use crate::registry::section::{Problems, Section};
+use super::device::{Draft, IDENTITY_KEYS};
+use crate::registry::section::Section;
 use crate::registry::spec::{LanFind, LanPicture, LanProtocol, LanSpec, PhoneStream, Probe};
 
-const KEYS: [&str; 14] = [
-    "protocol",
-    "mdns",
-    "instance",
-    "host",
-    "port",
-    "probe",
-    "probe_port",
-    "lease",
-    "path",
-    "width",
-    "height",
-    "fps",
-    "download",
-    "stream",
-];
+const KEYS: [&str; 8] = ["protocol", "mdns", "instance", "host", "port", "probe", "probe_port", "lease"];
 /// Keys of the table that only some protocols have.
 const OWN: [(Word, &[&str]); 4] = [
     (Word::Mjpeg, &["path", "width", "height", "fps"]),
@@ -59,84 +44,74 @@ impl Word {
 }
 
 /// Reads the table; `None` if a problem with it was reported.
-pub(super) fn lan(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<LanSpec> {
-    for key in ["camera", "serial"].into_iter().filter(|key| section.is_table(key)) {
-        let message = format!("a network device has no table [{}]", section.child(key));
-        section.report(problems, key, message, format!("write its settings into [{}]", section.child("lan")));
-    }
+pub(super) fn lan(section: &Section<'_>) -> Option<LanSpec> {
+    section.no_tables(&["camera", "tty", "serial"], "a network device", "lan");
     if !section.is_table("lan") {
         let fix =
             format!("write [{}] with protocol = \"mjpeg\", \"udp\", \"gopro\" or \"iphone\"", section.child("lan"));
-        section.missing(problems, "the table of the network device", &fix);
+        section.missing("the table of the network device", &fix);
         return None;
     }
-    let table = section.table(problems, "lan")?;
-    table.allow(problems, &KEYS);
-    if !table.has("protocol") {
-        table.missing(problems, "protocol", "write protocol = \"mjpeg\", \"udp\", \"gopro\" or \"iphone\"");
-    }
-    let word = table.choice(problems, "protocol", &Word::WORDS);
-    let port = port(&table, "port", problems);
-    let lease =
-        table.duration(problems, "lease", Duration::from_millis(500)..=Duration::from_mins(1)).unwrap_or(DEFAULT_LEASE);
+    let table = section.table("lan")?;
+    table.allow(&[&KEYS[..], &OPTIONAL].concat());
+    table.need("protocol", "write protocol = \"mjpeg\", \"udp\", \"gopro\" or \"iphone\"");
+    let word = table.choice("protocol", &Word::WORDS);
+    let port = port(&table, "port");
+    let lease = table.duration("lease", Duration::from_millis(500)..=Duration::from_mins(1)).unwrap_or(DEFAULT_LEASE);
     let word = word?;
     for key in OPTIONAL.into_iter().filter(|key| table.has(key) && !word.own().contains(key)) {
         let message = format!("protocol {:?} has no {key}", word.name());
-        table.report(problems, key, message, format!("remove {key}, or correct the protocol"));
+        table.report(key, message, format!("remove {key}, or correct the protocol"));
     }
-    let protocol = protocol(&table, word, port, problems);
-    let find = find(section, &table, word, port, problems);
+    let protocol = protocol(&table, word, port);
+    let find = find(section, &table, word, port);
     Some(LanSpec { protocol: protocol?, find: find?, lease })
 }
 
-fn port(table: &Section<'_>, key: &str, problems: &mut Problems<'_>) -> Option<u16> {
-    u16::try_from(table.integer(problems, key, 1..=65_535)?.value).ok()
+fn port(table: &Section<'_>, key: &str) -> Option<u16> {
+    table.integer(key, 1..=65_535)
 }
 
-fn protocol(table: &Section<'_>, word: Word, port: Option<u16>, problems: &mut Problems<'_>) -> Option<LanProtocol> {
+fn protocol(table: &Section<'_>, word: Word, port: Option<u16>) -> Option<LanProtocol> {
     Some(match word {
         Word::Mjpeg => {
-            let path = path(table, problems);
-            LanProtocol::Mjpeg { port, path, picture: picture(table, LanPicture::OF_A_CAMERA, problems) }
+            let path = path(table);
+            LanProtocol::Mjpeg { port, path, picture: picture(table, LanPicture::OF_A_CAMERA) }
         }
         Word::Udp => {
-            if !table.has("port") {
-                table.missing(problems, "port", "write port = the port of this computer that the device sends to");
-            }
+            table.need("port", "write port = the port of this computer that the device sends to");
             LanProtocol::Udp { port: port? }
         }
         Word::Gopro => LanProtocol::Gopro {
             port: port.unwrap_or(GOPRO_PORT),
-            download: table.flag(problems, "download").unwrap_or(false),
+            download: table.flag("download").unwrap_or(false),
             // Known when the whole registry is read.
             reserve: None,
         },
         Word::Iphone => {
             const STREAMS: [(&str, PhoneStream); 2] = [("image", PhoneStream::Image), ("pose", PhoneStream::Pose)];
-            let stream = table.choice(problems, "stream", &STREAMS).unwrap_or(PhoneStream::Image);
-            let picture = picture(table, LanPicture::OF_A_PHONE, problems);
+            let stream = table.choice("stream", &STREAMS).unwrap_or(PhoneStream::Image);
+            let picture = picture(table, LanPicture::OF_A_PHONE);
             LanProtocol::Iphone { port: port.unwrap_or(PHONE_PORT), stream, picture }
         }
     })
 }
 
-fn path(table: &Section<'_>, problems: &mut Problems<'_>) -> String {
+fn path(table: &Section<'_>) -> String {
     /// Servers take 8000 characters at the least they should (RFC 9110, 4.1); none of a camera's has as many.
     const LONGEST: usize = 1000;
-    let Some(path) = table.text(problems, "path") else { return "/".to_owned() };
+    let Some(path) = table.text("path") else { return "/".to_owned() };
     // What may stand in a request line: no spaces, no control characters, nothing beyond ASCII.
-    if path.value.starts_with('/') && path.value.len() <= LONGEST && path.value.bytes().all(|b| b.is_ascii_graphic()) {
-        return path.value.to_owned();
+    if path.starts_with('/') && path.len() <= LONGEST && path.bytes().all(|b| b.is_ascii_graphic()) {
+        return path.to_owned();
     }
     let fix = "begin with `/` and write what is not plain as %XX, for example path = \"/video?size=1\"";
-    table.report(problems, "path", format!("{:?} cannot be asked for", path.value), fix);
+    table.report("path", format!("{path:?} cannot be asked for"), fix);
     "/".to_owned()
 }
 
-fn picture(table: &Section<'_>, default: LanPicture, problems: &mut Problems<'_>) -> LanPicture {
-    let mut integer = |key, most, default| {
-        table.integer(problems, key, 1..=most).and_then(|found| u32::try_from(found.value).ok()).unwrap_or(default)
-    };
+fn picture(table: &Section<'_>, default: LanPicture) -> LanPicture {
+    let integer = |key, most, default| table.integer(key, 1..=most).unwrap_or(default);
     LanPicture {
         width: integer("width", 8192, default.width),
         height: integer("height", 8192, default.height),
@@ -145,7 +120,7 @@ fn picture(table: &Section<'_>, default: LanPicture, problems: &mut Problems<'_>
 }
 
 /// Two entries cannot have one port of this computer, unless each has it on an adapter of its own.
-pub(super) fn check_ports(drafts: &[Draft<'_>], problems: &mut Problems<'_>) {
+pub(super) fn check_ports(drafts: &[Draft<'_>]) {
     for (index, draft) in drafts.iter().enumerate() {
         let Some((port, own)) = draft.lan().and_then(|lan| Some((lan.own_port()?, lan))) else { continue };
         let same = |earlier: &&Draft<'_>| {
@@ -157,83 +132,68 @@ pub(super) fn check_ports(drafts: &[Draft<'_>], problems: &mut Problems<'_>) {
         let (_, number) = port;
         let message = format!("port {number} of this computer is already that of [{}]", earlier.section.entry);
         let fix = "write another port here, and set the device to send to it";
-        draft.section.report(problems, "lan", message, fix);
+        draft.section.report("lan", message, fix);
     }
 }
 
 /// Exactly one way: the USB identity of the entry, `mdns`, or `host`.
-fn find(
-    section: &Section<'_>,
-    table: &Section<'_>,
-    word: Word,
-    port: Option<u16>,
-    problems: &mut Problems<'_>,
-) -> Option<LanFind> {
-    let is_usb = ["vid", "pid", "port", "serial", "serial_number"].iter().any(|key| section.has(key));
+fn find(section: &Section<'_>, table: &Section<'_>, word: Word, port: Option<u16>) -> Option<LanFind> {
+    let is_usb = IDENTITY_KEYS.iter().any(|key| section.has(key));
     let is_mdns = table.has("mdns");
-    let host = host(table, problems);
-    let alone = |key: &str, owner: &str, problems: &mut Problems<'_>| {
+    let host = host(table);
+    let alone = |key: &str, owner: &str| {
         let message = format!("{key} belongs to a device that is found by {owner}");
-        table.report(problems, key, message, format!("remove {key}, or write {owner}"));
+        table.report(key, message, format!("remove {key}, or write {owner}"));
     };
     if !is_mdns && table.has("instance") {
-        alone("instance", "mdns", problems);
+        alone("instance", "mdns");
     }
     if is_usb || is_mdns || !table.has("host") {
         for key in ["probe", "probe_port"].into_iter().filter(|key| table.has(key)) {
-            alone(key, "host", problems);
+            alone(key, "host");
         }
     }
     match (is_usb, is_mdns, table.has("host")) {
         (true, true, _) => {
             let message = "the entry says two ways to find the device: by USB and by mdns".to_owned();
-            table.report(problems, "mdns", message, "keep vid and pid for a USB network adapter, or mdns, not both");
-            None
+            table.refuse("mdns", message, "keep vid and pid for a USB network adapter, or mdns, not both")
         }
         (true, false, has_host) => {
             if word == Word::Mjpeg && !has_host {
-                table.missing(problems, "host", "write host = the camera's address behind the network adapter");
+                table.missing("host", "write host = the camera's address behind the network adapter");
             }
             if has_host { Some(LanFind::Adapter { host: Some(host?) }) } else { Some(LanFind::Adapter { host: None }) }
         }
         (false, true, true) => {
             let message = "the entry says two ways to find the device: by mdns and by host".to_owned();
-            table.report(problems, "host", message, "keep mdns for a device that announces itself, or host, not both");
-            None
+            table.refuse("host", message, "keep mdns for a device that announces itself, or host, not both")
         }
         (false, true, false) => {
-            let service = service(table, problems);
-            let instance = table.text(problems, "instance").map(|text| text.value.to_owned());
+            let service = service(table);
+            let instance = table.text("instance").map(str::to_owned);
             Some(LanFind::Mdns { service: service?, instance })
         }
-        (false, false, true) => fixed(table, host, word, port, problems),
+        (false, false, true) => fixed(table, host, word, port),
         (false, false, false) => {
             let fix =
                 "write vid and pid of its USB network adapter, or mdns = \"_service._tcp\", or host = its address";
-            table.missing(problems, "a way to find the device", fix);
+            table.missing("a way to find the device", fix);
             None
         }
     }
 }
 
-fn fixed(
-    table: &Section<'_>,
-    host: Option<IpAddr>,
-    word: Word,
-    port: Option<u16>,
-    problems: &mut Problems<'_>,
-) -> Option<LanFind> {
+fn fixed(table: &Section<'_>, host: Option<IpAddr>, word: Word, port: Option<u16>) -> Option<LanFind> {
     const PROBES: [(&str, Probe); 3] = [("tcp", Probe::Tcp), ("http", Probe::Http), ("udp", Probe::Udp)];
     let default = match word {
         Word::Mjpeg | Word::Iphone => Probe::Tcp,
         Word::Gopro => Probe::Http,
         Word::Udp => Probe::Udp,
     };
-    let probe = if table.has("probe") { table.choice(problems, "probe", &PROBES) } else { Some(default) }?;
+    let probe = if table.has("probe") { table.choice("probe", &PROBES) } else { Some(default) }?;
     if probe == Probe::Udp && word != Word::Udp {
         let message = format!("probe \"udp\" hears packets, and protocol {:?} sends none", word.name());
-        table.report(problems, "probe", message, "write probe = \"tcp\" or \"http\"");
-        return None;
+        return table.refuse("probe", message, "write probe = \"tcp\" or \"http\"");
     }
     let own = match word {
         // That of HTTP (RFC 9110, 4.2.1).
@@ -245,31 +205,29 @@ fn fixed(
     };
     if probe == Probe::Udp && table.has("probe_port") {
         let message = "probe \"udp\" hears what comes to port".to_owned();
-        table.report(problems, "probe_port", message, "remove probe_port, or write probe = \"tcp\" or \"http\"");
-        return None;
+        return table.refuse("probe_port", message, "remove probe_port, or write probe = \"tcp\" or \"http\"");
     }
-    let asked = if table.has("probe_port") { self::port(table, "probe_port", problems) } else { own };
+    let asked = if table.has("probe_port") { self::port(table, "probe_port") } else { own };
     if asked.is_none() && !table.has("probe_port") && (table.has("port") || word == Word::Iphone) {
         let fix = "write probe_port = a port of the device that takes connections; `port` is one of this computer";
-        table.missing(problems, "probe_port", fix);
+        table.missing("probe_port", fix);
     }
     Some(LanFind::Host { host: host?, probe, port: asked? })
 }
 
-fn host(table: &Section<'_>, problems: &mut Problems<'_>) -> Option<IpAddr> {
-    let host = table.text(problems, "host")?;
-    let address =
-        host.value.parse().ok().filter(|address: &IpAddr| !address.is_unspecified() && !address.is_multicast());
+fn host(table: &Section<'_>) -> Option<IpAddr> {
+    let host = table.text("host")?;
+    let address = host.parse().ok().filter(|address: &IpAddr| !address.is_unspecified() && !address.is_multicast());
     if address.is_none() {
         let fix = "write its address, for example host = \"192.168.1.7\"; give the device a fixed one in your router";
-        table.report(problems, "host", format!("{:?} is not the address of a device", host.value), fix);
+        table.report("host", format!("{host:?} is not the address of a device"), fix);
     }
     address
 }
 
 /// `_name._tcp` or `_name._udp`; the name has up to 15 letters, digits and hyphens (RFC 6763, 7).
-fn service(table: &Section<'_>, problems: &mut Problems<'_>) -> Option<String> {
-    let service = table.text(problems, "mdns")?.value;
+fn service(table: &Section<'_>) -> Option<String> {
+    let service = table.text("mdns")?;
     let bare = service.trim_end_matches('.').trim_end_matches(".local");
     let legal = bare.split_once('.').is_some_and(|(name, transport)| {
         let name = name.strip_prefix('_').unwrap_or_default();
@@ -280,7 +238,7 @@ fn service(table: &Section<'_>, problems: &mut Problems<'_>) -> Option<String> {
     if !legal {
         let fix =
             "write it as the device announces it, for example mdns = \"_iphonevio._tcp\"; `avahi-browse -a` lists all";
-        table.report(problems, "mdns", format!("{service:?} is not a service"), fix);
+        table.report("mdns", format!("{service:?} is not a service"), fix);
     }
     legal.then(|| bare.to_owned())
 }

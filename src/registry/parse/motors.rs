@@ -1,53 +1,33 @@
 //! The motors of `[device.NAME.can]`, and the axes of actions that follow from them.
 
-mod conduct;
-
 use std::time::Duration;
 
-use super::window::Entry;
-use crate::registry::diagnostic::{Diagnostic, did_you_mean};
-use crate::registry::section::{Problems, Section};
+use super::interlock::{LEVELS, gpio_line};
+use crate::registry::diagnostic::did_you_mean;
+use crate::registry::section::Section;
 use crate::registry::spec::{
-    ActionSpec, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, MotorKind, MotorMode, MotorSpec, NodeSpec,
+    ActionSpec, BrakeSpec, CanProtocol, CanSpec, DamiaoSpec, DeviceSpec, MotionSpec, MotorKind, MotorMode, MotorSpec,
+    NodeSpec, Stop, StopSpec, WatchSpec,
 };
 use crate::registry::units::show_duration;
-use conduct::{brake, motion, or_never, stop, watch};
 
-const KEYS: [&str; 24] = [
-    "name",
-    "slave",
-    "master",
-    "type",
-    "mode",
-    "kp",
-    "kd",
-    "position",
-    "velocity",
-    "torque",
-    "slew",
-    "acceleration",
-    "soft_start",
-    "first_target",
-    "margin",
-    "lag",
-    "blocked_after",
-    "own_fault",
-    "other_fault",
-    "emergency",
-    "hold_for",
-    "brake",
-    "max_mos",
-    "max_rotor",
-];
+const KEYS: [&str; 11] =
+    ["name", "slave", "master", "type", "mode", "kp", "kd", "position", "velocity", "torque", "slew"];
+/// How the command of a position starts and changes.
+const MOTION_KEYS: [&str; 3] = ["acceleration", "soft_start", "first_target"];
+/// When what a motor does is a fault, and how it stops then.
+const FAULT_KEYS: [&str; 8] =
+    ["margin", "lag", "blocked_after", "own_fault", "other_fault", "emergency", "hold_for", "brake"];
+const TEMPERATURE_KEYS: [&str; 2] = ["max_mos", "max_rotor"];
 /// Six numbers a motor, and 64 in an action or a sample.
 const MOST: usize = 10;
 /// Motors that hold for want of an action must not do so between two commands.
 const DEADMAN_PERIODS: u32 = 2;
-/// A motor that stops by itself when it is told nothing must not do so between two commands.
+/// A motor that stops by itself when it receives nothing must not do so between two commands.
 const TIMEOUT_PERIODS: u32 = 4;
 /// A motor that continues for longer than this when this program is killed has gone far.
 const LONG_TIMEOUT: Duration = Duration::from_millis(500);
-/// What a motor does that nobody has set limits for: slow enough to step aside.
+/// Limits of a motor for which none are set: slow enough to step aside.
 const SPEED: f64 = 2.0;
 /// Of the highest torque of its type, likewise.
 const TORQUE_SHARE: f64 = 0.1;
@@ -62,27 +42,32 @@ const KD_STEP: f64 = 5.0 / 4095.0;
 /// The id by which parameters of all motors are read and written.
 const PARAMETERS: u16 = 0x7ff;
 
+/// What a brake looks like.
+const BRAKE: &str = "brake = { chip = \"/dev/gpiochip0\", line = 4, released = \"high\" }";
+/// A small spring-applied brake takes this long to engage or to release, unless its data sheet says otherwise.
+const BRAKE_TIME: Duration = Duration::from_millis(100);
+
 /// Reads the keys of `protocol = "damiao"`; `None` if a problem with them was reported.
-pub(super) fn damiao(table: &Section<'_>, problems: &mut Problems<'_>) -> Option<DamiaoSpec> {
+pub(super) fn damiao(table: &Section<'_>) -> Option<DamiaoSpec> {
     let (ms, second) = (Duration::from_millis, Duration::from_secs);
-    let hz = table.integer(problems, "hz", 10..=1000).and_then(|hz| u32::try_from(hz.value).ok()).unwrap_or(200);
-    let deadman = table.duration(problems, "deadman", ms(1)..=second(10));
+    let hz = table.integer("hz", 10..=1000).unwrap_or(200);
+    let deadman = table.duration("deadman", ms(1)..=second(10));
     let two = second(1) * DEADMAN_PERIODS / hz;
     if let Some(short) = deadman.filter(|deadman| *deadman < two) {
         let message = format!("deadman = {short:?} is less than {DEADMAN_PERIODS} commands at {hz} Hz take");
         let least = two.as_micros().div_ceil(1000);
         let fix = format!("write deadman = \"{least}ms\" or more, or remove it for twice the time between actions");
-        table.report(problems, "deadman", message, fix);
+        table.report("deadman", message, fix);
     }
-    let disable_after = or_never(table, problems, "disable_after", ms(10), None);
-    let silent_after = table.duration(problems, "silent_after", ms(1)..=second(10));
+    let disable_after = or_never(table, "disable_after", ms(10), None);
+    let silent_after = table.duration("silent_after", ms(1)..=second(10));
     let least = second(1) * TIMEOUT_PERIODS / hz;
-    let timeout = table.duration(problems, "timeout", ms(1)..=second(10));
+    let timeout = table.duration("timeout", ms(1)..=second(10));
     if let Some(short) = timeout.filter(|timeout| *timeout < least) {
         let message = format!("timeout = {short:?} is less than {TIMEOUT_PERIODS} commands at {hz} Hz take");
-        table.report(problems, "timeout", message, format!("write timeout = \"{}ms\" or more", least.as_millis() + 1));
+        table.report("timeout", message, format!("write timeout = \"{}ms\" or more", least.as_millis() + 1));
     }
-    let motors = motors(table, problems);
+    let motors = motors(table);
     Some(DamiaoSpec {
         motors: motors?,
         hz,
@@ -94,81 +79,67 @@ pub(super) fn damiao(table: &Section<'_>, problems: &mut Problems<'_>) -> Option
 }
 
 /// Warns of motors that continue for long once nothing commands them.
-pub(super) fn slow_to_stop(devices: &[DeviceSpec], entries: &[Entry], problems: &Problems<'_>) -> Vec<Diagnostic> {
-    let warn = |device: &DeviceSpec| {
-        let NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(motors), .. }) = &device.node else { return None };
-        let place = entries.iter().find(|entry| entry.name == device.name)?;
+pub(super) fn warn_of_slow_stop(devices: &[(Section<'_>, DeviceSpec)]) {
+    for (section, device) in devices {
+        let NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(motors), .. }) = &device.node else { continue };
         if motors.timeout <= LONG_TIMEOUT {
-            return None;
+            continue;
         }
         let timeout = show_duration(motors.timeout);
         let message = format!(
             "timeout = {timeout}: for so long the motors follow their last command when rapid and its guard are gone"
         );
-        let fix = format!("write timeout = \"500ms\" or less in [{}.can]", place.table);
-        Some(problems.diagnostic(place.at, &place.table, message, fix))
-    };
-    devices.iter().filter_map(warn).collect()
+        let fix = format!("write timeout = \"500ms\" or less in [{}.can]", section.entry);
+        section.warn_at(section.at, message, fix);
+    }
 }
 
-fn motors(table: &Section<'_>, problems: &mut Problems<'_>) -> Option<Vec<MotorSpec>> {
+fn motors(table: &Section<'_>) -> Option<Vec<MotorSpec>> {
     if !table.has("motors") {
         let example = "write motors = [{ name = \"gripper\", slave = 5, type = \"DMH3510\", kp = 0.8, kd = 0.05, \
                        position = [-1, 1] }]";
-        table.missing(problems, "motors", example);
+        table.missing("motors", example);
         return None;
     }
-    let listed =
-        table.fields().into_iter().find(|(_, key, _)| *key == "motors")?.2.get_ref().as_array().map(|list| list.len());
-    let entries = table.tables(problems, "motors");
+    let listed = table.field("motors")?.get_ref().as_array().map(|list| list.len());
+    let entries = table.tables("motors")?;
     if let Some(count) = listed.filter(|count| !(1..=MOST).contains(count)) {
-        table.report(problems, "motors", format!("{count} motors"), format!("list 1 to {MOST} motors"));
-        return None;
+        return table.refuse("motors", format!("{count} motors"), format!("list 1 to {MOST} motors"));
     }
     if listed != Some(entries.len()) {
         return None;
     }
-    let mut read: Vec<(Section<'_>, Option<MotorSpec>)> = Vec::new();
-    for entry in entries {
-        let motor = motor(&entry, problems);
-        read.push((entry, motor));
-    }
-    check_pairs(&read, problems);
+    let read: Vec<_> =
+        entries.into_iter().map(|entry| (motor(&entry), entry)).map(|(motor, entry)| (entry, motor)).collect();
+    check_pairs(&read);
     read.into_iter().map(|(_, motor)| motor).collect()
 }
 
-fn motor(entry: &Section<'_>, problems: &mut Problems<'_>) -> Option<MotorSpec> {
-    entry.allow(problems, &KEYS);
-    let name = name(entry, problems);
+fn motor(entry: &Section<'_>) -> Option<MotorSpec> {
+    entry.allow(&[&KEYS[..], &MOTION_KEYS, &FAULT_KEYS, &TEMPERATURE_KEYS].concat());
+    let name = name(entry);
     // 0x100 and more are the ids of commands in other modes.
-    let slave = id(entry, "slave", 1..=0xff, problems);
-    let master = id(entry, "master", 0..=0x7ff, problems);
-    let kind = kind(entry, problems);
-    for (key, fix) in [
-        ("slave", "write slave = the motor's CAN id, 1 to 255"),
-        ("position", "write position = [lowest, highest] in rad, as far as the joint may go"),
-    ] {
-        if !entry.has(key) {
-            entry.missing(problems, key, fix);
-        }
-    }
+    let slave: Option<u16> = entry.integer("slave", 1..=0xff);
+    let master = entry.integer("master", 0..=0x7ff);
+    let kind = kind(entry);
+    entry.need("slave", "write slave = the motor's CAN id, 1 to 255");
+    entry.need("position", "write position = [lowest, highest] in rad, as far as the joint may go");
     let (most_speed, most_torque) = kind.map_or((1000.0, 1000.0), |kind| {
         let [_, velocity, torque] = kind.shipped();
         (velocity, torque)
     });
-    let velocity = above_zero(entry, "velocity", most_speed, problems).unwrap_or(SPEED.min(most_speed));
-    let torque = above_zero(entry, "torque", most_torque, problems).unwrap_or(TORQUE_SHARE * most_torque);
-    let mode = mode(entry, problems);
-    let position = position(entry, mode, problems);
+    let velocity = above_zero(entry, "velocity", most_speed).unwrap_or(SPEED.min(most_speed));
+    let torque = above_zero(entry, "torque", most_torque).unwrap_or(TORQUE_SHARE * most_torque);
+    let mode = mode(entry);
+    let position = position(entry, mode);
     // A position can change no faster than the motor turns; a speed within a hundredth of a second.
     let most_slew = if mode == Some(MotorMode::Velocity) { 100.0 * most_speed } else { most_speed };
     // To its highest speed within a tenth of a second.
     let default_slew = if mode == Some(MotorMode::Velocity) { 10.0 * velocity } else { velocity };
-    let slew = above_zero(entry, "slew", most_slew, problems).unwrap_or(default_slew);
-    let motion = motion(entry, slew, mode, problems);
-    let (watch, stop, brake) = (watch(entry, problems), stop(entry, mode, problems), brake(entry, problems));
-    let mut temperature = |key| entry.number(problems, key, 20.0..=150.0).unwrap_or(TEMPERATURE);
-    let (max_mos, max_rotor) = (temperature("max_mos"), temperature("max_rotor"));
+    let slew = above_zero(entry, "slew", most_slew).unwrap_or(default_slew);
+    let motion = motion(entry, slew, mode);
+    let (watch, stop, brake) = (watch(entry), stop(entry, mode), brake(entry));
+    let [max_mos, max_rotor] = TEMPERATURE_KEYS.map(|key| entry.number(key, 20.0..=150.0).unwrap_or(TEMPERATURE));
     let slave = slave?;
     let mode = mode?;
     Some(MotorSpec {
@@ -190,88 +161,67 @@ fn motor(entry: &Section<'_>, problems: &mut Problems<'_>) -> Option<MotorSpec> 
     })
 }
 
-fn name(entry: &Section<'_>, problems: &mut Problems<'_>) -> Option<String> {
+fn name(entry: &Section<'_>) -> Option<String> {
     if !entry.has("name") {
-        entry.missing(problems, "name", "write name = what its axis is called, for example name = \"gripper\"");
+        entry.missing("name", "write name = what its axis is called, for example name = \"gripper\"");
         return None;
     }
-    let name = entry.text(problems, "name")?.value;
+    let name = entry.text("name")?;
     let legal = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.');
     if name.is_empty() || name.len() > 64 || !name.chars().all(legal) {
         let fix = "use letters, digits, `_`, `-` and `.`, at most 64";
-        entry.report(problems, "name", format!("{name:?} cannot be a motor's name"), fix);
-        return None;
+        return entry.refuse("name", format!("{name:?} cannot be a motor's name"), fix);
     }
     Some(name.to_owned())
 }
 
-fn id(
-    entry: &Section<'_>,
-    key: &str,
-    range: std::ops::RangeInclusive<i64>,
-    problems: &mut Problems<'_>,
-) -> Option<u16> {
-    u16::try_from(entry.integer(problems, key, range)?.value).ok()
-}
-
-fn kind(entry: &Section<'_>, problems: &mut Problems<'_>) -> Option<MotorKind> {
+fn kind(entry: &Section<'_>) -> Option<MotorKind> {
     let known: Vec<&str> = MotorKind::ALL.iter().map(|kind| kind.name()).collect();
     if !entry.has("type") {
-        entry.missing(problems, "type", &format!("write type = one of {}", known.join(", ")));
+        entry.missing("type", &format!("write type = one of {}", known.join(", ")));
         return None;
     }
-    let text = entry.text(problems, "type")?.value;
-    let kind = MotorKind::named(text);
-    if kind.is_none() {
-        let fix = did_you_mean(text, &known, "write one of");
-        entry.report(problems, "type", format!("unknown type {text:?}"), fix);
-    }
-    kind
+    let text = entry.text("type")?;
+    MotorKind::named(text)
+        .or_else(|| entry.refuse("type", format!("unknown type {text:?}"), did_you_mean(text, &known, "write one of")))
 }
 
-fn position(entry: &Section<'_>, mode: Option<MotorMode>, problems: &mut Problems<'_>) -> Option<[f64; 2]> {
+fn position(entry: &Section<'_>, mode: Option<MotorMode>) -> Option<[f64; 2]> {
     // Eight times what motors count to as they are shipped; a wheel turns on.
     let farthest = if mode == Some(MotorMode::Velocity) { 1000.0 } else { 100.0 };
-    if !entry.has("position") {
-        return None;
-    }
-    let limits = entry.numbers(problems, "position")?;
+    let limits = entry.numbers("position")?;
     match limits.as_slice() {
         [low, high] if low.abs() <= farthest && high.abs() <= farthest && low < high => Some([*low, *high]),
         _ => {
             let message = format!("position = {limits:?} is no range");
             let fix = format!("write [lowest, highest] in rad, the highest above the lowest, within {farthest}");
-            entry.report(problems, "position", message, fix);
-            None
+            entry.refuse("position", message, fix)
         }
     }
 }
 
 /// A number above zero.
-fn above_zero(entry: &Section<'_>, key: &str, most: f64, problems: &mut Problems<'_>) -> Option<f64> {
-    entry.number(problems, key, 0.001..=most)
+fn above_zero(entry: &Section<'_>, key: &str, most: f64) -> Option<f64> {
+    entry.number(key, 0.001..=most)
 }
 
-fn mode(entry: &Section<'_>, problems: &mut Problems<'_>) -> Option<MotorMode> {
+fn mode(entry: &Section<'_>) -> Option<MotorMode> {
     let zero = MotorMode::Mit { kp: 0.0, kd: 0.0 };
     let words = [("mit", zero), ("position", MotorMode::PositionVelocity), ("velocity", MotorMode::Velocity)];
-    let mode = if entry.has("mode") { entry.choice(problems, "mode", &words)? } else { zero };
+    let mode = if entry.has("mode") { entry.choice("mode", &words)? } else { zero };
     let gains = [("kp", 500.0), ("kd", 5.0)];
     if mode != zero {
         // Frames of these modes have room for none of them.
         for key in ["kp", "kd", "torque"].into_iter().filter(|key| entry.has(key)) {
             let message = format!("a motor that runs its own loop takes no {key}");
-            entry.report(problems, key, message, format!("remove {key}, or write mode = \"mit\""));
+            entry.report(key, message, format!("remove {key}, or write mode = \"mit\""));
         }
         return Some(mode);
     }
     let [kp, kd] = gains.map(|(key, most)| {
-        if !entry.has(key) {
-            let fix =
-                format!("write {key} = 0 to {most}, or mode = \"position\" or \"velocity\" for the motor's own loop");
-            entry.missing(problems, key, &fix);
-        }
-        entry.number(problems, key, 0.0..=most)
+        let fix = format!("write {key} = 0 to {most}, or mode = \"position\" or \"velocity\" for the motor's own loop");
+        entry.need(key, &fix);
+        entry.number(key, 0.0..=most)
     });
     let (kp, kd) = (kp?, kd?);
     // Position held without damping rings: the maker's manual forbids it. A frame has 12 bits for it.
@@ -281,18 +231,98 @@ fn mode(entry: &Section<'_>, problems: &mut Problems<'_>) -> Option<MotorMode> {
         } else {
             format!("kd = {kd} is less than a frame can express, {KD_STEP:.5}: the motor would swing")
         };
-        entry.report(problems, "kd", message, "write a higher kd, for example kd = 0.05");
-        return None;
+        return entry.refuse("kd", message, "write a higher kd, for example kd = 0.05");
     }
     Some(MotorMode::Mit { kp, kd })
 }
 
+/// How the command of a position starts and changes.
+fn motion(entry: &Section<'_>, slew: f64, mode: Option<MotorMode>) -> MotionSpec {
+    let default = MotionSpec::of_slew(slew);
+    if mode == Some(MotorMode::Velocity) {
+        for key in MOTION_KEYS.into_iter().filter(|key| entry.has(key)) {
+            let message = format!("a commanded velocity has no {key}");
+            entry.report(key, message, format!("remove {key}; slew limits its acceleration"));
+        }
+        return default;
+    }
+    let soft_start = entry.duration("soft_start", Duration::ZERO..=Duration::from_secs(10));
+    MotionSpec {
+        acceleration: above_zero(entry, "acceleration", 100_000.0).unwrap_or(default.acceleration),
+        soft_start: soft_start.unwrap_or(default.soft_start),
+        first_target: above_zero(entry, "first_target", 200.0).unwrap_or(default.first_target),
+    }
+}
+
+/// When what the motor does is a fault.
+fn watch(entry: &Section<'_>) -> WatchSpec {
+    let default = WatchSpec::default();
+    let half_a_second = Duration::from_millis(500);
+    WatchSpec {
+        margin: entry.number("margin", 0.0..=1.0).unwrap_or(default.margin),
+        lag: above_zero(entry, "lag", 10.0).unwrap_or(default.lag),
+        blocked_after: or_never(entry, "blocked_after", half_a_second, default.blocked_after),
+    }
+}
+
+/// How the motor stops at a fault, or at an emergency stop.
+fn stop(entry: &Section<'_>, mode: Option<MotorMode>) -> StopSpec {
+    let has_damping = mode.is_none_or(|mode| matches!(mode, MotorMode::Mit { .. }));
+    let other_fault = if has_damping { Stop::Damp } else { Stop::Hold };
+    let default = StopSpec { other_fault, ..StopSpec::default() };
+    let choice = |key| {
+        let stop = entry.has(key).then(|| entry.choice(key, &Stop::WORDS)).flatten()?;
+        if stop == Stop::Brake && !entry.has("brake") {
+            let fix = format!("write {BRAKE}, or another way to stop");
+            entry.report(key, format!("{key} = \"brake\", and the motor has no brake"), fix);
+        }
+        if stop == Stop::Damp && !has_damping {
+            let fix = "write \"hold\", which it does with all its torque, \"limp\" or \"brake\"";
+            entry.report(key, "a motor that runs its own loop cannot be damped".to_owned(), fix);
+        }
+        Some(stop)
+    };
+    let (own_fault, other_fault) = (choice("own_fault"), choice("other_fault"));
+    let emergency = choice("emergency");
+    StopSpec {
+        own_fault: own_fault.unwrap_or(default.own_fault),
+        other_fault: other_fault.unwrap_or(default.other_fault),
+        emergency: emergency.unwrap_or(default.emergency),
+        hold_for: or_never(entry, "hold_for", Duration::from_millis(10), default.hold_for),
+    }
+}
+
+/// The brake of the joint, if it has one.
+fn brake(entry: &Section<'_>) -> Option<BrakeSpec> {
+    let table = entry.table("brake")?;
+    table.allow(&["chip", "line", "released", "engages_in", "releases_in"]);
+    let (chip, line) = gpio_line(&table);
+    if !table.has("released") {
+        let fix = "write released = \"high\" or \"low\": the level that lets the joint turn, best the one that a broken wire \
+                   does not have";
+        table.missing("released", fix);
+    }
+    let released = table.choice("released", &LEVELS);
+    let time = |key| table.duration(key, Duration::ZERO..=BrakeSpec::SLOWEST).unwrap_or(BRAKE_TIME);
+    let (engages_in, releases_in) = (time("engages_in"), time("releases_in"));
+    Some(BrakeSpec { chip: chip?, line: line?, released_high: released?, engages_in, releases_in })
+}
+
+/// A time of `least` to an hour, or the word "never".
+fn or_never(table: &Section<'_>, key: &str, least: Duration, default: Option<Duration>) -> Option<Duration> {
+    match table.word(key) {
+        _ if !table.has(key) => default,
+        Some("never") => None,
+        _ => table.duration(key, least..=Duration::from_hours(1)),
+    }
+}
+
 /// Names and ids that two motors cannot both have. An answer with the id of a command would be taken for
 /// one by another motor.
-fn check_pairs(motors: &[(Section<'_>, Option<MotorSpec>)], problems: &mut Problems<'_>) {
+fn check_pairs(motors: &[(Section<'_>, Option<MotorSpec>)]) {
     let known = || motors.iter().filter_map(|(entry, motor)| Some((entry, motor.as_ref()?)));
     for (at, (entry, motor)) in known().enumerate() {
-        let mut refuse = |key: &str, message: String, fix: &str| entry.report(problems, key, message, fix);
+        let refuse = |key: &str, message: String, fix: &str| entry.report(key, message, fix);
         for (_, earlier) in known().take(at) {
             if earlier.name == motor.name {
                 refuse("name", format!("two motors are called {:?}", motor.name), "give each its own name");
@@ -302,7 +332,7 @@ fn check_pairs(motors: &[(Section<'_>, Option<MotorSpec>)], problems: &mut Probl
                 refuse("slave", message, "give each motor its own id, with its maker's program");
             } else if earlier.master == motor.master && earlier.slave & 0xf == motor.slave & 0xf {
                 let message = format!(
-                    "{} answers with master = {:#x} too, and cannot be told from it",
+                    "{} answers with master = {:#x} too, and cannot be distinguished from it",
                     earlier.name, motor.master
                 );
                 refuse("master", message, "give each motor its own master, with its maker's program");
@@ -333,15 +363,15 @@ fn check_pairs(motors: &[(Section<'_>, Option<MotorSpec>)], problems: &mut Probl
 }
 
 /// The axes of the entry's actions. They follow from its motors, whose limits are those that are kept: a
-/// table beside them would say what nobody heeds.
-pub(super) fn axes(damiao: &DamiaoSpec, section: &Section<'_>, problems: &mut Problems<'_>) -> ActionSpec {
+/// table beside them would have no effect.
+pub(super) fn axes(damiao: &DamiaoSpec, section: &Section<'_>) -> ActionSpec {
     if section.has("action") {
         let message = format!("motors take no table [{}]: their axes follow from them", section.child("action"));
         let fix = format!(
             "remove the table, and write limits as position, velocity, torque and slew of each motor in [{}]",
             section.child("can")
         );
-        section.report(problems, "action", message, fix);
+        section.report("action", message, fix);
     }
     let range = |motor: &MotorSpec| match motor.mode {
         MotorMode::Velocity => ("rad/s", [-motor.velocity, motor.velocity]),

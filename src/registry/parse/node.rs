@@ -1,83 +1,109 @@
-//! The settings of a node: `[device.NAME.camera]`, `[device.NAME.serial]`, and the sizes that follow
-//! from them.
+//! The settings of a node: `[device.NAME.camera]`, `[device.NAME.tty]`, `[device.NAME.can]` and `[device.NAME.process]`,
+//! and the sizes that follow from them.
 
 use std::time::Duration;
 
+use toml::de::DeValue;
+
+use super::device::Draft;
+use super::motors;
 use crate::modality::ModalityKind;
 use crate::registry::diagnostic::nearest;
-use crate::registry::section::{Problems, Section};
-use crate::registry::spec::{CAN_BATCH, CAN_RECORD, CameraSpec, Framing, NodeSpec, Parse, PixelFormat, SerialSpec};
+use crate::registry::section::Section;
+use crate::registry::spec::KINDS;
+use crate::registry::spec::{
+    CAN_BATCH, CAN_RECORD, CameraSpec, CanAdapter, CanProtocol, CanSpec, Framing, Hook, LanProtocol, LanSpec, NodeSpec,
+    Opens, Parse, PixelFormat, ProcessSpec, SLCAN_BITRATES, SerialSpec,
+};
 
-pub(super) fn camera(section: &Section<'_>, problems: &mut Problems<'_>) -> CameraSpec {
-    if section.is_table("serial") {
+/// Names of the table of a serial line: the present one, and the one before it.
+pub(super) const TTY: [&str; 2] = ["tty", "serial"];
+
+pub(super) fn camera(section: &Section<'_>) -> CameraSpec {
+    for key in TTY.into_iter().filter(|key| section.is_table(key)) {
         let fix = "remove the table, or write node = \"serial\"";
-        section.report(problems, "serial", format!("a camera has no table [{}]", section.child("serial")), fix);
+        section.report(key, format!("a camera has no table [{}]", section.child(key)), fix);
     }
     let mut camera = CameraSpec { width: 640, height: 480, fps: 30, format: PixelFormat::Mjpg, controls: Vec::new() };
-    let Some(table) = section.table(problems, "camera") else { return camera };
-    table.allow(problems, &["width", "height", "fps", "format", "controls"]);
-    let mut integer = |key, most, default| {
-        table.integer(problems, key, 1..=most).and_then(|found| u32::try_from(found.value).ok()).unwrap_or(default)
-    };
+    let Some(table) = section.table("camera") else { return camera };
+    table.allow(&["width", "height", "fps", "format", "controls"]);
+    let integer = |key, most, default| table.integer(key, 1..=most).unwrap_or(default);
     camera.width = integer("width", 8192, camera.width);
     camera.height = integer("height", 8192, camera.height);
     camera.fps = integer("fps", 1000, camera.fps);
-    camera.format = table.choice(problems, "format", &PixelFormat::WORDS).unwrap_or(camera.format);
-    if let Some(controls) = table.table(problems, "controls") {
+    camera.format = table.choice("format", &PixelFormat::WORDS).unwrap_or(camera.format);
+    if let Some(controls) = table.table("controls") {
         for (_, name, _) in controls.fields() {
-            if let Some(value) = controls.integer(problems, name, i64::MIN..=i64::MAX) {
-                camera.controls.push((name.to_owned(), value.value));
+            if let Some(value) = controls.integer(name, i64::MIN..=i64::MAX) {
+                camera.controls.push((name.to_owned(), value));
             }
         }
     }
     camera
 }
 
-pub(super) fn serial(section: &Section<'_>, problems: &mut Problems<'_>) -> Option<SerialSpec> {
+pub(super) fn serial(section: &Section<'_>) -> Option<SerialSpec> {
     if section.has("camera") {
         let fix = "remove the table, or write node = \"camera\"";
-        section.report(problems, "camera", format!("a serial line has no table [{}]", section.child("camera")), fix);
+        section.report("camera", format!("a serial line has no table [{}]", section.child("camera")), fix);
     }
-    if !section.is_table("serial") {
-        let fix = format!("write [{}] with channels = the count of numbers in a message", section.child("serial"));
-        section.missing(problems, "the table of the serial line", &fix);
+    let Some(key) = TTY.into_iter().find(|key| section.is_table(key)) else {
+        let fix = format!("write [{}] with channels = the count of numbers in a message", section.child("tty"));
+        section.missing("the table of the serial line", &fix);
         return None;
+    };
+    if key == "tty" && section.is_table("serial") {
+        let message = format!(
+            "[{}] is the old name of [{}], which begins on line {}",
+            section.child("serial"),
+            section.child("tty"),
+            section.line_of("tty")
+        );
+        section.report("serial", message, "move its keys there and remove it");
     }
-    let table = section.table(problems, "serial")?;
-    table.allow(problems, &["baud", "framing", "parse", "channels"]);
-    let baud =
-        table.integer(problems, "baud", 50..=12_000_000).map_or(Some(115_200), |baud| baud.value.try_into().ok());
-    let framing = framing(&table, problems).unwrap_or(Framing::Line);
-    let parse = table.choice(problems, "parse", &Parse::WORDS).unwrap_or(Parse::Csv);
-    let channels = table.integer(problems, "channels", 1..=1024).and_then(|count| usize::try_from(count.value).ok());
+    let table = section.table(key)?;
+    table.allow(&["baud", "framing", "parse", "channels"]);
+    let baud = table.integer("baud", 50..=12_000_000).unwrap_or(115_200);
+    let framing = framing(&table).unwrap_or(Framing::Line);
+    let parse = table.choice("parse", &Parse::WORDS).unwrap_or(Parse::Csv);
+    let channels = table.integer("channels", 1..=1024);
     if parse == Parse::Raw {
         if table.has("channels") {
             let fix = "remove channels, or write parse = \"csv\", \"json\" or \"f32le\"";
-            table.report(problems, "channels", "raw messages are not looked into and have no channels".to_owned(), fix);
+            table.report("channels", "raw messages are not looked into and have no channels".to_owned(), fix);
         }
-        return Some(SerialSpec { baud: baud?, framing, parse, channels: 0 });
+        return Some(SerialSpec { baud, framing, parse, channels: 0 });
     }
-    if !table.has("channels") {
-        table.missing(problems, "channels", "write channels = the count of numbers in a message");
-    }
+    table.need("channels", "write channels = the count of numbers in a message");
     let channels = channels?;
     if let (Parse::F32le, Framing::Fixed(bytes)) = (parse, framing)
         && bytes != 4 * channels
     {
         let message = format!("{channels} channels of f32le take {} bytes, not {bytes}", 4 * channels);
-        table.report(problems, "framing", message, format!("write framing = \"fixed {}\"", 4 * channels));
+        table.report("framing", message, format!("write framing = \"fixed {}\"", 4 * channels));
     }
     if let (Parse::F32le, Framing::Line) = (parse, framing) {
         let message = "f32le messages cannot be framed by lines: a number may contain a newline".to_owned();
-        table.report(problems, "framing", message, format!("write framing = \"fixed {}\" or \"cobs\"", 4 * channels));
+        table.report("framing", message, format!("write framing = \"fixed {}\" or \"cobs\"", 4 * channels));
     }
-    Some(SerialSpec { baud: baud?, framing, parse, channels })
+    Some(SerialSpec { baud, framing, parse, channels })
 }
 
-fn framing(table: &Section<'_>, problems: &mut Problems<'_>) -> Option<Framing> {
+/// Warns of tables of serial lines that still have the name that collides with the key of the serial number.
+pub(super) fn warn_of_old_names(drafts: &[Draft<'_>]) {
+    let is_old = |section: &&Section<'_>| section.is_table("serial") && !section.is_table("tty");
+    for section in drafts.iter().map(|draft| &draft.section).filter(is_old) {
+        let (old, new) = (section.child("serial"), section.child("tty"));
+        let message = format!("[{old}] is now called [{new}]; the old name is accepted until the next release");
+        let fix = format!("write [{new}]; `rapid register` renames it when it next writes this file");
+        section.warn_at(section.at_of("serial"), message, fix);
+    }
+}
+
+fn framing(table: &Section<'_>) -> Option<Framing> {
     /// More than any message of the devices this is for; bounds the buffer.
     const LONGEST: usize = 65_536;
-    let text = table.text(problems, "framing")?.value;
+    let text = table.text("framing")?;
     match text.split_once(' ') {
         None if text == "line" => return Some(Framing::Line),
         None if text == "cobs" => return Some(Framing::Cobs),
@@ -86,8 +112,7 @@ fn framing(table: &Section<'_>, problems: &mut Problems<'_>) -> Option<Framing> 
                 return Some(Framing::Fixed(bytes));
             }
             let message = format!("{:?} is not a message length", bytes.trim());
-            table.report(problems, "framing", message, format!("write \"fixed N\" with N from 1 to {LONGEST} bytes"));
-            return None;
+            return table.refuse("framing", message, format!("write \"fixed N\" with N from 1 to {LONGEST} bytes"));
         }
         _ => {}
     }
@@ -97,21 +122,21 @@ fn framing(table: &Section<'_>, problems: &mut Problems<'_>) -> Option<Framing> 
         Some(name) => format!("did you mean \"{name}\"?"),
         None => "write one of: line, cobs, fixed N".to_owned(),
     };
-    table.report(problems, "framing", format!("unknown framing {text:?}"), fix);
-    None
+    table.refuse("framing", format!("unknown framing {text:?}"), fix)
 }
 
 /// Half a second, or ten periods of a slow camera; a serial line's rate is not known.
 pub(super) fn default_stall(node: Option<&NodeSpec>) -> Duration {
     const LEAST: Duration = Duration::from_millis(500);
-    match node {
-        Some(NodeSpec::Camera(camera)) => (Duration::from_secs(10) / camera.fps.max(1)).max(LEAST),
-        Some(NodeSpec::Lan(lan)) => lan.stall(LEAST),
-        _ => LEAST,
+    match node.and_then(NodeSpec::picture) {
+        // It is looked at every 3 s.
+        _ if node.is_some_and(is_gopro) => Duration::from_secs(10),
+        Some(picture) => (Duration::from_secs(10) / picture.fps.max(1)).max(LEAST),
+        None => LEAST,
     }
 }
 
-pub(super) fn max_bytes(section: &Section<'_>, node: Option<&NodeSpec>, problems: &mut Problems<'_>) -> u64 {
+pub(super) fn max_bytes(section: &Section<'_>, node: Option<&NodeSpec>) -> u64 {
     /// A JPEG picture of a small, noisy scene with its tables can exceed two bytes a pixel.
     const SMALLEST_JPEG: u64 = 64 << 10;
     let (default, least) = match node {
@@ -143,16 +168,150 @@ pub(super) fn max_bytes(section: &Section<'_>, node: Option<&NodeSpec>, problems
         },
         None => (1, 1),
     };
-    section.size(problems, "max_bytes", least..=256 << 20).unwrap_or(default)
+    section.size("max_bytes", least..=256 << 20).unwrap_or(default)
 }
 
-/// About two seconds of pictures; a serial line may send a thousand samples a second.
+/// About two seconds of pictures, and a second of a LiDAR's packets; a serial line may send a thousand samples a second.
 pub(super) fn default_depth(node: Option<&NodeSpec>) -> u64 {
     match node {
-        Some(NodeSpec::Camera(camera)) => (2 * u64::from(camera.fps)).clamp(16, 1024),
-        Some(NodeSpec::Lan(lan)) => lan.depth(),
+        Some(node) if is_gopro(node) => 16,
         // Of a camera with 30 pictures a second, and of what may be as large.
         Some(NodeSpec::Process(process)) if process.kind != ModalityKind::Scalars => 60,
-        _ => 2048,
+        node => node.and_then(NodeSpec::picture).map_or(2048, |picture| (2 * u64::from(picture.fps)).clamp(16, 1024)),
     }
+}
+
+pub(super) fn is_gopro(node: &NodeSpec) -> bool {
+    matches!(node, NodeSpec::Lan(LanSpec { protocol: LanProtocol::Gopro { .. }, .. }))
+}
+
+const PROCESS_KEYS: [&str; 7] = ["args", "opens", "kind", "channels", "width", "height", "heartbeat"];
+/// As good as any program that only looks whether its device still answers once a second.
+const DEFAULT_HEARTBEAT: Duration = Duration::from_secs(2);
+
+/// How an entry's `program` is run and how long it may be silent; `None` if a problem with it was reported.
+pub(super) fn process(section: &Section<'_>, program: Option<Hook>) -> Option<(ProcessSpec, Duration)> {
+    section.no_tables(&["camera", "tty", "serial"], "a program", "process");
+    if section.has("stall_after") {
+        let fix = format!("write heartbeat in [{}]", section.child("process"));
+        section.report("stall_after", "a program has a heartbeat instead of stall_after".to_owned(), fix);
+    }
+    let bare = |Hook { program, args }| ProcessSpec {
+        program,
+        args,
+        opens: Opens::Usb,
+        kind: ModalityKind::Bytes,
+        shape: Vec::new(),
+    };
+    let Some(table) = section.table("process") else { return Some((bare(program?), DEFAULT_HEARTBEAT)) };
+    table.allow(&PROCESS_KEYS);
+    let given = args(&table);
+    if table.has("args") && program.as_ref().is_some_and(|program| !program.args.is_empty()) {
+        let fix = "keep those of on_attach or these".to_owned();
+        table.report("args", "on_attach gives the program arguments already".to_owned(), fix);
+    }
+    let opens = table.choice("opens", &Opens::WORDS).unwrap_or(Opens::Usb);
+    let kind = table.choice("kind", &KINDS).unwrap_or(ModalityKind::Bytes);
+    let shape = shape(&table, kind);
+    let range = Duration::from_millis(10)..=Duration::from_hours(1);
+    let heartbeat = table.duration("heartbeat", range).unwrap_or(DEFAULT_HEARTBEAT);
+    let mut process = ProcessSpec { opens, kind, shape, ..bare(program?) };
+    process.args.extend(given);
+    Some((process, heartbeat))
+}
+
+fn args(table: &Section<'_>) -> Vec<String> {
+    let Some(value) = table.field("args") else { return Vec::new() };
+    let DeValue::Array(items) = value.get_ref() else {
+        let fix = "write args = [\"--rate\", \"100\"]: one text for each argument";
+        table.report("args", "args must be a list of texts".to_owned(), fix);
+        return Vec::new();
+    };
+    let mut args = Vec::new();
+    for item in items {
+        let at = item.span().start;
+        match item.get_ref() {
+            DeValue::String(text) if !text.contains('\0') => args.push(text.clone().into_owned()),
+            DeValue::String(_) => {
+                table.report_at(at, "an argument cannot contain the character U+0000", "leave it out");
+            }
+            _ => table.report_at(at, "an argument must be text", "put it in double quotes"),
+        }
+    }
+    args
+}
+
+/// What a sample's shape is, from the keys that belong to its kind.
+fn shape(table: &Section<'_>, kind: ModalityKind) -> Vec<u32> {
+    let (word, keys): (&str, &[(&str, i64)]) = match kind {
+        ModalityKind::Scalars => ("scalars", &[("channels", 1024)]),
+        ModalityKind::Image => ("image", &[("height", 8192), ("width", 8192)]),
+        ModalityKind::Bytes => ("bytes", &[]),
+    };
+    for key in ["channels", "width", "height"] {
+        if table.has(key) && !keys.iter().any(|(own, _)| *own == key) {
+            let owner = if key == "channels" { "scalars" } else { "image" };
+            let message = format!("samples of kind {word:?} have no {key}");
+            table.report(key, message, format!("remove {key}, or write kind = {owner:?}"));
+        }
+    }
+    let mut shape = Vec::new();
+    for (key, most) in keys {
+        table.need(key, &format!("samples of kind {word:?} need it: write {key} = a whole number"));
+        shape.push(table.integer(key, 1..=*most).unwrap_or(1));
+    }
+    shape
+}
+
+const CAN_KEYS: [&str; 9] =
+    ["adapter", "bitrate", "protocol", "hz", "deadman", "disable_after", "timeout", "silent_after", "motors"];
+/// Keys that only a bus of motors has.
+const OF_MOTORS: [&str; 6] = ["motors", "hz", "deadman", "disable_after", "timeout", "silent_after"];
+
+/// What can be on a bus, by the word for it: motors, or not.
+const PROTOCOLS: [(&str, bool); 2] = [("raw", false), ("damiao", true)];
+
+/// Reads the table; `None` if a problem with it was reported.
+pub(super) fn can(section: &Section<'_>) -> Option<CanSpec> {
+    section.no_tables(&["camera", "tty", "serial", "lan"], "a CAN adapter", "can");
+    let default = CanSpec { adapter: CanAdapter::SocketCan, bitrate: 1_000_000, protocol: CanProtocol::Raw };
+    if !section.has("can") {
+        return Some(default);
+    }
+    let table = section.table("can")?;
+    table.allow(&CAN_KEYS);
+    let adapter = table.choice("adapter", &CanAdapter::WORDS).unwrap_or(default.adapter);
+    let bitrate = table.integer("bitrate", 10_000..=1_000_000).unwrap_or(default.bitrate);
+    check_bitrate(&table, adapter, bitrate);
+    let has_motors = table.choice("protocol", &PROTOCOLS);
+    if has_motors == Some(true) {
+        return Some(CanSpec { adapter, bitrate, protocol: CanProtocol::Damiao(motors::damiao(&table)?) });
+    }
+    // A word that is none has been reported; what it was to be is not known.
+    if has_motors.is_some() || !table.has("protocol") {
+        no_motors(&table);
+    }
+    Some(CanSpec { adapter, bitrate, protocol: CanProtocol::Raw })
+}
+
+fn no_motors(table: &Section<'_>) {
+    if let Some(key) = OF_MOTORS.into_iter().find(|key| table.has(key)) {
+        let message = format!("a bus whose frames are recorded as they are has no {key}");
+        table.report(key, message, "write protocol = \"damiao\" for a bus of motors, or remove it");
+    }
+}
+
+fn check_bitrate(table: &Section<'_>, adapter: CanAdapter, bitrate: u32) {
+    let (message, fix) = match adapter {
+        CanAdapter::Slcan if !SLCAN_BITRATES.contains(&bitrate) => {
+            let known: Vec<String> = SLCAN_BITRATES.iter().map(ToString::to_string).collect();
+            (format!("slcan has no name for {bitrate} bits a second"), format!("write one of: {}", known.join(", ")))
+        }
+        CanAdapter::Damiao if bitrate != 1_000_000 => (
+            "rapid does not set the bit rate of Damiao's adapter".to_owned(),
+            "remove bitrate; the adapter is set up with its maker's program, and its motors talk at 1000000".to_owned(),
+        ),
+        _ => return,
+    };
+    table.report("bitrate", message, fix);
 }

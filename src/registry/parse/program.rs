@@ -1,4 +1,5 @@
-//! Finding the program that an entry names.
+//! The programs that an entry names, and its hooks `on_attach`, `on_detach`, `on_record_start` and `on_record_stop`:
+//! programs with their arguments.
 //!
 //! 1. An absolute path is taken as it is.
 //! 2. A name is looked for beside the registry's file, then in the absolute directories of `PATH`.
@@ -10,8 +11,9 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
 use super::device::Draft;
-use crate::registry::diagnostic::{Diagnostic, nearest};
-use crate::registry::section::{Problems, printable};
+use crate::registry::diagnostic::nearest;
+use crate::registry::section::{Section, printable};
+use crate::registry::spec::{Hook, Hooks};
 use crate::registry::trust::distrust;
 
 /// Files beside the registry that are compared with a name that is not found.
@@ -149,15 +151,42 @@ fn trusted(path: &Path, label: &str) -> Result<(), Wrong> {
     }
 }
 
-/// Warnings for the programs of an entry that others could change. As root they have been refused.
-pub(super) fn distrusted(draft: &Draft<'_>, problems: &Problems<'_>) -> Vec<Diagnostic> {
-    let warn = |(key, path): (&str, &Path)| {
+/// Warns of the programs of entries that others could change. As root they have been refused.
+pub(super) fn warn_of_distrusted(drafts: &[Draft<'_>]) {
+    for (draft, (key, path)) in drafts.iter().flat_map(|draft| draft.programs().map(move |program| (draft, program))) {
         // What is not looked for, as nothing will be run, is not there either.
-        let reason = distrust(path).ok().flatten()?;
-        let message = format!("the program {}: {reason}", printable(&path.display().to_string()));
-        Some(problems.diagnostic(draft.section.at_of(key), &draft.section.entry, message, reason.fix()))
+        if let Ok(Some(reason)) = distrust(path) {
+            let message = format!("the program {}: {reason}", printable(&path.display().to_string()));
+            draft.section.warn_at(draft.section.at_of(key), message, reason.fix());
+        }
+    }
+}
+
+/// The hooks of an entry. With `node = "process"`, `on_attach` is the node itself and no hook.
+pub(super) fn hooks(section: &Section<'_>, attach_is_node: bool, programs: Programs<'_>) -> Hooks {
+    let read = |key| hook(section, key, programs);
+    Hooks {
+        attach: if attach_is_node { None } else { read("on_attach") },
+        detach: read("on_detach"),
+        record_start: read("on_record_start"),
+        record_stop: read("on_record_stop"),
+    }
+}
+
+/// A program and its arguments; `None` without the key, or if a problem with it was reported.
+pub(super) fn hook(section: &Section<'_>, key: &'static str, programs: Programs<'_>) -> Option<Hook> {
+    let words = section.texts(key)?;
+    let Some((name, args)) = words.split_first() else {
+        let fix = format!("write {key} = [\"program\", \"argument\"], or remove it");
+        return section.refuse(key, format!("{key} names no program"), fix);
     };
-    draft.programs().filter_map(warn).collect()
+    if args.iter().any(|arg| arg.contains('\0')) {
+        let message = format!("{key}: an argument cannot contain the character U+0000");
+        return section.refuse(key, message, "leave it out");
+    }
+    let found = programs.find(For::Hook(key), name);
+    let program = found.map_err(|(message, fix)| section.report(key, message, fix)).ok()?;
+    Some(Hook { program, args: args.to_vec() })
 }
 
 #[cfg(test)]

@@ -18,7 +18,7 @@ fn the_builtin_registry_is_the_demonstration_rig() {
 }
 
 #[test]
-fn a_device_too_slow_for_the_window_is_warned_of_with_what_to_write() {
+fn a_device_too_slow_for_the_window_gets_a_warning_with_a_fix() {
     let parse = |window: &str, fps: u32, verdict: &str| {
         let text = format!(
             "[rig]\n{window}\n[device.cam]\nvid = \"1209\"\npid = \"0001\"\nserial = \"A\"\nnode = \"camera\"\nbit = 0\n\

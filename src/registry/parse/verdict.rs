@@ -7,10 +7,11 @@
 //! 3. A limit for SUSPECT beyond the one for BAD moves that one along, unless both are written: then
 //!    the file contradicts itself. "off" turns both off, unless BAD is written.
 
+use std::iter::zip;
 use std::time::Duration;
 
-use crate::registry::limits::{Limits, VerdictSpec};
-use crate::registry::section::{Problems, Section};
+use crate::registry::section::Section;
+use crate::registry::spec::{Limits, VerdictSpec};
 
 type Share = fn(&mut Limits) -> &mut Option<f64>;
 type Time = fn(&mut Limits) -> &mut Option<Duration>;
@@ -68,60 +69,54 @@ pub(super) enum Whose {
 }
 
 /// Reads the table `verdict` of `section`.
-pub(super) fn read(section: &Section<'_>, whose: Whose, problems: &mut Problems<'_>) -> VerdictTable {
+pub(super) fn read(section: &Section<'_>, whose: Whose) -> VerdictTable {
     let mut table = VerdictTable::default();
-    let Some(section) = section.table(problems, "verdict") else { return table };
+    let Some(section) = section.table("verdict") else { return table };
     let checks = SHARES.iter().map(|(key, ..)| *key).chain(TIMES.iter().map(|(key, _)| *key));
     let mut known: Vec<&str> = checks.collect();
     let of_bad = known.clone();
     known.push("bad");
     if whose == Whose::Device {
         known.push("hz");
-        table.hz = section.number(problems, "hz", 0.001..=100_000.0);
+        table.hz = section.number("hz", 0.001..=100_000.0);
     } else if section.has("hz") {
         known.push("hz");
         let fix = "write it as hz = 100 in [device.NAME.verdict]";
-        section.report(problems, "hz", "hz is the rate of one device".to_owned(), fix);
+        section.report("hz", "hz is the rate of one device".to_owned(), fix);
     }
-    section.allow(problems, &known);
-    table.suspect = limits(&section, problems);
-    if let Some(bad) = section.table(problems, "bad") {
-        bad.allow(problems, &of_bad);
-        table.bad = limits(&bad, problems);
-        contradictions(&table, &section, &bad, problems);
+    section.allow(&known);
+    table.suspect = limits(&section);
+    if let Some(bad) = section.table("bad") {
+        bad.allow(&of_bad);
+        table.bad = limits(&bad);
+        contradictions(&table, &section, &bad);
     }
     table
 }
 
-fn limits(section: &Section<'_>, problems: &mut Problems<'_>) -> Written {
+fn limits(section: &Section<'_>) -> Written {
     let mut written = Written::default();
     for ((key, ..), share) in SHARES.iter().zip(&mut written.shares) {
-        *share = read_share(section, key, problems);
+        *share = read_share(section, key);
     }
     for ((key, _), time) in TIMES.iter().zip(&mut written.times) {
-        *time = match text(section, key) {
+        *time = match section.word(key) {
             Some("off") => Some(None),
-            _ => section.duration(problems, key, Duration::from_millis(1)..=Duration::from_hours(1)).map(Some),
+            _ => section.duration(key, Duration::from_millis(1)..=Duration::from_hours(1)).map(Some),
         };
     }
     written
 }
 
-/// The text of `key`, if it is one.
-fn text<'a>(section: &Section<'a>, key: &str) -> Option<&'a str> {
-    section.fields().into_iter().find(|(_, name, _)| *name == key)?.2.get_ref().as_str()
-}
-
 /// `"0.1%"`, `"0.1 %"`, or `"off"`.
-fn read_share(section: &Section<'_>, key: &str, problems: &mut Problems<'_>) -> Option<Given<f64>> {
+fn read_share(section: &Section<'_>, key: &str) -> Option<Given<f64>> {
     let usual = if ["rate", "valid"].contains(&key) { "90%" } else { "0.5%" };
     let fix = format!("write 0% to 100%, or \"off\", for example {key} = \"{usual}\"");
     if !section.has(key) {
         return None;
     }
-    let Some(written) = text(section, key) else {
-        section.report(problems, key, format!("{key} is not a share in percent"), fix);
-        return None;
+    let Some(written) = section.word(key) else {
+        return section.refuse(key, format!("{key} is not a share in percent"), fix);
     };
     if written == "off" {
         return Some(None);
@@ -130,32 +125,25 @@ fn read_share(section: &Section<'_>, key: &str, problems: &mut Problems<'_>) -> 
     let is_plain = |number: &&str| number.bytes().all(|byte| byte.is_ascii_digit() || byte == b'.');
     let percent: Option<f64> = number.filter(is_plain).and_then(|number| number.parse().ok());
     match percent {
-        Some(percent) if (0.0..=100.0).contains(&percent) => return Some(Some(percent / 100.0)),
-        Some(_) => section.report(problems, key, format!("{key} = {written:?} is out of range"), fix),
-        None => section.report(problems, key, format!("{key} = {written:?} is not a share in percent"), fix),
+        Some(percent) if (0.0..=100.0).contains(&percent) => Some(Some(percent / 100.0)),
+        Some(_) => section.refuse(key, format!("{key} = {written:?} is out of range"), fix),
+        None => section.refuse(key, format!("{key} = {written:?} is not a share in percent"), fix),
     }
-    None
 }
 
-fn contradictions(table: &VerdictTable, section: &Section<'_>, bad: &Section<'_>, problems: &mut Problems<'_>) {
-    let mut report = |key: &str| {
-        let line = problems.line(section.at_of(key));
+fn contradictions(table: &VerdictTable, section: &Section<'_>, bad: &Section<'_>) {
+    let report = |key: &str| {
+        let line = section.line_of(key);
         let message = format!("{key} is BAD before it is SUSPECT by [{}] on line {line}", section.entry);
-        bad.report(problems, key, message, "make the limit for BAD the graver of the two");
+        bad.report(key, message, "make the limit for BAD the graver of the two");
     };
-    for (index, (key, _, worse)) in SHARES.iter().enumerate() {
-        let written = |of: &Written| of.shares.get(index).copied().flatten().flatten();
-        if let (Some(suspect), Some(bad)) = (written(&table.suspect), written(&table.bad))
-            && worse.is_beyond(&suspect, &bad)
-        {
+    for ((key, _, worse), written) in SHARES.iter().zip(zip(table.suspect.shares, table.bad.shares)) {
+        if matches!(written, (Some(Some(suspect)), Some(Some(bad))) if worse.is_beyond(&suspect, &bad)) {
             report(key);
         }
     }
-    for (index, (key, _)) in TIMES.iter().enumerate() {
-        let written = |of: &Written| of.times.get(index).copied().flatten().flatten();
-        if let (Some(suspect), Some(bad)) = (written(&table.suspect), written(&table.bad))
-            && suspect > bad
-        {
+    for ((key, _), written) in TIMES.iter().zip(zip(table.suspect.times, table.bad.times)) {
+        if matches!(written, (Some(Some(suspect)), Some(Some(bad))) if suspect > bad) {
             report(key);
         }
     }
@@ -175,21 +163,11 @@ impl Worse {
 pub(super) fn changed(mut spec: VerdictSpec, rig: &VerdictTable, own: &VerdictTable) -> VerdictSpec {
     spec.hz = own.hz.or(spec.hz);
     for (table, whose) in [(rig, Whose::Rig), (own, Whose::Device)] {
-        for (index, (_, of, worse)) in SHARES.iter().enumerate() {
-            let written = |of: &Written| of.shares.get(index).copied().flatten();
-            change(
-                of(&mut spec.suspect),
-                of(&mut spec.bad),
-                written(&table.suspect),
-                written(&table.bad),
-                whose,
-                *worse,
-            );
+        for ((_, of, worse), written) in SHARES.iter().zip(zip(table.suspect.shares, table.bad.shares)) {
+            change(of(&mut spec.suspect), of(&mut spec.bad), written, whose, *worse);
         }
-        for (index, (_, of)) in TIMES.iter().enumerate() {
-            let written = |of: &Written| of.times.get(index).copied().flatten();
-            let (suspect, bad) = (written(&table.suspect), written(&table.bad));
-            change(of(&mut spec.suspect), of(&mut spec.bad), suspect, bad, whose, Worse::More);
+        for ((_, of), written) in TIMES.iter().zip(zip(table.suspect.times, table.bad.times)) {
+            change(of(&mut spec.suspect), of(&mut spec.bad), written, whose, Worse::More);
         }
     }
     spec
@@ -198,8 +176,7 @@ pub(super) fn changed(mut spec: VerdictSpec, rig: &VerdictTable, own: &VerdictTa
 fn change<T: PartialOrd + Copy>(
     suspect: &mut Option<T>,
     bad: &mut Option<T>,
-    new_suspect: Option<Given<T>>,
-    new_bad: Option<Given<T>>,
+    (new_suspect, new_bad): (Option<Given<T>>, Option<Given<T>>),
     whose: Whose,
     worse: Worse,
 ) {

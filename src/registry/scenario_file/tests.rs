@@ -72,7 +72,7 @@ fn events_are_ordered_by_time_and_then_by_the_file() {
 }
 
 #[test]
-fn two_units_of_one_model_without_serial_numbers_can_be_told() {
+fn two_units_of_one_model_without_serial_numbers_are_accepted() {
     let scenario = parse(
         r#"
         [[device]]
@@ -131,7 +131,7 @@ fn faults_are_those_of_the_device_above() {
 }
 
 #[test]
-fn mistakes_are_placed_and_all_told() {
+fn all_errors_are_reported_with_their_position() {
     for (text, expected) in [
         (
             "[[event]]\nat = \"1s\"\nunplug = \"tactile_tp\"\n[[event]]\nat = 3\nunplug = \"cam_wrist\"\n",

@@ -21,7 +21,7 @@ pub struct LanSpec {
 pub enum LanProtocol {
     /// Pictures over HTTP, `multipart/x-mixed-replace`; one sample a picture.
     Mjpeg {
-        /// Port of its HTTP server; `None` is what mDNS told, or 80.
+        /// Port of its HTTP server; `None` is what mDNS reported, or 80.
         port: Option<u16>,
         /// What is asked for, beginning with `/`, default `/`.
         path: String,
@@ -110,7 +110,7 @@ pub enum Probe {
     Udp,
 }
 
-/// Port of a server whose port is not told.
+/// Port of a server whose port is not reported.
 const HTTP_PORT: u16 = 80;
 /// The pose of a phone's camera is a matrix of 4 by 4.
 const POSE: u32 = 16;
@@ -226,25 +226,6 @@ impl LanSpec {
         }
     }
 
-    /// Without a sample for so long it is said to be late; at least `least`.
-    pub(in crate::registry) fn stall(&self, least: Duration) -> Duration {
-        match (&self.protocol, self.picture()) {
-            // It is looked at every 3 s.
-            (LanProtocol::Gopro { .. }, _) => Duration::from_secs(10),
-            (_, Some(picture)) => (Duration::from_secs(10) / picture.fps.max(1)).max(least),
-            _ => least,
-        }
-    }
-
-    /// About two seconds of pictures, and a second of a LiDAR's packets.
-    pub(in crate::registry) fn depth(&self) -> u64 {
-        match (&self.protocol, self.picture()) {
-            (LanProtocol::Gopro { .. }, _) => 16,
-            (_, Some(picture)) => (2 * u64::from(picture.fps)).clamp(16, 1024),
-            _ => 2048,
-        }
-    }
-
     /// The port at which the device is reached, or at which it reaches us, if the entry says.
     #[must_use]
     pub const fn port(&self) -> Option<u16> {
@@ -270,20 +251,5 @@ impl LanSpec {
             LanProtocol::Iphone { port, .. } => Some((false, *port)),
             LanProtocol::Mjpeg { .. } | LanProtocol::Gopro { .. } => None,
         }
-    }
-
-    /// The port of ours that a phone connects to.
-    #[must_use]
-    pub const fn phone_port(&self) -> Option<u16> {
-        match &self.protocol {
-            LanProtocol::Iphone { port, .. } => Some(*port),
-            _ => None,
-        }
-    }
-
-    /// Samples a second, where that is known.
-    #[must_use]
-    pub fn rate(&self) -> Option<f64> {
-        self.picture().map(|picture| f64::from(picture.fps))
     }
 }

@@ -1,4 +1,4 @@
-//! Motors of a CAN bus that speak Damiao's protocol, as `[device.NAME.can]` tells of them.
+//! Motors of a CAN bus that speak Damiao's protocol, as `[device.NAME.can]` declares them.
 //!
 //! Invariant: which ranges a motor counts in is read from the motor. [`MotorKind`] says what the maker
 //! ships, to compare it with.
@@ -179,63 +179,48 @@ pub enum MotorMode {
     Velocity,
 }
 
-/// Damiao's motors, by name: programs number them differently.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-#[allow(missing_docs)]
-pub enum MotorKind {
-    Dm3507,
-    Dm4310,
-    Dm4310V48,
-    Dm4340,
-    Dm4340V48,
-    Dm6006,
-    Dm8006,
-    Dm8009,
-    Dm10010,
-    Dm10010L,
-    Dmg6220,
-    Dmh3510,
-    Dmh6215,
+/// Makes [`MotorKind`] of its values and how they are written in `devices.toml`.
+macro_rules! motor_kinds {
+    ($($kind:ident = $name:literal),+ $(,)?) => {
+        /// Damiao's motors, by name: programs number them differently.
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+        #[allow(missing_docs)]
+        pub enum MotorKind {
+            $($kind),+
+        }
+
+        impl MotorKind {
+            /// All of them.
+            pub const ALL: [Self; [$($name),+].len()] = [$(Self::$kind),+];
+
+            /// As it is written in `devices.toml`.
+            #[must_use]
+            pub const fn name(self) -> &'static str {
+                match self {
+                    $(Self::$kind => $name),+
+                }
+            }
+        }
+    };
+}
+
+motor_kinds! {
+    Dm3507 = "DM3507",
+    Dm4310 = "DM4310",
+    Dm4310V48 = "DM4310_48V",
+    Dm4340 = "DM4340",
+    Dm4340V48 = "DM4340_48V",
+    Dm6006 = "DM6006",
+    Dm8006 = "DM8006",
+    Dm8009 = "DM8009",
+    Dm10010 = "DM10010",
+    Dm10010L = "DM10010L",
+    Dmg6220 = "DMG6220",
+    Dmh3510 = "DMH3510",
+    Dmh6215 = "DMH6215",
 }
 
 impl MotorKind {
-    /// All of them.
-    pub const ALL: [Self; 13] = [
-        Self::Dm3507,
-        Self::Dm4310,
-        Self::Dm4310V48,
-        Self::Dm4340,
-        Self::Dm4340V48,
-        Self::Dm6006,
-        Self::Dm8006,
-        Self::Dm8009,
-        Self::Dm10010,
-        Self::Dm10010L,
-        Self::Dmg6220,
-        Self::Dmh3510,
-        Self::Dmh6215,
-    ];
-
-    /// As it is written in `devices.toml`.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Dm3507 => "DM3507",
-            Self::Dm4310 => "DM4310",
-            Self::Dm4310V48 => "DM4310_48V",
-            Self::Dm4340 => "DM4340",
-            Self::Dm4340V48 => "DM4340_48V",
-            Self::Dm6006 => "DM6006",
-            Self::Dm8006 => "DM8006",
-            Self::Dm8009 => "DM8009",
-            Self::Dm10010 => "DM10010",
-            Self::Dm10010L => "DM10010L",
-            Self::Dmg6220 => "DMG6220",
-            Self::Dmh3510 => "DMH3510",
-            Self::Dmh6215 => "DMH6215",
-        }
-    }
-
     /// PMAX in rad, VMAX in rad/s and TMAX in Nm as the motor leaves the factory. Source: the tables of the
     /// public drivers `DM_CAN.py` and of `LeRobot`.
     #[must_use]
@@ -263,7 +248,7 @@ impl MotorKind {
 }
 
 impl DamiaoSpec {
-    /// The first two motors, by position, that cannot be told apart on the bus: one listens to what the
+    /// The first two motors, by position, that cannot be distinguished on the bus: one listens to what the
     /// other does, or they answer with one id and the same low four bits of their own.
     #[must_use]
     pub fn indistinct(&self) -> Option<(usize, usize)> {

@@ -11,8 +11,8 @@ use tokio::sync::{broadcast, watch};
 
 use super::*;
 use crate::action::Order;
-use crate::hotplug::HotplugError;
-use crate::permission::Permission;
+use crate::hotplug::{HotplugError, HotplugEvent};
+use crate::provenance::UnplugSource;
 use crate::registry::scenario::{SimDevice, SimSource};
 use crate::registry::{
     DeviceNode, Framing, IdentitySpec, LanFind, LanProtocol, LanSpec, NodeSpec, Parse, RigSpec, SerialSpec,
@@ -75,7 +75,7 @@ enum Step {
     /// The cable is pulled: the device notices, hot-plug has yet to tell.
     Pull(&'static str),
     /// Hot-plug tells of the removal of a port.
-    Removed(&'static str, Witness),
+    Removed(&'static str, UnplugSource),
     Silence(&'static str),
     Resume(&'static str),
     Restart(u8),
@@ -121,9 +121,9 @@ impl Bench {
                 }));
             }
             Pull(port) => self.units[port].unplug(),
-            Removed(port, witness) => {
+            Removed(port, source) => {
                 let syspath = PathBuf::from("/test").join(port);
-                self.tell(HotplugEvent::Removed { syspath, witnessed: Stamp::now(), witness: *witness });
+                self.tell(HotplugEvent::Removed { syspath, noticed: Stamp::now(), source: *source });
             }
             Silence(port) => self.units[port].set_silent(true),
             Resume(port) => self.units[port].set_silent(false),
@@ -188,7 +188,7 @@ impl Bench {
 fn word(what: &What) -> Option<String> {
     match what {
         What::Attach { device, unit, .. } => Some(format!("{device} at {}", unit.place())),
-        What::Detach { device, witness, .. } => Some(format!("{device} gone {witness}")),
+        What::Detach { device, source, .. } => Some(format!("{device} gone {}", source.word())),
         What::State { device, state, .. } => Some(format!("{device} {}", state.word())),
         What::Unregistered { .. } => Some("unused".into()),
         What::Actuator { device, arming, .. } => Some(format!("{device} {}", arming.word())),
@@ -242,11 +242,11 @@ async fn the_first_witness_wins_and_no_replug_is_lost() {
                 Plug("1", CHANNELS),
                 Until("a streaming"),
                 Mask(1),
-                Removed("1", Witness::Kernel),
+                Removed("1", UnplugSource::Kernel),
                 Until("a absent"),
                 Mask(0),
                 Pull("1"),
-                Removed("1", Witness::Udev),
+                Removed("1", UnplugSource::Udev),
                 Plug("1", CHANNELS),
                 Until("a streaming"),
                 Mask(1),
@@ -261,7 +261,7 @@ async fn the_first_witness_wins_and_no_replug_is_lost() {
                 Pull("1"),
                 Until("a absent"),
                 Mask(0),
-                Removed("1", Witness::Kernel),
+                Removed("1", UnplugSource::Kernel),
                 Plug("1", CHANNELS),
                 Until("a streaming"),
                 Mask(1),
@@ -273,7 +273,7 @@ async fn the_first_witness_wins_and_no_replug_is_lost() {
             &[
                 Plug("1", CHANNELS),
                 Until("a streaming"),
-                Removed("1", Witness::Enumeration),
+                Removed("1", UnplugSource::Enumeration),
                 Plug("1", CHANNELS),
                 Until("a streaming"),
                 Mask(1),
@@ -292,9 +292,9 @@ async fn the_first_witness_wins_and_no_replug_is_lost() {
                 Until("unused"),
                 Until("unused"),
                 Mask(3),
-                Removed("1", Witness::Kernel),
+                Removed("1", UnplugSource::Kernel),
                 Until("a streaming"),
-                Removed("2", Witness::Kernel),
+                Removed("2", UnplugSource::Kernel),
                 Until("b streaming"),
                 Mask(3),
             ],
@@ -387,7 +387,7 @@ async fn devices_are_told_of_the_episode_in_progress() {
     begin(2);
     come_to(&first, (2, 1)).await;
     // One that comes during the episode, while another is pulled.
-    for step in [Plug("2", CHANNELS), Until("b streaming"), Removed("1", Witness::Kernel), Until("a absent")] {
+    for step in [Plug("2", CHANNELS), Until("b streaming"), Removed("1", UnplugSource::Kernel), Until("a absent")] {
         bench.step(&step).await;
     }
     let second = Arc::clone(&bench.units["2"]);
@@ -538,7 +538,7 @@ async fn the_mask_comes_before_the_announcement_and_its_file_says_one_publicatio
                 let (node, unit) = (DeviceNode::Sim(Arc::clone(&unit)), usb.clone().into());
                 HotplugEvent::Added(Attachment { syspath: syspath.clone(), node, unit, driver: None })
             } else {
-                HotplugEvent::Removed { syspath: syspath.clone(), witnessed: Stamp::now(), witness: Witness::Kernel }
+                HotplugEvent::Removed { syspath: syspath.clone(), noticed: Stamp::now(), source: UnplugSource::Kernel }
             };
             hotplug.unbounded_send(Ok(event)).expect("rig");
             let begun = Instant::now();

@@ -24,7 +24,7 @@ fn what_is_published_is_read_back_and_goes_with_the_publisher() {
 }
 
 #[test]
-fn a_file_that_is_removed_or_replaced_is_made_anew_and_another_programs_is_left() {
+fn a_removed_or_replaced_file_is_recreated_and_foreign_files_are_kept() {
     let path = path();
     let mut file = MaskFile::create(&path, 1).expect("create");
     assert!(!file.restore().expect("it is there"));
@@ -45,7 +45,7 @@ fn a_file_that_is_removed_or_replaced_is_made_anew_and_another_programs_is_left(
 }
 
 #[test]
-fn a_second_publisher_is_told_the_pid_of_the_first() {
+fn a_second_publisher_gets_the_pid_of_the_first() {
     let path = path();
     let _first = MaskFile::create(&path, 1).expect("first");
     let error = MaskFile::create(&path, 1).expect_err("second");

@@ -50,7 +50,7 @@ fn every_transition_of_the_current_epoch() {
         (Absent, Input::Resumed(e), Absent, none.clone()),
         (Absent, Input::Ended(e, End::Gone), Absent, none.clone()),
         (Absent, Input::Ended(e, End::Retry), Absent, none.clone()),
-        (Absent, Input::Ended(e, End::Unlinked), Absent, none.clone()),
+        (Absent, Input::Ended(e, End::LinkDown), Absent, none.clone()),
         (Absent, Input::Ended(e, End::Fatal), Absent, none.clone()),
         (Absent, Input::Restart, Absent, none.clone()),
         (Absent, Input::Timer, Absent, none.clone()),
@@ -61,7 +61,7 @@ fn every_transition_of_the_current_epoch() {
         (Opening, Input::Resumed(e), Opening, none.clone()),
         (Opening, Input::Ended(e, End::Gone), Absent, none.clone()),
         (Opening, Input::Ended(e, End::Retry), Backoff, none.clone()),
-        (Opening, Input::Ended(e, End::Unlinked), Backoff, none.clone()),
+        (Opening, Input::Ended(e, End::LinkDown), Backoff, none.clone()),
         (Opening, Input::Ended(e, End::Fatal), Failed, none.clone()),
         (Opening, Input::Restart, Opening, none.clone()),
         (Opening, Input::Timer, Opening, none.clone()),
@@ -72,7 +72,7 @@ fn every_transition_of_the_current_epoch() {
         (Streaming, Input::Resumed(e), Streaming, none.clone()),
         (Streaming, Input::Ended(e, End::Gone), Absent, none.clone()),
         (Streaming, Input::Ended(e, End::Retry), Backoff, none.clone()),
-        (Streaming, Input::Ended(e, End::Unlinked), Backoff, none.clone()),
+        (Streaming, Input::Ended(e, End::LinkDown), Backoff, none.clone()),
         (Streaming, Input::Ended(e, End::Fatal), Failed, none.clone()),
         (Streaming, Input::Restart, Streaming, none.clone()),
         (Streaming, Input::Timer, Streaming, none.clone()),
@@ -83,7 +83,7 @@ fn every_transition_of_the_current_epoch() {
         (Stalled, Input::Resumed(e), Streaming, none.clone()),
         (Stalled, Input::Ended(e, End::Gone), Absent, none.clone()),
         (Stalled, Input::Ended(e, End::Retry), Backoff, none.clone()),
-        (Stalled, Input::Ended(e, End::Unlinked), Backoff, none.clone()),
+        (Stalled, Input::Ended(e, End::LinkDown), Backoff, none.clone()),
         (Stalled, Input::Ended(e, End::Fatal), Failed, none.clone()),
         (Stalled, Input::Restart, Stalled, none.clone()),
         (Stalled, Input::Timer, Stalled, none.clone()),
@@ -94,7 +94,7 @@ fn every_transition_of_the_current_epoch() {
         (Backoff, Input::Resumed(e), Backoff, none.clone()),
         (Backoff, Input::Ended(e, End::Gone), Backoff, none.clone()),
         (Backoff, Input::Ended(e, End::Retry), Backoff, none.clone()),
-        (Backoff, Input::Ended(e, End::Unlinked), Backoff, none.clone()),
+        (Backoff, Input::Ended(e, End::LinkDown), Backoff, none.clone()),
         (Backoff, Input::Ended(e, End::Fatal), Backoff, none.clone()),
         (Backoff, Input::Restart, Opening, start(2, 'a')),
         (Backoff, Input::Timer, Backoff, none.clone()),
@@ -105,7 +105,7 @@ fn every_transition_of_the_current_epoch() {
         (Failed, Input::Resumed(e), Failed, none.clone()),
         (Failed, Input::Ended(e, End::Gone), Failed, none.clone()),
         (Failed, Input::Ended(e, End::Retry), Failed, none.clone()),
-        (Failed, Input::Ended(e, End::Unlinked), Failed, none.clone()),
+        (Failed, Input::Ended(e, End::LinkDown), Failed, none.clone()),
         (Failed, Input::Ended(e, End::Fatal), Failed, none.clone()),
         (Failed, Input::Restart, Opening, start(2, 'a')),
         (Failed, Input::Timer, Failed, none),
@@ -129,7 +129,7 @@ fn an_older_epoch_changes_nothing_in_any_state() {
                 Input::Resumed(old),
                 Input::Ended(old, End::Gone),
                 Input::Ended(old, End::Retry),
-                Input::Ended(old, End::Unlinked),
+                Input::Ended(old, End::LinkDown),
                 Input::Ended(old, End::Fatal),
             ] {
                 let mut slot = slot_in(state);
@@ -162,7 +162,7 @@ fn after_the_cooldown_a_replug_starts_at_once() {
 }
 
 #[test]
-fn bounces_within_the_cooldown_end_with_what_is_attached_last() {
+fn bounces_within_the_cooldown_settle_on_the_last_attachment() {
     let mut slot = slot_in(Streaming);
     slot.apply(Input::Detached, ms(0));
     slot.apply(Input::Attached('b'), ms(100));
@@ -224,14 +224,14 @@ fn a_cable_may_be_pulled_as_often_as_one_likes() {
     let mut slot = slot_in(Opening);
     for n in 1..20 {
         let now = 600 * u64::from(n);
-        slot.apply(Input::Ended(Epoch(n), End::Unlinked), ms(now));
+        slot.apply(Input::Ended(Epoch(n), End::LinkDown), ms(now));
         assert_eq!((slot.state(), slot.deadline()), (Backoff, Some(ms(now + 500))));
         assert_eq!(slot.apply(Input::Timer, ms(now + 500)), start(n + 1, 'a'));
     }
 }
 
 #[test]
-fn a_stream_that_held_for_a_minute_begins_with_the_short_backoff_again() {
+fn a_stream_stable_for_a_minute_resets_the_backoff() {
     let mut slot = slot_in(Backoff);
     slot.apply(Input::Timer, ms(500));
     slot.apply(Input::Started(Epoch(2)), ms(600));
@@ -280,7 +280,7 @@ proptest! {
     /// Whatever happened, in whatever order, with reports of streams old and new: once a device
     /// that works has been attached, it streams; once it is gone, the slot is absent.
     #[test]
-    fn the_settled_state_depends_only_on_what_is_attached(
+    fn the_settled_state_depends_only_on_the_attachments(
         history in proptest::collection::vec(happens(), 0..60),
         last in proptest::option::of(proptest::char::range('a', 'd')),
     ) {
@@ -303,7 +303,7 @@ proptest! {
                         2 => Input::Resumed(epoch),
                         3 => Input::Ended(epoch, End::Gone),
                         4 => Input::Ended(epoch, End::Retry),
-                        5 => Input::Ended(epoch, End::Unlinked),
+                        5 => Input::Ended(epoch, End::LinkDown),
                         _ => Input::Ended(epoch, End::Fatal),
                     }
                 }

@@ -3,17 +3,17 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use tokio::sync::mpsc;
 use tokio::time::timeout;
 
 use super::{CLOSE_LIMIT, Stream};
-use crate::action::{ActuatorNotice, Order};
+use crate::action::{ActionSource, ActuatorNotice, Order};
 use crate::driver::{Driver, DriverError, Reading};
 use crate::permission::Attended;
 use crate::provenance::Negotiated;
 use crate::registry::NodeSpec;
 use crate::rig::worker::{MOST_SILENT_BEATS, Worker};
 use crate::status::Episode;
-use crate::time::Stamp;
 
 /// Where the samples of a stream come from.
 #[derive(Debug)]
@@ -48,9 +48,9 @@ impl Source {
         }
     }
 
-    pub(super) fn command(&mut self, target: &[f64], tick: Stamp) -> Result<(), DriverError> {
+    pub(super) fn command(&mut self, target: &[f64]) -> Result<(), DriverError> {
         match self {
-            Self::Driver(driver) => driver.command(target, tick),
+            Self::Driver(driver) => driver.command(target),
             // A program that moves something subscribes to actions itself.
             Self::Worker(_) => Ok(()),
         }
@@ -63,17 +63,17 @@ impl Source {
         }
     }
 
-    /// Has it carry out these orders. Says whether it takes them itself.
-    pub(super) fn attend(&mut self, orders: &Arc<Attended>) -> bool {
+    /// Has it carry out these orders and actions. Says whether it takes them itself.
+    pub(super) fn attend(&mut self, orders: &Arc<Attended>, actions: &Arc<dyn ActionSource>) -> bool {
         match self {
-            Self::Driver(driver) => driver.attend(orders),
+            Self::Driver(driver) => driver.attend(orders, actions),
             Self::Worker(_) => false,
         }
     }
 
-    pub(super) fn take_notice(&mut self) -> Option<ActuatorNotice> {
+    pub(super) fn notices(&mut self) -> Option<mpsc::Receiver<ActuatorNotice>> {
         match self {
-            Self::Driver(driver) => driver.take_notice(),
+            Self::Driver(driver) => driver.notices(),
             Self::Worker(_) => None,
         }
     }

@@ -111,7 +111,7 @@ fn what_stops_motion_does_so_at_any_moment() {
             // Ctrl-C is the answer to the question whether to leave.
             let leaves = question == "leaving" && what.contains("'c'");
             assert_eq!(effect, if leaves { Effect::Leave } else { Effect::Order(Order::Disarm) }, "{what}");
-            assert!(!model.is_help_open() || what.contains("'c'"), "{what}");
+            assert!(!model.help || what.contains("'c'"), "{what}");
             // The question is not answered by what comes next.
             assert_eq!(model.update(control('y')), Effect::None, "{what}");
         }
@@ -155,20 +155,20 @@ fn the_question_is_withdrawn_when_the_episode_ends_by_itself() {
     snapshot.recording = Some(recording(0));
     let mut model = Model::new(snapshot);
     model.update(press(KeyCode::Char('q')));
-    assert_eq!(model.quit(), Quit::Asked);
+    assert_eq!(model.quit, Quit::Asked);
     model.update(after(&three_streaming(), 100));
-    assert_eq!(model.quit(), Quit::No);
+    assert_eq!(model.quit, Quit::No);
 }
 
 #[test]
 fn the_selection_stays_within_the_devices() {
     let mut model = Model::new(three_streaming());
     model.update(press(KeyCode::Up));
-    assert_eq!(model.selected(), 0);
+    assert_eq!(model.selected, 0);
     model.update(press(KeyCode::End));
-    assert_eq!(model.selected(), 2);
+    assert_eq!(model.selected, 2);
     model.update(press(KeyCode::Down));
-    assert_eq!(model.selected(), 2);
+    assert_eq!(model.selected, 2);
     let mut empty = three_streaming();
     empty.devices.clear();
     let mut model = Model::new(empty);
@@ -178,7 +178,7 @@ fn the_selection_stays_within_the_devices() {
 }
 
 #[test]
-fn a_paused_view_stands_still_but_commands_know_what_is() {
+fn a_paused_view_is_frozen_but_commands_use_current_state() {
     let mut model = Model::new(every_state());
     model.update(press(KeyCode::Char('p')));
     let mut later = every_state();
@@ -202,20 +202,20 @@ fn a_log_scrolled_back_stays_where_it_is_when_lines_come() {
     snapshot.log = (0..50).map(|second| line(second, Level::Info, "tick")).collect();
     let mut model = Model::new(snapshot.clone());
     model.update(press(KeyCode::PageUp));
-    assert_eq!(model.scroll(), SCROLL_STEP);
+    assert_eq!(model.scroll, SCROLL_STEP);
     // Two lines come, the two oldest go.
     snapshot.log.drain(..2);
     snapshot.log.extend((50..52).map(|second| line(second, Level::Info, "tick")));
     model.update(after(&snapshot, 100));
-    assert_eq!(model.scroll(), SCROLL_STEP + 2);
+    assert_eq!(model.scroll, SCROLL_STEP + 2);
     model.update(press(KeyCode::Esc));
-    assert_eq!(model.scroll(), 0);
+    assert_eq!(model.scroll, 0);
     model.update(after(&snapshot, 200));
-    assert_eq!(model.scroll(), 0);
+    assert_eq!(model.scroll, 0);
     for _ in 0..30 {
         model.update(press(KeyCode::PageUp));
     }
-    assert_eq!(model.scroll(), 49);
+    assert_eq!(model.scroll, 49);
 }
 
 #[test]
@@ -305,12 +305,12 @@ fn a_short_episode_is_dropped_by_a_key_and_another_soon_after() {
 fn the_question_names_the_file_and_fades() {
     let mut model = Model::new(with_short("out/a_003.mcap"));
     model.update(press(KeyCode::Char('x')));
-    assert_eq!(model.notice(), Some("y removes a_003.mcap for good, any other key keeps it"));
+    assert_eq!(model.notice(), Some("y deletes a_003.mcap, any other key keeps it"));
     model.update(after(&with_short("out/a_003.mcap"), 4_100));
     assert_eq!(model.notice(), None);
     model.update(press(KeyCode::Char('y')));
-    assert_eq!(model.notice(), Some("nothing dropped"));
+    assert_eq!(model.notice(), Some("nothing deleted"));
     let mut model = Model::new(three_streaming());
     model.update(press(KeyCode::Char('x')));
-    assert_eq!(model.notice(), Some("nothing to drop: the last episode is not a short one"));
+    assert_eq!(model.notice(), Some("nothing to delete: the last episode is not too short"));
 }

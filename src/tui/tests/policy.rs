@@ -1,13 +1,13 @@
 //! The policy panel: acting, holding, dry, and with more than there is room for.
 
 use super::*;
-use crate::status::PolicyStatus;
 use crate::status::literal::policy;
+use crate::status::{Hold, PolicyStatus};
 
 const SMALL: (u16, u16) = (60, 12);
 const USUAL: (u16, u16) = (80, 24);
 const LARGE: (u16, u16) = (120, 40);
-const MISSING: &str = "a modality that the policy requires is missing: arm";
+const MISSING: &str = "a modality that the policy requires is missing";
 
 fn with(mut end: Snapshot, policy: PolicyStatus) -> Model {
     end.policy = Some(policy);
@@ -15,7 +15,8 @@ fn with(mut end: Snapshot, policy: PolicyStatus) -> Model {
 }
 
 fn holding() -> PolicyStatus {
-    PolicyStatus { hold: Some(MISSING.to_owned()), unused: 2, chunk_age: None, ..policy() }
+    let hold = Hold { device: Some("arm".to_owned()), reason: MISSING.to_owned() };
+    PolicyStatus { hold: Some(hold), unused: 2, chunk_age: None, ..policy() }
 }
 
 fn arm(count: usize) -> PolicyStatus {
@@ -36,7 +37,7 @@ fn a_policy_that_acts() {
 }
 
 #[test]
-fn a_policy_that_holds_says_why_in_a_colour_of_warning_and_without_any() {
+fn a_holding_policy_shows_its_reason_with_and_without_colour() {
     let mut end = three_streaming();
     end.recording = Some(recording(0));
     let model = with(end, holding());
@@ -56,7 +57,7 @@ fn a_policy_that_holds_says_why_in_a_colour_of_warning_and_without_any() {
 }
 
 #[test]
-fn a_dry_run_is_marked_and_what_is_not_known_yet_is_a_dash() {
+fn a_dry_run_is_marked_and_unknown_values_are_dashes() {
     let first = PolicyStatus { dry_run: true, action: Vec::new(), latency_ms: None, ..holding() };
     let model = with(three_streaming(), first);
     let screen = draw(&model, USUAL, THEME);
@@ -73,7 +74,7 @@ fn long_and_hostile_text_keeps_the_columns() {
     let said = PolicyStatus {
         name: format!("{hostile} 相机手腕左侧的相机 a name of a policy that is far too long for a rule"),
         dry_run: true,
-        hold: Some(format!("{hostile}: {}", "wörter ".repeat(30))),
+        hold: Some(Hold { device: Some("wörter ".repeat(30)), reason: hostile.to_owned() }),
         action: vec![
             axis("a_name_of_an_axis_that_is_long", f64::NAN, "newtons per second"),
             axis(hostile, -1e300, hostile),

@@ -27,7 +27,7 @@ use crate::process::Running;
 /// Bytes of a chunk, as the recorder has it.
 pub(crate) const CHUNK_BYTES: u64 = 1 << 20;
 const BUFFER_BYTES: usize = 64 << 10;
-/// What a child may take beside what it is told to.
+/// What a child may take beside its task.
 const LIMIT: Duration = Duration::from_secs(120);
 
 /// See the module's comment. Not for use by hand.
@@ -48,7 +48,7 @@ pub(crate) enum Child {
         /// How long
         seconds: u64,
     },
-    /// A policy computes chunks, and says what memory it kept
+    /// A policy computes chunks, and reports what memory it kept
     #[command(hide = true)]
     Chunks {
         /// Of the policy
@@ -58,7 +58,7 @@ pub(crate) enum Child {
     },
 }
 
-/// What a child says it took.
+/// What a child reports it took.
 #[derive(Debug, Default, Clone, Copy, Serialize, Deserialize)]
 pub(crate) struct Spent {
     /// Time on processors, s.
@@ -71,7 +71,7 @@ pub(crate) struct Spent {
 }
 
 impl Spent {
-    /// Runs a child and reads what it says.
+    /// Runs a child and reads its report.
     pub(crate) fn of(command: &mut Command) -> Result<Self, Failure> {
         let usage = Running::start(command)?.finish(LIMIT, || {})?;
         let spent: Self = serde_json::from_str(&usage.output)?;
@@ -80,14 +80,14 @@ impl Spent {
 }
 
 impl Child {
-    /// Does it and says what it took.
+    /// Does it and reports what it took.
     pub(crate) fn run(&self) -> Result<(), Failure> {
-        let said = match self {
+        let printed = match self {
             Self::Mcap { folder, seconds } => serde_json::to_string(&mcap_alone(folder, *seconds)?)?,
             Self::Devices { seconds } => serde_json::to_string(&devices_alone(*seconds)?)?,
             Self::Chunks { bundle, count } => serde_json::to_string(&heap::grown(bundle, *count)?)?,
         };
-        Ok(writeln!(std::io::stdout(), "{said}")?)
+        Ok(writeln!(std::io::stdout(), "{printed}")?)
     }
 }
 

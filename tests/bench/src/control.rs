@@ -142,7 +142,7 @@ fn beat(stop: &AtomicBool) -> Vec<f64> {
     late
 }
 
-/// Of a line that tells of a chunk.
+/// Of a line about a chunk.
 fn latency_ms(line: &str) -> Option<f64> {
     let line: Value = serde_json::from_str(line).ok()?;
     (line.get("event")?.as_str()? == "chunk").then(|| line.get("latency_ms")?.as_f64())?

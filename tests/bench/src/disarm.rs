@@ -26,7 +26,7 @@ use crate::{Bench, Failure, LIMIT};
 const AXES: u16 = 6;
 
 /// An arm of six motors, as `devices.toml` has it.
-fn registry() -> Result<Registry, Failure> {
+pub(crate) fn registry() -> Result<Registry, Failure> {
     let motors: Vec<String> = (1..=AXES)
         .map(|id| {
             format!("{{ name = \"m{id}\", slave = {id}, type = \"DM4310\", kp = 20, kd = 1, position = [-1, 1] }}")
@@ -95,7 +95,7 @@ fn disarms(bench: &Bench, adapter: &Adapter, instance: &str, count: usize) -> Re
         let begun = Stamp::now();
         until("they are armed", || {
             // Refused until the motors have been found.
-            let all = |action| (1..=AXES).all(|motor| adapter.told_at(motor, action, begun).is_some());
+            let all = |action| (1..=AXES).all(|motor| adapter.reported_at(motor, action, begun).is_some());
             let enabled = all("motor_enabled");
             Ok(enabled || rapid(&["arm", "--instance", instance])?.success() && all("motor_enabled"))
         })?;
@@ -106,7 +106,7 @@ fn disarms(bench: &Bench, adapter: &Adapter, instance: &str, count: usize) -> Re
             return Err("`rapid disarm` failed".into());
         }
         let last =
-            || (1..=AXES).map(|motor| adapter.told_at(motor, "motor_disabled", begun)).collect::<Option<Vec<_>>>();
+            || (1..=AXES).map(|motor| adapter.reported_at(motor, "motor_disabled", begun)).collect::<Option<Vec<_>>>();
         until("they are off", || Ok(last().is_some()))?;
         let last = last().and_then(|all| all.into_iter().max()).ok_or("a motor is on")?;
         off.push(last.since(begun).as_secs_f64() * 1e3);

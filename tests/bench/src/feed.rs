@@ -4,9 +4,9 @@ use std::sync::Arc;
 
 use rapid::bus::TopicId;
 use rapid::driver::sim;
+use rapid::episode::encode;
+use rapid::episode::schema::{self, SampleSchema};
 use rapid::modality::ModalityId;
-use rapid::record::encode;
-use rapid::record::schema::{self, SampleSchema};
 use rapid::registry::Registry;
 use rapid::registry::scenario::{Scenario, SimSource};
 use rapid::sample::{Encoding, SampleHeader};
@@ -131,7 +131,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_second_of_the_load_is_what_was_asked_for() {
+    fn one_second_of_load_matches_the_request() {
         let feed = Feed::full_load().unwrap();
         assert_eq!(feed.second.len(), 4 * 60 + 1000 + 500);
         let of = |lane: usize| feed.second.iter().filter(|place| **place == lane).count() as u64;

@@ -18,7 +18,7 @@ pub(crate) struct Figure {
     /// Of value, baseline and target; may be empty.
     #[serde(default)]
     pub unit: String,
-    /// `None` if it was not measured; then the note says why.
+    /// `None` if it was not measured; then the note gives the reason.
     pub value: Option<f64>,
     /// The same of something simpler, measured in the same run.
     #[serde(default)]
@@ -188,7 +188,7 @@ mod tests {
     }
 
     #[test]
-    fn what_others_print_is_read_and_judged() {
+    fn figures_of_other_programs_are_parsed_and_judged() {
         let text = "booting\n{\"name\":\"cycles/p50\",\"unit\":\"ms\",\"value\":3,\"baseline\":null,\"target\":2,\"note\":\"n\"}\n{}";
         let figures = read(text);
         assert_eq!(figures.len(), 1);
@@ -198,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn a_table_says_what_was_met_missed_and_not_measured() {
+    fn a_table_shows_met_missed_and_unmeasured_figures() {
         let figures = [
             Figure::new("load/cpu", "%", Some(12.345)).baseline(Some(3.0)).target("< 25").note("user and system"),
             Figure::new("load/drops", "", Some(2.0)).target("= 0"),

@@ -20,7 +20,7 @@ use crate::{Bench, Failure, policy};
 const WARM_UP: usize = 200;
 const LIMIT: Duration = Duration::from_secs(1800);
 
-/// What a child says of its memory.
+/// What a child reports of its memory.
 #[derive(Debug, Default, Clone, Copy, Serialize, Deserialize)]
 pub(crate) struct Memory {
     /// `RssAnon` after the warm-up and at the end, KiB.

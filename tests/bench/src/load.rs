@@ -1,7 +1,7 @@
 //! The full load: four cameras at 60 Hz, a state at 1 kHz, the mask at 500 Hz, recorded to a file by the real program.
 //!
 //! Beside it, in processes of their own so that the kernel accounts for them alike: the `mcap` crate writing the same
-//! messages, and the simulated devices read by nobody but a loop.
+//! messages, and the simulated devices read by a loop alone.
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -39,7 +39,7 @@ struct Run {
     seen: Seen,
     /// Samples, masks included, that did not come from the driver into the file.
     dropped: f64,
-    /// Samples that a simulated camera did not keep, because nobody read them in time.
+    /// Samples that a simulated camera did not keep, because no one read them in time.
     lost: f64,
     messages: f64,
     bytes: f64,
@@ -75,11 +75,11 @@ fn one(bench: &Bench) -> Result<Run, Failure> {
     program.mark();
     let watch = Watch::start(&mask_path(Some(&instance)));
     let begun = Instant::now();
-    let mut told = 0;
+    let mut reported = 0;
     let usage = program.finish(bench.load + SLACK, || {
         let done = begun.elapsed().as_secs();
-        if done >= told + 5 {
-            told = done;
+        if done >= reported + 5 {
+            reported = done;
             bench.progress(&format!("load: {done} of {} s", bench.load.as_secs()));
         }
     })?;
@@ -117,11 +117,11 @@ pub(crate) fn only_episode(folder: &Path) -> Result<PathBuf, Failure> {
     Ok(file.ok_or("rapid wrote no episode")?)
 }
 
-/// What `rapid inspect` says of an episode.
+/// What `rapid inspect` reports about an episode.
 pub(crate) struct Episode {
     /// Samples, masks included, that did not come from the driver into the file.
     pub dropped: f64,
-    /// Samples that a device did not keep, because nobody read them in time.
+    /// Samples that a device did not keep, because no one read them in time.
     pub lost: f64,
     /// Messages in the file.
     pub messages: f64,
@@ -136,18 +136,18 @@ impl Episode {
     pub(crate) fn inspect(bench: &Bench, folder: &Path) -> Result<Self, Failure> {
         let file = only_episode(folder)?;
         let output = Command::new(&bench.rapid).args(["--json", "inspect"]).arg(file).output()?;
-        let said: Value = serde_json::from_slice(&output.stdout)?;
+        let printed: Value = serde_json::from_slice(&output.stdout)?;
         let number = |value: &Value| value.as_f64().unwrap_or(0.0);
         let missing =
             |list: &Value| list.as_array().into_iter().flatten().map(|one| number(&one["missing"])).sum::<f64>();
-        let lost = number(&said["lost"]);
-        let holes = missing(&said["modalities"]) + missing(&said["topics"]);
+        let lost = number(&printed["lost"]);
+        let holes = missing(&printed["modalities"]) + missing(&printed["topics"]);
         Ok(Self {
-            dropped: number(&said["dropped"]).max(holes - lost),
+            dropped: number(&printed["dropped"]).max(holes - lost),
             lost,
-            messages: number(&said["messages"]),
-            bytes: number(&said["bytes"]),
-            seconds: number(&said["seconds"]).max(0.001),
+            messages: number(&printed["messages"]),
+            bytes: number(&printed["bytes"]),
+            seconds: number(&printed["seconds"]).max(0.001),
         })
     }
 }

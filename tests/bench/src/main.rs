@@ -1,7 +1,7 @@
 //! `rapid-bench`: figures of `rapid` on this machine, each beside a baseline measured in the same run.
 //!
 //! One file a section; `stats` computes, `figure` shows, `process` starts and watches children. A section that cannot be
-//! measured says why and the next one follows.
+//! measured gives its reason and the next one follows.
 //!
 //! Invariant: no value makes the program fail. Wrong arguments do, and so does a figure that was not measured for another
 //! reason than an environment that it names ([`Absent`]).
@@ -249,7 +249,7 @@ impl Bench {
         Duration::from_secs(if self.smoke { 1 } else { self.choose(full, quick) })
     }
 
-    /// Tells on standard error how far a long measurement has come.
+    /// Reports on standard error how far a long measurement has come.
     fn progress(&self, text: &str) {
         let mut out = io::stderr();
         let _ = if out.is_terminal() { write!(out, "\r\x1b[K{text}") } else { writeln!(out, "{text}") };

@@ -21,7 +21,7 @@ const SLACK: Duration = Duration::from_secs(60);
 /// Tables of the kinds, in turn: a camera, a serial line, a CAN bus, a device on the network.
 const KINDS: [&str; 4] = [
     "node = \"camera\"\n[device.NAME.camera]\nwidth = 640\nheight = 480\nfps = 30\n",
-    "node = \"serial\"\n[device.NAME.serial]\nbaud = 115200\nparse = \"csv\"\nchannels = 6\n",
+    "node = \"serial\"\n[device.NAME.tty]\nbaud = 115200\nparse = \"csv\"\nchannels = 6\n",
     "node = \"can\"\n[device.NAME.can]\nprotocol = \"raw\"\n",
     "node = \"lan\"\n[device.NAME.lan]\nprotocol = \"iphone\"\nstream = \"pose\"\nhost = \"192.0.2.HOST\"\nprobe_port = 5555\nport = PORT\n",
 ];

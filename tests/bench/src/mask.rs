@@ -83,7 +83,7 @@ impl Watch {
 }
 
 impl Seen {
-    /// With what the kernel said about the program's threads.
+    /// With the kernel's figures of the program's threads.
     #[must_use]
     pub(crate) fn of(mut self, usage: &Usage) -> Self {
         self.fifo = usage.threads.iter().any(|thread| thread.name == "mask" && thread.policy == 1);

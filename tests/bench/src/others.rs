@@ -52,11 +52,11 @@ fn run(bench: &Bench, program: &Path, arguments: &[OsString], remedy: &str) -> R
         return Err(format!("{} is not there: {remedy}", program.display()).into());
     }
     let begun = Instant::now();
-    let mut told = 0;
+    let mut reported = 0;
     let mut progress = || {
         let seconds = begun.elapsed().as_secs();
-        if seconds >= told + 10 {
-            told = seconds;
+        if seconds >= reported + 10 {
+            reported = seconds;
             bench.progress(&format!("{name}: {seconds} s"));
         }
     };

@@ -204,7 +204,7 @@ pub(crate) fn request(bundle: &Bundle) -> Result<Request, Failure> {
             let (encoding, width, height) = layout(*part);
             let encoding = encoding as u32;
             let header = SampleHeader { seq: number as u64, encoding, width, height, ..SampleHeader::default() };
-            request.cell_mut(at, step).ok_or("a request without its cells")?.set(&header, 0, &payload);
+            request.cell_mut(at, step).ok_or("a request without its cells")?.set(&header, &payload);
             request.set_present(at, true);
         }
     }

@@ -131,7 +131,7 @@ impl Running {
         }
     }
 
-    /// What was taken until now is told apart from what follows.
+    /// What was taken until now is distinguished from what follows.
     pub(crate) fn mark(&mut self) {
         self.usage.cpu_before_mark_s = cpu_s(self.pid).unwrap_or_default();
     }

@@ -29,7 +29,7 @@ const UNPLUGGED: Duration = Duration::from_millis(50);
 /// The device that is pulled: what it needs itself to open and to send its first sample is next to nothing.
 const DEVICE: &str = "state";
 
-/// Tells when a plug passes on its way to the rig.
+/// Reports when a plug passes on its way to the rig.
 struct Tap {
     script: Script,
     plugs: Sender<Stamp>,

@@ -222,7 +222,7 @@ fn plain(spec: DamiaoSpec, holds: Rc<Cell<bool>>) -> Program {
 }
 
 impl Axis {
-    /// The frame of a cycle: towards the target, as far from where the motor says that it is as the torque allows.
+    /// The frame of a cycle: towards the target, as far from the motor's reported position as the torque allows.
     fn follow(&mut self, motor: &rapid::registry::MotorSpec, ranges: &Ranges) -> Option<CanFrame> {
         let [kp, kd] = GAINS;
         // The first frame asks for the position: without gains nothing moves, and a joint held by hand stays.
@@ -244,7 +244,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_event_is_measured_and_what_is_to_stop_stops() {
+    fn every_event_is_measured_and_motion_stops() {
         for event in &EVENTS {
             let outcome = play(event, false);
             assert_eq!(outcome.stopped.is_some(), event.stops, "{}", event.name);

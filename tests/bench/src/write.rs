@@ -130,7 +130,7 @@ impl Source for Fed {
         }
         if self.left == 0 {
             let taken = Taken { wall_s: begun.elapsed().as_secs_f64(), cpu_s: thread_cpu_s() - cpu };
-            // Nobody waits any more if the recorder ended early.
+            // No one waits any more if the recorder ended early.
             let _ = self.done.send(taken);
         }
         Ok(())
@@ -264,7 +264,7 @@ fn lane_of(messages: Vec<Vec<u8>>) -> Feed {
     let lane = Lane {
         topic: TopicId::Mask,
         name: "/set".to_owned(),
-        schema: rapid::record::schema::SampleSchema::Bytes,
+        schema: rapid::episode::schema::SampleSchema::Bytes,
         header: SampleHeader::default(),
         payloads: messages.clone(),
         messages,

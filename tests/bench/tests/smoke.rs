@@ -1,6 +1,6 @@
 //! Every section of `make bench` measures: each is run as shortly as it can be, of the debug build.
 //!
-//! `deaf` is not run again: `tests/vbench/tests/deaf_child.rs` computes its figures from the same scenario. `frame` is left out:
+//! `deaf` is not run again: `tests/vbench/tests/guest/deaf_child.rs` computes its figures from the same scenario. `frame` is left out:
 //! in a debug build on a busy machine the cameras of its full load send nothing in the time that a short run has.
 
 use std::path::Path;
@@ -16,8 +16,8 @@ fn measured(sections: &[&str]) -> Vec<serde_json::Value> {
         .current_dir(root)
         .output()
         .expect("it starts");
-    let (printed, said) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
-    assert!(output.status.success(), "{said}\n{printed}");
+    let (printed, errors) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success(), "{errors}\n{printed}");
     let figures: Vec<serde_json::Value> =
         printed.lines().map(|line| serde_json::from_str(line).expect("a figure a line")).collect();
     for figure in figures.iter().filter(|figure| figure["value"].is_null()) {
@@ -52,9 +52,9 @@ fn a_section_that_measures_nothing_fails_with_its_reason() {
         .args(["--smoke", "--json", "--only", "policy", "--bundle", "/no/such/policy"])
         .output()
         .expect("it starts");
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert!(!output.status.success(), "{said}");
-    assert!(said.contains("not measured:") && said.contains("policy/all: "), "{said}");
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(!output.status.success(), "{errors}");
+    assert!(errors.contains("not measured:") && errors.contains("policy/all: "), "{errors}");
 }
 
 #[test]

@@ -46,7 +46,7 @@ fn cut_up(stream: &[u8], cut: u8) -> impl Iterator<Item = &[u8]> {
     stream.chunks(usize::from(cut) % 7 + 1)
 }
 
-/// What a decoder makes of these pieces. `feed` says how many bytes it took, and what they gave.
+/// What a decoder makes of these pieces. `feed` returns how many bytes it took, and what they gave.
 fn taken_from<T>(pieces: &mut dyn Iterator<Item = &[u8]>, mut feed: impl FnMut(&[u8]) -> (usize, Option<T>)) -> Vec<T> {
     let mut all = Vec::new();
     for mut piece in pieces {

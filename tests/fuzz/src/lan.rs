@@ -8,7 +8,7 @@ const LARGEST: usize = 1024;
 /// A session has a bound of its own, whatever the entry.
 const LARGEST_SESSION: usize = 64 << 10;
 
-/// The stream in pieces whose lengths the first byte says.
+/// The stream in pieces whose lengths the first byte gives.
 fn pieces(bytes: &[u8]) -> impl Iterator<Item = &[u8]> {
     let (size, stream) = bytes.split_first().map_or((0, bytes), |(size, stream)| (*size, stream));
     stream.chunks(usize::from(size) + 1)

@@ -107,10 +107,10 @@ fn is_harmless(frame: &CanFrame) -> bool {
 /// What is known of a motor from the frames alone.
 struct Axis {
     spec: MotorSpec,
-    /// The ends of position, velocity and torque that it told: the smallest and the largest of each. Which of
+    /// The ends of position, velocity and torque that it reported: the smallest and the largest of each. Which of
     /// them counts is for the bus to say, so what is judged by them is judged by the largest.
-    told: [[f64; 2]; 3],
-    /// The newest positions it told, rad, the newest last. Two that are impossible may be passed over, not a third.
+    reported: [[f64; 2]; 3],
+    /// The newest positions it reported, rad, the newest last. Two that are impossible may be passed over, not a third.
     measured: Vec<f64>,
     /// What a position may be commanded: within the limits, or where the joint was since the arm.
     span: [f64; 2],
@@ -118,7 +118,7 @@ struct Axis {
 
 impl Axis {
     fn new(spec: &MotorSpec) -> Self {
-        Self { spec: spec.clone(), told: [[f64::INFINITY, 0.0]; 3], measured: Vec::new(), span: spec.position }
+        Self { spec: spec.clone(), reported: [[f64::INFINITY, 0.0]; 3], measured: Vec::new(), span: spec.position }
     }
 
     fn hear(&mut self, frame: &CanFrame) {
@@ -134,13 +134,13 @@ impl Axis {
             _ => return,
         };
         if reply.slave == self.spec.slave && value.is_finite() && value > 0.0 {
-            let [smallest, largest] = &mut self.told[which];
+            let [smallest, largest] = &mut self.reported[which];
             (*smallest, *largest) = (smallest.min(value), largest.max(value));
         }
     }
 
     fn measure(&mut self, frame: &CanFrame) {
-        let ranges = Ranges::new(self.told[0][1], 1.0, 1.0);
+        let ranges = Ranges::new(self.reported[0][1], 1.0, 1.0);
         let Some(feedback) = ranges.and_then(|ranges| Feedback::decode(frame, &ranges)) else { return };
         if u16::from(feedback.id) == self.spec.slave {
             if self.measured.len() > 2 {
@@ -158,16 +158,16 @@ impl Axis {
         self.span = [measured.clone().fold(low, f64::min), measured.fold(high, f64::max)];
     }
 
-    /// What a position is counted in, rad, if it has told one range alone.
+    /// What a position is counted in, rad, if it has reported one range alone.
     fn quantum(&self) -> Option<f64> {
-        let [smallest, largest] = self.told[0];
+        let [smallest, largest] = self.reported[0];
         (smallest.to_bits() == largest.to_bits()).then_some(2.0 * largest / 65_535.0)
     }
 
     /// A command, after a step.
     fn judge(&self, command: f64) {
         let [low, high] = self.spec.position;
-        let slack = self.quantum().unwrap_or(2.0 * self.told[0][1] / 65_535.0);
+        let slack = self.quantum().unwrap_or(2.0 * self.reported[0][1] / 65_535.0);
         assert!(!self.measured.is_empty(), "a command before any answer");
         match self.spec.mode {
             MotorMode::Velocity => {
@@ -203,7 +203,7 @@ impl Axis {
             // Seven such bytes begin an order.
             MotorMode::Mit { .. } if frame.id == u32::from(self.spec.slave) && !frame.data.starts_with(&[0xff; 7]) => {
                 let Some(quantum) = self.quantum() else { return };
-                let command = f64::from(u16::from_be_bytes([a, b])) * quantum - self.told[0][1];
+                let command = f64::from(u16::from_be_bytes([a, b])) * quantum - self.reported[0][1];
                 self.judge(command);
                 self.judge_torque(command, [d, e], quantum);
             }
@@ -211,10 +211,10 @@ impl Axis {
         }
     }
 
-    /// What it is said to have answered.
+    /// Its alleged answer.
     fn judge_sample(&self, values: &[f64; SAMPLE_VALUES]) {
         let [q, dq, tau, rest @ ..] = values;
-        for (value, [_, end]) in [q, dq, tau].into_iter().zip(self.told) {
+        for (value, [_, end]) in [q, dq, tau].into_iter().zip(self.reported) {
             assert!(value.abs() <= end, "{value} of {end}");
         }
         let [mos, rotor, status] = rest.map(|value| (0_u8..=255).find(|byte| f64::from(*byte) == value));

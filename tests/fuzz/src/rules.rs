@@ -134,11 +134,11 @@ mod tests {
     #[test]
     fn rules_are_read_as_udev_reads_them() {
         let rules = parse("# a\nKERNEL==\"a\\\"b\", RUN+=\"x\"\n\n  SUBSYSTEM!=\"y\", \\\n ATTR{a}=\"z\"\n").unwrap();
-        let told: Vec<Vec<String>> = rules
+        let reported: Vec<Vec<String>> = rules
             .iter()
             .map(|rule| rule.iter().map(|t| format!("{}{}{}", t.key, t.operator, t.value)).collect())
             .collect();
-        assert_eq!(told, [vec!["KERNEL==a\"b", "RUN+=x"], vec!["SUBSYSTEM!=y", "ATTR{a}=z"]]);
+        assert_eq!(reported, [vec!["KERNEL==a\"b", "RUN+=x"], vec!["SUBSYSTEM!=y", "ATTR{a}=z"]]);
         for wrong in ["KERNEL==\"a", "KERNEL", "kernel==\"a\"", "KERNEL==a", "A==\"b\" \\", "A==\"\u{202e}\""] {
             assert!(parse(wrong).is_err(), "{wrong}");
         }

@@ -6,10 +6,10 @@ use std::path::Path;
 
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Compression, WriteOptions};
+use rapid::episode::encode;
+use rapid::episode::schema::{self, SampleSchema};
 use rapid::mask::{MaskRecord, PhysicalMask};
 use rapid::modality::ModalityId;
-use rapid::record::encode;
-use rapid::record::schema::{self, SampleSchema};
 use rapid::registry::{BUILTIN, Registry};
 use rapid::sample::{Encoding, SampleHeader};
 use rapid::status::Level;

@@ -8,10 +8,10 @@ use std::time::Duration;
 
 use rapid::commands;
 use rapid::driver;
+use rapid::episode::recover::recover_bytes;
 use rapid::headless::style::Palette;
 use rapid::mask::{MaskRecord, RECORD_LEN};
 use rapid::record::inspect as inspection;
-use rapid::record::recover::recover_bytes;
 use rapid::registry::scenario::Scenario;
 use rapid::registry::units::{parse_duration, parse_size, show_duration, show_size};
 use rapid::registry::{
@@ -104,7 +104,7 @@ pub fn serial(bytes: &[u8]) {
 /// One recorded message, of each schema.
 pub fn message(bytes: &[u8]) {
     for schema in ["foxglove.CompressedImage", "foxglove.RawImage", "rapid.Scalars", "rapid.Bytes"] {
-        if let Some((payload, width, _)) = driver::replay::decode(schema, bytes) {
+        if let Some((payload, width, _)) = rapid::episode::decode(schema, bytes) {
             // Padding of rows is taken away; nothing is added.
             assert!(payload.len() <= bytes.len(), "{schema} grew");
             assert!(schema != "rapid.Scalars" || payload.len() == width as usize * 8);
@@ -195,7 +195,7 @@ fn check_mask(record: &MaskRecord, names: Option<&commands::mask::Layout>) {
 }
 
 /// What a USB device calls itself: a registry may hold it or refuse it; nothing that follows from the
-/// registry says more than it says without, and the device is matched by exactly these characters.
+/// registry gives more than it gives without, and the device is matched by exactly these characters.
 pub fn strings(bytes: &[u8]) {
     // As hotplug does with what lies in sysfs.
     let Some(serial) = short(bytes).map(String::from_utf8_lossy) else { return };

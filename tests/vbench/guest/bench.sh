@@ -36,7 +36,7 @@ emu_start() {
 # emu COMMAND...: one line to the emulator.
 emu() { echo "$*" >&7; }
 
-# emu_done SECONDS: until the emulator has done all it was told so far.
+# emu_done SECONDS: until the emulator has done all its commands so far.
 emu_done() {
   emu_asked=$((${emu_asked:-0} + 1))
   emu "say done-$emu_asked"
@@ -100,7 +100,7 @@ lan_rule() {
   udevadm control --reload
 }
 
-# mark WORD: the emulator's log says the word; what is told from now on is told after it.
+# mark WORD: the emulator's log has the word; what is logged from now on comes after it.
 mark() {
   emu "say $1"
   wait_for 20 said "$out/emu.jsonl" "\"word\":\"$1\"" || fail "the emulator does not say $1"

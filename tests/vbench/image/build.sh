@@ -4,7 +4,7 @@
 # a build is either whole or absent and a second call does nothing.
 #
 #   build.sh           builds what is missing, prints the directory last
-#   build.sh --check   prints the directory when it is built, otherwise says what to run and exits 3
+#   build.sh --check   prints the directory when it is built, otherwise names what to run and exits 3
 #
 # Needs the packages of packages.txt and root, or unprivileged user namespaces with a range of ids, or sudo.
 set -euo pipefail

@@ -8,7 +8,7 @@ use crate::outcome::Outcome;
 use crate::recording::{Edge, Recording, missing, rises};
 use crate::scenario::Scenario;
 
-/// The bench's own troubles end a test with a sentence that says what to do.
+/// The bench's own troubles end a test with a sentence that names what to do.
 pub fn play(scenario: Scenario) -> Outcome {
     let outcome = scenario.run().unwrap_or_else(|error| panic!("{error}"));
     println!("{:.1} s wall", outcome.wall.as_secs_f64());

@@ -21,16 +21,16 @@ pub fn scalars(name: &str, topic: &str, bit: u32, model: &str, serial: &str) -> 
     format!(
         "[device.{name}]\nvid = \"0x{vid}\"\npid = \"0x{pid}\"\nserial_number = \"{serial}\"\nnode = \"serial\"\n\
          topic = \"{topic}\"\nslot = \"tip\"\nbit = {bit}\n\
-         [device.{name}.serial]\nbaud = 115200\nframing = \"line\"\nparse = \"csv\"\nchannels = 4\n"
+         [device.{name}.tty]\nbaud = 115200\nframing = \"line\"\nparse = \"csv\"\nchannels = 4\n"
     )
 }
 
-/// A network device behind a USB adapter of the model `vid:pid`; `lan` is what its table says.
+/// A network device behind a USB adapter of the model `vid:pid`; `lan` is the content of its table.
 pub fn lan(name: &str, topic: &str, bit: u32, model: &str, serial: &str, lan: &str) -> String {
     usb(name, topic, bit, model, serial, "lan", lan)
 }
 
-/// A CAN adapter of the model `vid:pid`; `can` is what its table says.
+/// A CAN adapter of the model `vid:pid`; `can` is the content of its table.
 pub fn can(name: &str, topic: &str, bit: u32, model: &str, serial: &str, can: &str) -> String {
     usb(name, topic, bit, model, serial, "can", can)
 }

@@ -89,7 +89,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_figure_says_what_it_lacks() {
+    fn a_figure_names_missing_requirements() {
         let figure = Figure::new("unplug_to_bit_p50", "ms", Some(12.345_67)).target(100.0).note("x");
         assert_eq!(
             figure.json(),

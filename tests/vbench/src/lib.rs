@@ -1,7 +1,7 @@
 //! The virtual USB bench: real kernel paths without hardware.
 //!
 //! A scenario names emulated devices, a registry and a timeline; the harness boots a guest with a stock kernel and the real
-//! udev, runs the emulator and `rapid` in it, and hands back what they said and recorded.
+//! udev, runs the emulator and `rapid` in it, and hands back what they printed and recorded.
 //!
 //! Invariant: nothing here imports `rapid`; the bench knows it by its command line, its output and its files.
 //! Invariant: a missing image or binary is an error that names the remedy, never a skipped test.

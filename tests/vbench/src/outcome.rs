@@ -1,4 +1,4 @@
-//! What a scenario left behind: exit codes, what everyone said, recorded files.
+//! What a scenario left behind: exit codes, what each program printed, recorded files.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -21,12 +21,12 @@ pub enum EpisodeError {
     Recording(#[from] RecordingError),
 }
 
-/// What the emulator says of one stream of a camera.
+/// What the emulator logs about one stream of a camera.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stream {
     /// Frames that were sent whole.
     pub sent: u64,
-    /// Beats at which none was sent: nobody read, or the machine was busy.
+    /// Beats at which none was sent: no one read, or the machine was busy.
     pub skipped: u64,
 }
 

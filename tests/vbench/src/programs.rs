@@ -38,7 +38,7 @@ pub fn process_node() -> Result<PathBuf, ProgramError> {
     find("process_node", "PROCESS_NODE_BIN", built("examples/process_node"))
 }
 
-/// The example of a program that tells an actuator where to go: `PUBLISH_ACTION_BIN`, else the newer of the workspace's builds.
+/// The example of a program that publishes targets of an actuator: `PUBLISH_ACTION_BIN`, else the newer of the workspace's builds.
 pub fn publish_action() -> Result<PathBuf, ProgramError> {
     find("publish_action", "PUBLISH_ACTION_BIN", built("examples/publish_action"))
 }

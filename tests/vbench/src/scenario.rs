@@ -1,7 +1,7 @@
 //! A scenario as data, and its outcome.
 //!
 //! Devices, a registry and a timeline become a guest script; after the boot the outcome holds what the emulator, `rapid`
-//! and the kernel said, and the recorded files.
+//! and the kernel printed, and the recorded files.
 //!
 //! Invariant: the timeline's clock starts when `rapid` records and every device named in `streaming` streams, never after a guess.
 //! Invariant: an outcome dropped by a failing assertion prints the logs and keeps its folder.
@@ -144,7 +144,7 @@ impl Scenario {
         self
     }
 
-    /// Puts `publish_action`, the example of a program that tells an actuator where to go, beside `devices.toml`.
+    /// Puts `publish_action`, the example of a program that publishes targets of an actuator, beside `devices.toml`.
     #[must_use]
     pub fn action_program(mut self) -> Self {
         self.action_program = true;

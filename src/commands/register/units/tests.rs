@@ -65,7 +65,7 @@ fn what_an_entry_reads_is_no_news_and_the_rest_of_its_device_may_be() {
 }
 
 #[test]
-fn units_that_a_serial_number_cannot_tell_apart_are_told_apart_by_their_ports() {
+fn units_with_equal_serial_numbers_are_distinguished_by_port() {
     for (serials, expected) in [
         ([Some("A"), Some("B")], [("serial", "A"), ("serial", "B")]),
         ([Some("A"), Some("A")], [("port", "1-1"), ("port", "1-2")]),

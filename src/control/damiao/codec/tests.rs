@@ -124,7 +124,7 @@ fn field(data: [u8; 8], high: u32, bits: u32) -> u64 {
 
 proptest! {
     #[test]
-    fn what_is_sent_is_what_was_meant_or_the_end_of_the_range(
+    fn encoded_values_round_trip_or_saturate(
         kp in number(), kd in number(), q in number(), dq in number(), tau in number(),
         p in 0.1..100.0, v in 0.1..400.0, t in 0.1..400.0,
     ) {

@@ -9,8 +9,8 @@ impl Motor {
     /// The frame that keeps the motor from falling, or from falling fast, while no program reads what it reports; one that
     /// disables it where it is to be limp.
     ///
-    /// A joint in MIT mode that is to hold is damped: with nobody to lower the stiffness, a joint that is pushed away would
-    /// push back with more than its torque limit.
+    /// A joint in MIT mode that is to hold is damped: with nothing to lower the stiffness, a joint that is pushed away
+    /// would push back with more than its torque limit.
     pub(in crate::control::motors) fn last_will(&self, command: f64) -> CanFrame {
         let slave = self.spec.slave;
         let frame = match (self.last_stop(), self.spec.mode, self.ranges, self.feedback) {

@@ -114,7 +114,7 @@ impl Motor {
         }
     }
 
-    /// What it said that it counts in, if that is a range: by another one every position means something else.
+    /// The range it reported for positions, if it is one: with another, every position means something else.
     fn range(&self, parameter: Parameter) -> Option<f64> {
         let [p, v, t] = self.read;
         match parameter {

@@ -120,7 +120,7 @@ fn every_fault_of_a_motor_that_moves_disables_all() {
 }
 
 #[test]
-fn a_fault_between_two_cycles_is_not_covered_up_by_what_follows() {
+fn a_fault_between_two_cycles_is_not_masked_by_later_frames() {
     for (status, hot) in [(MotorStatus::Disabled, 30), (MotorStatus::Overload, 30), (MotorStatus::Enabled, 90)] {
         let mut world = World::armed();
         world.run(2);
@@ -134,7 +134,7 @@ fn a_fault_between_two_cycles_is_not_covered_up_by_what_follows() {
 }
 
 #[test]
-fn a_motor_that_gets_hot_is_told_of_and_then_disables_all() {
+fn an_overheating_motor_is_reported_and_then_disables_all() {
     let mut world = World::armed();
     let warm = |celsius| Notice::Warm { motor: 0, part: Part::Mos, celsius, limit: 80.0 };
     for (mos, told) in [(69, 0), (70, 1), (68, 1), (75, 1), (64, 1), (71, 2), (79, 2)] {
@@ -157,7 +157,7 @@ fn a_motor_that_gets_hot_is_told_of_and_then_disables_all() {
 }
 
 #[test]
-fn a_motor_that_does_not_do_as_it_is_told_is_a_fault() {
+fn a_motor_that_ignores_commands_is_a_fault() {
     let mut world = World::ready();
     world.sims[1].deaf = Some(Order::Enable);
     world.arm();
@@ -175,7 +175,7 @@ fn a_motor_that_does_not_do_as_it_is_told_is_a_fault() {
 }
 
 #[test]
-fn who_waits_for_the_others_yields_when_leant_on() {
+fn a_joint_waiting_for_the_others_yields_to_external_force() {
     let mut stiff = spec(vec![motor(1, 0x11, MIT), motor(2, 0x12, MIT)]);
     stiff.motors[0].torque = 2.0;
     let mut world = World::new(stiff);
@@ -214,7 +214,7 @@ fn a_disarm_ends_an_arm_at_any_moment() {
 }
 
 #[test]
-fn a_motor_is_off_when_it_says_so_after_it_was_told() {
+fn a_motor_counts_as_off_when_it_confirms_after_the_order() {
     let enabling = || {
         let mut world = World::ready();
         world.sims[0].deaf = Some(Order::Enable);
@@ -390,7 +390,7 @@ fn an_arm_has_time_for_all_its_cycles() {
 }
 
 #[test]
-fn no_joint_begins_where_one_damaged_frame_says_that_it_is() {
+fn no_joint_starts_from_a_single_damaged_frame() {
     for cycles in 0..40 {
         let mut world = World::ready();
         world.arm();

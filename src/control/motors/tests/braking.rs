@@ -5,24 +5,29 @@ use crate::action::Trip;
 use crate::registry::{Stop, StopSpec};
 use world::brake;
 
-/// Two motors, the second of which has a brake and stops in this way, at any fault and at an emergency stop.
-fn ready(stop: Stop) -> World {
+/// Two motors, the second of which has a brake and stops in these ways.
+fn braked(stop: StopSpec) -> DamiaoSpec {
     let mut spec = spec(vec![motor(1, 0x11, MIT), motor(2, 0x12, MIT)]);
-    spec.motors[1].stop = StopSpec { own_fault: stop, other_fault: stop, emergency: stop, hold_for: None };
-    spec.motors[1].brake = Some(brake());
-    let mut world = World::new(spec);
+    (spec.motors[1].stop, spec.motors[1].brake) = (stop, Some(brake()));
+    spec
+}
+
+/// In the same way at any fault and at an emergency stop.
+const fn always(stop: Stop) -> StopSpec {
+    StopSpec { own_fault: stop, other_fault: stop, emergency: stop, hold_for: None }
+}
+
+fn ready(stop: Stop) -> World {
+    let mut world = World::new(braked(always(stop)));
     world.run_until(BusState::Disarmed);
     world
 }
 
 fn armed(stop: Stop) -> World {
-    let mut world = ready(stop);
-    world.arm();
-    world.run_until(BusState::Holding);
-    world.target(&[0.5, 0.5]);
-    world.run(15);
-    world
+    World::following(braked(always(stop)))
 }
+
+const EMERGENCY: Trip = Trip { stop: 0, is_lost: false };
 
 #[test]
 fn a_brake_is_released_once_its_motor_is_on_and_nothing_is_followed_before() {
@@ -52,7 +57,7 @@ fn a_joint_that_stops_by_its_brake_holds_until_that_does_and_is_disabled_then() 
     for trouble in [
         |world: &mut World| world.sims[0].status = MotorStatus::OverCurrent,
         |world: &mut World| world.sims[1].mos = 99,
-        |world: &mut World| world.emergency(Trip { stop: 0, is_lost: false }),
+        |world: &mut World| world.emergency(EMERGENCY),
     ] {
         let mut world = armed(Stop::Brake);
         trouble(&mut world);
@@ -72,19 +77,12 @@ fn a_joint_that_stops_by_its_brake_holds_until_that_does_and_is_disabled_then() 
 }
 
 #[test]
-fn a_joint_whose_brake_does_not_engage_goes_on_holding() {
+fn a_joint_whose_brake_does_not_engage_keeps_holding() {
     for (is_stuck, hold_for) in [(true, None), (false, None), (false, Some(Duration::from_millis(500)))] {
-        let mut world = armed(Stop::Brake);
-        world.spec.motors[1].stop.hold_for = hold_for;
-        let mut spec = world.spec.clone();
-        spec.motors[1].stop.hold_for = hold_for;
-        let mut world = World::new(spec);
-        world.run_until(BusState::Disarmed);
-        world.arm();
-        world.run_until(BusState::Holding);
+        let mut world = World::following(braked(StopSpec { hold_for, ..always(Stop::Brake) }));
         // Its chip hangs, or is gone.
         (world.are_brakes_stuck, world.brakes.broken) = (true, if is_stuck { 0 } else { 3 });
-        world.emergency(Trip { stop: 0, is_lost: false });
+        world.emergency(EMERGENCY);
         world.run(80);
         assert!(world.sims[1].is_on() && !world.sims[0].is_on());
         world.run(100);
@@ -112,26 +110,11 @@ fn a_brake_that_cannot_be_driven_refuses_an_arm_and_ends_one() {
     assert_eq!(text, "the brake of motor joint_2 cannot be driven: the log says why");
 }
 
-/// Armed, the second motor to stop in these ways.
-fn armed_with(stop: StopSpec) -> World {
-    let mut spec = spec(vec![motor(1, 0x11, MIT), motor(2, 0x12, MIT)]);
-    (spec.motors[1].stop, spec.motors[1].brake) = (stop, Some(brake()));
-    let mut world = World::new(spec);
-    world.run_until(BusState::Disarmed);
-    world.arm();
-    world.run_until(BusState::Holding);
-    world.target(&[0.5, 0.5]);
-    world.run(15);
-    world
-}
-
-const EMERGENCY: Trip = Trip { stop: 0, is_lost: false };
-
 #[test]
 fn a_joint_that_has_sunk_is_not_driven_back_up_by_an_emergency_stop() {
     for is_broken in [false, true] {
         let stop = StopSpec { own_fault: Stop::Limp, other_fault: Stop::Damp, emergency: Stop::Brake, hold_for: None };
-        let mut world = armed_with(stop);
+        let mut world = World::following(braked(stop));
         world.sims[0].status = MotorStatus::OverCurrent;
         world.run_to_fault();
         let before = world.sims[1].q;
@@ -211,7 +194,8 @@ fn a_brake_that_is_about_to_be_released_is_not_taken_for_engaged() {
 fn a_brake_is_engaged_before_the_motor_that_held_its_joint_for_a_time_is_off() {
     let hold_for = Some(Duration::from_millis(400));
     for (stop, hold_for) in [(Stop::Hold, hold_for), (Stop::Hold, Some(Duration::from_millis(10)))] {
-        let mut world = armed_with(StopSpec { own_fault: stop, other_fault: stop, emergency: stop, hold_for });
+        let mut world =
+            World::following(braked(StopSpec { own_fault: stop, other_fault: stop, emergency: stop, hold_for }));
         world.emergency(EMERGENCY);
         let mut engaged = None;
         let begun = world.now;
@@ -233,7 +217,7 @@ fn a_brake_is_engaged_before_the_motor_that_held_its_joint_for_a_time_is_off() {
 fn a_sound_joint_does_not_fall_because_its_brake_cannot_be_driven() {
     for (other_fault, is_damped) in [(Stop::Hold, 0), (Stop::Damp, 2)] {
         let stop = StopSpec { own_fault: Stop::Limp, other_fault, emergency: Stop::Limp, hold_for: None };
-        let mut world = armed_with(stop);
+        let mut world = World::following(braked(stop));
         (world.are_brakes_stuck, world.brakes.broken) = (true, 2);
         assert_eq!(world.run_to_fault(), Fault::Brake { motor: 1 });
         world.run(100);

@@ -53,7 +53,7 @@ fn a_step_that_comes_late_makes_no_leap() {
 }
 
 #[test]
-fn what_is_beyond_the_limits_is_the_limit() {
+fn targets_beyond_the_limits_are_clamped() {
     let mut world = World::armed();
     for _ in 0..10 {
         world.target(&[7.0, -1e9]);
@@ -278,7 +278,7 @@ fn one_pause_does_not_make_the_deadman_patient() {
 }
 
 #[test]
-fn who_is_slow_is_known_by_the_second_action() {
+fn a_slow_publisher_is_detected_by_the_second_action() {
     let mut world = World::armed();
     for _ in 0..3 {
         assert!(world.target(&[0.5, 0.5]));
@@ -320,7 +320,7 @@ fn a_velocity_comes_to_rest_where_the_motor_counts_no_further() {
 }
 
 #[test]
-fn what_comes_and_goes_is_reported_once_a_second() {
+fn intermittent_conditions_are_reported_once_a_second() {
     let mut world = World::armed();
     for round in 0..400 {
         // Beyond its limits and not, and refused for one reason and another.

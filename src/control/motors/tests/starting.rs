@@ -107,7 +107,7 @@ fn a_pause_of_the_actions_stops_the_joint_softly() {
 }
 
 #[test]
-fn a_fault_that_nobody_has_seen_is_reported_before_an_arm_clears_it() {
+fn an_unseen_fault_is_reported_before_arming_clears_it() {
     let mut world = World::new(spec(vec![motor(1, 0x11, MIT), motor(2, 0x12, MIT)]));
     let [lost, hot] = [MotorStatus::CommunicationLost, MotorStatus::MosOverTemperature];
     (world.sims[0].status, world.sims[1].status) = (lost, hot);

@@ -8,13 +8,7 @@ use crate::registry::{Stop, StopSpec};
 fn armed(mode: MotorMode, stop: StopSpec) -> World {
     let mut spec = spec(vec![motor(1, 0x11, MIT), motor(2, 0x12, mode)]);
     spec.motors[1].stop = stop;
-    let mut world = World::new(spec);
-    world.run_until(BusState::Disarmed);
-    world.arm();
-    world.run_until(BusState::Holding);
-    world.target(&[0.5, 0.5]);
-    world.run(15);
-    world
+    World::following(spec)
 }
 
 /// The last command to the second motor.
@@ -233,7 +227,7 @@ fn one_damaged_frame_lets_no_joint_fall_that_is_to_be_kept() {
 }
 
 #[test]
-fn what_a_frame_with_an_impossible_position_says_of_the_motor_is_not_believed() {
+fn a_frame_with_an_impossible_position_is_ignored() {
     let mut world = armed(MIT, others(Stop::Limp));
     let mut frame = world.sims[1].feedback().unwrap();
     (frame.data[0], frame.data[1]) = (frame.data[0] & 0xf | 0xa0, 0xff);

@@ -85,7 +85,7 @@ fn an_arm_outside_the_limits_is_refused_with_where_the_joint_is() {
 type Trouble = (&'static str, fn(&mut World), std::ops::RangeInclusive<usize>, &'static str);
 
 #[test]
-fn what_lasts_is_a_fault_with_its_name_and_is_told_before() {
+fn a_persistent_condition_is_warned_of_and_then_a_named_fault() {
     const TROUBLES: [Trouble; 6] = [
         ("it sinks", |world| (world.sims[0].stuck, world.sims[0].drift) = (true, -0.77), 40..=80, "moves away from"),
         ("it is blocked", |world| world.sims[0].stuck = true, 400..=450, "does not move with 1 Nm"),
@@ -136,7 +136,7 @@ fn a_blocked_joint_is_a_fault_though_actions_come_in_the_moment_of_a_step() {
 }
 
 #[test]
-fn what_comes_again_within_a_second_is_not_told_again() {
+fn repeats_within_a_second_are_not_reported_again() {
     let mut world = armed(|joint| (joint.watch.blocked_after, joint.velocity) = (None, 5.0));
     for (cycles, stuck) in [(40, true), (40, false), (40, true), (200, false), (60, true)] {
         world.sims[0].stuck = stuck;

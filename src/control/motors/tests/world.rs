@@ -288,10 +288,23 @@ impl World {
         world
     }
 
+    /// Armed, and on the way to a target of both motors.
+    pub(super) fn following(spec: DamiaoSpec) -> Self {
+        let mut world = Self::new(spec);
+        world.run_until(BusState::Disarmed);
+        world.arm();
+        world.run_until(BusState::Holding);
+        world.target(&[0.5, 0.5]);
+        world.run(15);
+        world
+    }
+
     pub(super) fn arm(&mut self) {
+        let was_arming = self.bus.state() == BusState::Arming;
         self.bus.arm(self.now);
-        if !self.judge.may_move {
-            // What motors said before is of the past.
+        if !self.judge.may_move || !was_arming && self.bus.state() == BusState::Arming {
+            // What motors reported before is of the past: the bus may have seen a fault in a frame that cannot be, of
+            // which the judge takes nothing.
             self.judge.axes.iter_mut().for_each(|axis| (axis.told, axis.is_on) = (false, false));
         }
         (self.judge.may_move, self.judge.may_keep) = (true, true);

@@ -1,6 +1,5 @@
 use proptest::prelude::*;
 
-use super::super::layout::{Frame, Layout, Progress};
 use super::*;
 use crate::sample::FLAG_ERROR;
 use crate::time::Stamp;
@@ -23,7 +22,7 @@ fn layout(format: PixelFormat, width: u32, height: u32, stride: usize) -> Layout
 }
 
 #[test]
-fn only_what_was_wished_is_accepted() {
+fn only_the_requested_format_is_accepted() {
     let mjpg = spec(PixelFormat::Mjpg);
     assert!(agreed(*b"MJPG", 640, Some((1, 30))).accept(&mjpg).is_some());
     assert!(agreed(*b"MJPG", 640, Some((1001, 30000))).accept(&mjpg).is_some(), "29.97 is called 30");
@@ -35,7 +34,7 @@ fn only_what_was_wished_is_accepted() {
 }
 
 #[test]
-fn the_refusal_names_what_is_offered_and_where_to_change_the_wish() {
+fn the_error_lists_offered_formats_and_the_setting_to_change() {
     let size = Size::One { width: 1280, height: 720 };
     let rates = Rates::List(vec![Rate::of_interval(1, 30), Rate::of_interval(1, 15)]);
     let yuyv = Size::Range { smallest: (2, 2), largest: (640, 480) };

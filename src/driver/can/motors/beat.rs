@@ -1,30 +1,31 @@
 //! Thread `control`: the beat of a bus of motors.
 //!
 //! A cycle: take what the bus brings until the cycle's deadline, take what was asked for, let
-//! [`MotorBus`] decide, send. Deadlines are absolute: a late cycle does not shift those after it, and
-//! cycles that were missed are left out.
+//! [`MotorBus`] decide, send. [`Pace`] says when a cycle begins. The thread waits for the bus, for orders and for the
+//! topic of actions at once: an order that stops the motors begins a cycle at its arrival, a fresh action begins one as
+//! soon as the bus has room for it, as a rule at its arrival too.
 //!
 //! Invariant: between two cycles nothing is allocated, locked or logged, but for two things: text is made of
 //! what happened, and a sample is handed over by tokio's channel, which allocates room for some dozens where
 //! none is free, and whose reader is woken under a lock of the runtime.
-//! Invariant: however the thread ends, a panic included, [`Powered`] tells every motor to turn off. Without a
-//! panic it also waits until each that was on has said that it is off, for a tenth of a second at most. A process that
-//! is killed sends nothing: then its guard does it.
+//! Invariant: however the thread ends, a panic included, [`Powered`] orders every motor to turn off. Without a
+//! panic it also waits until each that was on has confirmed that it is off, for a tenth of a second at most. A process
+//! that is killed sends nothing: then its guard does it.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::Receiver;
 use std::time::Duration;
 
 use tokio::sync::mpsc;
 
 use super::powered::Powered;
 use super::tally::{Punctuality, Tally};
-use crate::action::{ActuatorNotice, Arming, Order, OrderSlot};
+use crate::action::{ActionSource, ActuatorNotice, Arming, MAX_ACTION, Order, OrderSlot};
 use crate::control::can::CanFrame;
 use crate::control::motors::{BusState, SAMPLE_VALUES};
+use crate::control::pace::Pace;
 use crate::driver::DriverError;
 use crate::driver::can::link::LinkError;
 use crate::fault;
@@ -35,9 +36,9 @@ use crate::time::Stamp;
 
 /// Frames taken after the deadline of a cycle: a flooded bus must not keep the motors from their commands.
 const LATE_FRAMES: usize = 64;
-/// Trouble with the bus is told anew when there was none for so long.
+/// Trouble with the bus is reported again when there was none for so long.
 const QUIET: Duration = Duration::from_secs(1);
-/// Texts of it that wait to be told.
+/// Texts of it that wait to be reported.
 const TROUBLES: usize = 4;
 
 /// State of all motors.
@@ -51,32 +52,15 @@ pub(super) struct Sample {
     pub(super) values: [f64; MAX_MOTORS * SAMPLE_VALUES],
 }
 
-/// An action.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Target {
-    values: [f64; MAX_MOTORS],
-    count: usize,
-    tick: Stamp,
-}
-
-impl Target {
-    /// Of at most [`MAX_MOTORS`] numbers.
-    pub(super) fn new(target: &[f64], tick: Stamp) -> Self {
-        let mut values = [0.0; MAX_MOTORS];
-        for (place, value) in values.iter_mut().zip(target) {
-            *place = *value;
-        }
-        Self { values, count: target.len().min(MAX_MOTORS), tick }
-    }
-}
-
-/// What the thread shares with its owner: what it is told, and why it ended.
+/// What the thread shares with its owner: what it is to do, and why it ended.
 #[derive(Debug, Default)]
 pub(super) struct Shared {
     asked: AtomicBool,
     pub(super) orders: OrderSlot,
     /// Orders that are taken from where they were given.
     pub(super) attended: OnceLock<Arc<Attended>>,
+    /// Where the motors are to go.
+    pub(super) actions: OnceLock<Arc<dyn ActionSource>>,
     reason: OnceLock<LinkError>,
     pub(super) punctuality: OnceLock<Punctuality>,
 }
@@ -85,6 +69,7 @@ impl Shared {
     /// It is to end.
     pub(super) fn ask(&self) {
         self.asked.store(true, Ordering::Release);
+        self.orders.bell().ring();
     }
 
     /// It gave a reason to end.
@@ -99,7 +84,7 @@ impl Shared {
     }
 }
 
-/// Something that goes on for a while, and is told when it begins.
+/// Something that lasts for a while, and is reported when it begins.
 #[derive(Debug, Default)]
 struct Spell(Option<Stamp>);
 
@@ -115,18 +100,18 @@ impl Spell {
 pub(super) struct Beat {
     powered: Powered,
     cycle: Duration,
-    targets: Receiver<Target>,
     samples: mpsc::Sender<Sample>,
     notices: mpsc::Sender<ActuatorNotice>,
     shared: Arc<Shared>,
-    /// Samples for which there was no room, not told yet.
+    /// Samples for which there was no room, not reported yet.
     lost: u64,
     /// The kernel stamped all frames since the last sample.
     from_kernel: bool,
     is_bus_off: bool,
     full: Spell,
     losing: Spell,
-    /// Trouble with the bus that is not told yet.
+    strange: Spell,
+    /// Trouble with the bus that is not reported yet.
     troubles: VecDeque<String>,
     /// An action that no frame was sent after.
     unsent: Option<Stamp>,
@@ -137,7 +122,6 @@ impl Beat {
     pub(super) fn new(
         powered: Powered,
         spec: &DamiaoSpec,
-        targets: Receiver<Target>,
         samples: mpsc::Sender<Sample>,
         notices: mpsc::Sender<ActuatorNotice>,
         shared: Arc<Shared>,
@@ -145,7 +129,6 @@ impl Beat {
         Self {
             powered,
             cycle: Duration::from_secs(1) / spec.hz.max(1),
-            targets,
             samples,
             notices,
             shared,
@@ -154,6 +137,7 @@ impl Beat {
             is_bus_off: false,
             full: Spell::default(),
             losing: Spell::default(),
+            strange: Spell::default(),
             troubles: VecDeque::with_capacity(TROUBLES),
             unsent: None,
             tally: Tally::new(),
@@ -195,31 +179,45 @@ impl Beat {
     }
 
     fn beat(&mut self) -> Result<(), LinkError> {
-        let mut due = Stamp::now().after(self.cycle);
+        let mut pace = Pace::new(self.cycle, Stamp::now());
+        // There is an action that no cycle has seen.
+        let mut is_fresh = false;
         while !self.shared.asked.load(Ordering::Acquire) {
             fault::point("control");
-            self.listen(due)?;
+            let until = if is_fresh { pace.earliest() } else { pace.due() };
+            self.listen(until)?;
             let now = Stamp::now();
-            self.tally.late(now.0.saturating_sub(due.0));
-            self.take_orders(now);
+            let is_urgent = self.take_orders(now);
+            is_fresh |= self.take_action(now);
+            let is_early = now < pace.due();
+            if is_early && !is_urgent && !(is_fresh && now >= pace.earliest()) {
+                continue;
+            }
+            if is_early {
+                self.tally.early += 1;
+            } else {
+                self.tally.late(now.since(pace.due()));
+            }
             self.step(now)?;
             self.tell();
-            due = due.after(self.cycle);
-            if due <= now {
-                // Whole cycles were missed: the grid goes on where it is.
-                let missed = now.since(due).as_nanos() / self.cycle.as_nanos().max(1);
-                due = due.after(self.cycle * u32::try_from(missed + 1).unwrap_or(1));
-            }
+            pace.begin(now);
+            is_fresh = false;
         }
         Ok(())
     }
 
-    /// Takes what the bus brings until the cycle ends.
-    fn listen(&mut self, due: Stamp) -> Result<(), LinkError> {
+    /// Takes what the bus brings until the cycle ends, an order is given or an action published.
+    fn listen(&mut self, until: Stamp) -> Result<(), LinkError> {
         let mut frame = CanFrame::default();
         let mut late = 0;
         while late < LATE_FRAMES {
-            match self.powered.link.recv_until(due, &mut frame) {
+            let (attended, actions) = (self.shared.attended.get(), self.shared.actions.get());
+            let bells = [
+                self.shared.orders.bell().descriptor(),
+                attended.and_then(|attended| attended.bell().descriptor()),
+                actions.and_then(|actions| actions.bell()),
+            ];
+            match self.powered.link.recv_unless_rung(until, &mut frame, bells) {
                 Ok(Some(arrival)) => {
                     self.is_bus_off = false;
                     self.from_kernel &= arrival.from_kernel;
@@ -231,7 +229,7 @@ impl Beat {
                 Err(LinkError::BusOff) => self.bus_off()?,
                 Err(error) => return Err(error),
             }
-            if Stamp::now() >= due {
+            if Stamp::now() >= until {
                 late += 1;
             }
         }
@@ -245,10 +243,14 @@ impl Beat {
         Ok(())
     }
 
-    fn take_orders(&mut self, now: Stamp) {
+    /// Carries out orders. Says whether one of them stops the motors, which has no time to lose.
+    fn take_orders(&mut self, now: Stamp) -> bool {
         let bus = &mut self.powered.bus;
+        let before = bus.state();
+        let mut is_stop = false;
         let attended = self.shared.attended.get().map(|attended| attended.take());
         for order in self.shared.orders.take().chain(attended.into_iter().flatten()) {
+            is_stop |= matches!(order, Order::Disarm | Order::Emergency(_));
             match order {
                 Order::Arm => bus.arm(now),
                 Order::ArmBack => bus.arm_back(now),
@@ -256,10 +258,28 @@ impl Beat {
                 Order::Emergency(trip) => bus.emergency(trip, now),
             }
         }
-        while let Ok(target) = self.targets.try_recv() {
-            let values = target.values.get(..target.count).unwrap_or_default();
-            if bus.target(values, target.tick, now) {
-                self.unsent = Some(target.tick);
+        // Given again and again, it does nothing more.
+        is_stop && bus.state() != before
+    }
+
+    /// Takes the newest action. Says whether the motors follow it.
+    fn take_action(&mut self, now: Stamp) -> bool {
+        let Some(actions) = self.shared.actions.get() else { return false };
+        let mut action = [0.0; MAX_ACTION];
+        match actions.newest(&mut action) {
+            Ok(None) => false,
+            Ok(Some((target, tick))) => {
+                let is_followed = self.powered.bus.target(target, tick, now);
+                if is_followed {
+                    self.unsent = Some(tick);
+                }
+                is_followed
+            }
+            Err(refused) => {
+                if self.strange.goes_on(now) {
+                    self.complain(refused.to_string());
+                }
+                false
             }
         }
     }
@@ -273,7 +293,7 @@ impl Beat {
         let (mut sent, mut full) = (false, 0);
         bus.step(now, |frame| match link.send(&frame) {
             Ok(()) => sent = true,
-            // The motor is not answered for, and is said to be silent if that lasts.
+            // The motor counts as not having answered, and is reported as silent if that lasts.
             Err(LinkError::Full | LinkError::BusOff) => full += 1,
             Err(error) => end = Some(error),
         });
@@ -325,7 +345,7 @@ impl Beat {
         }
     }
 
-    /// Tells what happened, as far as there is room; the rest waits.
+    /// Reports what happened, as far as there is room; the rest waits.
     fn tell(&mut self) {
         let bus = &mut self.powered.bus;
         while let Ok(place) = self.notices.try_reserve() {

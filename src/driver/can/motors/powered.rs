@@ -12,9 +12,9 @@ use crate::driver::can::link::{Link, LinkError};
 use crate::registry::DamiaoSpec;
 use crate::time::Stamp;
 
-/// Motors are told to turn off so often at least, at [`AGAIN`] from one another: a frame may be lost.
+/// Motors are ordered to turn off so often at least, at [`AGAIN`] from one another: a frame may be lost.
 const TURN_OFF: usize = 3;
-/// ...and for this long at most, while one that was on has not said that it is off.
+/// ...and for this long at most, while one that was on has not confirmed that it is off.
 const OFF_WITHIN: Duration = Duration::from_millis(100);
 /// See [`TURN_OFF`].
 const AGAIN: Duration = Duration::from_millis(5);
@@ -89,7 +89,7 @@ impl Drop for Powered {
             let motors = self.bus.still_on().collect::<Vec<_>>().join(", ");
             tracing::warn!(
                 motors,
-                "motors were told to turn off and did not say that they are; without commands they stop by their own \
+                "motors were ordered to turn off and did not confirm it; without commands they stop by their own \
                  time limit"
             );
         }

@@ -1,10 +1,12 @@
 //! What thread `control` counts: how well it kept its beat, and what went wrong.
 
 use std::fmt;
+use std::time::Duration;
 
 use hdrhistogram::Histogram;
 
 use crate::control::motors::Counts;
+use crate::time::nanoseconds;
 
 /// Longest time the statistics tell apart, ns.
 const LONGEST: u64 = 10_000_000_000;
@@ -12,9 +14,11 @@ const LONGEST: u64 = 10_000_000_000;
 /// How well the thread kept its beat.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Punctuality {
-    /// Cycles that were counted.
+    /// Cycles of the grid: early ones are not counted.
     pub cycles: u64,
-    /// How late they began, ms: the median, all but one in a thousand, all.
+    /// Cycles that began early, for a fresh action or an order to stop.
+    pub early: u64,
+    /// How late the cycles of the grid began, ms: the median, all but one in a thousand, all.
     pub late_ms: [f64; 3],
     /// Actions that commands followed.
     pub actions: u64,
@@ -26,10 +30,11 @@ impl fmt::Display for Punctuality {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let [p50, p999, max] = self.late_ms;
         write!(f, "{} cycles of thread `control`: late by p50 {p50:.3} p99.9 {p999:.3} max {max:.3} ms", self.cycles)?;
+        write!(f, ", {} more begun early", self.early)?;
         let [p50, p99] = self.wire_ms;
         match self.actions {
             0 => Ok(()),
-            actions => write!(f, "; {actions} actions on the wire p50 {p50:.1} p99 {p99:.1} ms after their tick"),
+            actions => write!(f, "; {actions} actions on the wire p50 {p50:.2} p99 {p99:.2} ms after their tick"),
         }
     }
 }
@@ -39,27 +44,29 @@ impl fmt::Display for Punctuality {
 pub(super) struct Tally {
     /// How late cycles began, ns.
     lateness: Histogram<u64>,
+    /// Cycles that began early.
+    pub(super) early: u64,
     /// From the tick of an action to the first command after it, ns.
     latency: Histogram<u64>,
     /// Frames that were lost before they could be read.
     pub(super) lost_frames: u64,
     /// Frames for which there was no room to the bus.
     pub(super) full: u64,
-    /// Frames that the adapter took and said it did not send.
+    /// Frames that the adapter accepted and reported as not sent.
     pub(super) unsent: u64,
-    /// Samples that nobody read in time.
+    /// Samples that were not read in time.
     pub(super) lost_samples: u64,
 }
 
 impl Tally {
     pub(super) fn new() -> Self {
         let (lateness, latency) = (statistics(), statistics());
-        Self { lateness, latency, lost_frames: 0, full: 0, unsent: 0, lost_samples: 0 }
+        Self { lateness, early: 0, latency, lost_frames: 0, full: 0, unsent: 0, lost_samples: 0 }
     }
 
-    /// A cycle began so late.
-    pub(super) fn late(&mut self, ns: u64) {
-        self.lateness.saturating_record(ns);
+    /// A cycle of the grid began so late.
+    pub(super) fn late(&mut self, late: Duration) {
+        self.lateness.saturating_record(nanoseconds(late));
     }
 
     /// An action was so old when the first command after it was sent.
@@ -71,6 +78,7 @@ impl Tally {
         let ms = |histogram: &Histogram<u64>, quantile| histogram.value_at_quantile(quantile) as f64 / 1e6;
         Punctuality {
             cycles: self.lateness.len(),
+            early: self.early,
             late_ms: [0.5, 0.999, 1.0].map(|quantile| ms(&self.lateness, quantile)),
             actions: self.latency.len(),
             wire_ms: [0.5, 0.99].map(|quantile| ms(&self.latency, quantile)),
@@ -87,8 +95,8 @@ impl Tally {
             (self.unsent, "frames that the adapter did not send"),
             (self.lost_frames, "frames lost before they were read"),
             (bus.strangers, "frames of no motor of the entry"),
-            (self.lost_samples, "samples that nobody read in time"),
-            (bus.lost_notices, "notices that nobody read in time"),
+            (self.lost_samples, "samples that were not read in time"),
+            (bus.lost_notices, "notices that were not read in time"),
         ];
         let counted = all.iter().filter(|(count, _)| *count > 0).map(|(count, what)| format!("{count} {what}"));
         let counted = counted.collect::<Vec<_>>().join(", ");
@@ -109,7 +117,7 @@ mod tests {
     #[test]
     fn the_bounds_of_the_statistics_are_ones() {
         let mut tally = Tally::new();
-        tally.late(u64::MAX);
+        tally.late(Duration::MAX);
         assert_eq!(tally.punctuality().cycles, 1);
     }
 

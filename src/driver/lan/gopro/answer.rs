@@ -39,13 +39,13 @@ pub(super) fn clock() -> String {
         local.tm_hour,
         local.tm_min,
         local.tm_sec,
-        // The zone without daylight saving, which is told apart.
+        // The zone without daylight saving, which is kept apart.
         local.tm_gmtoff / 60 - if local.tm_isdst > 0 { 60 } else { 0 },
         i32::from(local.tm_isdst > 0),
     )
 }
 
-/// The model and firmware, as `/gopro/camera/info` tells them.
+/// The model and firmware, as `/gopro/camera/info` reports them.
 pub(super) fn model(info: &[u8]) -> Option<String> {
     let info: serde_json::Value = serde_json::from_slice(info).ok()?;
     // Older firmware wraps it.
@@ -55,7 +55,7 @@ pub(super) fn model(info: &[u8]) -> Option<String> {
     Some(text("firmware_version").map_or_else(|| model.clone(), |firmware| format!("{model}, firmware {firmware}")))
 }
 
-/// The serial number, as `/gopro/camera/info` tells it, if it is a plain name.
+/// The serial number, as `/gopro/camera/info` reports it, if it is a plain name.
 pub(super) fn serial(info: &[u8]) -> Option<String> {
     let info: serde_json::Value = serde_json::from_slice(info).ok()?;
     let info = info.get("info").unwrap_or(&info);
@@ -97,7 +97,7 @@ pub(super) fn newest(answer: &[u8]) -> Result<Option<Name>, String> {
     Ok(Some(Name { folder: name("folder", folder)?, file: name("file", file)? }))
 }
 
-/// The size that the camera tells of a clip, as text or number.
+/// The size that the camera reports of a clip, as text or number.
 pub(super) fn size(info: &[u8]) -> Option<u64> {
     let info: serde_json::Value = serde_json::from_slice(info).ok()?;
     let size = info.get("s")?;

@@ -5,9 +5,9 @@
 //! it and loses nothing.
 //!
 //! Which clip an episode has is known by what was newest on the card before its shutter was started. Where that is not
-//! known, or clips of ours may still come to be listed, no clip is said to be the episode's.
+//! known, or clips of ours may still come to be listed, no clip is named as the episode's.
 //!
-//! Invariant: what goes wrong with a clip is said, and changes nothing of the episode.
+//! Invariant: what goes wrong with a clip is reported, and changes nothing of the episode.
 
 use std::collections::VecDeque;
 use std::path::PathBuf;
@@ -21,13 +21,13 @@ use tokio_util::task::AbortOnDropHandle;
 use super::super::http;
 use super::super::place::Server;
 use super::answer::{self, Name, State};
-use super::books::{Before, Books, Shutter};
 use super::clip::{self, Clip, Failure};
 use super::{ANSWER_LIMIT, Clips, LARGEST_ANSWER, TRIES, ask};
+use super::{Before, Books, Shutter};
 use crate::driver::DriverError;
 use crate::time::Stamp;
 
-/// The episode in progress, if there is one; `None` until that was told.
+/// The episode in progress, if there is one; `None` until it was notified.
 pub(super) type Told = Option<Option<PathBuf>>;
 
 /// How long things take.
@@ -67,7 +67,7 @@ pub(super) struct Camera {
     unlisted: Option<(Shutter, Instant)>,
     /// Until then clips may come to be listed whose episodes are not known.
     unclear_until: Option<Instant>,
-    /// What the camera refused was said.
+    /// What the camera refused was reported.
     is_said: bool,
     /// Clips that are still to be fetched; the first is being fetched.
     pending: VecDeque<Clip>,
@@ -104,7 +104,7 @@ impl Camera {
         camera
     }
 
-    /// Goes on with what an earlier connection, or an earlier run, left to be fetched.
+    /// Continues with what an earlier connection, or an earlier run, left to be fetched.
     async fn inherit(&mut self) {
         for note in self.books.notes().to_vec() {
             let path = note.clone();
@@ -123,7 +123,7 @@ impl Camera {
         }
     }
 
-    /// Runs until nobody tells it anything any more, or the camera does not answer.
+    /// Runs until its owner is dropped, or the camera does not answer.
     pub(super) async fn run(mut self, mut told: watch::Receiver<Told>) {
         let mut beat = interval(self.pace.beat);
         beat.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -143,12 +143,12 @@ impl Camera {
                     let state = self.look().await;
                     let is_over = state.is_err();
                     if !self.states.is_closed() && self.states.try_send(state).is_err() {
-                        tracing::debug!(device = self.name, "a state that nobody read");
+                        tracing::debug!(device = self.name, "a state was not read in time");
                     }
                     if is_over {
                         return;
                     }
-                    // An episode in progress is told as soon as the camera is open.
+                    // An episode in progress is notified as soon as the camera is open.
                     if !std::mem::take(&mut is_first) {
                         self.wanted.get_or_insert(None);
                     }
@@ -197,7 +197,7 @@ impl Camera {
         let Ok(state) = self.look().await else { return false };
         self.is_inherited = false;
         if let (Some(shutter), false) = (self.books.shutter().cloned(), state.recording) {
-            self.unknown(&shutter, "its shutter was closed while nobody looked").await;
+            self.unknown(&shutter, "its recording ended while it was not connected").await;
             self.books.set_shutter(None).await;
         }
         true
@@ -317,7 +317,7 @@ impl Camera {
         tracing::error!(device = self.name, "which clip belongs to {episode} is not known: {reason}{newest}");
     }
 
-    /// Goes on with the clips that are to be fetched.
+    /// Continues with the clips that are to be fetched.
     fn fetch(&mut self) {
         if self.fetching.is_some() || self.wanted != Some(None) || self.books.shutter().is_some() {
             return;

@@ -60,7 +60,7 @@ impl Clip {
         Self { name, size, episode, device: device.to_owned() }
     }
 
-    /// The clip that a note tells of, which is at this path; `None` if it is no note of ours.
+    /// The clip that a note describes, which is at this path; `None` if it is no note of ours.
     pub(super) fn of_note(path: &Path) -> Option<Self> {
         let text = crate::folder::read_text(path, LARGEST_NOTE).ok()?;
         Self::read(path, &text)
@@ -132,7 +132,7 @@ pub(super) async fn fetch(clip: Clip, server: Server, reserve: Option<u64>) -> R
             Err(Broken::Off(reason)) => reason,
         };
         let there = length(&part);
-        // One that begins anew each time comes no further.
+        // A download that starts over each time makes no progress.
         failed = if there > furthest { 0 } else { failed + 1 };
         furthest = furthest.max(there);
         if failed == TRIES {
@@ -166,7 +166,7 @@ async fn attempt(clip: &Clip, server: &Server, mut part: Part, progress: &mut Pr
         StatusCode::PARTIAL_CONTENT if begins(&reply) == Some(part.there) => {}
         StatusCode::PARTIAL_CONTENT => {
             part.begin_anew()?;
-            return Err(off("the camera goes on elsewhere than where it was asked to"));
+            return Err(off("the camera continued at another byte than requested"));
         }
         // All of it is there.
         StatusCode::RANGE_NOT_SATISFIABLE if part.there > 0 && clip.size == Some(part.there) => return Ok(()),
@@ -253,7 +253,7 @@ impl Part {
             io::Result::Ok(part)
         };
         match tokio::task::spawn_blocking(open).await.map_err(off)? {
-            Err(error) if error.kind() == io::ErrorKind::WouldBlock => Err(off("somebody else is fetching it")),
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => Err(off("another program is fetching it")),
             opened => opened.map_err(|error| stays(format_args!("{named}: {error}"))),
         }
     }
@@ -320,7 +320,7 @@ fn length(path: &Path) -> u64 {
     std::fs::metadata(path).map_or(0, |metadata| metadata.len())
 }
 
-/// Tells every tenth.
+/// Reports every tenth.
 #[derive(Debug)]
 struct Progress {
     device: String,

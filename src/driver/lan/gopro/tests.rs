@@ -69,7 +69,7 @@ async fn a_clip_is_fetched_on_from_where_it_broke_off() {
 }
 
 #[tokio::test]
-async fn a_camera_that_always_breaks_off_is_given_up_and_what_came_is_kept() {
+async fn a_camera_that_keeps_aborting_is_abandoned_and_partial_data_kept() {
     let (server, _) = camera(vec![7], usize::MAX).await;
     let folder = tempfile::tempdir().expect("a folder");
     let failed = clip::fetch(clip_in(folder.path()), server, None).await.expect_err("half of one byte never comes");
@@ -79,7 +79,7 @@ async fn a_camera_that_always_breaks_off_is_given_up_and_what_came_is_kept() {
 }
 
 #[test]
-fn a_note_says_where_the_clip_is() {
+fn a_note_records_the_clip_location() {
     let folder = tempfile::tempdir().expect("a folder");
     clip_in(folder.path()).note("http://172.24.106.51:8080/videos/DCIM/100GOPRO/GX010001.MP4").expect("written");
     let note = std::fs::read_to_string(folder.path().join("ep_001.gopro.clip.json")).expect("a note");
@@ -449,7 +449,7 @@ async fn an_episode_that_ends_while_the_connection_is_lost_ends_the_clip_too() {
 }
 
 #[tokio::test]
-async fn the_next_run_fetches_what_this_one_did_not() {
+async fn the_next_run_fetches_remaining_clips() {
     let mut bench = Bench::new(true).await;
     bench.fake.deafen(Some("/videos/"));
     bench.record(Some("one"));
@@ -492,7 +492,7 @@ async fn fetched(head: &'static str, size: Option<u64>, there: &[u8]) -> (Result
 }
 
 #[tokio::test]
-async fn what_does_not_fit_what_is_there_begins_anew() {
+async fn a_mismatched_partial_file_is_restarted() {
     let long = [7; 100];
     for (head, size, there) in [
         // Elsewhere than where it was asked to, or it does not say where.

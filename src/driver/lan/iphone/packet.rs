@@ -53,7 +53,7 @@ pub(in crate::driver::lan) struct Packets {
     missing: usize,
     /// What comes is let go.
     skips: bool,
-    /// The message was told, and `payload` begins anew.
+    /// The message was handed over, and `payload` begins again.
     told: bool,
     largest_picture: usize,
 }
@@ -140,7 +140,7 @@ impl Packets {
         self.told = true;
         let kind = self.header[4];
         if self.skips {
-            // Told when it began.
+            // Reported when it began.
             self.payload.clear();
             self.header_filled = 0;
             self.told = false;

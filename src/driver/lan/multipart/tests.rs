@@ -52,7 +52,7 @@ fn the_liberties_of_cameras() {
 }
 
 #[test]
-fn what_is_wrong_costs_its_own_part() {
+fn a_malformed_part_loses_only_itself() {
     // Announces more than is permitted.
     check(b"--frame\r\nContent-Length: 65\r\n\r\nabc\r\n--frame\r\nContent-Length: 1\r\n\r\na", &[b"a"], 1);
     check(

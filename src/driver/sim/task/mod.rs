@@ -41,7 +41,7 @@ pub struct Trial {
     /// The same one step earlier.
     before: World,
     looks: Looks,
-    /// What the actuator was told last.
+    /// The last action.
     command: Option<[f64; AXES]>,
     picture: Vec<u8>,
 }
@@ -55,7 +55,7 @@ impl Trial {
         Self { before: world.clone(), world, looks, command: None, picture: Vec::with_capacity(SIDE * SIDE * 3) }
     }
 
-    /// Tells the actuator where to go; it goes there from the next step on.
+    /// Sets the action that the actuator follows from the next step on.
     pub fn command(&mut self, target: [f64; AXES]) {
         self.command = Some(target);
     }

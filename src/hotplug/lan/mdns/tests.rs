@@ -65,7 +65,7 @@ impl Bench {
                     assert_eq!(lan.address, address.to_string());
                     format!("+{} {} {address}", lan.entry, lan.instance.as_deref().unwrap_or_default())
                 }
-                HotplugEvent::Removed { syspath, witness, .. } => format!("-{} {}", syspath.display(), witness.word()),
+                HotplugEvent::Removed { syspath, source, .. } => format!("-{} {}", syspath.display(), source.word()),
             });
         }
         told
@@ -73,7 +73,7 @@ impl Bench {
 }
 
 #[tokio::test]
-async fn an_instance_is_told_once_and_its_goodbye_at_once() {
+async fn an_instance_is_reported_once_and_its_goodbye_immediately() {
     let mut bench = Bench::new(&[("phone", None)]);
     assert_eq!(bench.announced("a", &["127.0.0.1:5"]).await, ["+phone a 127.0.0.1:5"]);
     // More of the same announcement.
@@ -87,7 +87,7 @@ async fn an_instance_is_told_once_and_its_goodbye_at_once() {
 }
 
 #[tokio::test]
-async fn what_is_announced_is_asked_again_and_its_silence_is_the_end_of_the_lease() {
+async fn announced_instances_are_queried_again_and_silence_ends_the_lease() {
     let mut bench = Bench::new(&[("phone", None)]);
     bench.announced("a", &["127.0.0.1:5"]).await;
     assert_eq!(bench.pass(3000).await, (1, vec![]));

@@ -28,7 +28,7 @@ fn nobody() -> SocketAddr {
 }
 
 #[tokio::test]
-async fn an_answer_is_told_from_none() {
+async fn a_reply_is_distinguished_from_silence() {
     let greeting = |text: &'static [u8]| {
         server(move |mut stream| async move {
             let _ = stream.read(&mut [0; 1024]).await;
@@ -104,7 +104,7 @@ async fn a_device_on_this_machine_is_not_listened_for_on_the_network() {
 }
 
 #[tokio::test]
-async fn a_refusal_says_nothing_while_the_driver_has_the_only_connection() {
+async fn a_refused_probe_proves_nothing_while_the_driver_holds_the_connection() {
     let listener = TcpListener::bind((LOCAL, 0)).await.expect("a port");
     let address = listener.local_addr().expect("an address");
     let (tell, mut told) = mpsc::channel(8);
@@ -116,8 +116,8 @@ async fn a_refusal_says_nothing_while_the_driver_has_the_only_connection() {
     drop(listener);
     heard.now();
     let since = heard.at();
-    let Some(HotplugEvent::Removed { witnessed, .. }) = told.recv().await else { panic!("not gone") };
-    assert!(witnessed.since(since) >= lease, "gone after {:?}", witnessed.since(since));
+    let Some(HotplugEvent::Removed { noticed, .. }) = told.recv().await else { panic!("not gone") };
+    assert!(noticed.since(since) >= lease, "gone after {:?}", noticed.since(since));
 }
 
 #[tokio::test]
@@ -142,7 +142,7 @@ async fn a_lease_waits_for_a_driver_that_is_started_later() {
 }
 
 #[tokio::test]
-async fn a_device_comes_and_goes_and_one_that_sends_is_not_asked() {
+async fn a_device_appears_and_disappears_and_a_sending_one_is_not_probed() {
     let listener = TcpListener::bind((LOCAL, 0)).await.expect("a port");
     let address = listener.local_addr().expect("an address");
     let (tell, mut told) = mpsc::channel(8);
@@ -157,8 +157,8 @@ async fn a_device_comes_and_goes_and_one_that_sends_is_not_asked() {
         assert!(asked.is_err(), "asked although it sends");
     }
     drop(listener);
-    let Some(HotplugEvent::Removed { witness, .. }) = told.recv().await else { panic!("not gone") };
-    assert_eq!(witness, Witness::Lease);
+    let Some(HotplugEvent::Removed { source, .. }) = told.recv().await else { panic!("not gone") };
+    assert_eq!(source, UnplugSource::Lease);
     let _listener = TcpListener::bind(address).await.expect("the port again");
     assert!(matches!(told.recv().await, Some(HotplugEvent::Added(_))), "found again");
 }

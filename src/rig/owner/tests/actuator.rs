@@ -57,7 +57,7 @@ async fn an_arm_at_the_start_is_given_once() {
     // A disarm, to hear that nothing armed it before.
     let end = [Give(Order::Disarm), Until("a disarmed")];
     let plug = || [Plug("1", NUMBERS), Until("a streaming")];
-    let replugged = || [Removed("1", Witness::Kernel), Until("a absent")].into_iter().chain(plug());
+    let replugged = || [Removed("1", UnplugSource::Kernel), Until("a absent")].into_iter().chain(plug());
     let table: [(&str, bool, Vec<Step>, Vec<&str>); 7] = [
         ("at the first plug", true, plug().into(), [&UP[..], &["a disarmed"]].concat()),
         ("without it, never", false, plug().into(), [&UP_DISARMED[..], &["a disarmed"]].concat()),
@@ -72,7 +72,7 @@ async fn an_arm_at_the_start_is_given_once() {
             true,
             plug()
                 .into_iter()
-                .chain([Pull("1"), Until("a absent"), Removed("1", Witness::Kernel)])
+                .chain([Pull("1"), Until("a absent"), Removed("1", UnplugSource::Kernel)])
                 .chain(plug())
                 .collect(),
             [&UP[..], &["a gone stream", "a disarmed", "a absent"], &again, &["a disarmed"]].concat(),

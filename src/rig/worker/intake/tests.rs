@@ -24,7 +24,7 @@ fn complaint(kind: ModalityKind, shape: &[u32], header: SampleHeader, payload: &
 }
 
 #[test]
-fn what_is_not_as_the_entry_says_is_refused_with_a_reason() {
+fn samples_that_contradict_the_entry_are_rejected_with_a_reason() {
     use Encoding::{Bytes, F64, Grey, Mjpeg, Yuyv};
     use ModalityKind::{Image, Scalars};
     let other = |id, epoch| SampleHeader { id, epoch, ..header(F64) };
@@ -59,7 +59,7 @@ fn what_is_not_as_the_entry_says_is_refused_with_a_reason() {
 }
 
 #[test]
-fn what_is_as_the_entry_says_is_passed_on() {
+fn samples_that_match_the_entry_are_forwarded() {
     let mut scalars = intake(ModalityKind::Scalars, &[2]);
     let judged = scalars.judge(&SampleHeader { flags: 0xffff, width: 9, ..header(Encoding::F64) }, &[0; 16], NOW);
     let expected =

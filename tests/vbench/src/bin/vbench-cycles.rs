@@ -170,7 +170,7 @@ impl Seen {
         let episode = outcome.episode()?;
         let starts: Vec<Moment> = outcome.origins();
         let [start, plain_start] = starts[..] else { return Err("the timeline has not two starts".into()) };
-        // Both clocks were read at the same moment, and nobody sets the guest's.
+        // Both clocks were read at the same moment, and the guest's is never set.
         let shift = start.real_ns - start.mono_ns;
         let within = |time: &u64| (start.mono_ns..plain_start.mono_ns).contains(time);
         let acts =
@@ -239,8 +239,8 @@ impl Seen {
 
     fn replug_figures(&self) -> Vec<Figure> {
         let nodes = self.uevents("udev", "add", "video4linux");
-        let told = self.firsts(&nodes);
-        let from_node = Delays::between(&told, &self.received);
+        let reported = self.firsts(&nodes);
+        let from_node = Delays::between(&reported, &self.received);
         let from_plug = Delays::between(&self.plugs, &self.received);
         let plain = |key| self.plain.iter().filter_map(|line| line[key].as_u64()).collect::<Vec<_>>();
         let plain_from_node = Delays::between(&plain("told_ns"), &plain("mono_ns"));
@@ -281,7 +281,7 @@ impl Seen {
             ("stage_udev", Delays::between(&self.firsts(&kernel_nodes), &nodes), None, "-> udev has processed it"),
             (
                 "stage_told",
-                Delays::beside(&self.firsts(&kernel_nodes), &told, &self.attached),
+                Delays::beside(&self.firsts(&kernel_nodes), &reported, &self.attached),
                 None,
                 "-> rapid has matched it to its entry; below 0 it heard of it before the listener of the bench",
             ),
@@ -351,7 +351,7 @@ impl Seen {
 
     fn uevents(&self, by: &str, event: &str, subsystem: &str) -> Vec<u64> {
         let wanted = |line: &&Value| {
-            // udev says which of a camera's nodes captures; it is the first that the kernel makes.
+            // udev names which of a camera's nodes captures; it is the first that the kernel makes.
             line["by"] == by
                 && line["event"] == event
                 && line["subsystem"] == subsystem

@@ -1,7 +1,7 @@
 //! `vbench-sweep [9|1] [--json]`: the ablation of the paper's table, three fingers times three sets of modalities, or the first
 //! of the nine configurations alone, which shows that it works. First each is put
 //! together by plugging while one `rapid` records, and nothing else is done; then each is recorded as an episode by the command
-//! that `rapid ablation` gives, until it says that none is missing. Gives the time that the software takes in each. A
+//! that `rapid ablation` gives, until it reports that none is missing. Gives the time that the software takes in each. A
 //! benchmark: it asserts nothing about its figures.
 
 use std::path::{Path, PathBuf};
@@ -267,8 +267,8 @@ fn nodes(outcome: &Outcome) -> Vec<u64> {
         let is_node = line["subsystem"] == "net" || line["captures"] == true;
         line["by"] == "udev" && line["event"] == "add" && is_node
     };
-    let said = json_lines(&outcome.file("uevents.jsonl"));
-    said.iter().filter(|line| is_ready(line)).filter_map(|line| line["real_ns"].as_u64()).collect()
+    let printed = json_lines(&outcome.file("uevents.jsonl"));
+    printed.iter().filter(|line| is_ready(line)).filter_map(|line| line["real_ns"].as_u64()).collect()
 }
 
 fn plugged(

@@ -1,4 +1,4 @@
-//! A device and its port: plugging and unplugging, as the kernel's `vhci_hcd` is told of it.
+//! A device and its port: plugging and unplugging, as the kernel's `vhci_hcd` is notified of it.
 
 use std::fs::OpenOptions;
 use std::io::{self, Write};
@@ -89,7 +89,7 @@ impl Device {
         if self.shared.befall(motor, order) { Ok(()) } else { Err(PortError::Order) }
     }
 
-    /// Plugs it in. The moment that is logged is the one right before the kernel was told.
+    /// Plugs it in. The moment that is logged is the one right before the kernel was notified.
     pub fn plug(&mut self) -> Result<(), PortError> {
         if let Some(port) = self.plugged {
             return Err(PortError::Plugged(port));
@@ -141,9 +141,9 @@ impl Device {
     pub fn unplug(&mut self) -> Result<(), PortError> {
         let port = self.plugged.take().ok_or(PortError::Unplugged)?;
         let moment = Moment::now();
-        let told = tell_vhci("detach", &port.to_string());
+        let reported = tell_vhci("detach", &port.to_string());
         self.shared.log.say("unplug", moment, json!({"device": self.index, "port": port}));
-        told.map_err(|source| PortError::Vhci { file: "detach", text: port.to_string(), source })
+        reported.map_err(|source| PortError::Vhci { file: "detach", text: port.to_string(), source })
     }
 
     /// Waits until the kernel has let go of the device that was in the port. A hub disables a port that loses its device, so
@@ -179,16 +179,17 @@ impl Drop for Device {
     }
 }
 
-/// Pulls everything that is plugged, as fast as the kernel can be told; which devices these were.
+/// Pulls everything that is plugged, as fast as the kernel can be notified; which devices these were.
 pub fn unplug_together(devices: &mut [Device]) -> Result<Vec<usize>, PortError> {
-    let told = |text: &str, source| PortError::Vhci { file: "detach", text: text.into(), source };
-    let mut detach = OpenOptions::new().write(true).open(format!("{VHCI}/detach")).map_err(|error| told("", error))?;
+    let reported = |text: &str, source| PortError::Vhci { file: "detach", text: text.into(), source };
+    let mut detach =
+        OpenOptions::new().write(true).open(format!("{VHCI}/detach")).map_err(|error| reported("", error))?;
     let mut pulled = Vec::new();
     // Nothing is logged before the last one is out.
     for device in devices.iter_mut() {
         let Some(port) = device.plugged.take() else { continue };
         let moment = Moment::now();
-        detach.write_all(port.to_string().as_bytes()).map_err(|error| told(&port.to_string(), error))?;
+        detach.write_all(port.to_string().as_bytes()).map_err(|error| reported(&port.to_string(), error))?;
         pulled.push((device.index, port, moment));
     }
     for (index, port, moment) in &pulled {

@@ -58,7 +58,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_packed_is_unpacked() {
+    fn packed_frames_round_trip() {
         let records: [&[u8]; 3] = [b"one", b"", b"three\n"];
         let packed = pack(records);
         assert_eq!(unpack(&packed), Some(records.map(<[u8]>::to_vec).to_vec()));

@@ -11,7 +11,7 @@ const COM_TAG: &str = "rapid-vbench";
 const YUYV_TAG: &[u8; 4] = b"RVBF";
 /// Bytes that its identity adds to a JPEG, at most.
 pub const STAMP: usize = 64;
-/// Different pictures a camera cycles through, so that a frozen picture can be told from a live one.
+/// Different pictures a camera cycles through, so that a frozen picture can be distinguished from a live one.
 pub const PICTURES: usize = 6;
 
 /// A folder like one of `/sys/class/leds`: while it is there, cameras that send YUYV look at this light.
@@ -32,7 +32,7 @@ pub struct FrameId {
     pub sent_ns: u64,
 }
 
-/// Numbers of different devices never meet, so that a frame or line tells which of two equal units sent it.
+/// Numbers of different devices never meet, so that a frame or line shows which of two equal units sent it.
 pub const NUMBERS_PER_DEVICE: u32 = 1_000_000;
 
 /// The number of the first frame or line of the `index`-th device.

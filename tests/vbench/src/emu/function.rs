@@ -86,7 +86,7 @@ impl Function {
         Ok(Self { identity: spec.identity.clone(), configured: 0, role })
     }
 
-    /// Back to the state of a device that was just plugged in. Numbers go on counting.
+    /// Back to the state of a device that was just plugged in. Numbers continue counting.
     pub fn reset(&mut self) {
         self.configured = 0;
         match &mut self.role {

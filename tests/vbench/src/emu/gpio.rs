@@ -8,11 +8,11 @@ use serde_json::json;
 use super::descriptor::{Answer, Configuration, DeviceClass, Setup};
 use super::function::DATA_IN;
 use super::order::Order;
+use super::reported::Reported;
 use super::talker::Talker;
-use super::told::Told;
 
 const DATA_OUT: u8 = 0x02;
-/// Requests of one kind, told apart by wValue.
+/// Requests of one kind, distinguished by wValue.
 const VENDOR_SPECIFIC: u8 = 0xff;
 const GET_PARTNUM: u16 = 0x370b;
 const GET_PORTCONFIG: u16 = 0x370c;
@@ -31,12 +31,12 @@ pub struct Gpio {
     latch: u8,
     /// What pulls each line from outside; high is what nothing pulls.
     outside: u8,
-    told: Vec<Told>,
+    reported: Vec<Reported>,
 }
 
 impl Default for Gpio {
     fn default() -> Self {
-        Self { latch: 0x0f, outside: 0x0f, told: Vec::new() }
+        Self { latch: 0x0f, outside: 0x0f, reported: Vec::new() }
     }
 }
 
@@ -52,7 +52,7 @@ impl Gpio {
         for line in 0..LINES {
             let (was, is) = (before >> line & 1, self.latch >> line & 1);
             if OUTPUTS >> line & 1 == 1 && was != is {
-                self.told.push(Told::new("gpio", json!({"line": line, "level": is})));
+                self.reported.push(Reported::new("gpio", json!({"line": line, "level": is})));
             }
         }
     }
@@ -73,7 +73,7 @@ impl Talker for Gpio {
 
     fn control(&mut self, setup: Setup, _: &[u8], _: u64) -> Answer {
         if setup.request != VENDOR_SPECIFIC {
-            // Of the serial line, which nobody opens.
+            // Of the serial line, which is never opened.
             return if setup.is_in() { Answer::Data(vec![0; setup.length.into()]) } else { Answer::Done };
         }
         match (setup.value, setup.is_in()) {
@@ -121,8 +121,8 @@ impl Talker for Gpio {
         true
     }
 
-    fn told(&mut self, told: &mut Vec<Told>) {
-        told.append(&mut self.told);
+    fn reported(&mut self, reported: &mut Vec<Reported>) {
+        reported.append(&mut self.reported);
     }
 }
 
@@ -146,8 +146,8 @@ mod tests {
         assert!(gpio.befall(Some(2), Order::Level(false), 0));
         assert!(!gpio.befall(Some(4), Order::Level(false), 0) && !gpio.befall(Some(1), Order::Ask, 0));
         assert_eq!(latch(&mut gpio), 0b1001);
-        let mut told = Vec::new();
-        gpio.told(&mut told);
-        assert_eq!(told.last(), Some(&Told::new("gpio", json!({"line": 0, "level": 1}))));
+        let mut reported = Vec::new();
+        gpio.reported(&mut reported);
+        assert_eq!(reported.last(), Some(&Reported::new("gpio", json!({"line": 0, "level": 1}))));
     }
 }

@@ -24,13 +24,13 @@ pub const LEAST_INERTIA: f64 = 0.001;
 pub enum Order {
     /// A motor latches this fault (8 to 14); 0 takes it away.
     Fault(u8),
-    /// A motor neither hears nor answers, and goes on as it is.
+    /// A motor neither hears nor answers, and continues as it is.
     Mute(bool),
     /// A motor has this temperature, degrees Celsius.
     Hot(u8),
     /// A motor loses or regains its supply: what was not saved is forgotten.
     Power(bool),
-    /// A motor tells its state to the log.
+    /// A motor writes its state to the log.
     Ask,
     /// A torque pulls the joint towards negative angles, Nm.
     Load {

@@ -72,7 +72,7 @@ mod tests {
         let mut beats = |ms: u64| std::iter::from_fn(|| pace.beat(ms * MS)).collect::<Vec<u32>>();
         assert_eq!(beats(0), [0_u32; 0]);
         assert_eq!(beats(3), [0, 1, 2]);
-        // Nobody asked for a second.
+        // No second was asked for.
         let late = beats(1_003);
         assert_eq!((late.first(), late.len()), (Some(&3), 50));
         assert_eq!(pace.next_ns(1_003 * MS), 1_004 * MS);

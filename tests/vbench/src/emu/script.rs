@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn refuses_what_it_cannot_read() {
+    fn rejects_unreadable_lines() {
         for line in [
             "plug",
             "plug x",

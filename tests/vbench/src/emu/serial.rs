@@ -49,7 +49,7 @@ impl Serial {
     pub fn class(&self) -> DeviceClass {
         match self.flavour {
             Flavour::Acm => DeviceClass { class: [2, 0, 0], release: 0x0100 },
-            // ftdi_sio tells the chips apart by this release: 6.00 is an FT232R.
+            // ftdi_sio distinguishes the chips by this release: 6.00 is an FT232R.
             Flavour::Ftdi => DeviceClass { class: [0, 0, 0], release: 0x0600 },
         }
     }

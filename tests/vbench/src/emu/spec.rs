@@ -41,7 +41,7 @@ pub struct DeviceSpec {
     pub feed: String,
 }
 
-/// What a device says about itself.
+/// What a device reports about itself.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Identity {
     /// idVendor.

@@ -1,7 +1,7 @@
 use super::*;
 
 #[test]
-fn what_is_printed_is_read_back() {
+fn printed_specs_are_parsed_back() {
     let camera = DeviceSpec::uvc(0x046d, 0x0825).serial("CAM00A1").port(3).mode(Format::Mjpg, 640, 480, &[30]).mode(
         Format::Yuyv,
         320,

@@ -34,16 +34,16 @@ impl Shared {
         done
     }
 
-    /// Lets the device do what is due, sends what the host asks for, logs what it tells.
+    /// Lets the device do what is due, sends what the host asks for, logs what it reports.
     pub(super) fn attend(&self, state: &mut State, now: Moment) {
         let Some(talker) = state.function.talker() else { return };
         let due_ns = talker.tend(now.mono_ns).unwrap_or(u64::MAX);
-        let mut told = Vec::new();
-        talker.told(&mut told);
-        for told in told {
-            let mut fields = told.fields;
+        let mut reported = Vec::new();
+        talker.reported(&mut reported);
+        for reported in reported {
+            let mut fields = reported.fields;
             fields["device"] = self.index.into();
-            self.log.say(told.action, now, fields);
+            self.log.say(reported.action, now, fields);
         }
         state.deliver(now.mono_ns);
         let sooner = due_ns < state.due_ns;

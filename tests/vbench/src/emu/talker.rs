@@ -4,7 +4,7 @@
 
 use super::descriptor::{Answer, DeviceClass, Setup};
 use super::order::Order;
-use super::told::Told;
+use super::reported::Reported;
 
 /// A device that is spoken with. It exists whether it is plugged or not; `reset` is the plug's going in or out.
 pub trait Talker: std::fmt::Debug + Send {
@@ -32,12 +32,12 @@ pub trait Talker: std::fmt::Debug + Send {
     /// Throws away what waits to be taken.
     fn discard(&mut self);
 
-    /// The cable went in or out: the host's side begins anew, what lies behind goes on.
+    /// The cable went in or out: the host's side begins again, what lies behind continues.
     fn reset(&mut self);
 
     /// Something happens to it, or to a motor behind it; false: not to such a device.
     fn befall(&mut self, motor: Option<u16>, order: Order, now_ns: u64) -> bool;
 
     /// Appends what it has to tell since the last call.
-    fn told(&mut self, told: &mut Vec<Told>);
+    fn reported(&mut self, reported: &mut Vec<Reported>);
 }

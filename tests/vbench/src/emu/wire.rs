@@ -56,7 +56,7 @@ pub struct Submit {
     pub setup: [u8; 8],
 }
 
-/// A header that is not USB/IP as spoken here; the connection cannot go on.
+/// A header that is not USB/IP as spoken here; the connection cannot continue.
 #[derive(Debug, Error, PartialEq, Eq)]
 pub enum WireError {
     /// A command other than submit and unlink.

@@ -25,7 +25,7 @@ pub fn run(period: Duration, path: &Path) -> io::Result<()> {
         clock_nanosleep_absolute(ClockId::Monotonic, &due)?;
         let now_ns = clock::mono_ns();
         out.write_all(&now_ns.to_le_bytes())?;
-        // As the mask's publisher does: held up, it goes on from here rather than in a burst.
+        // As the mask's publisher does: held up, it continues from here rather than in a burst.
         if due_ns + period_ns <= now_ns {
             due_ns = now_ns;
         }

@@ -27,7 +27,7 @@ const INBOX: usize = 1 << 20;
 /// One message.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Uevent {
-    /// Told by udev, its rules done; otherwise by the kernel.
+    /// Reported by udev, its rules done; otherwise by the kernel.
     pub processed: bool,
     properties: Vec<(String, String)>,
 }
@@ -126,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn reads_what_the_kernel_says() {
+    fn parses_kernel_events() {
         let event = Uevent::parse(b"remove@/devices/x\0ACTION=remove\0DEVPATH=/devices/x\0SUBSYSTEM=usb\0").unwrap();
         assert!(!event.processed);
         assert_eq!([event.get("ACTION"), event.get("SUBSYSTEM"), event.get("DEVNAME")], ["remove", "usb", ""]);
@@ -134,14 +134,14 @@ mod tests {
     }
 
     #[test]
-    fn reads_what_udev_says() {
+    fn parses_udev_events() {
         let event = Uevent::parse(&by_udev()).unwrap();
         assert!(event.processed);
         assert_eq!(event.camera_added().as_deref(), Some("/dev/video0"));
     }
 
     #[test]
-    fn passes_over_what_it_cannot_read() {
+    fn skips_malformed_events() {
         let whole = by_udev();
         for length in 0..whole.len() {
             let _neither_panics_nor_matters = Uevent::parse(&whole[..length]);

@@ -97,14 +97,14 @@ pub fn first_frames(log: &Log) -> Result<(), ReadError> {
     let heard = |error| ReadError::Call("recv from udev", error);
     let mut listener = Listener::open().map_err(heard)?;
     loop {
-        let (event, told) = listener.receive().map_err(heard)?;
+        let (event, reported) = listener.receive().map_err(heard)?;
         let Some(node) = event.camera_added() else { continue };
         match first_frame(Path::new(&node)) {
             Ok((streaming, came)) => {
-                let fields = json!({"node": node, "told_ns": told.mono_ns, "streaming_ns": streaming.mono_ns});
+                let fields = json!({"node": node, "told_ns": reported.mono_ns, "streaming_ns": streaming.mono_ns});
                 log.say("first_frame", came, fields);
             }
-            Err(error) => log.say("missed", told, json!({"node": node, "error": error.to_string()})),
+            Err(error) => log.say("missed", reported, json!({"node": node, "error": error.to_string()})),
         }
     }
 }

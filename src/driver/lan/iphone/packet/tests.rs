@@ -82,7 +82,7 @@ fn a_session_frames_and_what_is_let_go() {
 }
 
 #[test]
-fn what_is_wrong_costs_its_own_message() {
+fn a_malformed_message_loses_only_itself() {
     let stream = [
         picture(&[9; 101], 1.0),
         message(1, b"short"),
@@ -98,7 +98,7 @@ fn what_is_wrong_costs_its_own_message() {
 }
 
 #[test]
-fn a_frame_says_where_the_camera_was() {
+fn a_frame_carries_the_camera_pose() {
     let mut packets = Packets::new(100);
     let bytes = picture(b"x", 3.25);
     let (taken, Cut::Frame(frame)) = packets.feed(&bytes) else { panic!("a frame") };

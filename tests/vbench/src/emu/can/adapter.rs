@@ -14,14 +14,14 @@ use super::slcan::{Heard, Slcan};
 use crate::emu::descriptor::{Answer, BULK_PACKET, Configuration, DeviceClass, Setup};
 use crate::emu::function::DATA_IN;
 use crate::emu::order::Order;
+use crate::emu::reported::Reported;
 use crate::emu::serial::{Flavour, Serial};
 use crate::emu::talker::Talker;
-use crate::emu::told::Told;
 
 /// The rate of every simulated bus, bits a second.
 const BUS_RATE: u32 = 1_000_000;
 const DATA_OUT: u8 = 0x02;
-/// What an adapter can hold for a host that does not fetch it; more is lost, and told.
+/// What an adapter can hold for a host that does not fetch it; more is lost, and reported.
 const OUTBOX: usize = 64 * 1024;
 
 /// How the adapter speaks with the host.
@@ -40,7 +40,7 @@ pub enum Protocol {
 pub struct Adapter {
     speech: Speech,
     bus: Bus,
-    /// Bits a second it was told; `None`: it is not on the bus.
+    /// Bits a second it was set to; `None`: it is not on the bus.
     on_bus: Option<u32>,
     rate: u32,
     is_off: bool,
@@ -48,7 +48,7 @@ pub struct Adapter {
     held: VecDeque<(u32, Frame)>,
     outbox: VecDeque<u8>,
     lost: u64,
-    told: Vec<Told>,
+    reported: Vec<Reported>,
 }
 
 #[derive(Debug)]
@@ -90,7 +90,7 @@ impl Adapter {
             held: VecDeque::new(),
             outbox: VecDeque::new(),
             lost: 0,
-            told: Vec::new(),
+            reported: Vec::new(),
         };
         adapter.reset();
         adapter
@@ -164,7 +164,7 @@ impl Adapter {
     }
 
     fn tell(&mut self, action: &'static str, fields: serde_json::Value) {
-        self.told.push(Told::new(action, fields));
+        self.reported.push(Reported::new(action, fields));
     }
 }
 
@@ -282,9 +282,9 @@ impl Talker for Adapter {
         }
     }
 
-    fn told(&mut self, told: &mut Vec<Told>) {
-        told.append(&mut self.told);
-        told.extend(self.bus.told());
+    fn reported(&mut self, reported: &mut Vec<Reported>) {
+        reported.append(&mut self.reported);
+        reported.extend(self.bus.reported());
     }
 }
 

@@ -28,9 +28,9 @@ fn start(adapter: &mut Adapter, brp: u32) {
 }
 
 fn actions(adapter: &mut Adapter) -> Vec<&'static str> {
-    let mut told = Vec::new();
-    adapter.told(&mut told);
-    told.into_iter().map(|told| told.action).collect()
+    let mut reported = Vec::new();
+    adapter.reported(&mut reported);
+    reported.into_iter().map(|reported| reported.action).collect()
 }
 
 #[test]
@@ -56,7 +56,7 @@ fn a_gs_usb_frame_comes_back_before_its_answer() {
 }
 
 #[test]
-fn a_wrong_bit_rate_reaches_nobody() {
+fn a_wrong_bit_rate_reaches_no_motor() {
     let mut adapter = adapter(Protocol::GsUsb);
     start(&mut adapter, 6);
     adapter.hear(&gsusb::encode(&Frame::data(5, ZERO_MIT), 7), 0);
@@ -64,7 +64,7 @@ fn a_wrong_bit_rate_reaches_nobody() {
 }
 
 #[test]
-fn what_was_sent_while_bus_off_goes_out_afterwards() {
+fn frames_queued_while_bus_off_are_sent_afterwards() {
     let mut adapter = adapter(Protocol::GsUsb);
     start(&mut adapter, 3);
     assert!(adapter.befall(None, Order::BusOff(true), 0));
@@ -93,7 +93,7 @@ fn serial_adapters_reach_the_same_motor() {
 }
 
 #[test]
-fn a_motor_goes_on_when_the_adapter_is_pulled() {
+fn a_motor_keeps_moving_when_the_adapter_is_pulled() {
     let mut adapter = adapter(Protocol::GsUsb);
     start(&mut adapter, 3);
     for bytes in [[0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xfc], ZERO_MIT] {
@@ -104,8 +104,8 @@ fn a_motor_goes_on_when_the_adapter_is_pulled() {
     assert_eq!(adapter.tend(MS), Some(100 * MS));
     assert_eq!(adapter.tend(100 * MS), Some(500 * MS));
     assert_eq!(adapter.tend(500 * MS), None);
-    let told = actions(&mut adapter);
-    assert!(told.ends_with(&["commands_end", "motor_timeout", "motor_fault"]), "{told:?}");
+    let reported = actions(&mut adapter);
+    assert!(reported.ends_with(&["commands_end", "motor_timeout", "motor_fault"]), "{reported:?}");
 }
 
 #[test]

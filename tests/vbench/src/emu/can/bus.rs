@@ -9,7 +9,7 @@ use super::motor::Motor;
 use super::registers::Type;
 use crate::emu::order::Order;
 use crate::emu::pace::Pace;
-use crate::emu::told::Told;
+use crate::emu::reported::Reported;
 
 /// Identifier of generated frames: no motor's, and lower in rank than all of them.
 pub const FLOOD_ID: u16 = 0x7f0;
@@ -47,14 +47,14 @@ impl std::fmt::Display for MotorSpec {
 pub struct Bus {
     motors: Vec<Motor>,
     flood: Option<Pace>,
-    told: Vec<Told>,
+    reported: Vec<Reported>,
 }
 
 impl Bus {
     /// A bus with these motors.
     pub fn new(motors: &[MotorSpec]) -> Self {
         let motors = motors.iter().map(|spec| Motor::new(spec.kind, spec.slave, spec.master)).collect();
-        Self { motors, flood: None, told: Vec::new() }
+        Self { motors, flood: None, reported: Vec::new() }
     }
 
     /// A frame of the adapter's; what is answered is given to `answers`.
@@ -82,7 +82,7 @@ impl Bus {
     pub fn befall(&mut self, motor: Option<u16>, order: Order, now_ns: u64) -> bool {
         if let Order::Flood(hz) = order {
             if let Some(mut flood) = self.flood.take() {
-                self.told.push(Told::new("flood_end", flood.summary(now_ns)));
+                self.reported.push(Reported::new("flood_end", flood.summary(now_ns)));
             }
             self.flood = (hz > 0.0).then(|| Pace::new(hz, now_ns));
             return true;
@@ -97,8 +97,8 @@ impl Bus {
     }
 
     /// What the bus has to tell since the last call.
-    pub fn told(&mut self) -> impl Iterator<Item = Told> + '_ {
-        self.told.drain(..).chain(self.motors.iter_mut().flat_map(Motor::told))
+    pub fn reported(&mut self) -> impl Iterator<Item = Reported> + '_ {
+        self.reported.drain(..).chain(self.motors.iter_mut().flat_map(Motor::reported))
     }
 }
 
@@ -135,11 +135,11 @@ mod tests {
         answers.clear();
         bus.send(&Frame::data(0x05, [0; 8]), 0, |frame| answers.push(frame));
         assert_eq!(answers, []);
-        assert_eq!(bus.told().map(|told| told.action).collect::<Vec<_>>(), ["motor_enabled"]);
+        assert_eq!(bus.reported().map(|reported| reported.action).collect::<Vec<_>>(), ["motor_enabled"]);
     }
 
     #[test]
-    fn the_generator_counts_what_it_gave_out() {
+    fn the_generator_counts_its_output() {
         let mut bus = Bus::new(&[]);
         bus.befall(None, Order::Flood(1_000.0), 0);
         assert_eq!(counters(&mut bus, 0), [0_u32; 0]);
@@ -147,7 +147,7 @@ mod tests {
         assert_eq!(bus.tend(3 * MS), Some(4 * MS));
         bus.befall(None, Order::Flood(0.0), 4 * MS);
         assert_eq!(counters(&mut bus, 9 * MS), [0_u32; 0]);
-        let told: Vec<Told> = bus.told().collect();
-        assert_eq!(told[0], Told::new("flood_end", json!({"sent": 3, "skipped": 0})));
+        let reported: Vec<Reported> = bus.reported().collect();
+        assert_eq!(reported[0], Reported::new("flood_end", json!({"sent": 3, "skipped": 0})));
     }
 }

@@ -71,7 +71,7 @@ pub fn decode(bytes: &[u8]) -> Option<(u32, Frame)> {
     Some((echo, Frame::new(id & mask, extended, id & REMOTE != 0, len, bytes.get(12..12 + len)?)?))
 }
 
-/// The error frame that says the adapter has gone bus-off, or has recovered.
+/// The error frame that reports that the adapter has gone bus-off, or has recovered.
 pub fn bus_off(is_off: bool) -> [u8; HOST_FRAME] {
     host_frame(FROM_THE_BUS, ERROR | if is_off { CLASS_BUS_OFF } else { CLASS_RESTARTED }, 8, [0; 8])
 }

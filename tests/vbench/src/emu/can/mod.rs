@@ -1,6 +1,6 @@
 //! A CAN bus: adapters of three kinds, the motors behind them, and a generator of frames.
 //!
-//! The bus is there whether its adapter is plugged or not: a motor has a power supply of its own, goes on when the cable to the
+//! The bus is there whether its adapter is plugged or not: a motor has a power supply of its own, continues when the cable to the
 //! computer is pulled, and ends by its own time-out.
 //!
 //! Invariant: no clock, no socket, no thread below this module; times come in as ns of CLOCK_MONOTONIC.

@@ -1,12 +1,12 @@
-//! A simulated Damiao motor: what it is told over the bus, how it moves, what it answers.
+//! A simulated Damiao motor: what it is sent over the bus, how it moves, what it answers.
 //!
 //! Frames as in the vendor's `DM_CAN.py` and LeRobot's `motors/damiao`: MIT at its slave id, position with velocity at 0x100 more,
 //! velocity at 0x200 more, parameters at 0x7FF; the answer is one feedback or parameter frame at its master id. It moves towards
-//! what it is told with a lag of the first order, never faster than VMAX, and carries no load; once an order gives it a body
+//! its commands with a lag of the first order, never faster than VMAX, and carries no load; once an order gives it a body
 //! (`plant`), it moves as that does under the torque of its loops, TMAX at the most, and without any while it is disabled.
 //!
 //! Invariant: every frame for a motor that can hear gets one answer, but for a register it does not have and a save while enabled.
-//! Invariant: it moves by itself only while it is enabled; a fault and the time-out of its own disable it until somebody enables it again.
+//! Invariant: it moves by itself only while it is enabled; a fault and the time-out of its own disable it until it is enabled again.
 
 use serde_json::{Value, json};
 
@@ -16,7 +16,7 @@ use super::plant::{Body, Drive, MOST_STEPS, Movement, STEP_NS, Trouble};
 use super::registers::{self, Registers, Type};
 use super::run::Run;
 use crate::emu::order::Order;
-use crate::emu::told::Told;
+use crate::emu::reported::Reported;
 
 /// Identifier that parameters of every motor are spoken to by.
 const PARAMETERS: u32 = 0x7ff;
@@ -43,7 +43,7 @@ pub struct Motor {
     moved_ns: u64,
     heard_ns: u64,
     run: Option<Run>,
-    told: Vec<Told>,
+    reported: Vec<Reported>,
 }
 
 impl Motor {
@@ -65,7 +65,7 @@ impl Motor {
             moved_ns: 0,
             heard_ns: 0,
             run: None,
-            told: Vec::new(),
+            reported: Vec::new(),
         }
     }
 
@@ -85,8 +85,8 @@ impl Motor {
     }
 
     /// What it has to tell since the last call.
-    pub fn told(&mut self) -> impl Iterator<Item = Told> + '_ {
-        self.told.drain(..)
+    pub fn reported(&mut self) -> impl Iterator<Item = Reported> + '_ {
+        self.reported.drain(..)
     }
 
     /// Hears a frame; its answer, if the frame is for it.
@@ -205,7 +205,7 @@ impl Motor {
                 self.tell("motor_enabled", json!({}));
             }
             0xfd => {
-                // Said each time: whoever stops a motor may say it more than once.
+                // Reported each time: a motor may be stopped more than once.
                 self.stop();
                 self.tell("motor_disabled", json!({}));
             }
@@ -286,7 +286,7 @@ impl Motor {
         }
     }
 
-    /// What it says of itself.
+    /// What it reports about itself.
     fn feedback(&self) -> Frame {
         let [pmax, vmax, tmax] = [self.registers.pmax, self.registers.vmax, self.registers.tmax].map(f64::from);
         let Movement { position, velocity, torque } = self.movement;
@@ -376,7 +376,7 @@ impl Motor {
 
     fn tell(&mut self, action: &'static str, mut fields: Value) {
         fields["motor"] = json!(self.registers.slave);
-        self.told.push(Told::new(action, fields));
+        self.reported.push(Reported::new(action, fields));
     }
 }
 

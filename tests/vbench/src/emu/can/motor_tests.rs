@@ -27,7 +27,7 @@ fn position(feedback: [u8; 8]) -> f64 {
 }
 
 fn actions(motor: &mut Motor) -> Vec<&'static str> {
-    motor.told().map(|told| told.action).collect()
+    motor.reported().map(|reported| reported.action).collect()
 }
 
 /// MIT bytes as a driver would make them.
@@ -124,7 +124,7 @@ fn parameters_are_read_written_and_saved() {
 }
 
 #[test]
-fn it_gives_up_when_nobody_speaks() {
+fn it_gives_up_when_nothing_is_sent() {
     let mut motor = motor();
     ask(&mut motor, 0x7ff, [0x05, 0, 0x55, 9, 0x10, 0x27, 0, 0], 0);
     ask(&mut motor, 0x05, ENABLE, 0);
@@ -132,9 +132,9 @@ fn it_gives_up_when_nobody_speaks() {
     assert_eq!(motor.tend(500 * MS), Some(900 * MS), "its patience begins with the last frame");
     assert_eq!(motor.tend(899 * MS), Some(900 * MS));
     assert_eq!(motor.tend(900 * MS), None);
-    let told = actions(&mut motor);
+    let reported = actions(&mut motor);
     let expected = ["motor_written", "motor_enabled", "commands_begin", "commands_end", "motor_timeout", "motor_fault"];
-    assert_eq!(told, expected);
+    assert_eq!(reported, expected);
     assert_eq!(ask(&mut motor, 0x05, ENABLE, 950)[0] >> 4, COMMUNICATION_LOST, "enabled with a fault");
     ask(&mut motor, 0x05, CLEAR, 960);
     assert_eq!(ask(&mut motor, 0x05, ENABLE, 970)[0] >> 4, 1);
@@ -150,7 +150,7 @@ fn a_disabled_motor_waits_for_ever() {
 }
 
 #[test]
-fn what_befalls_it_is_answered() {
+fn changes_to_it_are_answered() {
     let mut motor = motor();
     ask(&mut motor, 0x05, ENABLE, 0);
     motor.befall(Order::Hot(95), MS);
@@ -176,15 +176,15 @@ fn a_run_of_commands_is_summed_up() {
         ask(&mut motor, 0x05, mit(position, 10.0), ms);
     }
     motor.tend(145 * MS);
-    let told: Vec<Told> = motor.told().collect();
-    let end = &told.last().unwrap();
+    let reported: Vec<Reported> = motor.reported().collect();
+    let end = &reported.last().unwrap();
     assert_eq!(end.action, "commands_end");
     assert_eq!((&end.fields["count"], &end.fields["last_mono_ns"]), (&json!(4), &json!(45 * MS)));
     assert_eq!((&end.fields["longest_gap_ns"], &end.fields["motor"]), (&json!(25 * MS), &json!(5)));
     assert!((end.fields["largest_step"].as_f64().unwrap() - 0.3).abs() < 0.001);
 }
 
-/// Befalls it what a line of the script says.
+/// Applies a line of the script to it.
 fn befall(motor: &mut Motor, line: &str, ms: u64) {
     let mut words = line.split_whitespace();
     let (_, order) = crate::emu::order::parse(words.next().unwrap(), &mut words).expect("an order");

@@ -11,8 +11,8 @@ use crate::emu::descriptor::{Answer, CS_INTERFACE, Configuration, DeviceClass, S
 use crate::emu::function::DATA_IN;
 use crate::emu::order::Order;
 use crate::emu::pace::Pace;
+use crate::emu::reported::Reported;
 use crate::emu::talker::Talker;
-use crate::emu::told::Told;
 
 const DATA_OUT: u8 = 0x02;
 const NOTIFY_IN: u8 = 0x83;
@@ -40,7 +40,7 @@ pub struct Ecm {
     lidar: Option<Lidar>,
     linked: bool,
     notices: Vec<[u8; 8]>,
-    told: Vec<Told>,
+    reported: Vec<Reported>,
 }
 
 #[derive(Debug)]
@@ -51,7 +51,7 @@ struct Lidar {
 }
 
 impl Ecm {
-    /// An adapter with this behind it; a camera's address follows from its serial number. `first` tells adapters apart.
+    /// An adapter with this behind it; a camera's address follows from its serial number. `first` distinguishes adapters.
     pub fn new(net: &NetSpec, serial: &str, first: u32) -> Self {
         let gopro = net.gopro.map(|megabytes| Gopro::new(serial, megabytes));
         let address = gopro.as_ref().map_or(LIDAR_ADDRESS, Gopro::address);
@@ -64,7 +64,7 @@ impl Ecm {
             lidar: net.lidar.map(|hz| Lidar { hz, pace: None }),
             linked: true,
             notices: Vec::new(),
-            told: Vec::new(),
+            reported: Vec::new(),
         }
     }
 
@@ -154,14 +154,14 @@ impl Talker for Ecm {
     fn befall(&mut self, _motor: Option<u16>, order: Order, _now_ns: u64) -> bool {
         let Order::Link(linked) = order else { return false };
         self.link(linked);
-        self.told.push(Told::new("link", serde_json::json!({"linked": linked})));
+        self.reported.push(Reported::new("link", serde_json::json!({"linked": linked})));
         true
     }
 
-    fn told(&mut self, told: &mut Vec<Told>) {
-        told.append(&mut self.told);
+    fn reported(&mut self, reported: &mut Vec<Reported>) {
+        reported.append(&mut self.reported);
         if let Some(gopro) = &mut self.gopro {
-            told.extend(gopro.told());
+            reported.extend(gopro.reported());
         }
     }
 }

@@ -3,14 +3,14 @@
 //! Its address is 172.2X.1YZ.51 with XYZ the last three digits of its serial number, its port 8080.
 //! A clip that was stopped is there after it was finished, as on a real camera; until then it is busy.
 //!
-//! Invariant: every request is told to the log with its answer's status.
+//! Invariant: every request is logged with its answer's status.
 
 use std::net::Ipv4Addr;
 
 use serde_json::{Value, json};
 
 use super::http::{Body, Reply, Request};
-use crate::emu::told::Told;
+use crate::emu::reported::Reported;
 
 /// Port of its HTTP server.
 pub const PORT: u16 = 8080;
@@ -28,14 +28,14 @@ pub struct Gopro {
     encoding: bool,
     /// Clips that are there or will be: their number is their place plus one, and when they are finished.
     clips: Vec<u64>,
-    told: Vec<Told>,
+    reported: Vec<Reported>,
 }
 
 impl Gopro {
     /// A camera without a clip.
     pub fn new(serial: &str, megabytes: u32) -> Self {
         let clip_bytes = u64::from(megabytes) * 1_000_000;
-        Self { serial: serial.into(), clip_bytes, encoding: false, clips: Vec::new(), told: Vec::new() }
+        Self { serial: serial.into(), clip_bytes, encoding: false, clips: Vec::new(), reported: Vec::new() }
     }
 
     /// Its address; one without three digits at the end of its serial number has zeros for them.
@@ -49,13 +49,13 @@ impl Gopro {
     /// Answers a request.
     pub fn answer(&mut self, request: &Request, now_ns: u64) -> Reply {
         let reply = self.reply(request, now_ns);
-        self.told.push(Told::new("http", json!({"target": request.target, "status": reply.status})));
+        self.reported.push(Reported::new("http", json!({"target": request.target, "status": reply.status})));
         reply
     }
 
     /// What it has to tell since the last call.
-    pub fn told(&mut self) -> impl Iterator<Item = Told> + '_ {
-        self.told.drain(..)
+    pub fn reported(&mut self) -> impl Iterator<Item = Reported> + '_ {
+        self.reported.drain(..)
     }
 
     fn reply(&mut self, request: &Request, now_ns: u64) -> Reply {
@@ -188,9 +188,9 @@ mod tests {
         assert_eq!(ask(&mut gopro, "/gopro/media/info?path=100GOPRO/GX010002.MP4", 1_700).0, 404);
         let (_, list) = ask(&mut gopro, "/gopro/media/list", 1_700);
         assert_eq!(list["media"][0]["fs"], json!([{"n": "GX010001.MP4", "cre": "1", "mod": "1", "s": "2000000"}]));
-        let told: Vec<Told> = gopro.told().collect();
-        assert_eq!(told.len(), 14);
-        assert_eq!(told[0].fields, json!({"target": "/gopro/camera/control/wired_usb?p=1", "status": 200}));
+        let reported: Vec<Reported> = gopro.reported().collect();
+        assert_eq!(reported.len(), 14);
+        assert_eq!(reported[0].fields, json!({"target": "/gopro/camera/control/wired_usb?p=1", "status": 200}));
     }
 
     #[test]

@@ -134,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn a_part_of_a_clip_says_which() {
+    fn a_part_of_a_clip_is_named() {
         let head = Reply { status: 206, body: Body::Clip { number: 1, from: 10, size: 100 } }.head();
         assert!(
             head.contains("Content-Length: 90\r\n") && head.contains("Content-Range: bytes 10-99/100\r\n"),

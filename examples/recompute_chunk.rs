@@ -1,0 +1,152 @@
+//! Computes the first chunk of actions that a policy gave in an episode once more, from the recording alone.
+//!
+//!     recompute_chunk EPISODE [POLICY]
+//!
+//! The event of a chunk names the samples that it was computed from, the mask and the seed of its noise
+//! (docs/policies.md describes all of it). What is printed: the first numbers of the noise, and how far the chunk
+//! computed here is from the recorded one. POLICY is the folder of the policy; by default the one inside `rapid`.
+
+#![expect(clippy::print_stdout, reason = "what a program prints is for whoever started it")]
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::error::Error;
+use std::path::Path;
+
+use prost::Message;
+use rapid::mask::PhysicalMask;
+use rapid::policy::bundle::Bundle;
+use rapid::policy::library::Environment;
+use rapid::policy::model::Model;
+use rapid::policy::request::Request;
+use rapid::random::Random;
+use rapid::sample::{Encoding, SampleHeader};
+use serde::Deserialize;
+
+/// The stream of the seed that noise is drawn from: ASCII "policy".
+const NOISE: u64 = 0x706f_6c69_6379;
+
+/// `rapid.Event`, as far as it is needed.
+#[derive(Clone, PartialEq, Message)]
+struct EventMessage {
+    #[prost(string, tag = "2")]
+    kind: String,
+    #[prost(string, tag = "5")]
+    json: String,
+}
+
+/// `foxglove.CompressedImage` and `rapid.Scalars`: the payload is field 2 of both.
+#[derive(Clone, PartialEq, Message)]
+struct SampleMessage {
+    #[prost(bytes = "vec", tag = "2")]
+    payload: Vec<u8>,
+}
+
+#[derive(Deserialize)]
+struct Chunk {
+    tick: u64,
+    mask: String,
+    seed: u64,
+    samples: Vec<Observed>,
+    actions: Vec<f32>,
+}
+
+#[derive(Deserialize)]
+struct Observed {
+    modality: String,
+    seqs: Vec<u64>,
+}
+
+/// What the metadata record `rapid` says of a modality.
+#[derive(Deserialize)]
+struct Modality {
+    name: String,
+    topic: String,
+    shape: Vec<u32>,
+}
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let mut arguments = std::env::args_os().skip(1);
+    let file = arguments.next().ok_or("usage: recompute_chunk EPISODE [POLICY]")?;
+    let bytes = std::fs::read(&file)?;
+    let chunk = first_chunk(&bytes)?.ok_or("the episode holds no chunk: no policy ran while it was recorded")?;
+    let modalities = modalities(&bytes)?;
+
+    let bundle = Bundle::open(arguments.next().as_deref().map(Path::new))?;
+    let mut model = Model::load(&bundle, &Environment::open(None)?, None)?;
+    let mut request = Request::new(&bundle);
+    request.tick = chunk.tick;
+    request.seed = chunk.seed;
+    request.mask = PhysicalMask(u64::from_str_radix(chunk.mask.trim_start_matches("0x"), 16)?);
+    for (at, observed) in chunk.samples.iter().enumerate() {
+        let modality = modalities.iter().find(|modality| modality.name == observed.modality);
+        let modality = modality.ok_or_else(|| format!("{} is no modality of the episode", observed.modality))?;
+        let samples = samples(&bytes, &modality.topic, &observed.seqs)?;
+        // An absent modality has none.
+        request.set_present(at, !observed.seqs.is_empty());
+        for (step, seq) in observed.seqs.iter().enumerate() {
+            let payload = samples.get(seq).ok_or("a sample of the chunk is not in the episode: it began later")?;
+            let (encoding, width, height) = match *modality.shape.as_slice() {
+                [height, width] => (Encoding::Mjpeg, width, height),
+                _ => (Encoding::F64, 0, 0),
+            };
+            let header =
+                SampleHeader { seq: *seq, encoding: encoding as u32, width, height, ..SampleHeader::default() };
+            request.cell_mut(at, step).ok_or("the chunk is of another policy")?.set(&header, payload);
+        }
+    }
+
+    let mut computed = vec![0.0; model.chunk_len()];
+    let mut noise = computed.clone();
+    Random::new(chunk.seed, NOISE).fill_normal(&mut noise);
+    model.answer(&request, &mut computed)?;
+    if computed.len() != chunk.actions.len() {
+        return Err("the chunk is of another policy".into());
+    }
+    let apart = computed.iter().zip(&chunk.actions).map(|(one, other)| (one - other).abs()).fold(0.0, f32::max);
+    println!("tick {}, mask {}, seed {}", chunk.tick, chunk.mask, chunk.seed);
+    println!("noise begins {:?}", &noise[..noise.len().min(4)]);
+    println!("action 0, recorded {:?}", &chunk.actions[..bundle.action.len()]);
+    println!("action 0, computed {:?}", &computed[..bundle.action.len()]);
+    println!("largest difference of {} numbers: {apart:e}", computed.len());
+    Ok(())
+}
+
+/// The first chunk of the file.
+fn first_chunk(bytes: &[u8]) -> Result<Option<Chunk>, Box<dyn Error>> {
+    for message in mcap::MessageStream::new(bytes)? {
+        let message = message?;
+        if message.channel.topic == "/rapid/event" {
+            let event = EventMessage::decode(&*message.data)?;
+            if event.kind == "chunk" {
+                return Ok(Some(serde_json::from_str(&event.json)?));
+            }
+        }
+    }
+    Ok(None)
+}
+
+/// The modalities, from the metadata record `rapid`.
+fn modalities(bytes: &[u8]) -> Result<Vec<Modality>, Box<dyn Error>> {
+    let summary = mcap::Summary::read(bytes)?.ok_or("the episode is not finished: run rapid recover")?;
+    for index in &summary.metadata_indexes {
+        if index.name == "rapid" {
+            let record = mcap::read::metadata(bytes, index)?;
+            return Ok(serde_json::from_str(record.metadata.get("modalities").ok_or("no modalities")?)?);
+        }
+    }
+    Err("no metadata: the file is no episode".into())
+}
+
+/// The payloads of these samples of a topic. A message has the lower 32 bits of a sample's number.
+fn samples(bytes: &[u8], topic: &str, seqs: &[u64]) -> Result<BTreeMap<u64, Vec<u8>>, Box<dyn Error>> {
+    let wanted: BTreeSet<u64> = seqs.iter().copied().collect();
+    let mut found = BTreeMap::new();
+    for message in mcap::MessageStream::new(bytes)? {
+        let message = message?;
+        let seq = wanted.iter().find(|seq| **seq & 0xffff_ffff == u64::from(message.sequence));
+        if let (Some(seq), true) = (seq, message.channel.topic == topic) {
+            found.entry(*seq).or_insert(SampleMessage::decode(&*message.data)?.payload);
+        }
+    }
+    Ok(found)
+}

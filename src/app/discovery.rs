@@ -1,0 +1,62 @@
+//! Stage discovery: what is plugged in and unplugged, from the machine, the network or a scenario.
+
+use std::path::Path;
+
+use futures::StreamExt;
+use tokio::sync::mpsc;
+
+use super::stage::Stage;
+use super::{AppError, Devices};
+use crate::hotplug::HotplugStream;
+#[cfg(feature = "lan")]
+use crate::hotplug::lan::LanMonitor;
+use crate::hotplug::script::Script;
+use crate::hotplug::udev::UdevMonitor;
+use crate::registry::Registry;
+
+/// Created by udev's daemon when it starts.
+const UDEV: &str = "/run/udev/control";
+/// Events that may wait for the rig, which takes them at once.
+const DEPTH: usize = 64;
+
+/// Starts to watch; also what is handed to the rig, which ends when the stage does.
+///
+/// # Errors
+/// When plug events of this machine cannot be received.
+pub(super) fn start(devices: Devices, registry: &Registry) -> Result<(Stage, HotplugStream), AppError> {
+    let mut source = open(devices, registry)?;
+    let (events, to_rig) = mpsc::channel(DEPTH);
+    let stage = Stage::start("discovery", |stop| async move {
+        loop {
+            let event = tokio::select! {
+                biased;
+                () = stop.cancelled() => return Ok(()),
+                event = source.next() => event,
+            };
+            let Some(event) = event else { return Ok(()) };
+            // An error ends the rig, which reports it; no reader is left once the rig has ended.
+            if events.send(event).await.is_err() {
+                return Ok(());
+            }
+        }
+    });
+    let received = futures::stream::unfold(to_rig, |mut to_rig| async { Some((to_rig.recv().await?, to_rig)) });
+    Ok((stage, Box::pin(received)))
+}
+
+fn open(devices: Devices, registry: &Registry) -> Result<HotplugStream, AppError> {
+    if let Devices::Simulated(scenario) = devices {
+        return Ok(Box::pin(Script::new(scenario)));
+    }
+    #[cfg(feature = "motors")]
+    crate::driver::can::prepare(registry);
+    if !Path::new(UDEV).exists() {
+        tracing::warn!("no udev runs here ({UDEV} is missing): USB devices are not detected; start systemd-udevd");
+    }
+    let machine = UdevMonitor::open()?;
+    #[cfg(feature = "lan")]
+    if let Some(lan) = LanMonitor::open(registry) {
+        return Ok(Box::pin(futures::stream::select(machine, lan)));
+    }
+    Ok(Box::pin(machine))
+}

@@ -1,0 +1,173 @@
+//! Stage inference: the policy of a run, loaded beside everything else, started when what it requires is there, ended
+//! first.
+//!
+//! Invariant: it never starts without what it requires.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::time::{Instant, MissedTickBehavior, interval};
+use tokio_util::sync::CancellationToken;
+
+use super::AppError;
+use super::stage::Stage;
+use crate::bus::{Bus, Inbox, TopicId, Writer};
+use crate::mask::PhysicalMask;
+use crate::modality::ModalityId;
+use crate::policy::library::{Environment, LibraryError};
+use crate::policy::live::{Live, LiveOptions};
+use crate::policy::model::Model;
+use crate::policy::sampler::PolicyError;
+use crate::registry::Registry;
+use crate::status::{Board, Level, What};
+
+/// Devices attached at the start have this long to deliver.
+const SETTLE: Duration = Duration::from_secs(3);
+/// How often the mask is checked for that.
+const LOOK: Duration = Duration::from_millis(5);
+
+/// The policy of a run.
+#[derive(Debug)]
+pub struct PolicyOptions {
+    /// The policy, checked against the registry, and how it acts.
+    pub live: LiveOptions,
+    /// Wait for required devices instead of giving up.
+    pub wait: bool,
+    /// Denoising steps instead of the bundle's own.
+    pub denoising_steps: Option<usize>,
+    /// Library of onnxruntime instead of the built-in one.
+    pub library: Option<PathBuf>,
+}
+
+/// Why a policy cannot be loaded.
+#[derive(Debug, thiserror::Error)]
+pub enum LoadError {
+    /// onnxruntime.
+    #[error(transparent)]
+    Library(#[from] LibraryError),
+    /// The graphs.
+    #[error(transparent)]
+    Policy(#[from] PolicyError),
+}
+
+/// Starts the stage: it loads the policy and starts it when everything it requires is there; when it is to be recorded,
+/// after the episode has begun, so that everything it observed is in it.
+///
+/// # Errors
+/// When it cannot read the bus.
+pub(super) fn start(
+    options: PolicyOptions,
+    registry: &Arc<Registry>,
+    bus: &Bus,
+    board: &Arc<Board>,
+    is_recorded: bool,
+) -> Result<Stage, AppError> {
+    let flight = Flight {
+        required: required(&options, registry),
+        inbox: bus.inbox()?,
+        actions: bus.writer(TopicId::Action),
+        registry: Arc::clone(registry),
+        board: Arc::clone(board),
+        is_recorded,
+        options,
+    };
+    Ok(Stage::start("the policy", |stop| flight.run(stop)))
+}
+
+/// What must be there: the modalities the bundle requires, and what is moved.
+fn required(options: &PolicyOptions, registry: &Registry) -> Vec<(ModalityId, String)> {
+    let observed = options.live.bundle.observations.iter().filter(|observation| observation.required);
+    let moved = (!options.live.dry_run).then_some(&options.live.bundle.action.actuator);
+    let mut names: Vec<&String> = observed.map(|observation| &observation.modality).chain(moved).collect();
+    names.sort_unstable();
+    names.dedup();
+    names.into_iter().filter_map(|name| Some((registry.named(name)?.id, name.clone()))).collect()
+}
+
+/// A policy from its load to its end.
+struct Flight {
+    options: PolicyOptions,
+    required: Vec<(ModalityId, String)>,
+    inbox: Inbox,
+    actions: Option<Arc<Writer>>,
+    registry: Arc<Registry>,
+    board: Arc<Board>,
+    is_recorded: bool,
+}
+
+impl Flight {
+    async fn run(mut self, stop: CancellationToken) -> Result<(), AppError> {
+        let loaded = tokio::task::spawn_blocking({
+            let (bundle, named, steps) =
+                (Arc::clone(&self.options.live.bundle), self.options.library.clone(), self.options.denoising_steps);
+            move || -> Result<(Model, String), LoadError> {
+                let environment = Environment::open(named.as_deref())?;
+                let model = Model::load(&bundle, &environment, steps)?;
+                Ok((model, environment.origin.to_string()))
+            }
+        });
+        let (model, library) = tokio::select! {
+            biased;
+            () = stop.cancelled() => return Ok(()),
+            loaded = loaded => loaded.map_err(|_| AppError::Panicked("the policy"))??,
+        };
+        if !self.settled(&stop).await? {
+            return Ok(());
+        }
+        let Self { options: PolicyOptions { live, .. }, inbox, actions, registry, board, .. } = self;
+        board.announce(live.bundle.begins(library, live.dry_run));
+        let live = Live::start(live, model, &registry, inbox, actions, Arc::clone(&board))?;
+        let ended = live.ended();
+        tokio::select! {
+            () = stop.cancelled() => {}
+            () = ended.cancelled() => {}
+        }
+        let ended = tokio::task::spawn_blocking(move || live.stop()).await;
+        board.set_policy(None);
+        match ended {
+            Ok(Ok(())) if stop.is_cancelled() => Ok(()),
+            Ok(Err(thread)) => Err(AppError::Panicked(thread)),
+            // It ends by itself only when one of its threads is gone.
+            Ok(Ok(())) | Err(_) => Err(AppError::Panicked("the policy")),
+        }
+    }
+
+    /// Waits until everything required is there, and the episode that it is to be recorded in, if it is; `false` if the
+    /// run is to end before. Unless it is to wait for devices, a missing one is an error after [`SETTLE`].
+    // Exclusive, as what reads the bus cannot be shared between threads.
+    async fn settled(&mut self, stop: &CancellationToken) -> Result<bool, AppError> {
+        let begun = Instant::now();
+        let mut look = interval(LOOK);
+        look.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut is_reported = false;
+        loop {
+            tokio::select! {
+                biased;
+                () = stop.cancelled() => return Ok(false),
+                _ = look.tick() => {}
+            }
+            let missing = missing(&self.required, self.board.mask());
+            if missing.is_empty() {
+                if !self.is_recorded || self.board.is_recording() {
+                    return Ok(true);
+                }
+                continue;
+            }
+            if begun.elapsed() < SETTLE {
+                continue;
+            }
+            if !self.options.wait {
+                return Err(AppError::Required(missing.join(", ")));
+            }
+            if !std::mem::replace(&mut is_reported, true) {
+                let text = format!("the policy waits for {}", missing.join(", "));
+                self.board.announce(What::Log { level: Level::Warn, text });
+            }
+        }
+    }
+}
+
+fn missing(required: &[(ModalityId, String)], mask: PhysicalMask) -> Vec<&str> {
+    required.iter().filter(|(id, _)| !mask.contains(*id)).map(|(_, name)| name.as_str()).collect()
+}

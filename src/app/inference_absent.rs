@@ -1,0 +1,28 @@
+//! Stage inference of a program that was built without cargo feature `policy`: there is none to start.
+
+use std::sync::Arc;
+
+use super::AppError;
+use super::stage::Stage;
+use crate::bus::Bus;
+use crate::registry::Registry;
+use crate::status::Board;
+
+/// No policy can be given.
+#[derive(Debug)]
+pub enum PolicyOptions {}
+
+/// No policy is loaded.
+#[derive(Debug, thiserror::Error)]
+pub enum LoadError {}
+
+/// Starts nothing.
+pub(super) fn start(
+    options: PolicyOptions,
+    _: &Arc<Registry>,
+    _: &Bus,
+    _: &Arc<Board>,
+    _: bool,
+) -> Result<Stage, AppError> {
+    match options {}
+}

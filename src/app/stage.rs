@@ -1,0 +1,95 @@
+//! A stage of a run: a tokio task that owns whatever must block behind it.
+//!
+//! | stage       | its task                                          | what blocks behind it                        |
+//! |-------------|---------------------------------------------------|----------------------------------------------|
+//! | discovery   | reads hot-plug events and hands them to streaming  | nothing: netlink and mDNS sockets are polled |
+//! | streaming   | the rig: slots, mask, a task for each device       | thread `mask`, threads of drivers            |
+//! | recording   | waits for its thread and joins it                  | thread `writer`                              |
+//! | inference   | loads the policy, starts it and joins its threads  | threads `control` and `policy`               |
+//!
+//! Synchronisation is a pure function of samples and ticks ([`crate::sync`]), executed by recording and inference at
+//! their own ticks: a task between would add a hop and could only repeat what both compute from the same samples.
+//!
+//! Invariant: a stage that ended by itself and one that was stopped report how, once; a panic is an end like any other.
+//! Invariant: no stage blocks a worker of the runtime: threads are joined where blocking is allowed.
+
+use tokio::task::JoinHandle;
+use tokio_util::sync::CancellationToken;
+
+use super::AppError;
+
+/// A running stage.
+#[derive(Debug)]
+pub(super) struct Stage {
+    name: &'static str,
+    /// Until its outcome is taken.
+    task: Option<JoinHandle<Result<(), AppError>>>,
+    stop: CancellationToken,
+}
+
+impl Stage {
+    /// Starts the task, which is to end when the token it is given is cancelled.
+    pub(super) fn start<F>(name: &'static str, run: impl FnOnce(CancellationToken) -> F) -> Self
+    where
+        F: Future<Output = Result<(), AppError>> + Send + 'static,
+    {
+        let stop = CancellationToken::new();
+        Self { name, task: Some(tokio::spawn(run(stop.clone()))), stop }
+    }
+
+    /// Waits for the end of the task and takes the outcome; for ever if it is taken already. Cancel-safe.
+    pub(super) async fn outcome(&mut self) -> Result<(), AppError> {
+        let Some(task) = &mut self.task else { return std::future::pending().await };
+        let outcome = task.await;
+        self.task = None;
+        outcome.unwrap_or(Err(AppError::Panicked(self.name)))
+    }
+
+    /// Asks the task to end. Does not wait.
+    pub(super) fn ask_to_end(&self) {
+        self.stop.cancel();
+    }
+
+    /// Asks the task to end and waits; `Ok` if its outcome is taken already.
+    pub(super) async fn end(&mut self) -> Result<(), AppError> {
+        self.ask_to_end();
+        if self.task.is_some() { self.outcome().await } else { Ok(()) }
+    }
+}
+
+/// Joins a thread that is ending, where blocking is allowed.
+///
+/// # Errors
+/// When it panicked: `thread` names it.
+pub(super) async fn join(handle: std::thread::JoinHandle<()>, thread: &'static str) -> Result<(), AppError> {
+    let joined = tokio::task::spawn_blocking(move || handle.join()).await;
+    if let Ok(Ok(())) = joined { Ok(()) } else { Err(AppError::Panicked(thread)) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_stage_ends_when_asked_and_reports_once() {
+        let mut stage = Stage::start("test", |stop| async move {
+            stop.cancelled().await;
+            Err(AppError::Stuck)
+        });
+        assert!(matches!(stage.end().await, Err(AppError::Stuck)));
+        assert!(stage.end().await.is_ok());
+    }
+
+    #[tokio::test]
+    async fn a_panic_is_an_end_that_names_the_stage() {
+        let mut stage = Stage::start("test", |_| async { panic!("ordered") });
+        assert!(matches!(stage.outcome().await, Err(AppError::Panicked("test"))));
+    }
+
+    #[tokio::test]
+    async fn a_thread_that_panics_is_named() {
+        let thread = std::thread::spawn(|| panic!("ordered"));
+        assert!(matches!(join(thread, "thread `test`").await, Err(AppError::Panicked("thread `test`"))));
+        join(std::thread::spawn(|| ()), "thread `test`").await.unwrap();
+    }
+}

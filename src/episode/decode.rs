@@ -1,0 +1,265 @@
+//! The content of recorded messages, which are protobuf: the inverse of [`encode`](super::encode).
+//!
+//! Every message is read once, by hand, just the fields that are used; what other programs write into the
+//! same schemas is read too.
+//!
+//! Invariant: any bytes may stand in a message; one that is not whole, or not of its schema, is `None`, never a
+//! panic.
+//! Invariant: memory does not grow with what a message claims.
+
+use super::encode::EventText;
+use super::schema::SampleSchema;
+use super::wire::{Proto, whole_protobuf};
+use crate::mask::PhysicalMask;
+use crate::modality::{MAX_MODALITIES, ModalityId};
+use crate::sample::Encoding;
+
+/// What the messages of a channel hold.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Kind {
+    Sample(SampleSchema),
+    /// `rapid.Mask`.
+    Mask,
+    /// `rapid.Frame`.
+    Frame,
+    /// `rapid.Event`.
+    Event,
+    /// Not read by this program.
+    Other,
+}
+
+/// The content of a message.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Content<'a> {
+    Sample(Sample<'a>),
+    /// A publication of the mask.
+    Mask(PhysicalMask),
+    /// A tick of the frame index: one entry for each modality.
+    Frame(&'a [FrameSlot]),
+    Event(EventText<'a>),
+    /// A whole message of a channel of [`Kind::Other`].
+    Other,
+}
+
+/// A sample, as its device gave it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Sample<'a> {
+    /// How `payload` is encoded.
+    pub(crate) encoding: Encoding,
+    /// Pixels of a picture, or the count of numbers; 0 if unknown.
+    pub(crate) width: u32,
+    /// Pixels of a picture, else 0.
+    pub(crate) height: u32,
+    pub(crate) payload: &'a [u8],
+}
+
+/// One modality in a tick of the frame index.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct FrameSlot {
+    pub(crate) id: ModalityId,
+    pub(crate) present: bool,
+    /// A sample lies within the window.
+    pub(crate) valid: bool,
+    /// Present without such a sample.
+    pub(crate) stale: bool,
+    /// Age of the sample at the tick, ns; negative if it was captured after it.
+    pub(crate) age_ns: i64,
+}
+
+/// Memory for content that does not lie in the message as it is needed; used again for every message.
+#[derive(Debug, Default)]
+pub(crate) struct Scratch {
+    payload: Vec<u8>,
+    slots: Vec<FrameSlot>,
+}
+
+/// Reads a message of a channel of `kind`.
+pub(crate) fn content<'a>(kind: Kind, message: &'a [u8], scratch: &'a mut Scratch) -> Option<Content<'a>> {
+    Some(match kind {
+        Kind::Sample(schema) => Content::Sample(sample(schema, message, &mut scratch.payload)?),
+        Kind::Mask => Content::Mask(mask(message)?),
+        Kind::Frame => Content::Frame(frame(message, &mut scratch.slots)?),
+        Kind::Event => Content::Event(event(message)?),
+        Kind::Other => whole_protobuf(message).all(|field| field.is_some()).then_some(Content::Other)?,
+    })
+}
+
+/// The payload of one message of the schema named so, with its width and height.
+#[doc(hidden)]
+#[must_use]
+pub fn decode(schema: &str, message: &[u8]) -> Option<(Vec<u8>, u32, u32)> {
+    let mut scratch = Vec::new();
+    let sample = sample(SampleSchema::named(schema)?, message, &mut scratch)?;
+    Some((sample.payload.to_owned(), sample.width, sample.height))
+}
+
+fn sample<'a>(schema: SampleSchema, message: &'a [u8], scratch: &'a mut Vec<u8>) -> Option<Sample<'a>> {
+    match schema {
+        SampleSchema::CompressedImage => compressed(message),
+        SampleSchema::RawImage => raw(message, scratch),
+        SampleSchema::Scalars => scalars(message, scratch),
+        SampleSchema::Bytes => {
+            Some(Sample { encoding: Encoding::Bytes, width: 0, height: 0, payload: last_bytes(message, 2)? })
+        }
+    }
+}
+
+fn mask(message: &[u8]) -> Option<PhysicalMask> {
+    let mut mask = 0;
+    for field in whole_protobuf(message) {
+        if let (2, Proto::Fixed64(bits)) = field? {
+            mask = bits;
+        }
+    }
+    Some(PhysicalMask(mask))
+}
+
+fn frame<'a>(message: &[u8], slots: &'a mut Vec<FrameSlot>) -> Option<&'a [FrameSlot]> {
+    slots.clear();
+    for field in whole_protobuf(message) {
+        let (4, slot) = field? else { continue };
+        if slots.len() == MAX_MODALITIES {
+            return None;
+        }
+        slots.push(frame_slot(slot.bytes())?);
+    }
+    Some(slots)
+}
+
+fn frame_slot(message: &[u8]) -> Option<FrameSlot> {
+    let (mut bit, mut present, mut valid, mut stale, mut age_ns) = (0, false, false, false, 0);
+    for field in whole_protobuf(message) {
+        match field? {
+            (1, value) => bit = value.number(),
+            (2, value) => valid = value.number() != 0,
+            (3, value) => stale = value.number() != 0,
+            (4, value) => age_ns = value.zigzag(),
+            (6, value) => present = value.number() != 0,
+            _ => {}
+        }
+    }
+    Some(FrameSlot { id: ModalityId::new(u8::try_from(bit).ok()?)?, present, valid, stale, age_ns })
+}
+
+fn event(message: &[u8]) -> Option<EventText<'_>> {
+    let mut event = EventText::default();
+    for field in whole_protobuf(message) {
+        let (number, value) = field?;
+        let place = match number {
+            2 => &mut event.kind,
+            3 => &mut event.device,
+            4 => &mut event.text,
+            5 => &mut event.json,
+            _ => continue,
+        };
+        *place = str::from_utf8(value.bytes()).ok()?;
+    }
+    Some(event)
+}
+
+fn compressed(message: &[u8]) -> Option<Sample<'_>> {
+    if last_bytes(message, 3)? != b"jpeg" {
+        return None;
+    }
+    let payload = last_bytes(message, 2)?;
+    // A picture without a readable header is played as it was recorded.
+    let (width, height) = jpeg_size(payload).unwrap_or((0, 0));
+    Some(Sample { encoding: Encoding::Mjpeg, width, height, payload })
+}
+
+fn raw<'a>(message: &'a [u8], scratch: &'a mut Vec<u8>) -> Option<Sample<'a>> {
+    let (mut width, mut height, mut step, mut encoding, mut data) = (0, 0, 0, &[][..], &[][..]);
+    for field in whole_protobuf(message) {
+        match field? {
+            (2, Proto::Fixed32(number)) => width = number,
+            (3, Proto::Fixed32(number)) => height = number,
+            (4, Proto::Bytes(bytes)) => encoding = bytes,
+            (5, Proto::Fixed32(number)) => step = number,
+            (6, Proto::Bytes(bytes)) => data = bytes,
+            _ => {}
+        }
+    }
+    let (encoding, row) = match encoding {
+        b"yuyv" | b"yuv422_yuy2" => (Encoding::Yuyv, (width as usize).checked_mul(2)?),
+        b"mono8" | b"8UC1" => (Encoding::Grey, width as usize),
+        _ => return None,
+    };
+    let payload = if step as usize > row { without_padding(data, step as usize, row, height, scratch) } else { data };
+    Some(Sample { encoding, width, height, payload })
+}
+
+/// Of each line of `step` bytes the first `row`.
+fn without_padding<'a>(data: &[u8], step: usize, row: usize, height: u32, into: &'a mut Vec<u8>) -> &'a [u8] {
+    into.clear();
+    for line in data.chunks(step).take(height as usize) {
+        into.extend_from_slice(line.get(..row).unwrap_or(line));
+    }
+    into
+}
+
+/// Doubles lie in the message as the driver once gave them: little endian, packed one after another. Only those in
+/// several pieces are copied.
+fn scalars<'a>(message: &'a [u8], into: &'a mut Vec<u8>) -> Option<Sample<'a>> {
+    into.clear();
+    let mut last: &[u8] = &[];
+    for field in whole_protobuf(message) {
+        match field? {
+            (2, Proto::Bytes(packed)) if packed.len() % 8 == 0 => {
+                into.extend_from_slice(std::mem::replace(&mut last, packed));
+            }
+            (2, Proto::Fixed64(one)) => {
+                into.extend_from_slice(std::mem::take(&mut last));
+                into.extend_from_slice(&one.to_le_bytes());
+            }
+            (2, _) => return None,
+            _ => {}
+        }
+    }
+    let payload = if into.is_empty() {
+        last
+    } else {
+        into.extend_from_slice(last);
+        into
+    };
+    Some(Sample { encoding: Encoding::F64, width: u32::try_from(payload.len() / 8).ok()?, height: 0, payload })
+}
+
+/// The bytes of field `wished`; the last one counts, a missing one is empty.
+fn last_bytes(message: &[u8], wished: u64) -> Option<&[u8]> {
+    let mut found = &[][..];
+    for field in whole_protobuf(message) {
+        if let (number, Proto::Bytes(bytes)) = field?
+            && number == wished
+        {
+            found = bytes;
+        }
+    }
+    Some(found)
+}
+
+/// Width and height in a JPEG's frame header (ITU-T T.81, B.2.2): any SOF marker but DHT, JPG, DAC.
+fn jpeg_size(bytes: &[u8]) -> Option<(u32, u32)> {
+    let mut rest = bytes.strip_prefix(&[0xff, 0xd8])?;
+    loop {
+        let (&[0xff, marker], after) = rest.split_first_chunk()? else { return None };
+        // Fill bytes may stand before a marker.
+        if marker == 0xff {
+            rest = rest.get(1..)?;
+            continue;
+        }
+        let (&length, _) = after.split_first_chunk()?;
+        let segment = after.get(2..usize::from(u16::from_be_bytes(length)))?;
+        if matches!(marker, 0xc0..=0xcf) && !matches!(marker, 0xc4 | 0xc8 | 0xcc) {
+            let &[_, h1, h0, w1, w0] = segment.first_chunk()?;
+            return Some((u16::from_be_bytes([w1, w0]).into(), u16::from_be_bytes([h1, h0]).into()));
+        }
+        // Start of scan: no frame header follows.
+        if marker == 0xda {
+            return None;
+        }
+        rest = after.get(2 + segment.len()..)?;
+    }
+}
+
+#[cfg(test)]
+mod tests;

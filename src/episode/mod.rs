@@ -1,0 +1,108 @@
+//! Episodes as files: MCAP, read record by record, whole or not.
+//!
+//! What reads an episode, to tell of it, to repair it or to play it, reads it through a
+//! [`records::RecordIter`]; what only one of them needs is theirs.
+//!
+//! Invariant: no bytes make anything here panic, and memory holds one record of a file at a time.
+
+mod chunk;
+pub(crate) mod chunk_writer;
+pub(crate) mod decode;
+pub mod encode;
+mod failed;
+mod index;
+mod integrity;
+mod names;
+pub(crate) mod op;
+pub(crate) mod own;
+pub(crate) mod partial;
+pub(crate) mod reader;
+pub(crate) mod record_iter;
+pub mod recover;
+mod resync;
+pub mod schema;
+mod source;
+#[cfg(test)]
+pub(crate) mod testing;
+#[cfg(test)]
+mod tests;
+pub(crate) mod wire;
+
+pub use decode::decode;
+pub(crate) use failed::Failed;
+pub(crate) use integrity::Writer;
+pub(crate) use source::ReadAt;
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io;
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::{Path, PathBuf};
+
+use rustix::fs::OFlags;
+
+/// Topic of the frame index.
+pub(crate) const FRAME_TOPIC: &str = "/rapid/frame";
+/// Topic of events.
+pub(crate) const EVENT_TOPIC: &str = "/rapid/event";
+/// Topic of the log.
+pub(crate) const LOG_TOPIC: &str = "/rapid/log";
+
+/// Metadata record at an episode's beginning.
+pub(crate) const ABOUT: &str = "rapid";
+/// Metadata record at an episode's end.
+pub(crate) const SUMMARY: &str = "rapid/summary";
+/// Metadata record of an episode that was repaired.
+pub(crate) const RECOVERED: &str = "rapid/recovered";
+
+/// Key of [`RECOVERED`]: why the original's recorder called it BAD.
+pub(crate) const FAILED: &str = "failed";
+
+/// Key of [`ABOUT`]: the boot of the machine in which the episode was recorded.
+pub(crate) const BOOT_ID: &str = "boot_id";
+
+/// Pairs of text as MCAP's metadata have them.
+pub(crate) fn text_map<const N: usize>(pairs: [(&str, String); N]) -> BTreeMap<String, String> {
+    pairs.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
+}
+
+/// The present boot of this machine (proc(5)): within one boot the kernel keeps the order of writes, whatever becomes
+/// of the processes. `None` where the system does not provide it.
+pub(crate) fn boot_id() -> Option<String> {
+    let text = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").ok()?;
+    Some(text.trim().to_owned()).filter(|id| !id.is_empty())
+}
+
+/// Why a file cannot be read as an episode.
+#[derive(Debug, thiserror::Error)]
+pub enum ReadError {
+    /// It cannot be opened or read.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// The error of the system.
+        source: io::Error,
+    },
+    /// It is a folder, a pipe or a device.
+    #[error("{}: not a file; name an episode, a file that ends in .mcap or .mcap.partial", .0.display())]
+    NotFile(PathBuf),
+    /// It does not begin as an MCAP file does.
+    #[error("{}: not an MCAP file", .0.display())]
+    NotMcap(PathBuf),
+}
+
+/// Opens a file to be read, and its size in bytes. Pipes, devices and folders are refused without
+/// being opened: opening one may wait for ever, or do something.
+pub(crate) fn open(path: &Path) -> Result<(File, u64), ReadError> {
+    let io = |source| ReadError::Io { path: path.to_owned(), source };
+    let not_file = || ReadError::NotFile(path.to_owned());
+    if !std::fs::metadata(path).map_err(io)?.is_file() {
+        return Err(not_file());
+    }
+    let flags = OFlags::NONBLOCK.bits().cast_signed();
+    let file = File::options().read(true).custom_flags(flags).open(path).map_err(io)?;
+    // What has the name now may be another thing than what had it a moment ago.
+    let metadata = file.metadata().map_err(io)?;
+    if metadata.is_file() { Ok((file, metadata.len())) } else { Err(not_file()) }
+}

@@ -1,0 +1,357 @@
+//! The record that begins every chunk of an episode of ours: which episode the chunk belongs to, and what its channels
+//! are.
+//!
+//! A chunk need not repeat what an earlier one defines, and that one may be damaged; nor does MCAP record which file a
+//! chunk belongs to, and one that is found behind damage may be the payload of a message. The chunk's check value covers
+//! this record, so both are known wherever the chunk is right.
+//!
+//! Layout: private opcode [`op::OWN`], which other readers pass over; its content is [`MARK`], 16 bytes of the episode,
+//! then schema and channel records with their heads, each schema before the channels that need it.
+//!
+//! Which episode a file is follows from its metadata `rapid`, or from its first chunk, if everything before that is right.
+//! Otherwise from all of its right chunks, see [`Owners`].
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::io;
+
+use super::chunk::{Records, take};
+use super::integrity::{LARGEST_HEADER, Writer, writer};
+use super::op;
+use super::record_iter::{HEAD, MAGIC, RecordIter};
+use super::source::{ReadAt, Source};
+use super::wire::Fields;
+use super::{ABOUT, BOOT_ID};
+
+/// Distinguishes the record from another program's of the same opcode.
+const MARK: [u8; 8] = *b"rapid/1\n";
+/// Bytes of definitions that are repeated in every chunk; no more, or a hostile file would grow without bound when it is
+/// repaired. An episode of 64 devices has about 30 KiB.
+const LARGEST: usize = 256 << 10;
+
+/// Identifies an episode among all that may lie in one file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct EpisodeId([u8; 16]);
+
+impl EpisodeId {
+    /// Of the episode that begins now: ns since 1970, and ns of the monotonic clock, which no two have alike.
+    pub(crate) fn new(wall_ns: u64, monotonic_ns: u64) -> Self {
+        Self((u128::from(wall_ns) << 64 | u128::from(monotonic_ns)).to_le_bytes())
+    }
+
+    /// Of the episode whose metadata [`ABOUT`] are these.
+    pub(crate) fn of(about: &BTreeMap<String, String>) -> Option<Self> {
+        let number = |key: &str| about.get(key)?.parse().ok();
+        Some(Self::new(number("begin_wall_ns")?, number("begin_monotonic_ns")?))
+    }
+}
+
+/// Which episode the chunks of a file belong to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(super) enum Owner {
+    #[default]
+    Unknown,
+    /// Whose file it is is being looked for: every chunk counts.
+    Any,
+    /// No right chunk names one: the file is another program's, or is older than this record.
+    Unnamed,
+    Episode(EpisodeId),
+}
+
+impl Owner {
+    pub(super) fn of(episode: Option<EpisodeId>) -> Self {
+        episode.map_or(Self::Unnamed, Self::Episode)
+    }
+}
+
+/// The record of an episode that is being written.
+#[derive(Debug)]
+pub(crate) struct Own {
+    content: Vec<u8>,
+    known: BTreeSet<(u8, u16)>,
+}
+
+impl Own {
+    /// Of an episode without channels.
+    pub(crate) fn new(episode: EpisodeId) -> Self {
+        Self { content: [&MARK[..], &episode.0].concat(), known: BTreeSet::new() }
+    }
+
+    /// The record's content.
+    pub(crate) fn content(&self) -> &[u8] {
+        &self.content
+    }
+
+    /// The record's content without the definitions.
+    pub(crate) fn episode(&self) -> &[u8] {
+        self.content.get(..MARK.len() + 16).unwrap_or_default()
+    }
+
+    /// Adds the definition whose record has this content, unless its number is known. Those beyond [`LARGEST`] bytes are
+    /// left out.
+    pub(crate) fn define(&mut self, opcode: u8, record: &[u8]) {
+        let Some(id) = Fields(record).u16() else { return };
+        if self.content.len() + record.len() <= LARGEST && self.known.insert((opcode, id)) {
+            self.content.push(opcode);
+            self.content.extend((record.len() as u64).to_le_bytes());
+            self.content.extend(record);
+        }
+    }
+}
+
+/// Is this private record's content ours?
+pub(crate) fn is(content: &[u8]) -> bool {
+    content.starts_with(&MARK)
+}
+
+/// The record's episode and its definitions, if the first of these records is one.
+fn first(records: &[u8]) -> Option<(EpisodeId, Fields<'_>)> {
+    let (opcode, content) = take(&mut Fields(records))?;
+    let rest = content.strip_prefix(&MARK).filter(|_| opcode == op::OWN)?;
+    let (episode, definitions) = rest.split_first_chunk()?;
+    Some((EpisodeId(*episode), Fields(definitions)))
+}
+
+impl<R: ReadAt> RecordIter<R> {
+    /// The episode that the chunks shown so far belong to; `None` also if they name none.
+    pub(crate) fn episode(&self) -> Option<EpisodeId> {
+        match self.names.owner {
+            Owner::Episode(episode) => Some(episode),
+            Owner::Unknown | Owner::Any | Owner::Unnamed => None,
+        }
+    }
+
+    /// Is the file an episode of ours, as far as anything in it shows?
+    pub(super) fn is_episode(&mut self) -> io::Result<bool> {
+        self.look_for_owner()?;
+        Ok(matches!(self.names.owner, Owner::Episode(_) | Owner::Any))
+    }
+
+    /// Do these records name an episode of ours?
+    pub(super) fn is_owned(&self, records: &Records) -> bool {
+        first(self.bytes(records)).is_some()
+    }
+
+    pub(super) fn bytes(&self, records: &Records) -> &[u8] {
+        let bytes = if records.unpacked { &self.unpacked } else { &self.buffer };
+        bytes.get(records.range.clone()).unwrap_or_default()
+    }
+
+    /// Learns from a right chunk, where the records of this file lie; `false`: it is not this file's.
+    pub(super) fn learn(&mut self, records: &Records) -> io::Result<bool> {
+        let owner = Owner::of(first(self.bytes(records)).map(|(episode, _)| episode));
+        if self.names.owner == Owner::Unknown {
+            // The metadata at the beginning name the episode; without them its first chunk does.
+            let is_named = self.names.named.is_none_or(|named| owner == Owner::Episode(named));
+            if self.checked && is_named {
+                self.names.owner = owner;
+            } else {
+                self.look_for_owner()?;
+            }
+        }
+        if matches!(self.names.owner, Owner::Episode(_)) && self.names.owner != owner {
+            self.integrity.left_out.other_chunks += 1;
+            self.checked = false;
+            return Ok(false);
+        }
+        let bytes = if records.unpacked { &self.unpacked } else { &self.buffer };
+        let bytes = bytes.get(records.range.clone()).unwrap_or_default();
+        if self.names.owner == Owner::Any {
+            self.names.owners.take(owner, bytes);
+        }
+        let mut definitions = first(bytes).map_or(Fields(&[]), |(_, definitions)| definitions);
+        while let Some((opcode, data)) = take(&mut definitions) {
+            self.names.wait(opcode, data);
+        }
+        Ok(true)
+    }
+
+    /// What the file states about itself at its beginning.
+    pub(super) fn remember(&mut self, opcode: u8) {
+        if opcode != op::METADATA || self.begin_ns.is_some() {
+            return;
+        }
+        let Some(about) = about(&self.buffer) else { return };
+        self.begin_ns = about.get("begin_wall_ns").and_then(|ns| ns.parse().ok());
+        self.same_boot = self.boot.is_some() && about.get(BOOT_ID) == self.boot.as_ref();
+        // What stands behind damage may be another file's.
+        self.names.named = if self.checked && !self.chunked { EpisodeId::of(&about) } else { None };
+    }
+
+    /// Are these records, found behind damage, this file's? Where no chunk names an episode, it is those that contradict
+    /// nothing.
+    pub(super) fn is_own(&mut self, records: &Records) -> io::Result<bool> {
+        let owner = Owner::of(first(self.bytes(records)).map(|(episode, _)| episode));
+        self.look_for_owner()?;
+        Ok(match self.names.owner {
+            Owner::Any => true,
+            known @ Owner::Episode(_) => known == owner,
+            Owner::Unnamed if owner != Owner::Unnamed => false,
+            Owner::Unnamed | Owner::Unknown => self.is_consistent(self.bytes(records)),
+        })
+    }
+
+    /// Reads the file once more, for whose it is, unless that is known or was looked for.
+    fn look_for_owner(&mut self) -> io::Result<()> {
+        if self.names.owner != Owner::Unknown {
+            return Ok(());
+        }
+        self.names.owner = Owner::Unnamed;
+        let Some(mut records) = RecordIter::begin(self.source.again(), Some(Owner::Any))? else { return Ok(()) };
+        while records.advance()? {}
+        let owners = records.names.owners;
+        let is_foreign = self.integrity.writer == Writer::Another;
+        self.names.owner = owners.owner(self.names.named, self.checked, is_foreign, &mut self.source)?;
+        Ok(())
+    }
+
+    /// Where the episode begins of which a chunk was found, if its beginning stands before that, behind something else.
+    pub(super) fn beginning(&mut self) -> io::Result<Option<u64>> {
+        let Some(episode) = self.episode() else { return Ok(None) };
+        let begun = beginnings(&mut self.source, self.at)?;
+        Ok(begun.into_iter().find_map(|(at, begun)| (begun == episode).then_some(at)))
+    }
+}
+
+/// The metadata [`ABOUT`], if the content of a metadata record is those.
+fn about(content: &[u8]) -> Option<BTreeMap<String, String>> {
+    let mut fields = Fields(content);
+    fields.string().filter(|name| *name == ABOUT)?;
+    fields.map()
+}
+
+/// The episode that each [`MARK`] in `bytes` behind the first names.
+fn marks(bytes: &[u8]) -> impl Iterator<Item = EpisodeId> {
+    let mut rest = bytes;
+    std::iter::from_fn(move || {
+        while let Some(at) = rest.iter().position(|byte| *byte == MARK[0]) {
+            let here = rest.get(at..)?;
+            rest = here.get(1..)?;
+            if let Some((episode, _)) = here.strip_prefix(&MARK).and_then(<[u8]>::split_first_chunk) {
+                return Some(EpisodeId(*episode));
+            }
+        }
+        None
+    })
+}
+
+/// Episodes that are distinguished in a file, and beginnings that are looked at.
+const MOST: usize = 64;
+/// Metadata at a beginning have less.
+const LARGEST_ABOUT: u64 = 4 << 20;
+
+/// The episodes of the right chunks of a file: whose it is in which chunks of several lie. One may be the payload of a
+/// message of another, or all of them lie in an archive.
+///
+/// 1. The metadata at its undamaged beginning name it.
+/// 2. An episode is not the file if it lies within a right chunk of another.
+/// 3. An episode that has its own beginning in the file lies in it; one whose beginning is lost is the file. Of several
+///    it is the last: what lies in a message of an episode is followed by the rest of that episode.
+/// 4. If each has its own, the file is an archive, and the first is taken.
+///
+/// Not decidable, and then 3. and 4. may name the inner one: the outer beginning is lost, no right chunk of the outer
+/// episode holds the inner one, and none follows it.
+#[derive(Debug, Default)]
+pub(super) struct Owners {
+    /// By their first chunk.
+    seen: Vec<Seen>,
+    /// Chunks so far.
+    chunks: u64,
+    /// Those that lie within a chunk of another.
+    nested: Vec<EpisodeId>,
+    is_unnamed: bool,
+}
+
+#[derive(Debug)]
+struct Seen {
+    episode: EpisodeId,
+    /// Number of its last chunk.
+    last: u64,
+}
+
+impl Owners {
+    /// Takes a right chunk of an episode.
+    pub(super) fn take(&mut self, owner: Owner, records: &[u8]) {
+        self.chunks += 1;
+        let itself = if let Owner::Episode(episode) = owner { Some(episode) } else { None };
+        for inner in marks(records).filter(|inner| Some(*inner) != itself) {
+            if self.nested.len() < MOST && !self.nested.contains(&inner) {
+                self.nested.push(inner);
+            }
+        }
+        let Some(episode) = itself else {
+            self.is_unnamed = true;
+            return;
+        };
+        let last = self.chunks;
+        if let Some(seen) = self.seen.iter_mut().find(|seen| seen.episode == episode) {
+            seen.last = last;
+        } else if self.seen.len() < MOST {
+            self.seen.push(Seen { episode, last });
+        }
+    }
+
+    /// Whose file it is. `named`: what the metadata at its beginning name; `checked`: what was read so far is right;
+    /// `is_foreign`: its header names another program.
+    pub(super) fn owner<R: ReadAt>(
+        self,
+        named: Option<EpisodeId>,
+        checked: bool,
+        is_foreign: bool,
+        source: &mut Source<R>,
+    ) -> io::Result<Owner> {
+        // Behind damage a chunk of another episode is a message's; before any it is the file's, which contradicts itself.
+        let is_there = |named: &EpisodeId| self.seen.iter().any(|seen| seen.episode == *named);
+        if let Some(named) = named.filter(|named| is_there(named) || !checked && !self.is_unnamed) {
+            return Ok(Owner::Episode(named));
+        }
+        let outer: Vec<&Seen> = self.seen.iter().filter(|seen| !self.nested.contains(&seen.episode)).collect();
+        if self.is_unnamed && (is_foreign || outer.is_empty()) {
+            return Ok(Owner::Unnamed);
+        }
+        let begun = if outer.len() > 1 { beginnings(source, u64::MAX)? } else { Vec::new() };
+        let is_begun = |seen: &Seen| begun.iter().any(|(_, episode)| *episode == seen.episode);
+        let lost = outer.iter().filter(|seen| !is_begun(seen)).max_by_key(|seen| seen.last);
+        let owner = lost.or(outer.first()).copied().or(self.seen.first());
+        Ok(Owner::of(owner.map(|seen| seen.episode)))
+    }
+}
+
+/// Where episodes begin that have a name of their own: magic number, header and metadata, before `end`.
+fn beginnings<R: ReadAt>(source: &mut Source<R>, end: u64) -> io::Result<Vec<(u64, EpisodeId)>> {
+    let (mut at, mut begun) = (0, Vec::new());
+    while at < end && begun.len() < MOST {
+        let window = source.peek(at, MAGIC.len())?;
+        if window.len() < MAGIC.len() {
+            break;
+        }
+        let places = window.len() - MAGIC.len() + 1;
+        let is_magic = |place: &usize| window.get(*place..).is_some_and(|bytes| bytes.starts_with(&MAGIC));
+        let Some(place) = (0..places).find(is_magic) else {
+            at += places as u64;
+            continue;
+        };
+        at += place as u64;
+        begun.extend(beginning(source, at)?.map(|episode| (at, episode)));
+        at += MAGIC.len() as u64;
+    }
+    Ok(begun)
+}
+
+/// The episode that begins at `at`.
+fn beginning<R: ReadAt>(source: &mut Source<R>, at: u64) -> io::Result<Option<EpisodeId>> {
+    let mut content = Vec::new();
+    let mut at = at + MAGIC.len() as u64;
+    for wanted in [op::HEADER, op::METADATA] {
+        let mut head = Fields(source.peek(at, 9)?);
+        let (Some(opcode), Some(length)) = (head.u8(), head.u64()) else { return Ok(None) };
+        let largest = if wanted == op::HEADER { LARGEST_HEADER } else { LARGEST_ABOUT };
+        if opcode != wanted || length > largest || !source.read(at + HEAD, length, &mut content)? {
+            return Ok(None);
+        }
+        if wanted == op::HEADER && writer(&content) != Writer::Rapid {
+            return Ok(None);
+        }
+        at += HEAD + length;
+    }
+    Ok(about(&content).and_then(|about| EpisodeId::of(&about)))
+}

@@ -1,0 +1,69 @@
+//! A file that is being written or repaired: its lock, and its final name, which is given once and never taken from
+//! another file.
+//!
+//! The lock is an advisory one of the open file (flock): it ends with the process that holds it, however that
+//! ends, and copies of the handle share it.
+//!
+//! Invariant: whoever writes a `.partial`, repairs it or takes it away holds its lock.
+
+use std::fs::{File, TryLockError};
+use std::io;
+use std::os::unix::fs::MetadataExt;
+use std::path::Path;
+
+use crate::folder::{Folder, Links, Missing};
+
+/// Extension of a file that is not finished.
+pub(crate) const PARTIAL: &str = "partial";
+
+/// Whose a file is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Lock {
+    /// Ours, as long as the handle or a copy of it is open.
+    Ours,
+    /// Somebody else writes or repairs it.
+    Others,
+    /// The name has gone, or means another file by now.
+    Gone,
+    /// This file system knows no locks.
+    Unknown,
+}
+
+/// Tries to take the lock of `file`, which was opened as `path`. Never waits.
+pub(crate) fn take(file: &File, path: &Path) -> io::Result<Lock> {
+    match file.try_lock() {
+        Ok(()) => {}
+        Err(TryLockError::WouldBlock) => return Ok(Lock::Others),
+        // A file system without locks gives one of a dozen errors.
+        Err(TryLockError::Error(error)) => {
+            tracing::debug!(path = %path.display(), %error, "no lock");
+            return Ok(Lock::Unknown);
+        }
+    }
+    // Between opening and locking another program may have finished and removed it.
+    let ours = file.metadata()?;
+    Ok(match std::fs::symlink_metadata(path) {
+        Ok(named) if (named.dev(), named.ino()) == (ours.dev(), ours.ino()) => Lock::Ours,
+        Ok(_) => Lock::Gone,
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Lock::Gone,
+        Err(error) => return Err(error),
+    })
+}
+
+/// Gives a file its final name, in the same folder, which must be free, and waits for the name to be
+/// on the disk where the file system can be asked for that.
+pub(crate) fn publish(file: &Path, name: &Path) -> io::Result<()> {
+    let folder = Folder::open(name.parent().unwrap_or(Path::new("")), Links::Own, Missing::Refused);
+    rename(&folder.map_err(io::Error::from)?, file, name)
+}
+
+/// [`publish`] in a folder that is open.
+pub(crate) fn rename(folder: &Folder, file: &Path, name: &Path) -> io::Result<()> {
+    let part = |path: &'_ Path| path.file_name().unwrap_or_default().to_owned();
+    folder.rename_new(&part(file), &part(name))?;
+    // The file has its name: what remains is what a loss of power right now would do to it.
+    if let Err(error) = folder.sync() {
+        tracing::warn!(folder = %folder.path().display(), %error, "folder not synced");
+    }
+    Ok(())
+}

@@ -1,0 +1,279 @@
+//! Copying: from what can be read of a file to a whole one.
+//!
+//! Channels and schemas keep their numbers, messages their order; what the reader of the file leaves out is
+//! counted.
+
+use std::cell::{Cell, RefCell};
+use std::fs::File;
+use std::io;
+use std::ops::ControlFlow;
+use std::path::PathBuf;
+
+use mcap::McapError;
+use sha2::{Digest, Sha256};
+
+use super::super::chunk_writer::{Channel, ChunkWriter, Sink, io_error};
+use super::super::reader::Entry;
+use super::super::record_iter::{Record, RecordIter, op};
+use super::report;
+use super::{Repaired, Watch, summary::Summary};
+use crate::episode::{Failed, RECOVERED, ReadAt, SUMMARY, own};
+use crate::{text, time};
+
+/// Bytes read between two calls of a [`Watch`]; what is read in vain, in search of a chunk, counts too.
+const WATCH_EVERY: u64 = 1 << 20;
+/// Bytes read at once where only their hash is wanted.
+const PIECE: usize = 256 << 10;
+
+/// Why copying ended.
+#[derive(Debug)]
+pub(super) enum Error {
+    Read(io::Error),
+    Write(io::Error),
+    Interrupted,
+}
+
+/// Facts about the repair itself.
+#[derive(Debug, Clone)]
+pub(super) struct About<'a> {
+    /// The original.
+    pub(super) name: &'a str,
+    /// Its SHA-256, hexadecimal.
+    pub(super) sha256: String,
+    /// Wall time now.
+    pub(super) time_ns: u64,
+    /// The present boot, if that is to prove what was written last: see [`RecordIter::of_boot`].
+    pub(super) boot: Option<String>,
+    /// What the original's recorder wrote behind it.
+    pub(super) failed: Option<&'a Failed>,
+}
+
+/// A whole file was written.
+#[derive(Debug)]
+pub(super) struct Copied {
+    pub(super) summary: Summary,
+    /// What it holds and lacks; its name and that of the original are whoever asked for it to add.
+    pub(super) repaired: Repaired,
+    /// Nothing of the original is left out but a torn end.
+    pub(super) is_lossless: bool,
+}
+
+/// What a file holds. `None`: no MCAP file.
+pub(super) fn summary(file: impl ReadAt, size: u64, watch: &mut Watch<'_>) -> Result<Option<Summary>, Error> {
+    let file = Watched::new(file, size, watch);
+    let Some(mut records) = RecordIter::new(&file, size).map_err(|error| file.error(error))? else { return Ok(None) };
+    let mut summary = Summary::default();
+    while let Some(record) = records.next().map_err(|error| file.error(error))? {
+        if let Some(entry) = Entry::read(record) {
+            summary.take(&entry);
+        }
+        file.done.set(records.integrity().bytes);
+    }
+    summary.integrity(&records.integrity());
+    Ok(Some(summary))
+}
+
+/// Writes to `sink` a whole file of what can be read of `file`, `size` bytes long. Returns once it is on the disk.
+/// `None`: no MCAP file.
+pub(super) fn copy(
+    file: impl ReadAt,
+    size: u64,
+    about: &About<'_>,
+    sink: impl Sink,
+    watch: &mut Watch<'_>,
+) -> Result<Option<Copied>, Error> {
+    let file = Watched::new(file, size, watch);
+    let recorded = about.failed.map_or(size, |failed| failed.at);
+    let Some(records) = RecordIter::new(&file, recorded).map_err(|error| file.error(error))? else { return Ok(None) };
+    let mut records = records.of_boot(about.boot.clone());
+    let mut copy = Copy::new(sink, about.failed.map(|failed| failed.why.clone()))?;
+    while records.advance().map_err(|error| file.error(error))? {
+        // As in the original, one damaged byte costs no more than one of its chunks.
+        if records.integrity().bytes != file.done.get() {
+            copy.writer.part().map_err(|error| Error::Write(io_error(error)))?;
+        }
+        copy.writer.belong(records.episode());
+        copy.take(records.record())?;
+        file.done.set(records.integrity().bytes);
+    }
+    let integrity = records.integrity();
+    let repaired = Repaired {
+        to: PathBuf::new(),
+        seconds: copy.summary.seconds(),
+        messages: copy.summary.messages,
+        end: integrity.end,
+        unread_bytes: integrity.unread(recorded),
+        damaged_chunks: integrity.damaged_chunks,
+        left_out: integrity.left_out,
+        nameless: records.nameless().clone(),
+        ordered_messages: integrity.ordered_messages,
+        refused_records: copy.refused,
+        // Or of the file from which that one was made.
+        failed: copy.failed.take().or_else(|| copy.summary.failed.take()),
+        last: time::rfc3339(copy.summary.last_ns),
+        original: None,
+    };
+    let is_lossless = integrity.is_all() && copy.refused == 0;
+    let copied = Copied { summary: copy.summary, repaired, is_lossless };
+    finish(copy.writer, &copied, about, size)?;
+    Ok(Some(copied))
+}
+
+/// Writes what stands at the end of a repaired file, and the end itself.
+fn finish<S: Sink>(mut writer: ChunkWriter<S>, copied: &Copied, about: &About<'_>, size: u64) -> Result<(), Error> {
+    let finished = (|| {
+        if !copied.summary.has_end {
+            writer.metadata(SUMMARY, report::end(&copied.summary))?;
+        }
+        writer.metadata(RECOVERED, report::recovered(copied, about, size))
+    })();
+    finished.map_err(|error| Error::Write(io_error(error)))?;
+    writer.finish().map_err(Error::Write)
+}
+
+/// The SHA-256 of the first `size` bytes of `file`, hexadecimal.
+pub(super) fn sha256(file: &File, size: u64, watch: &mut Watch<'_>) -> Result<String, Error> {
+    let file = Watched::new(file, size, watch);
+    let (mut hasher, mut piece) = (Sha256::new(), vec![0; PIECE]);
+    let mut done = 0;
+    while done < size {
+        let count = usize::try_from(size - done).unwrap_or(usize::MAX).min(PIECE);
+        let Some(room) = piece.get_mut(..count) else { break };
+        let read = match file.read_at(room, done) {
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
+            read => read.map_err(|error| file.error(error))?,
+        };
+        if read == 0 {
+            break;
+        }
+        hasher.update(room.get(..read).unwrap_or_default());
+        done += read as u64;
+        file.done.set(done);
+    }
+    Ok(text::hexadecimal(&hasher.finalize()))
+}
+
+/// The whole file that repair makes of `bytes`, which may be any; `None` if they are no MCAP file.
+/// Nothing of it touches a disk, and nothing proves what a torn chunk holds.
+#[must_use]
+pub fn recover_bytes(bytes: &[u8]) -> Option<Vec<u8>> {
+    let size = bytes.len() as u64;
+    let about = About { name: "bytes.mcap", sha256: String::new(), time_ns: 0, boot: None, failed: None };
+    let mut whole = Vec::new();
+    // Memory takes what is written to it.
+    copy(bytes, size, &about, &mut whole, &mut |_, _| ControlFlow::Continue(())).ok()??;
+    Some(whole)
+}
+
+/// A file that has its [`Watch`] called while it is read, for whatever purpose.
+struct Watched<'a, 'w, R> {
+    file: R,
+    size: u64,
+    /// Bytes understood so far.
+    done: Cell<u64>,
+    /// Bytes read since the last call.
+    read: Cell<u64>,
+    interrupted: Cell<bool>,
+    watch: RefCell<&'a mut Watch<'w>>,
+}
+
+impl<'a, 'w, R> Watched<'a, 'w, R> {
+    fn new(file: R, size: u64, watch: &'a mut Watch<'w>) -> Self {
+        let (done, read, interrupted) = (Cell::default(), Cell::default(), Cell::default());
+        Self { file, size, done, read, interrupted, watch: RefCell::new(watch) }
+    }
+
+    /// What an error of reading means.
+    fn error(&self, error: io::Error) -> Error {
+        if self.interrupted.get() { Error::Interrupted } else { Error::Read(error) }
+    }
+}
+
+impl<R: ReadAt> ReadAt for Watched<'_, '_, R> {
+    fn read_at(&self, buffer: &mut [u8], at: u64) -> io::Result<usize> {
+        let read = self.file.read_at(buffer, at)?;
+        self.read.set(self.read.get() + read as u64);
+        if self.read.get() >= WATCH_EVERY {
+            self.read.set(0);
+            let called = self.watch.try_borrow_mut().map(|mut watch| watch(self.done.get(), self.size));
+            self.interrupted.set(matches!(called, Ok(ControlFlow::Break(()))));
+        }
+        // Not the kind that is tried again.
+        if self.interrupted.get() { Err(io::Error::other("interrupted")) } else { Ok(read) }
+    }
+}
+
+/// The file being written.
+struct Copy<S: Sink> {
+    writer: ChunkWriter<S>,
+    /// Why the original's recorder called it BAD.
+    failed: Option<String>,
+    summary: Summary,
+    refused: u64,
+}
+
+impl<S: Sink> Copy<S> {
+    fn new(sink: S, failed: Option<String>) -> Result<Self, Error> {
+        let writer = ChunkWriter::new(sink, None).map_err(Error::Write)?;
+        Ok(Self { writer, failed, summary: Summary::default(), refused: 0 })
+    }
+
+    /// Writes a record; one that makes no sense as it stands is counted.
+    fn take(&mut self, record: Record<'_>) -> Result<(), Error> {
+        let Some(entry) = Entry::read(record) else {
+            self.refused += 1;
+            return Ok(());
+        };
+        let written = match &entry {
+            Entry::Schema { id, name, encoding, data } => self.writer.schema(Some(*id), name, encoding, data).map(drop),
+            Entry::Channel { id, schema, topic, encoding, metadata } => {
+                self.channel(*id, &Channel { schema: *schema, topic, encoding, metadata })
+            }
+            Entry::Message { header, data } => self.writer.message(header, data),
+            Entry::Attachment(attachment) => self.writer.attach(attachment),
+            Entry::Metadata { name, map: Some(map) } => {
+                let failed = self.failed.as_ref().filter(|_| *name == SUMMARY).map(|why| report::failed(why));
+                let map = map.clone().into_iter().chain(failed.into_iter().flatten()).collect();
+                self.writer.metadata(name, map)
+            }
+            Entry::Metadata { map: None, .. } => {
+                self.refused += 1;
+                return Ok(());
+            }
+            // The copy has chunks of its own.
+            Entry::Other if record.opcode >= op::PRIVATE && !(record.opcode == op::OWN && own::is(record.data)) => {
+                self.writer.private(record.opcode, record.data)
+            }
+            // The container's own, which has no place in a chunk.
+            Entry::Other => return Ok(()),
+        };
+        match written {
+            Ok(()) => {
+                self.summary.take(&entry);
+                Ok(())
+            }
+            Err(
+                McapError::ConflictingSchemas(_)
+                | McapError::ConflictingChannels(_)
+                | McapError::InvalidSchemaId
+                | McapError::UnknownChannel(..),
+            ) => {
+                self.refused += 1;
+                Ok(())
+            }
+            Err(error) => Err(Error::Write(io_error(error))),
+        }
+    }
+
+    fn channel(&mut self, id: u16, channel: &Channel<'_>) -> Result<(), McapError> {
+        let added = match self.writer.channel(Some(id), channel) {
+            // Better a channel that cannot be decoded than none.
+            Err(McapError::UnknownSchema(..)) => {
+                self.refused += 1;
+                self.writer.channel(Some(id), &Channel { schema: 0, ..*channel })
+            }
+            added => added,
+        };
+        added.map(drop)
+    }
+}

@@ -1,0 +1,47 @@
+//! Repair in the background.
+
+use super::super::tests::{names, put, recorded};
+use super::*;
+use crate::episode::testing::strictly;
+use crate::record::tests::registry;
+
+#[tokio::test]
+async fn in_the_background_a_folder_is_repaired_and_reported() {
+    let (folder, bytes) = recorded().await;
+    put(&folder, "a_001.mcap.partial", &bytes[..bytes.len() / 2]);
+    put(&folder, "a_002.mcap.partial", b"");
+    let busy = put(&folder, "a_003.mcap.partial", &bytes[..bytes.len() / 2]);
+    put(&folder, "a_004.mcap", &bytes[..100]);
+    let held = File::open(&busy).unwrap();
+    held.lock().unwrap();
+    let board = Arc::new(Board::new(&registry()));
+    let mut events = board.events();
+    let repairs = Repairs::start(folder.path().to_owned(), Some(1 << 20), Arc::clone(&board)).unwrap();
+    let mut said = Vec::new();
+    for _ in 0..3 {
+        said.push(events.recv().await.unwrap().what);
+    }
+    let What::Recovered { file, messages, text, .. } = &said[0] else { panic!("{said:?}") };
+    assert_eq!((file, strictly(&fs::read(file).unwrap()).len() as u64), (&folder.path().join("a_001.mcap"), *messages));
+    assert!(text.contains("a_001.mcap.partial: repaired, "), "{text}");
+    assert!(matches!(&said[1], What::Log { text, .. } if text.ends_with("a_002.mcap.partial: of no bytes; removed")));
+    assert!(matches!(&said[2], What::Log { text, .. } if text.contains("a_003.mcap.partial: another rapid")));
+    drop(repairs);
+    // A finished file is left alone.
+    assert_eq!(names(folder.path()), ["a_001.mcap", "a_003.mcap.partial", "a_004.mcap"]);
+    assert!(Repairs::start(folder.path().join("missing"), None, board).is_ok());
+}
+
+#[tokio::test]
+async fn a_repair_in_the_background_leaves_the_room_of_an_episode() {
+    let (folder, bytes) = recorded().await;
+    let partial = put(&folder, "a_001.mcap.partial", &bytes[..bytes.len() / 2]);
+    let free = Disk::of(&File::open(folder.path()).unwrap()).unwrap().free;
+    let board = Arc::new(Board::new(&registry()));
+    let mut events = board.events();
+    // Three quarters of what is free: a repair would fit, and an episode be warned of.
+    let _repairs = Repairs::start(folder.path().to_owned(), Some(free / 4 * 3), board).unwrap();
+    let What::Log { text, .. } = events.recv().await.unwrap().what else { panic!() };
+    assert!(text.contains("a_001.mcap.partial: not repaired: it takes ") && text.contains("; make room and"), "{text}");
+    assert!(partial.exists());
+}

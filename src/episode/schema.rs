@@ -1,0 +1,110 @@
+//! Schemas of what is recorded, written into every file. They are compiled from the `.proto` files beside them; the test
+//! `schemas_are_those_of_their_proto_files` says how.
+
+use crate::modality::ModalityKind;
+use crate::registry::{DeviceSpec, NodeSpec, PixelFormat};
+use crate::sample::{Encoding, SampleHeader};
+
+/// Message encoding and schema encoding of every channel.
+pub const PROTOBUF: &str = "protobuf";
+
+/// A schema: the name of its message and the `FileDescriptorSet` that describes it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Schema {
+    /// Fully qualified name of the message.
+    pub name: &'static str,
+    /// Serialized `google.protobuf.FileDescriptorSet`, imports included.
+    pub data: &'static [u8],
+}
+
+macro_rules! schema {
+    ($name:literal) => {
+        Schema {
+            name: $name,
+            data: include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/src/episode/proto/", $name, ".bin")),
+        }
+    };
+}
+
+/// `foxglove.Log`.
+pub const LOG: Schema = schema!("foxglove.Log");
+/// `rapid.Event`.
+pub const EVENT: Schema = schema!("rapid.Event");
+/// `rapid.Frame`.
+pub const FRAME: Schema = schema!("rapid.Frame");
+/// `rapid.Mask`.
+pub const MASK: Schema = schema!("rapid.Mask");
+
+/// How the samples of a modality are written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SampleSchema {
+    /// `foxglove.CompressedImage`.
+    CompressedImage,
+    /// `foxglove.RawImage`.
+    RawImage,
+    /// `rapid.Scalars`.
+    Scalars,
+    /// `rapid.Bytes`.
+    Bytes,
+}
+
+impl SampleSchema {
+    /// How many there are.
+    pub const COUNT: usize = 4;
+
+    /// The schema itself.
+    #[must_use]
+    pub const fn schema(self) -> Schema {
+        match self {
+            Self::CompressedImage => schema!("foxglove.CompressedImage"),
+            Self::RawImage => schema!("foxglove.RawImage"),
+            Self::Scalars => schema!("rapid.Scalars"),
+            Self::Bytes => schema!("rapid.Bytes"),
+        }
+    }
+
+    /// The schema of this name.
+    #[must_use]
+    pub fn named(name: &str) -> Option<Self> {
+        [Self::CompressedImage, Self::RawImage, Self::Scalars, Self::Bytes]
+            .into_iter()
+            .find(|schema| schema.schema().name == name)
+    }
+
+    /// Position in arrays with one entry a schema.
+    #[must_use]
+    pub const fn index(self) -> usize {
+        self as usize
+    }
+
+    /// What the registry lets expect of a device.
+    #[must_use]
+    pub fn expected(device: &DeviceSpec) -> Self {
+        match &device.node {
+            NodeSpec::Camera(camera) => match camera.format {
+                PixelFormat::Mjpg => Self::CompressedImage,
+                PixelFormat::Yuyv | PixelFormat::Grey => Self::RawImage,
+            },
+            NodeSpec::Serial(_) | NodeSpec::Process(_) | NodeSpec::Can(_) | NodeSpec::Lan(_) => {
+                match device.modality().kind {
+                    ModalityKind::Scalars => Self::Scalars,
+                    // A program's raw pictures get a channel of their own when the first one comes.
+                    ModalityKind::Image => Self::CompressedImage,
+                    ModalityKind::Bytes => Self::Bytes,
+                }
+            }
+        }
+    }
+
+    /// What a sample can be written as without losing a byte: a payload that does not match its header is
+    /// written as bytes.
+    #[must_use]
+    pub fn of(header: &SampleHeader, payload: &[u8]) -> Self {
+        match Encoding::from_raw(header.encoding) {
+            Some(Encoding::Mjpeg) => Self::CompressedImage,
+            Some(Encoding::Yuyv | Encoding::Grey) => Self::RawImage,
+            Some(Encoding::F64) if payload.len().is_multiple_of(8) => Self::Scalars,
+            Some(Encoding::F64 | Encoding::Bytes | Encoding::Mask) | None => Self::Bytes,
+        }
+    }
+}

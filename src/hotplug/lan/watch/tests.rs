@@ -1,0 +1,74 @@
+use proptest::prelude::*;
+
+use super::*;
+
+const LENGTH: Duration = Duration::from_nanos(3);
+
+#[derive(Debug, Clone, Copy)]
+enum Step {
+    /// Heard of at this moment.
+    Heard(u64),
+    /// Looked at.
+    Look(u64),
+    /// Goodbye, or the link is down.
+    End(u64),
+}
+use Step::{End, Heard, Look};
+
+fn play(lease: &mut Lease, step: Step) -> Option<Change> {
+    match step {
+        Heard(at) => lease.heard(Stamp(at)),
+        Look(at) => lease.look(Stamp(at)),
+        End(at) => lease.end(Stamp(at)),
+    }
+}
+
+#[test]
+fn a_lease_is_renewed_expires_and_restarts() {
+    let table: &[(&str, &[Step], &[&str])] = &[
+        ("never there", &[Look(5), End(6), Look(100)], &[]),
+        ("there, once", &[Heard(1), Heard(2), Heard(2)], &["came"]),
+        ("held while it is heard of", &[Heard(1), Look(3), Heard(3), Look(5)], &["came"]),
+        ("over at its end, once", &[Heard(1), Look(4), Look(9)], &["came", "went"]),
+        ("an older answer does not shorten it", &[Heard(5), Heard(2), Look(7)], &["came"]),
+        ("a goodbye ends it at once", &[Heard(1), End(2), Look(9)], &["came", "went"]),
+        (
+            "an answer from before the goodbye says nothing",
+            &[Heard(1), End(4), Heard(3), Heard(5)],
+            &["came", "went", "came"],
+        ),
+        ("and again", &[Heard(1), Look(9), Heard(10), Look(13)], &["came", "went", "came", "went"]),
+    ];
+    for (name, steps, expected) in table {
+        let mut lease = Lease::new(LENGTH);
+        let told = steps.iter().filter_map(|step| play(&mut lease, *step));
+        let told: Vec<_> = told.map(|change| if change == Change::Came { "came" } else { "went" }).collect();
+        assert_eq!(told, *expected, "{name}");
+    }
+}
+
+proptest! {
+    #[test]
+    fn arrivals_and_departures_take_turns(steps in prop::collection::vec((0_u64..4, 0_u8..3), 0..200)) {
+        let mut lease = Lease::new(LENGTH);
+        let (mut now, mut heard, mut there) = (1, 0, false);
+        for (later, kind) in steps {
+            now += later;
+            let change = play(&mut lease, [Heard(now), Look(now), End(now)][usize::from(kind)]);
+            if kind == 0 && (there || change.is_some()) {
+                heard = now;
+            }
+            match change {
+                Some(Change::Came) => { prop_assert!(!there); there = true; }
+                Some(Change::Went) => {
+                    prop_assert!(there);
+                    prop_assert!(kind == 2 || now >= heard + 3, "let go within the lease");
+                    there = false;
+                }
+                None => prop_assert!(kind != 1 || !there || now < heard + 3, "held beyond the lease"),
+            }
+            prop_assert_eq!(lease.is_there(), there);
+            prop_assert_eq!(lease.ends().is_some(), there);
+        }
+    }
+}

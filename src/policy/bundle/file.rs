@@ -1,0 +1,290 @@
+//! The contents of `policy.json` as serde reads them: objects that the file describes differently from `spec`, and
+//! values with a smaller range than their types.
+
+use std::ops::Range;
+
+use serde::Deserialize;
+use serde::de::{Deserializer, Error, IgnoredAny, IntoDeserializer};
+use serde_json::{Map, Value};
+
+use super::spec::{ColorOrder, Operation};
+use crate::text;
+
+/// Most actions in a chunk, and values of an action.
+const MAX_ACTION: i64 = 1024;
+/// Longest side of a picture, pixels.
+type Side = Whole<1, 8192>;
+/// Numbers of a vector.
+const MAX_VALUES: i64 = 4096;
+
+/// The file without the objects in it, which are read one by one.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Head {
+    #[serde(rename = "format")]
+    _format: IgnoredAny,
+    #[serde(deserialize_with = "name")]
+    pub(super) name: String,
+    pub(super) mask_aware: bool,
+    pub(super) n_obs_steps: Whole<1, 64>,
+    pub(super) horizon: Whole<1, MAX_ACTION>,
+    pub(super) n_action_steps: Whole<1, MAX_ACTION>,
+    pub(super) action_start: Whole<0, { MAX_ACTION - 1 }>,
+    pub(super) control_hz: f64,
+    pub(super) max_observation_age_ms: Whole<1, 60_000>,
+    #[serde(rename = "observations")]
+    _observations: Vec<IgnoredAny>,
+    #[serde(rename = "mask")]
+    _mask: IgnoredAny,
+    #[serde(rename = "action")]
+    _action: IgnoredAny,
+    #[serde(rename = "scheduler")]
+    _scheduler: IgnoredAny,
+    #[serde(rename = "graphs")]
+    _graphs: IgnoredAny,
+    pub(super) training: Map<String, Value>,
+}
+
+/// One of `observations`, by its `kind`.
+#[derive(Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(super) enum ObservationFile {
+    Image(ImageFile),
+    Vector(VectorFile),
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ImageFile {
+    #[serde(deserialize_with = "name")]
+    pub(super) key: String,
+    #[serde(deserialize_with = "name")]
+    pub(super) modality: String,
+    pub(super) required: bool,
+    pub(super) shape: [Side; 3],
+    #[serde(deserialize_with = "word")]
+    pub(super) color: ColorOrder,
+    #[serde(deserialize_with = "size")]
+    pub(super) resize: Option<[usize; 2]>,
+    #[serde(deserialize_with = "size")]
+    pub(super) crop: Option<[usize; 2]>,
+    #[serde(deserialize_with = "word_or_null")]
+    pub(super) operation: Option<Operation>,
+    pub(super) normalization: Value,
+    /// Observations are one tick of the control grid apart.
+    #[serde(default, rename = "down_sample_steps")]
+    _down_sample_steps: Option<Whole<1, 1>>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct VectorFile {
+    #[serde(deserialize_with = "name")]
+    pub(super) key: String,
+    #[serde(deserialize_with = "name")]
+    pub(super) modality: String,
+    pub(super) required: bool,
+    pub(super) shape: [Whole<1, MAX_VALUES>; 1],
+    #[serde(default, deserialize_with = "some_slice")]
+    pub(super) slice: Option<Range<usize>>,
+    pub(super) normalization: Value,
+    /// Observations are one tick of the control grid apart.
+    #[serde(default, rename = "down_sample_steps")]
+    _down_sample_steps: Option<Whole<1, 1>>,
+    /// Null: values are taken as they are.
+    #[serde(default, rename = "rotation")]
+    _rotation: (),
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct MaskFile {
+    #[serde(deserialize_with = "name")]
+    pub(super) input: String,
+    #[serde(deserialize_with = "names")]
+    pub(super) order: Vec<String>,
+    #[serde(rename = "absent", deserialize_with = "word")]
+    _absent: Absent,
+}
+
+/// The embedding of an absent modality.
+#[derive(Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Absent {
+    ZeroEmbedding,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ActionFile {
+    #[serde(deserialize_with = "name")]
+    pub(super) actuator: String,
+    pub(super) shape: [Whole<1, MAX_ACTION>; 1],
+    #[serde(deserialize_with = "names")]
+    pub(super) names: Vec<String>,
+    #[serde(deserialize_with = "names")]
+    pub(super) units: Vec<String>,
+    #[serde(deserialize_with = "word")]
+    pub(super) representation: Representation,
+    pub(super) limits: Value,
+    pub(super) normalization: Vec<Value>,
+    /// Null: values are taken as they are.
+    #[serde(default, rename = "rotation")]
+    _rotation: (),
+}
+
+/// What the values of an action are relative to. Only absolute ones are executed.
+#[derive(PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(super) enum Representation {
+    Absolute,
+    Relative,
+    Delta,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Limits {
+    #[serde(deserialize_with = "numbers")]
+    pub(super) min: Vec<f32>,
+    #[serde(deserialize_with = "numbers")]
+    pub(super) max: Vec<f32>,
+}
+
+/// The `slice` of a normalisation of an action, which is read apart from the rest.
+#[derive(Deserialize)]
+pub(super) struct Sliced {
+    #[serde(deserialize_with = "slice")]
+    pub(super) slice: Range<usize>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Graphs {
+    pub(super) encoder: Value,
+    pub(super) denoiser: Value,
+}
+
+/// A whole number from `MIN` to `MAX`.
+#[derive(Debug, Clone, Copy, Deserialize)]
+#[serde(try_from = "i64")]
+pub(super) struct Whole<const MIN: i64, const MAX: i64>(usize);
+
+impl<const MIN: i64, const MAX: i64> Whole<MIN, MAX> {
+    pub(super) const fn get(self) -> usize {
+        self.0
+    }
+}
+
+impl<const MIN: i64, const MAX: i64> TryFrom<i64> for Whole<MIN, MAX> {
+    type Error = String;
+
+    fn try_from(number: i64) -> Result<Self, String> {
+        let found = usize::try_from(number).ok().filter(|_| (MIN..=MAX).contains(&number));
+        found.map(Self).ok_or_else(|| match MAX - MIN {
+            0 => format!("{number} is not supported, only {MIN} is"),
+            _ => format!("{number} is not within {MIN} and {MAX}"),
+        })
+    }
+}
+
+/// A number that an f32 can hold.
+#[derive(Deserialize)]
+#[serde(try_from = "f64")]
+struct Float(f32);
+
+impl TryFrom<f64> for Float {
+    type Error = String;
+
+    #[expect(clippy::cast_possible_truncation, reason = "what becomes infinite is refused")]
+    fn try_from(number: f64) -> Result<Self, String> {
+        let float = number as f32;
+        float
+            .is_finite()
+            .then_some(Self(float))
+            .ok_or_else(|| format!("{number:e} is beyond the range of a 32-bit float"))
+    }
+}
+
+/// Text that can be shown and is not empty.
+#[derive(Deserialize)]
+#[serde(try_from = "String")]
+struct Name(String);
+
+impl TryFrom<String> for Name {
+    type Error = &'static str;
+
+    fn try_from(name: String) -> Result<Self, Self::Error> {
+        match name.as_str() {
+            "" => Err("is empty"),
+            shown if text::plain(shown) != shown => Err("contains control characters"),
+            _ => Ok(Self(name)),
+        }
+    }
+}
+
+pub(super) fn name<'de, D: Deserializer<'de>>(value: D) -> Result<String, D::Error> {
+    Name::deserialize(value).map(|name| name.0)
+}
+
+fn names<'de, D: Deserializer<'de>>(value: D) -> Result<Vec<String>, D::Error> {
+    Vec::<Name>::deserialize(value).map(|names| names.into_iter().map(|name| name.0).collect())
+}
+
+pub(super) fn numbers<'de, D: Deserializer<'de>>(value: D) -> Result<Vec<f32>, D::Error> {
+    Vec::<Float>::deserialize(value).map(|numbers| numbers.into_iter().map(|number| number.0).collect())
+}
+
+/// `[height, width]` or null.
+fn size<'de, D: Deserializer<'de>>(value: D) -> Result<Option<[usize; 2]>, D::Error> {
+    Option::<[Side; 2]>::deserialize(value).map(|size| size.map(|sides| sides.map(Whole::get)))
+}
+
+/// `[begin, end]`, end not included, not empty.
+fn slice<'de, D: Deserializer<'de>>(value: D) -> Result<Range<usize>, D::Error> {
+    let [begin, end] = <[Whole<0, MAX_VALUES>; 2]>::deserialize(value)?.map(Whole::get);
+    if begin < end { Ok(begin..end) } else { Err(D::Error::custom(format!("[{begin}, {end}] is empty"))) }
+}
+
+fn some_slice<'de, D: Deserializer<'de>>(value: D) -> Result<Option<Range<usize>>, D::Error> {
+    slice(value).map(Some)
+}
+
+pub(super) fn whole<'de, D: Deserializer<'de>, const MIN: i64, const MAX: i64>(value: D) -> Result<usize, D::Error> {
+    Whole::<MIN, MAX>::deserialize(value).map(Whole::get)
+}
+
+/// A variant of an enum without values, by its name; serde alone would take `{name: null}` as well.
+pub(super) fn word<'de, D: Deserializer<'de>, T: Deserialize<'de>>(value: D) -> Result<T, D::Error> {
+    T::deserialize(String::deserialize(value)?.into_deserializer())
+}
+
+/// The same, or null. Without such a function a key of type `Option` could be left out.
+fn word_or_null<'de, D: Deserializer<'de>, T: Deserialize<'de>>(value: D) -> Result<Option<T>, D::Error> {
+    let given = Option::<String>::deserialize(value)?;
+    given.map(|given| T::deserialize(given.into_deserializer())).transpose()
+}
+
+pub(super) fn file_name<'de, D: Deserializer<'de>>(value: D) -> Result<String, D::Error> {
+    let file = name(value)?;
+    if file.contains(['/', '\\']) || file.starts_with('.') {
+        return Err(D::Error::custom(format!("\"{file}\" is not a plain file name")));
+    }
+    Ok(file)
+}
+
+pub(super) fn sha256<'de, D: Deserializer<'de>>(value: D) -> Result<String, D::Error> {
+    let sha256 = name(value)?;
+    if sha256.len() != 64 || !sha256.bytes().all(|byte| byte.is_ascii_hexdigit()) {
+        return Err(D::Error::custom(format!("\"{sha256}\" is not a SHA-256")));
+    }
+    Ok(sha256.to_ascii_lowercase())
+}
+
+/// For a variant without keys of its own: none may be given.
+pub(super) fn no_keys<'de, D: Deserializer<'de>>(value: D) -> Result<(), D::Error> {
+    #[derive(Deserialize)]
+    #[serde(deny_unknown_fields)]
+    struct Empty {}
+    Empty::deserialize(value).map(|Empty {}| ())
+}

@@ -1,0 +1,365 @@
+//! The text of `policy.json` to a [`Bundle`]: what the types cannot express is checked here, such as lengths that must agree.
+
+use std::ops::{Range, RangeInclusive};
+use std::path::PathBuf;
+use std::time::Duration;
+
+use serde::de::DeserializeOwned;
+use serde_json::Value;
+
+use super::file::{
+    ActionFile, Graphs, Head, ImageFile, Limits, MaskFile, ObservationFile, Representation, Sliced, VectorFile, Whole,
+};
+use super::read::{Problems, Strict, read, read_tagged};
+use super::spec::{
+    Bundle, BundleAction, BundleErrors, ImageSpec, MaskSpec, Normalization, ObservationInput, ObservationSpec,
+    SchedulerSpec, SliceNormalization, TimestepSpacing, VectorSpec,
+};
+use crate::registry::did_you_mean;
+
+/// What `format` must be.
+const FORMAT: &str = "rapid-policy/1";
+/// Channels of every picture.
+const CHANNELS: usize = 3;
+/// Smaller ones are lost in a 32-bit float's 1 - beta.
+const BETAS: RangeInclusive<f64> = 1e-6..=0.999;
+
+/// Reads `text`; `file` is how it is named in messages. The folder and the hash are the caller's.
+pub(super) fn parse(text: &str, file: &str) -> Result<Bundle, BundleErrors> {
+    let mut problems = Problems::new(file);
+    let bundle = match serde_json::from_str(text) {
+        Ok(Strict(value)) => root(&value, &mut problems),
+        Err(error) => {
+            report_syntax(text, &error, &mut problems);
+            None
+        }
+    };
+    if bundle.is_none() {
+        // Of what is not there the reason has been reported; should it not have been, this is it.
+        problems.report_first("cannot be read", "compare it with the description of the format");
+    }
+    problems.check()?;
+    bundle.ok_or(BundleErrors { diagnostics: Vec::new() })
+}
+
+fn report_syntax(text: &str, error: &serde_json::Error, problems: &mut Problems) {
+    let line = text.lines().nth(error.line().saturating_sub(1)).unwrap_or_default();
+    let fix = if ["NaN", "Infinity"].iter().any(|word| line.contains(word)) {
+        "JSON has no NaN and no Infinity: the statistics it was exported with are not finite, compute them again"
+    } else {
+        "correct it, or export the bundle again"
+    };
+    let message = error.to_string();
+    let message = message.split(" at line ").next().unwrap_or_default();
+    problems.report_at((error.line(), error.column()), "", &format!("not JSON: {message}"), fix);
+}
+
+fn root(value: &Value, problems: &mut Problems) -> Option<Bundle> {
+    // Of another format nothing else is known.
+    if let Some(format) = value.get("format").filter(|format| *format != FORMAT) {
+        let fix = format!("this program reads \"{FORMAT}\": export the bundle for it");
+        problems.report("format", format!("is {format}"), fix);
+        return None;
+    }
+    let head: Option<Head> = read("", value, problems);
+    if let Some(head) = &head {
+        check_head(head, problems);
+    }
+    let observations = value.get("observations").and_then(|value| observations(value, problems));
+    let mask = match value.get("mask")? {
+        Value::Null => Some(None),
+        value => read("mask", value, problems).map(|mask| Some(check_mask(mask, problems))),
+    };
+    if let (Some(observations), Some(mask), Some(head)) = (&observations, &mask, &head) {
+        check_mask_fits(observations, mask.as_ref(), head.mask_aware, problems);
+    }
+    let action = section(value, "action", problems).and_then(|action| check_action(action, problems));
+    let scheduler = section(value, "scheduler", problems);
+    if let Some(scheduler) = &scheduler {
+        check_scheduler(scheduler, problems);
+    }
+    let graphs = section(value, "graphs", problems);
+    let graphs = graphs.map(|Graphs { encoder, denoiser }| {
+        (read("graphs.encoder", &encoder, problems), read("graphs.denoiser", &denoiser, problems))
+    });
+    let (head, (encoder, denoiser)) = (head?, graphs?);
+    Some(Bundle {
+        folder: PathBuf::new(),
+        inside: false,
+        hash: String::new(),
+        name: head.name,
+        mask_aware: head.mask_aware,
+        n_obs_steps: head.n_obs_steps.get(),
+        horizon: head.horizon.get(),
+        n_action_steps: head.n_action_steps.get(),
+        action_start: head.action_start.get(),
+        control_hz: head.control_hz,
+        max_observation_age: Duration::from_millis(head.max_observation_age_ms.get() as u64),
+        observations: observations?,
+        mask: mask?,
+        action: action?,
+        scheduler: scheduler?,
+        encoder: encoder?,
+        denoiser: denoiser?,
+        training: Value::Object(head.training),
+    })
+}
+
+fn section<T: DeserializeOwned>(root: &Value, name: &str, problems: &mut Problems) -> Option<T> {
+    read(name, root.get(name)?, problems)
+}
+
+fn check_range(entry: &str, number: f64, range: &RangeInclusive<f64>, problems: &mut Problems) {
+    if !range.contains(&number) {
+        problems.wrong(entry, format!("{number} is not within {} and {}", range.start(), range.end()));
+    }
+}
+
+fn check_length(entry: &str, numbers: &[f32], len: usize, problems: &mut Problems) -> bool {
+    if numbers.len() != len {
+        let plural = if len == 1 { "" } else { "s" };
+        problems.wrong(entry, format!("has {} numbers for {len} dimension{plural}", numbers.len()));
+    }
+    numbers.len() == len
+}
+
+fn check_head(head: &Head, problems: &mut Problems) {
+    let (horizon, start, steps) = (head.horizon.get(), head.action_start.get(), head.n_action_steps.get());
+    match horizon.checked_sub(start) {
+        None | Some(0) => problems.wrong("action_start", format!("{start} lies beyond the horizon of {horizon}")),
+        Some(left) if steps > left => {
+            let message = format!("is {steps}, but from action_start = {start} to horizon = {horizon} are {left}");
+            problems.wrong("n_action_steps", message);
+        }
+        Some(_) => {}
+    }
+    check_range("control_hz", head.control_hz, &(0.1..=1000.0), problems);
+}
+
+fn observations(value: &Value, problems: &mut Problems) -> Option<Vec<ObservationSpec>> {
+    let list = value.as_array()?;
+    if list.is_empty() {
+        problems.wrong("observations", "is empty");
+    }
+    let mut found: Vec<ObservationSpec> = Vec::with_capacity(list.len());
+    for (at, value) in list.iter().enumerate() {
+        let entry = format!("observations[{at}]");
+        let Some(observation) = observation(&entry, value, problems) else { continue };
+        if found.iter().any(|earlier| earlier.key == observation.key) {
+            let fix = "give each observation a key of its own, as the encoder's inputs have";
+            problems.report(
+                &format!("{entry}.key"),
+                format!("another observation has the key \"{}\"", observation.key),
+                fix,
+            );
+        }
+        found.push(observation);
+    }
+    (found.len() == list.len()).then_some(found)
+}
+
+fn observation(entry: &str, value: &Value, problems: &mut Problems) -> Option<ObservationSpec> {
+    let (key, modality, required, numbers, len, input) = match read_tagged(entry, "kind", value, problems)? {
+        ObservationFile::Image(file) => {
+            let input = ObservationInput::Image(check_image(entry, &file, problems));
+            (file.key, file.modality, file.required, file.normalization, CHANNELS, input)
+        }
+        ObservationFile::Vector(file) => {
+            let vector = check_vector(entry, &file, problems);
+            let len = vector.len;
+            (file.key, file.modality, file.required, file.normalization, len, ObservationInput::Vector(vector))
+        }
+    };
+    let normalization = normalization(&format!("{entry}.normalization"), &numbers, Some(len), problems)?;
+    Some(ObservationSpec { key, modality, required, input, normalization })
+}
+
+fn check_image(entry: &str, file: &ImageFile, problems: &mut Problems) -> ImageSpec {
+    let [channels, height, width] = file.shape.map(Whole::get);
+    let (shape, show) =
+        (format!("[{channels}, {height}, {width}]"), |[height, width]: [usize; 2]| format!("[{height}, {width}]"));
+    if channels != CHANNELS {
+        problems.wrong(&format!("{entry}.shape"), format!("is {shape}, but pictures have {CHANNELS} channels"));
+    }
+    if let (Some(resize), Some(crop)) = (file.resize, file.crop)
+        && (crop[0] > resize[0] || crop[1] > resize[1])
+    {
+        problems.wrong(&format!("{entry}.crop"), format!("{} is larger than resize = {}", show(crop), show(resize)));
+    }
+    if let Some((step, size)) = file.crop.map(|size| ("crop", size)).or(file.resize.map(|size| ("resize", size)))
+        && size != [height, width]
+    {
+        problems.wrong(&format!("{entry}.shape"), format!("is {shape}, but {step} leaves {}", show(size)));
+    }
+    ImageSpec { height, width, color: file.color, resize: file.resize, crop: file.crop, operation: file.operation }
+}
+
+fn check_vector(entry: &str, file: &VectorFile, problems: &mut Problems) -> VectorSpec {
+    let len = file.shape[0].get();
+    if let Some(slice) = file.slice.as_ref().filter(|slice| slice.len() != len) {
+        let message = format!("[{}, {}] holds {} numbers, shape says {len}", slice.start, slice.end, slice.len());
+        problems.wrong(&format!("{entry}.slice"), message);
+    }
+    VectorSpec { len, slice: file.slice.clone() }
+}
+
+/// A normalisation of `len` dimensions, if their number is known.
+fn normalization(entry: &str, value: &Value, len: Option<usize>, problems: &mut Problems) -> Option<Normalization> {
+    let found = read_tagged(entry, "mode", value, problems)?;
+    let place = |name: &str| format!("{entry}.{name}");
+    let fits = |name: &str, numbers: &[f32], problems: &mut Problems| {
+        len.is_none_or(|len| check_length(&place(name), numbers, len, problems))
+    };
+    match &found {
+        Normalization::MinMax { min, max } => {
+            if !(fits("min", min, problems) & fits("max", max, problems)) {
+                return None;
+            }
+            for (at, (min, max)) in min.iter().zip(max).enumerate() {
+                let place = place(&format!("max[{at}]"));
+                if max <= min {
+                    problems.wrong(&place, format!("{max} is not above min[{at}] = {min}"));
+                } else if !(max - min).is_finite() {
+                    problems.wrong(&place, format!("is too far from min[{at}] for a 32-bit float"));
+                }
+            }
+        }
+        Normalization::MeanStd { mean, std, eps } => {
+            if !(fits("mean", mean, problems) & fits("std", std, problems)) {
+                return None;
+            }
+            if !(0.0..=1.0).contains(eps) {
+                problems.wrong(&place("eps"), format!("{eps} is not within 0 and 1"));
+                return None;
+            }
+            for (at, std) in std.iter().enumerate() {
+                let place = place(&format!("std[{at}]"));
+                if *std < 0.0 {
+                    problems.wrong(&place, format!("{std} is below 0"));
+                } else if std + eps <= 0.0 {
+                    problems.wrong(&place, "both this value and eps are 0: the statistics would be divided by 0");
+                }
+            }
+        }
+        Normalization::Identity => {}
+    }
+    Some(found)
+}
+
+fn check_mask(mask: MaskFile, problems: &mut Problems) -> MaskSpec {
+    if mask.order.is_empty() {
+        problems.wrong("mask.order", "is empty");
+    }
+    for (at, modality) in mask.order.iter().enumerate() {
+        if mask.order.iter().take(at).any(|earlier| earlier == modality) {
+            problems.wrong(&format!("mask.order[{at}]"), format!("names \"{modality}\" a second time"));
+        }
+    }
+    MaskSpec { input: mask.input, order: mask.order }
+}
+
+/// The mask must be about the modalities that are observed.
+fn check_mask_fits(
+    observations: &[ObservationSpec],
+    mask: Option<&MaskSpec>,
+    mask_aware: bool,
+    problems: &mut Problems,
+) {
+    let Some(mask) = mask else {
+        if mask_aware {
+            problems.wrong("mask", "is null, but the bundle is mask_aware");
+        }
+        return;
+    };
+    if observations.is_empty() {
+        return;
+    }
+    let known: Vec<&str> = observations.iter().map(|observation| observation.modality.as_str()).collect();
+    for (at, modality) in mask.order.iter().enumerate().filter(|(_, modality)| !known.contains(&modality.as_str())) {
+        let fix = did_you_mean(modality, &known, "the modalities here are");
+        problems.report(&format!("mask.order[{at}]"), format!("names \"{modality}\", which no observation has"), fix);
+    }
+    for (at, observation) in observations.iter().enumerate() {
+        if observation.key == mask.input {
+            problems.wrong("mask.input", format!("\"{}\" is the key of observations[{at}]", mask.input));
+        }
+        if mask_aware && !observation.required && !mask.order.contains(&observation.modality) {
+            let message = format!("\"{}\" is not required, but mask.order does not have it", observation.modality);
+            let fix = "write \"required\": true, or name it in mask.order if the encoder knows when it is absent";
+            problems.report(&format!("observations[{at}]"), message, fix);
+        }
+    }
+}
+
+fn check_action(file: ActionFile, problems: &mut Problems) -> Option<BundleAction> {
+    let len = file.shape[0].get();
+    if file.representation != Representation::Absolute {
+        problems.wrong("action.representation", "is not supported: only absolute targets are executed");
+    }
+    for (name, list) in [("names", &file.names), ("units", &file.units)] {
+        if list.len() != len {
+            let message = format!("has {} entries, but an action has {len} values", list.len());
+            problems.wrong(&format!("action.{name}"), message);
+        }
+    }
+    let limits = read("action.limits", &file.limits, problems);
+    let normalization = slices(&file.normalization, len, problems);
+    let Limits { min, max } = limits?;
+    if check_length("action.limits.min", &min, len, problems) & check_length("action.limits.max", &max, len, problems) {
+        for (at, (min, max)) in min.iter().zip(&max).enumerate().filter(|(_, (min, max))| max < min) {
+            problems.wrong(&format!("action.limits.max[{at}]"), format!("{max} is below min[{at}] = {min}"));
+        }
+    }
+    let ActionFile { actuator, names, units, .. } = file;
+    Some(BundleAction { actuator, names, units, min, max, normalization: normalization? })
+}
+
+/// The normalisations of an action of `len` values, ascending.
+fn slices(list: &[Value], len: usize, problems: &mut Problems) -> Option<Vec<SliceNormalization>> {
+    let entry = "action.normalization";
+    let read = |(at, value)| sliced(&format!("{entry}[{at}]"), value, problems);
+    let found: Vec<Option<SliceNormalization>> = list.iter().enumerate().map(read).collect();
+    // Which values one covers that could not be read is not known.
+    let mut found: Vec<SliceNormalization> = found.into_iter().collect::<Option<_>>()?;
+    for end in found.iter().map(|part| part.slice.end).filter(|end| *end > len) {
+        problems.wrong(entry, format!("covers values up to {end}, but an action has {len}"));
+    }
+    for value in 0..len {
+        match found.iter().filter(|part| part.slice.contains(&value)).count() {
+            0 => problems.wrong(entry, format!("does not cover value {value}")),
+            1 => {}
+            _ => problems.wrong(entry, format!("covers value {value} more than once")),
+        }
+    }
+    found.sort_by_key(|part| part.slice.start);
+    Some(found)
+}
+
+fn sliced(entry: &str, value: &Value, problems: &mut Problems) -> Option<SliceNormalization> {
+    let slice: Option<Range<usize>> = read(entry, value, problems).map(|Sliced { slice }| slice);
+    let mut rest = value.clone();
+    rest.as_object_mut()?.remove("slice");
+    let normalization = normalization(entry, &rest, slice.as_ref().map(ExactSizeIterator::len), problems);
+    Some(SliceNormalization { slice: slice?, normalization: normalization? })
+}
+
+fn check_scheduler(scheduler: &SchedulerSpec, problems: &mut Problems) {
+    let (start, end) = (scheduler.beta_start, scheduler.beta_end);
+    check_range("scheduler.beta_start", start, &BETAS, problems);
+    check_range("scheduler.beta_end", end, &BETAS, problems);
+    if BETAS.contains(&start) && BETAS.contains(&end) && end < start {
+        problems.wrong("scheduler.beta_end", format!("{end} is below beta_start = {start}"));
+    }
+    let range = scheduler.clip_sample_range;
+    if !(1e-6..=1000.0).contains(&range) {
+        problems.wrong("scheduler.clip_sample_range", format!("{range} is not within 0.000001 and 1000"));
+    }
+    let (train, steps) = (scheduler.num_train_timesteps, scheduler.num_inference_steps);
+    let last = (steps - 1) * (train / steps) + scheduler.steps_offset;
+    if steps > train {
+        let message = format!("{steps} is more than num_train_timesteps = {train}");
+        problems.wrong("scheduler.num_inference_steps", message);
+    } else if scheduler.timestep_spacing == TimestepSpacing::Leading && last >= train {
+        problems.wrong("scheduler.steps_offset", format!("leads to timestep {last} of {train}"));
+    }
+}

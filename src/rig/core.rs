@@ -1,0 +1,334 @@
+//! The decisions of a rig without any I/O: slots, assignment of devices to entries, and the mask.
+//!
+//! [`Core::step`] takes one input and the time, and writes down what is to be done. Whoever calls it carries the
+//! effects out in their order: the live rig (`owner`) with tasks and shared memory, the lockstep rig with a
+//! virtual clock.
+//!
+//! Invariant: no clock, no I/O, no lock: the same inputs give the same effects.
+//! Invariant: a step that changes the mask has [`Effect::Publish`] as its first effect, once, with the mask after
+//! the whole step: nothing that allocates or locks stands before it.
+//! Invariant: a bit is set only while its device is attached and a stream of its newest epoch runs.
+//! Invariant: what is attached to a slot is what the assigner has given to its entry.
+
+use std::path::Path;
+use std::time::Duration;
+
+use super::slot::{self, End, Slot};
+use crate::hotplug::HotplugEvent;
+use crate::mask::PhysicalMask;
+use crate::modality::ModalityId;
+use crate::provenance::UnplugSource;
+use crate::registry::{Assigner, Assignment, Attachment, Registry, Unit};
+use crate::sample::Epoch;
+use crate::status::SlotState;
+use crate::time::Stamp;
+
+/// What happens to a rig.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Input {
+    /// A device was plugged in or removed.
+    Hotplug(HotplugEvent),
+    /// The stream of this epoch reports; an older epoch changes nothing.
+    Stream {
+        /// Modality of the stream.
+        id: ModalityId,
+        /// Incarnation of the stream.
+        epoch: Epoch,
+        /// The report.
+        event: StreamEvent,
+    },
+    /// A user wants a failed device started again.
+    Restart(ModalityId),
+    /// Time passed; see [`Core::deadline`].
+    Timer,
+}
+
+/// What a stream reports about its life.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum StreamEvent {
+    /// The device is not opened before its network link is up.
+    LinkDown,
+    /// The device is open.
+    Opened,
+    /// The first sample was published.
+    Started,
+    /// Samples have stopped.
+    Stalled,
+    /// Samples arrive again.
+    Resumed,
+    /// The stream ended.
+    Ended(End),
+}
+
+/// What is to be done.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Effect {
+    /// Publish this mask. Always the first effect of a step.
+    Publish(PhysicalMask),
+    /// Report that no entry uses this device.
+    Unused {
+        /// The device.
+        unit: Unit,
+        /// Why, for people.
+        reason: String,
+    },
+    /// Log that a device in use has another node, which no entry reads.
+    WrongNode {
+        /// Why, for people.
+        reason: String,
+    },
+    /// What concerns one modality.
+    Device(ModalityId, DeviceEffect),
+}
+
+/// What is to be done for one modality.
+#[derive(Debug, Clone, PartialEq)]
+pub enum DeviceEffect {
+    /// Tell the running stream to end; do not wait for it.
+    Stop,
+    /// The stream that ran until now counts no more: it was told to stop, or has ended.
+    Ended,
+    /// Announce that [`Core::attached`] is there.
+    AnnounceAttach,
+    /// Announce that the device is gone; once until it is announced as attached again.
+    AnnounceDetach(UnplugSource),
+    /// Hot-plug attached a device: its hooks begin.
+    Plugged,
+    /// Hot-plug removed the device: its hooks end.
+    Unplugged,
+    /// Start a stream.
+    Start(Epoch, Attachment),
+    /// Report a new state of the slot.
+    State(Transition),
+}
+
+/// How the state of a slot changed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Transition {
+    /// State before.
+    pub from: SlotState,
+    /// State now.
+    pub to: SlotState,
+    /// Until the next start, in [`SlotState::Backoff`].
+    pub wait: Option<Duration>,
+    /// What noticed the removal, in [`SlotState::Absent`].
+    pub source: Option<UnplugSource>,
+}
+
+/// See the module's comment.
+#[derive(Debug, Clone)]
+pub struct Core {
+    lanes: Vec<Lane>,
+    assigner: Assigner,
+    mask: PhysicalMask,
+}
+
+/// One modality.
+#[derive(Debug, Clone)]
+struct Lane {
+    id: ModalityId,
+    slot: Slot<Attachment>,
+    /// When the newest device was attached.
+    attached_at: Stamp,
+    /// A removal was announced, and no attachment after it.
+    is_announced_gone: bool,
+}
+
+impl Core {
+    /// With nothing attached.
+    #[must_use]
+    pub fn new(registry: &Registry) -> Self {
+        let lane = |id| Lane {
+            id,
+            slot: Slot::new(registry.rig.cooldown),
+            attached_at: Stamp::default(),
+            is_announced_gone: false,
+        };
+        Self {
+            lanes: registry.devices.iter().map(|device| lane(device.id)).collect(),
+            assigner: Assigner::new(registry),
+            mask: PhysicalMask::EMPTY,
+        }
+    }
+
+    /// Takes one input at `now` and appends to `effects`, which is empty, what is to be done, in order.
+    pub fn step(&mut self, input: Input, now: Stamp, effects: &mut Vec<Effect>) {
+        let before = self.mask;
+        match input {
+            Input::Hotplug(HotplugEvent::Added(attachment)) => self.added(attachment, now, effects),
+            Input::Hotplug(HotplugEvent::Removed { syspath, source, .. }) => {
+                self.removed(&syspath, source, now, effects);
+            }
+            Input::Stream { id, epoch, event } if self.is_current(id, epoch) => {
+                self.stream(id, epoch, event, now, effects);
+            }
+            Input::Stream { .. } => {}
+            Input::Restart(id) => self.apply(id, slot::Input::Restart, None, now, effects),
+            Input::Timer => {
+                for index in 0..self.lanes.len() {
+                    let due = |lane: &&Lane| lane.slot.deadline().is_some_and(|deadline| deadline <= now);
+                    if let Some(id) = self.lanes.get(index).filter(due).map(|lane| lane.id) {
+                        self.apply(id, slot::Input::Timer, None, now, effects);
+                    }
+                }
+            }
+        }
+        if self.mask != before {
+            effects.insert(0, Effect::Publish(self.mask));
+        }
+    }
+
+    /// The mask in force.
+    #[must_use]
+    pub const fn mask(&self) -> PhysicalMask {
+        self.mask
+    }
+
+    /// When [`Input::Timer`] is to be given, if nothing happens before.
+    #[must_use]
+    pub fn deadline(&self) -> Option<Stamp> {
+        self.lanes.iter().filter_map(|lane| lane.slot.deadline()).min()
+    }
+
+    /// Is this the stream that runs now? What any other reports changes nothing.
+    #[must_use]
+    pub fn is_current(&self, id: ModalityId, epoch: Epoch) -> bool {
+        self.lane(id).is_some_and(|lane| lane.slot.is_current(epoch))
+    }
+
+    /// State and newest epoch of a modality; absent if there is no such modality.
+    #[must_use]
+    pub fn state(&self, id: ModalityId) -> (SlotState, Epoch) {
+        self.lane(id).map_or((SlotState::Absent, Epoch(0)), |lane| (lane.slot.state(), lane.slot.epoch()))
+    }
+
+    /// The device that is attached as this modality.
+    #[must_use]
+    pub fn attached(&self, id: ModalityId) -> Option<&Attachment> {
+        self.lane(id)?.slot.attached()
+    }
+
+    /// When the newest device of this modality was attached.
+    #[must_use]
+    pub fn attached_at(&self, id: ModalityId) -> Stamp {
+        self.lane(id).map(|lane| lane.attached_at).unwrap_or_default()
+    }
+
+    fn added(&mut self, attachment: Attachment, now: Stamp, effects: &mut Vec<Effect>) {
+        if self.assigner.replaces(&attachment) {
+            self.removed(&attachment.syspath, UnplugSource::Enumeration, now, effects);
+        }
+        match self.assigner.attach(&attachment) {
+            Assignment::Entry(id) => self.attach(id, attachment, now, effects),
+            Assignment::Waiting { reason } | Assignment::Unregistered { reason } => {
+                effects.push(Effect::Unused { unit: attachment.unit, reason });
+            }
+            Assignment::WrongNode { reason } => effects.push(Effect::WrongNode { reason }),
+        }
+    }
+
+    fn removed(&mut self, syspath: &Path, source: UnplugSource, now: Stamp, effects: &mut Vec<Effect>) {
+        let detached = self.assigner.detach(syspath);
+        for id in detached.freed {
+            self.announce_detach(id, source, effects);
+            self.apply(id, slot::Input::Detached, Some(source), now, effects);
+            effects.push(Effect::Device(id, DeviceEffect::Unplugged));
+        }
+        for (id, attachment) in detached.assigned {
+            self.attach(id, attachment, now, effects);
+        }
+    }
+
+    /// The assigner gave this device to `id`. Reported twice, it is the same attachment.
+    fn attach(&mut self, id: ModalityId, attachment: Attachment, now: Stamp, effects: &mut Vec<Effect>) {
+        let Some(lane) = self.lane_mut(id).filter(|lane| lane.slot.attached() != Some(&attachment)) else { return };
+        lane.attached_at = now;
+        lane.is_announced_gone = false;
+        effects.push(Effect::Device(id, DeviceEffect::AnnounceAttach));
+        effects.push(Effect::Device(id, DeviceEffect::Plugged));
+        self.apply(id, slot::Input::Attached(attachment), None, now, effects);
+    }
+
+    fn stream(&mut self, id: ModalityId, epoch: Epoch, event: StreamEvent, now: Stamp, effects: &mut Vec<Effect>) {
+        let mut source = None;
+        let input = match event {
+            StreamEvent::LinkDown => return self.announce_detach(id, UnplugSource::Link, effects),
+            // A removal that hot-plug did not report: the link is up again, or the device never was gone.
+            StreamEvent::Opened => {
+                if let Some(lane) = self.lane_mut(id)
+                    && std::mem::take(&mut lane.is_announced_gone)
+                {
+                    effects.push(Effect::Device(id, DeviceEffect::AnnounceAttach));
+                }
+                return;
+            }
+            StreamEvent::Started => slot::Input::Started(epoch),
+            StreamEvent::Stalled => slot::Input::Stalled(epoch),
+            StreamEvent::Resumed => slot::Input::Resumed(epoch),
+            StreamEvent::Ended(end) => {
+                source = match end {
+                    End::Gone => Some(UnplugSource::Stream),
+                    End::LinkDown => Some(UnplugSource::Link),
+                    End::Retry | End::Fatal => None,
+                };
+                if let Some(source) = source {
+                    self.announce_detach(id, source, effects);
+                }
+                slot::Input::Ended(epoch, end)
+            }
+        };
+        self.apply(id, input, source, now, effects);
+    }
+
+    /// Announces who noticed a removal, unless it was announced before.
+    fn announce_detach(&mut self, id: ModalityId, source: UnplugSource, effects: &mut Vec<Effect>) {
+        if let Some(lane) = self.lane_mut(id)
+            && !std::mem::replace(&mut lane.is_announced_gone, true)
+        {
+            effects.push(Effect::Device(id, DeviceEffect::AnnounceDetach(source)));
+        }
+    }
+
+    fn apply(
+        &mut self,
+        id: ModalityId,
+        input: slot::Input<Attachment>,
+        source: Option<UnplugSource>,
+        now: Stamp,
+        effects: &mut Vec<Effect>,
+    ) {
+        let Some(lane) = self.lanes.iter_mut().find(|lane| lane.id == id) else { return };
+        let (from, epoch) = (lane.slot.state(), lane.slot.epoch());
+        let ran = lane.slot.is_current(epoch);
+        let slot::Effects { stop, start } = lane.slot.apply(input, now);
+        self.mask = self.mask.with(id, lane.slot.is_present());
+        let mut push = |effect| effects.push(Effect::Device(id, effect));
+        if stop.is_some() {
+            push(DeviceEffect::Stop);
+        }
+        if ran && !lane.slot.is_current(epoch) {
+            push(DeviceEffect::Ended);
+        }
+        let to = lane.slot.state();
+        let is_changed = to != from || start.is_some();
+        if let Some((epoch, attachment)) = start {
+            push(DeviceEffect::Start(epoch, attachment));
+        }
+        if is_changed {
+            let wait = lane.slot.deadline().filter(|_| to == SlotState::Backoff).map(|deadline| deadline.since(now));
+            let source = source.filter(|_| to == SlotState::Absent);
+            push(DeviceEffect::State(Transition { from, to, wait, source }));
+        }
+    }
+
+    fn lane(&self, id: ModalityId) -> Option<&Lane> {
+        self.lanes.iter().find(|lane| lane.id == id)
+    }
+
+    fn lane_mut(&mut self, id: ModalityId) -> Option<&mut Lane> {
+        self.lanes.iter_mut().find(|lane| lane.id == id)
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,3 @@
+//! The core under long random sequences of inputs.
+
+mod simulator;

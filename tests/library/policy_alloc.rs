@@ -1,0 +1,205 @@
+//! A policy at the controls allocates nothing once it has warmed up, tick by tick: what it sees, what it asks,
+//! what it does. An answer to a request costs what the JPEG decoder makes for its pictures, and no more on
+//! this side of onnxruntime.
+//!
+//! Warm is what has held the largest samples once: each place of a ring, each cell of a request.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "what fails here fails a test")]
+
+use std::time::Duration;
+
+use crate::support::allocations::allocations;
+use crate::support::onnx::{ACTION, HORIZON, STEPS, write_bundle};
+use rapid::driver::sim::task::layout;
+use rapid::mask::PhysicalMask;
+use rapid::policy::bundle::Bundle;
+use rapid::policy::horizon::{ActionQueue, Situation, WithoutMask};
+use rapid::policy::library::Environment;
+use rapid::policy::model::Model;
+use rapid::policy::observer::Observer;
+use rapid::policy::pilot::Pilot;
+use rapid::policy::request::Request;
+use rapid::registry::Registry;
+use rapid::registry::task::PARTS;
+use rapid::sample::{Encoding, FLAG_ERROR, SampleHeader};
+use rapid::time::Stamp;
+use zune_jpeg::JpegDecoder;
+use zune_jpeg::zune_core::bytestream::ZCursor;
+
+/// Between two ticks.
+const PERIOD: Duration = Duration::from_millis(100);
+/// Bytes of the largest sample.
+const LARGEST: usize = 4000;
+const TICKS: u64 = 400;
+
+fn bundle() -> (tempfile::TempDir, Bundle) {
+    let folder = tempfile::tempdir().unwrap();
+    write_bundle(folder.path(), &[]);
+    let bundle = Bundle::load(folder.path()).unwrap();
+    (folder, bundle)
+}
+
+fn at(tick: u64) -> Stamp {
+    Stamp(1_000_000_000).after(PERIOD * u32::try_from(tick).unwrap())
+}
+
+/// Ticks in which each place of every ring is written.
+fn warm_up(registry: &Registry) -> u64 {
+    2 * registry.devices.iter().map(|device| device.depth as u64).max().unwrap()
+}
+
+/// Of the devices of the task, the samples of a tick, captured before it: as large as they get, or of a size that
+/// goes up and down. Now and then one is damaged.
+fn samples(registry: &Registry, tick: u64, large: bool, mut take: impl FnMut(usize, &SampleHeader, &[u8])) {
+    let bytes = [7; LARGEST];
+    let captured = at(tick).0 - 5_000_000;
+    for (place, (name, part)) in PARTS.iter().enumerate() {
+        let (encoding, width, height) = layout(*part);
+        let header = SampleHeader {
+            seq: tick,
+            capture_ns: captured,
+            recv_ns: captured + 1_000_000,
+            id: u32::try_from(place).unwrap(),
+            epoch: 1,
+            encoding: encoding as u32,
+            flags: if tick % 37 == 5 { FLAG_ERROR } else { 0 },
+            width,
+            height,
+            ..SampleHeader::default()
+        };
+        let len = if large { LARGEST } else { usize::try_from(tick * 131 % LARGEST as u64).unwrap() };
+        let device = registry.devices.iter().position(|device| device.name == *name).unwrap();
+        take(device, &header, &bytes[..len]);
+    }
+}
+
+#[test]
+fn a_tick_costs_no_allocation() {
+    let (_folder, bundle) = bundle();
+    let registry = Registry::task();
+    let mut pilot = Pilot::new(&bundle, &registry, WithoutMask::Hold, 0);
+    let mut request = Request::new(&bundle);
+    let chunk = [0.5; HORIZON * ACTION];
+    let wild = [f32::NAN; HORIZON * ACTION];
+    let mut asked: Option<u64> = None;
+    let mut tick = |number: u64, large: bool| {
+        samples(&registry, number, large, |device, header, payload| {
+            pilot.observer.push(registry.devices[device].id, header, payload);
+        });
+        // Of 16 ticks the tactile sensor is away for four, and the wrist's camera for two of these.
+        pilot.mask = PhysicalMask(match number % 16 {
+            0..12 => 0b111,
+            12 | 13 => 0b101,
+            _ => 0b100,
+        });
+        if let Some(asked) = asked.take_if(|asked| number - *asked > number % 3) {
+            match number % 5 {
+                0 => pilot.queue.failed(asked),
+                1 => drop(pilot.queue.take(asked, &wild)),
+                _ => drop(pilot.queue.take(asked, &chunk)),
+            }
+        }
+        // Late by a while at times.
+        let now = at(number).after(Duration::from_millis(number % 7));
+        if pilot.look(number, at(number), now) {
+            pilot.fill(number, at(number), &mut request);
+            asked = Some(number);
+        }
+        let _ = pilot.step(number);
+    };
+    let begin = warm_up(&registry);
+    (0..begin).for_each(|number| tick(number, true));
+    assert_eq!(allocations(|| drop(vec![1])), 1, "nothing is counted");
+    assert_eq!(allocations(|| (begin..begin + TICKS).for_each(|number| tick(number, false))), 0);
+    let counts = pilot.queue.counts();
+    assert!(counts.actions > TICKS / 4 && counts.held_ticks > 0, "{counts:?}");
+    assert!(counts.requests > TICKS / 16 && counts.chunks > 0, "{counts:?}");
+    assert!(counts.failed_requests > 0 && counts.not_finite_chunks > 0, "{counts:?}");
+}
+
+#[test]
+fn a_sample_that_is_kept_costs_no_allocation() {
+    let (_folder, bundle) = bundle();
+    let registry = Registry::task();
+    let mut observer = Observer::new(&bundle, &registry);
+    let mut push = |number: u64, large: bool| {
+        samples(&registry, number, large, |device, header, payload| {
+            observer.push(registry.devices[device].id, header, payload);
+        });
+    };
+    let begin = warm_up(&registry);
+    (0..begin).for_each(|number| push(number, true));
+    assert_eq!(allocations(|| (begin..begin + TICKS).for_each(|number| push(number, false))), 0);
+    let last = begin + TICKS - 1;
+    assert!(observer.look(at(last), at(last), PhysicalMask(0b111)).is_some(), "nothing was kept");
+}
+
+#[test]
+fn a_step_of_the_horizon_costs_no_allocation_from_the_first_one_on() {
+    let (_folder, bundle) = bundle();
+    let mut queue = ActionQueue::new(&bundle, &Registry::task(), WithoutMask::Hold);
+    // Beyond the limits, so that they are held against it.
+    let chunk = [10.0; HORIZON * ACTION];
+    let allocated = allocations(|| {
+        for tick in 0..TICKS {
+            let mask = PhysicalMask(if tick % 50 < 40 { 0b111 } else { 0b110 });
+            let situation = Situation { mask, observation_age: Some(Duration::from_millis(tick % 400)) };
+            let asked = queue.wants_observation(tick, situation);
+            let _ = queue.step(tick, situation);
+            if asked {
+                let _ = queue.take(tick, &chunk);
+            }
+        }
+    });
+    assert_eq!(allocated, 0);
+    let counts = queue.counts();
+    assert!(counts.actions > 0 && counts.held_ticks > 0 && counts.chunks > 0, "{counts:?}");
+}
+
+/// A picture as a camera sends it.
+fn jpeg(side: u16, color: u8) -> Vec<u8> {
+    let mut jpeg = Vec::new();
+    let pixels = vec![color; 3 * usize::from(side) * usize::from(side)];
+    let encoder = jpeg_encoder::Encoder::new(&mut jpeg, 90);
+    encoder.encode(&pixels, side, side, jpeg_encoder::ColorType::Rgb).unwrap();
+    jpeg
+}
+
+#[test]
+fn an_answer_costs_what_its_pictures_cost_the_decoder() {
+    const SIDE: u16 = 8;
+    let (_folder, bundle) = bundle();
+    let environment = Environment::open(None).expect("`make setup` fetches the library; then build again");
+    let mut model = Model::load(&bundle, &environment, None).unwrap();
+    let mut request = Request::new(&bundle);
+    let pictures: Vec<Vec<u8>> = [40, 200].map(|color| jpeg(SIDE, color)).into();
+    let state: Vec<u8> = [0.1_f64, 0.2, 0.3, 0.4].into_iter().flat_map(f64::to_le_bytes).collect();
+    for step in 0..STEPS {
+        for (observation, payload) in [&pictures[0], &pictures[1], &state].into_iter().enumerate() {
+            let (encoding, side) =
+                if observation < 2 { (Encoding::Mjpeg, u32::from(SIDE)) } else { (Encoding::F64, 0) };
+            let header =
+                SampleHeader { encoding: encoding as u32, width: side, height: side, ..SampleHeader::default() };
+            request.cell_mut(observation, step).unwrap().set(&header, payload);
+            request.set_present(observation, true);
+        }
+    }
+    let mut pixels = vec![0; 3 * usize::from(SIDE) * usize::from(SIDE)];
+    let mut decode = |picture: &Vec<u8>| {
+        let mut decoder = JpegDecoder::new(ZCursor::new(picture));
+        decoder.decode_headers().unwrap();
+        decoder.decode_into(&mut pixels).unwrap();
+    };
+    pictures.iter().for_each(&mut decode);
+    let decoder = allocations(|| pictures.iter().for_each(&mut decode)) * STEPS as u64;
+    assert!(decoder > 0, "the decoder is not counted");
+
+    let mut chunk = vec![0.0; model.chunk_len()];
+    let mut answer = |request: &Request| model.answer(request, &mut chunk).unwrap();
+    answer(&request);
+    assert_eq!(allocations(|| (0..50).for_each(|_| answer(&request))), 50 * decoder);
+    // Numbers alone cost nothing.
+    request.set_present(0, false);
+    request.set_present(1, false);
+    assert_eq!(allocations(|| (0..50).for_each(|_| answer(&request))), 0);
+}

@@ -1,0 +1,198 @@
+//! The path of a sample does not allocate once it has warmed up.
+//!
+//! Seen twice, because `rig::stream` is private:
+//!
+//! 1. On one thread, by public parts: `Driver::read` of a simulated device, header, `Writer::publish`
+//!    (loan, one copy, send, notify), `Inbox::wait` and `Inbox::drain`. That is what a stream does
+//!    between two samples, without its `select!`, timer and counters. No allocation.
+//! 2. The rig as it is: `Rig::run` on a multi-thread runtime, the `mask` thread at 500 Hz, and an
+//!    inbox as the recorder has. Every thread of the process counts. Beside the samples the rig writes
+//!    the mask's JSON file once a second, which allocates, and each thread keeps the memory of its
+//!    first loan. So samples are counted in stretches much shorter than a second: a stretch without
+//!    a JSON file and without a thread's first sample has none.
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use rapid::bus::{Bus, Inbox, TopicId};
+use rapid::driver::Driver;
+use rapid::hotplug::script::Script;
+use rapid::registry::scenario::{Scenario, SimDevice};
+use rapid::registry::{DeviceNode, Registry};
+use rapid::rig::Rig;
+use rapid::rig::presence::{Claim, Presence};
+use rapid::sample::SampleHeader;
+use rapid::status::Board;
+use rapid::time::Stamp;
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+
+use crate::{COUNT, COUNTING, alone};
+
+/// What a device sends has the size the registry lets it have: a picture, and a vector of numbers.
+const REGISTRY: &str = r#"
+[device.cam]
+vid = "1209"
+pid = "0001"
+node = "camera"
+bit = 0
+[device.cam.camera]
+width = 320
+height = 240
+fps = 500
+
+[device.state]
+vid = "1209"
+pid = "0002"
+node = "serial"
+bit = 1
+[device.state.tty]
+baud = 115200
+parse = "csv"
+channels = 8
+"#;
+
+const SCENARIO: &str = r#"
+[[device]]
+name = "cam"
+hz = 500
+
+[[device]]
+name = "state"
+hz = 1000
+"#;
+
+/// Threads of the rig's runtime.
+const WORKERS: usize = 2;
+const WARM_UP: usize = 200;
+const SAMPLES: usize = 1000;
+/// Samples of a stretch: at 1,500 a second, some 30 ms.
+const STRETCH: usize = 50;
+/// How often the rig writes its JSON file.
+const JSON_PERIOD: Duration = Duration::from_secs(1);
+
+#[test]
+fn a_sample_costs_no_allocation() {
+    let _alone = alone();
+    let registry = Registry::parse(REGISTRY, None).unwrap().registry;
+    let scenario = Scenario::parse(SCENARIO, None, &registry).unwrap();
+    for device in 0..registry.devices.len() {
+        one_thread(&registry, &scenario, device);
+    }
+    whole_rig(&registry, scenario);
+}
+
+fn one_thread(registry: &Registry, scenario: &Scenario, device: usize) {
+    let instance = format!("alloc{device}-{}", std::process::id());
+    let bus = Bus::open(registry, Some(&instance)).unwrap();
+    let inbox = bus.inbox().unwrap();
+    let spec = &registry.devices[device];
+    let writer = bus.writer(TopicId::Modality(spec.id)).unwrap();
+    let source = scenario.devices[device].source.clone();
+    // A paused clock continues by itself whenever nothing is ready: the device delivers as it is read.
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().start_paused(true).build().unwrap();
+    let allocated = runtime.block_on(async {
+        let node = DeviceNode::Sim(Arc::new(SimDevice::new(&spec.name, source, Stamp::now())));
+        let mut driver = Driver::open(spec, &node).await.unwrap();
+        let mut bytes = 0;
+        for seq in 0..WARM_UP + SAMPLES {
+            if seq == WARM_UP {
+                COUNT.store(0, Ordering::Relaxed);
+                COUNTING.store(true, Ordering::Relaxed);
+            }
+            let reading = driver.read().await.unwrap();
+            let header = SampleHeader {
+                seq: seq as u64,
+                lost: 0,
+                capture_ns: reading.captured.0,
+                recv_ns: Stamp::now().0,
+                id: u32::from(spec.id.bit()),
+                epoch: 1,
+                encoding: reading.encoding as u32,
+                flags: reading.flags,
+                width: reading.width,
+                height: reading.height,
+            };
+            writer.publish(header, reading.bytes).unwrap();
+            inbox.wait(Duration::from_millis(20)).unwrap();
+            let mut taken = 0;
+            inbox
+                .drain(&mut |topic, header, payload| {
+                    assert!(topic == TopicId::Modality(spec.id) && header.seq == seq as u64);
+                    assert!(payload == reading.bytes);
+                    bytes += payload.len();
+                    taken += 1;
+                })
+                .unwrap();
+            assert!(taken == 1);
+        }
+        COUNTING.store(false, Ordering::Relaxed);
+        assert!(bytes > SAMPLES * 8);
+        COUNT.load(Ordering::Relaxed)
+    });
+    assert_eq!(allocated, 0, "{}: allocations for {SAMPLES} samples", spec.name);
+    drop((inbox, writer, bus));
+}
+
+fn whole_rig(registry: &Registry, scenario: Scenario) {
+    let instance = format!("alloc-rig-{}", std::process::id());
+    let folder = tempfile::tempdir().unwrap();
+    let bus = Bus::open(registry, Some(&instance)).unwrap();
+    let board = Arc::new(Board::new(registry));
+    let claim = Claim::new(&folder.path().join("mask"), 2).unwrap();
+    let presence = Presence::start(claim, bus.writer(TopicId::Mask).unwrap(), Arc::clone(&board)).unwrap();
+    let inbox = bus.inbox().unwrap();
+    let mut rig = Rig::new(registry, &bus, presence, board);
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(WORKERS).enable_all().build().unwrap();
+    let stop = CancellationToken::new();
+    let (commands, asked) = mpsc::channel(1);
+    let task = runtime.spawn({
+        let stop = stop.clone();
+        async move {
+            rig.run(Box::pin(Script::new(scenario)), asked, stop).await.unwrap();
+        }
+    });
+
+    let mut counts = [0; 3];
+    while counts[0] < WARM_UP || counts[1] < WARM_UP {
+        take(&inbox, &mut counts);
+    }
+    let begun = Stamp::now();
+    let mut counts = [0; 3];
+    let (mut stretches, mut noisy) = (0, 0);
+    while counts[0] < SAMPLES || counts[1] < SAMPLES {
+        let end = counts[0] + counts[1] + STRETCH;
+        COUNT.store(0, Ordering::Relaxed);
+        COUNTING.store(true, Ordering::Relaxed);
+        while counts[0] + counts[1] < end {
+            take(&inbox, &mut counts);
+        }
+        COUNTING.store(false, Ordering::Relaxed);
+        stretches += 1;
+        noisy += u64::from(COUNT.load(Ordering::Relaxed) > 0);
+    }
+    let elapsed = Stamp::now().since(begun);
+    stop.cancel();
+    runtime.block_on(task).unwrap();
+    drop((commands, inbox, bus));
+
+    // A file may fall between two stretches or be cut by their border, and a worker may have had no
+    // sample while it was warming up.
+    let files = elapsed.as_secs() / JSON_PERIOD.as_secs() + 1;
+    let allowed = 2 * files + WORKERS as u64;
+    assert!(noisy <= allowed, "{noisy} of {stretches} stretches allocated, {files} JSON files in {elapsed:?}");
+    assert!(stretches > 2 * allowed, "{stretches} stretches in {elapsed:?} are too few to tell");
+    assert!(counts[2] > 0, "no mask came");
+}
+
+fn take(inbox: &Inbox, counts: &mut [usize; 3]) {
+    inbox.wait(Duration::from_millis(20)).unwrap();
+    inbox
+        .drain(&mut |topic, _, _| match topic {
+            TopicId::Modality(id) => counts[id.index()] += 1,
+            TopicId::Mask => counts[2] += 1,
+            TopicId::Action => {}
+        })
+        .unwrap();
+}

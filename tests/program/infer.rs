@@ -1,0 +1,289 @@
+//! `rapid --infer` from the command line to the recording: the trained policy on simulated devices that
+//! come and go.
+
+#![allow(clippy::expect_used, reason = "what fails here fails a test")]
+
+use std::path::Path;
+
+use crate::support::{self, Episode, EventMessage, Place, events};
+use serde_json::Value;
+
+/// What the policy observes. A replugged device may be started at once.
+const REGISTRY: &str = r#"
+[rig]
+name = "infer"
+observation_hz = 10
+cooldown = "0ms"
+
+[device.cam_wrist]
+vid = "1209"
+pid = "7a01"
+node = "camera"
+bit = 0
+[device.cam_wrist.camera]
+width = 96
+height = 96
+fps = 30
+
+[device.tactile_tip]
+vid = "1209"
+pid = "7a02"
+node = "camera"
+bit = 1
+[device.tactile_tip.camera]
+width = 96
+height = 96
+fps = 30
+
+[device.arm]
+vid = "1209"
+pid = "7a03"
+node = "can"
+bit = 2
+[device.arm.can]
+protocol = "damiao"
+motors = [
+    { name = "x", slave = 1, type = "DM4310", kp = 20, kd = 1, position = [-1.1, 1.0] },
+    { name = "y", slave = 2, type = "DM4310", kp = 20, kd = 1, position = [-1.0, 1.0] },
+    { name = "z", slave = 3, type = "DM4310", kp = 20, kd = 1, position = [0.03, 0.9] },
+    { name = "grip", slave = 4, type = "DM4310", kp = 20, kd = 1, position = [0.0, 1.0] },
+]
+"#;
+
+/// The tactile sensor is pulled out for a second.
+const PULLED: &str = "[[device]]\nname = \"cam_wrist\"\n[[device]]\nname = \"tactile_tip\"\n[[device]]\nname = \"arm\"\n\
+                      [[event]]\nat = \"3s\"\nunplug = \"tactile_tip\"\n[[event]]\nat = \"5s\"\nplug = \"tactile_tip\"\n";
+
+/// The folder of the policy of the repository.
+const BUNDLE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/models/tactile-id");
+
+/// Runs a policy in `place` and gives the exit code, the events and standard error.
+fn infer(place: &Place, bundle: &str, scenario: &str, more: &[&str]) -> (Option<i32>, Vec<Value>, String) {
+    let registry = place.write("rig.toml", REGISTRY).display().to_string();
+    let scenario = place.write("play.toml", scenario).display().to_string();
+    let arguments = ["--json", "--infer", bundle, "--config", &registry, "--sim", &scenario];
+    let output = place.run(&[&arguments[..], more].concat());
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    (output.status.code(), events(&text), String::from_utf8_lossy(&output.stderr).into_owned())
+}
+
+/// The exit code by the verdicts of the episodes.
+fn recorded_code(events: &[Value]) -> Option<i32> {
+    support::recorded_code(&events.iter().map(Value::to_string).collect::<Vec<_>>().join("\n"))
+}
+
+fn of<'a>(events: &'a [Value], event: &'a str) -> impl Iterator<Item = &'a Value> {
+    events.iter().filter(move |printed| printed["event"] == event)
+}
+
+/// Numbers of the samples of a modality that a chunk was computed from.
+fn samples(chunk: &Value, modality: &str) -> usize {
+    let samples = chunk["samples"].as_array().expect("samples");
+    let of = samples.iter().find(|of| of["modality"] == modality).expect("the modality");
+    of["seqs"].as_array().expect("numbers").len()
+}
+
+/// Holds for another reason than that the machine is slow.
+fn holds(events: &[Value]) -> Vec<&Value> {
+    of(events, "hold").filter(|hold| hold["reason"] != "the next actions are still being computed").collect()
+}
+
+/// A copy of the policy in `place` whose `policy.json` has `to` in place of `from`.
+fn changed(place: &Place, from: &str, to: &str) -> String {
+    let folder = place.path("policy");
+    std::fs::create_dir(&folder).expect("folder");
+    for file in ["encoder.onnx", "denoiser.onnx"] {
+        std::fs::copy(Path::new(BUNDLE).join(file), folder.join(file)).expect("graph");
+    }
+    let text = std::fs::read_to_string(Path::new(BUNDLE).join("policy.json")).expect("policy.json");
+    assert!(text.contains(from), "{from}");
+    std::fs::write(folder.join("policy.json"), text.replacen(from, to, 1)).expect("policy.json");
+    folder.display().to_string()
+}
+
+#[test]
+fn a_pulled_sensor_is_left_out_at_the_next_tick_and_actions_continue() {
+    let place = Place::new();
+    let (code, printed, stderr) = infer(&place, BUNDLE, PULLED, &["--record", "--duration", "8s", "--out", "out"]);
+    assert_eq!(code, recorded_code(&printed), "{stderr}");
+    let policy = of(&printed, "policy").next().expect("an event of the policy");
+    assert_eq!((&policy["policy"], &policy["dry_run"]), (&"tactile-id".into(), &false.into()));
+    assert!(holds(&printed).is_empty(), "{:?}", holds(&printed));
+    let masks: Vec<_> =
+        of(&printed, "chunk").map(|chunk| (chunk["mask"].as_str(), samples(chunk, "tactile_tip"))).collect();
+    assert!(masks.contains(&(Some("0x07"), 2)) && masks.contains(&(Some("0x05"), 0)), "{masks:?}");
+    assert!(masks.iter().all(|mask| matches!(mask, (Some("0x07"), 2) | (Some("0x05"), 0))), "{masks:?}");
+    assert_eq!(masks.last(), Some(&(Some("0x07"), 2)), "it is back");
+
+    // The recording holds what the policy saw and what it did.
+    let files = place.files("out");
+    let episode = Episode::read(&place.path("out").join(files.first().expect("an episode")));
+    let recorded: Vec<Value> = episode
+        .topic("/rapid/event")
+        .map(|message| serde_json::from_str(&message.decode::<EventMessage>().json).expect("JSON"))
+        .collect();
+    let chunks: Vec<_> = recorded.iter().filter(|event| event["event"] == "chunk").collect();
+    // All of them but the one that was being computed when the episode ended, if there was one.
+    let ticks = |chunk: &Value| chunk["tick"].as_u64();
+    let announced: Vec<_> = of(&printed, "chunk").map(ticks).collect();
+    assert_eq!(chunks.iter().map(|chunk| ticks(chunk)).collect::<Vec<_>>(), announced[..chunks.len()]);
+    assert!(announced.len() - chunks.len() <= 1, "{announced:?}");
+    let actions: Vec<_> = episode.topic("/action").collect();
+    // An action is recorded at its tick, and the ticks lie on the grid.
+    let first = actions.first().expect("an action");
+    for action in &actions {
+        let ticks = u64::from(action.sequence - first.sequence);
+        assert_eq!(action.log_time - first.log_time, ticks * 100_000_000);
+    }
+    // While the bit was clear, actions went on; how many is the machine's affair.
+    let edges = episode.mask_edges();
+    let out = edges.iter().position(|(_, mask)| *mask == 0x05).expect("it was pulled out");
+    let (from, until) = (edges[out].0, edges[out + 1].0);
+    let meanwhile = actions.iter().filter(|action| (from..until).contains(&action.log_time)).count();
+    assert!(meanwhile > 0);
+
+    // The first tick after the bit was cleared asks without it, unless a chunk is being computed at that time.
+    let asked = chunks.iter().filter(|chunk| chunk["mask"] == "0x05").filter_map(|chunk| chunk["tick"].as_u64()).min();
+    let begin = first.log_time - u64::from(first.sequence) * 100_000_000;
+    let cleared = (from - begin).div_ceil(100_000_000);
+    let before = chunks.iter().filter_map(|chunk| chunk["tick"].as_u64()).filter(|tick| *tick < cleared).max();
+    let busy = before.is_some_and(|tick| {
+        let late = chunks.iter().find(|chunk| chunk["tick"] == tick).and_then(|chunk| chunk["latency_ms"].as_f64());
+        late.is_some_and(|ms| tick as f64 + ms / 100.0 > cleared as f64)
+    });
+    // A tick that a busy machine left out has no action either.
+    let acted = |asked: u64| actions.iter().any(|action| (cleared..asked).contains(&u64::from(action.sequence)));
+    assert!(
+        busy || asked.is_some_and(|asked| asked >= cleared && !acted(asked)),
+        "cleared at tick {cleared}, asked at {asked:?}"
+    );
+}
+
+#[test]
+fn without_required_modalities_it_does_not_start_unless_it_may_wait() {
+    let place = Place::new();
+    let arm_later = "[[device]]\nname = \"cam_wrist\"\n[[device]]\nname = \"tactile_tip\"\n[[device]]\nname = \"arm\"\n\
+                     plugged = false\n[[event]]\nat = \"5s\"\nplug = \"arm\"\n";
+    let (code, printed, stderr) = infer(&place, BUNDLE, arm_later, &["--duration", "20s"]);
+    assert_eq!(code, Some(3), "{stderr}");
+    assert!(stderr.contains("the policy needs arm") && stderr.contains("--wait"), "{stderr}");
+    assert_eq!(of(&printed, "policy").count(), 0);
+
+    let (code, printed, stderr) = infer(&place, BUNDLE, arm_later, &["--duration", "10s", "--wait"]);
+    assert_eq!(code, Some(0), "{stderr}");
+    let waits = |printed: &Value| printed["event"] == "log" && printed["text"] == "the policy waits for arm";
+    assert!(printed.iter().any(waits) && of(&printed, "act").count() > 0, "{printed:?}");
+}
+
+#[test]
+fn a_dry_run_computes_and_moves_nothing() {
+    let place = Place::new();
+    let all = "[[device]]\nname = \"cam_wrist\"\n[[device]]\nname = \"tactile_tip\"\n[[device]]\nname = \"arm\"\n";
+    let more = ["--dry-run", "--record", "--duration", "4s", "--out", "out"];
+    let (code, printed, stderr) = infer(&place, BUNDLE, all, &more);
+    assert_eq!(code, recorded_code(&printed), "{stderr}");
+    assert!(of(&printed, "chunk").count() > 0 && of(&printed, "act").count() > 0);
+    let files = place.files("out");
+    let episode = Episode::read(&place.path("out").join(files.first().expect("an episode")));
+    assert_eq!(episode.topic("/action").count(), 0);
+}
+
+#[test]
+fn a_policy_not_trained_without_a_sensor_holds_until_it_is_back_or_ignored() {
+    let place = Place::new();
+    let bundle = changed(&place, "\"mask_aware\": true", "\"mask_aware\": false");
+    let (code, printed, stderr) = infer(&place, &bundle, PULLED, &["--duration", "8s"]);
+    assert_eq!(code, Some(0), "{stderr}");
+    let [hold] = holds(&printed)[..] else { panic!("{:?}", holds(&printed)) };
+    assert_eq!(hold["device"], "tactile_tip");
+    let acted = printed.iter().rposition(|event| event["event"] == "act");
+    let stopped = printed.iter().position(|event| std::ptr::eq(event, hold));
+    assert!(acted > stopped, "it goes on when the sensor is back");
+
+    let (code, printed, stderr) = infer(&place, &bundle, PULLED, &["--duration", "8s", "--ignore-missing"]);
+    assert_eq!(code, Some(0), "{stderr}");
+    assert!(holds(&printed).is_empty(), "{:?}", holds(&printed));
+    assert!(of(&printed, "chunk").any(|chunk| chunk["mask"] == "0x05"));
+}
+
+#[test]
+fn a_policy_that_is_none_or_not_for_this_rig_is_refused_by_name() {
+    let place = Place::new();
+    let (code, _, stderr) = infer(&place, "nowhere", "", &[]);
+    assert_eq!(code, Some(2), "{stderr}");
+    assert!(stderr.contains("nowhere/policy.json"), "{stderr}");
+    let bundle = changed(&place, "\"modality\": \"tactile_tip\"", "\"modality\": \"tactile_top\"");
+    let (code, _, stderr) = infer(&place, &bundle, "", &[]);
+    assert_eq!(code, Some(2), "{stderr}");
+    assert!(stderr.contains("tactile_top"), "{stderr}");
+    let (code, _, stderr) = infer(&place, BUNDLE, "", &["--ort-lib", "/nowhere/libonnxruntime.so", "--duration", "5s"]);
+    assert_eq!(code, Some(1), "{stderr}");
+    assert!(stderr.contains("/nowhere/libonnxruntime.so"), "{stderr}");
+    let text = place.write("libonnxruntime.so", "no library").display().to_string();
+    let (code, _, stderr) = infer(&place, BUNDLE, "", &["--ort-lib", &text, "--duration", "5s"]);
+    assert_eq!(code, Some(1), "{stderr}");
+    assert!(stderr.contains(&format!("{text} (--ort-lib): it cannot be loaded: ")), "{stderr}");
+}
+
+/// A device that does not move is no actuator, whatever the registry states.
+#[test]
+fn what_does_not_move_is_refused_before_anything_starts() {
+    let place = Place::new();
+    let still = "[device.arm]\nvid = \"1209\"\npid = \"7a03\"\nnode = \"serial\"\nbit = 2\n[device.arm.tty]\nchannels = 4\n\
+                 [device.arm.action]\nnames = [\"x\", \"y\", \"z\", \"grip\"]\nunits = [\"m\", \"m\", \"m\", \"1\"]\n\
+                 min = [-1.1, -1.0, 0.03, 0.0]\nmax = [1.0, 1.0, 0.9, 1.0]\n";
+    let (cameras, _) = REGISTRY.split_once("[device.arm]").expect("an arm");
+    let registry = place.write("still.toml", &format!("{cameras}{still}")).display().to_string();
+    for arguments in [&["check"][..], &["--infer", BUNDLE, "--sim", "--duration", "2s"]] {
+        let output = place.run(&[arguments, &["--config", &registry]].concat());
+        let printed = [output.stdout, output.stderr].concat();
+        let printed = String::from_utf8_lossy(&printed);
+        assert_eq!(output.status.code(), Some(2), "{printed}");
+        assert!(printed.contains("[device.arm] node \"serial\" takes no actions: nothing would move"), "{printed}");
+    }
+    // Without the table there is no actuator at all.
+    let (without, _) = still.split_once("[device.arm.action]").expect("a table");
+    let registry = place.write("without.toml", &format!("{cameras}{without}")).display().to_string();
+    let output = place.run(&["--infer", BUNDLE, "--sim", "--config", &registry, "--duration", "2s"]);
+    let printed = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(2), "{printed}");
+    assert!(printed.contains("actuator \"arm\" takes no actions"), "{printed}");
+}
+
+/// The policy that the program carries fits the simulated task, and reports it on any other rig.
+#[test]
+fn the_policy_inside_is_there_from_any_folder_and_names_the_rig_it_fits() {
+    let place = Place::new();
+    let arguments = ["--json", "--infer", "--sim", "task", "--duration", "4s", "--record", "--out", "out"];
+    let output = place.run(&arguments);
+    let printed = events(&String::from_utf8_lossy(&output.stdout));
+    assert_eq!(output.status.code(), recorded_code(&printed), "{}", String::from_utf8_lossy(&output.stderr));
+    let policy = of(&printed, "policy").next().expect("an event of the policy");
+    assert_eq!((&policy["policy"], &policy["folder"]), (&"tactile-id".into(), &"inside rapid".into()));
+    assert!(of(&printed, "act").count() > 0, "{printed:?}");
+    let folder = rapid::policy::bundle::Bundle::load(Path::new(BUNDLE)).expect("the same as a folder");
+    assert_eq!(policy["hash"], folder.hash);
+
+    let builtin = place.write("builtin.toml", rapid::registry::BUILTIN).display().to_string();
+    let output = place.run(&["--infer", "--config", &builtin, "--sim", "--duration", "2s"]);
+    let printed = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(2), "{printed}");
+    assert!(printed.contains("for the simulated task only: rapid --infer --sim task"), "{printed}");
+}
+
+/// It was trained with each of its cameras taken away.
+#[test]
+fn the_policy_continues_without_the_wrist_camera_and_holds_without_both() {
+    let place = Place::new();
+    let pulled = "[[device]]\nname = \"cam_wrist\"\n[[device]]\nname = \"tactile_tip\"\n[[device]]\nname = \"arm\"\n\
+                  [[event]]\nat = \"4s\"\nunplug = \"cam_wrist\"\n[[event]]\nat = \"8s\"\nunplug = \"tactile_tip\"\n";
+    let (code, printed, stderr) = infer(&place, BUNDLE, pulled, &["--duration", "12s"]);
+    assert_eq!(code, Some(0), "{stderr}");
+    assert!(of(&printed, "chunk").any(|chunk| chunk["mask"] == "0x06"), "it is asked without the wrist camera");
+    let [hold] = holds(&printed)[..] else { panic!("{:?}", holds(&printed)) };
+    assert_eq!(
+        (&hold["reason"], &hold["device"]),
+        (&"no picture that the policy observes is there".into(), &"cam_wrist".into())
+    );
+    assert!(of(&printed, "chunk").all(|chunk| chunk["mask"] != "0x04"), "nothing is asked without both");
+}

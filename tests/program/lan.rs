@@ -1,0 +1,178 @@
+//! Devices on the network: servers and senders on 127.0.0.1 that behave as cameras, LiDARs and phones do, in
+//! front of the real binary.
+
+#![expect(clippy::expect_used, reason = "what fails here fails a test")]
+
+use std::io::Write;
+use std::net::{TcpStream, UdpSocket};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::time::{Duration, Instant};
+
+use crate::support::lan::{
+    HEIGHT, RIG, RUN, Server, WIDTH, camera, camera_entry, free_ports, life_of, picture, stop, wait_for,
+};
+use crate::support::{self, Episode, Place, until};
+use serde_json::Value;
+
+#[test]
+fn a_camera_appears_is_recorded_is_killed_and_comes_back() {
+    let (place, [port]) = (Place::new(), free_ports());
+    place.write("devices.toml", &format!("{RIG}{}", camera_entry("cam", 0, port)));
+    let running = place.start(&[&RUN[..], &["--record", "--out", "out"]].concat(), "begin");
+    let first = Server::start(port, camera);
+    wait_for(&running, "cam", "streaming", 1);
+    drop(first);
+    wait_for(&running, "cam", "by lease", 1);
+    let _second = Server::start(port, camera);
+    wait_for(&running, "cam", "streaming", 2);
+    let reported = stop(running);
+    let life = life_of(&reported, "cam");
+    assert_eq!(life.iter().filter(|word| *word == "by lease").count(), 1, "{life:?}");
+    let gone = reported.iter().position(|event| event["event"] == "detach").expect("gone");
+    assert_eq!(reported[gone + 1]["mask"], "0x00");
+    // The bit was cleared when the connection ended, before the lease did.
+    let backoff = reported.iter().find(|event| event["state"] == "backoff").expect("its connection ended");
+    assert_eq!(backoff["mask"], "0x00");
+
+    let files = place.files("out");
+    let episode = Episode::read(&place.path("out").join(&files[0]));
+    let edges: Vec<u64> = episode.mask_edges().iter().map(|(_, mask)| *mask).collect();
+    assert_eq!(edges, [0, 1, 0, 1]);
+    let pictures: Vec<Vec<u8>> = episode.topic("/rapid/lan/cam").map(support::Message::payload).collect();
+    assert_eq!(pictures[0], picture(0), "the picture is as the camera sent it");
+}
+
+#[test]
+fn packets_are_samples_as_they_came() {
+    let (place, [port]) = (Place::new(), free_ports());
+    let entry = format!(
+        "{RIG}[device.lidar]\nnode = \"lan\"\nbit = 0\nmax_bytes = \"1KiB\"\n[device.lidar.lan]\nprotocol = \"udp\"\n\
+         host = \"127.0.0.1\"\nport = {port}\nlease = \"1s\"\n"
+    );
+    place.write("devices.toml", &entry);
+    let running = place.start(&[&RUN[..], &["--record", "--out", "out"]].concat(), "begin");
+    let (sends, sent) = (Arc::new(AtomicBool::new(true)), Arc::new(AtomicU32::new(0)));
+    let sender = std::thread::spawn({
+        let (sends, sent) = (Arc::clone(&sends), Arc::clone(&sent));
+        move || {
+            let socket = UdpSocket::bind("127.0.0.1:0").expect("a port");
+            let stranger = UdpSocket::bind("127.0.0.9:0").expect("a port");
+            while sends.load(Ordering::Relaxed) {
+                let number = sent.load(Ordering::Relaxed);
+                let mut packet = number.to_le_bytes().to_vec();
+                // Each tenth is larger than the entry permits.
+                packet.resize(if number % 10 == 9 { 1025 } else { 1000 }, 7);
+                let _ = socket.send_to(&packet, ("127.0.0.1", port));
+                let _ = stranger.send_to(b"not mine", ("127.0.0.1", port));
+                sent.store(number + 1, Ordering::Relaxed);
+                std::thread::sleep(Duration::from_millis(2));
+            }
+        }
+    });
+    wait_for(&running, "lidar", "streaming", 1);
+    let before = sent.load(Ordering::Relaxed);
+    until("a hundred packets", || sent.load(Ordering::Relaxed) > before + 100);
+    sends.store(false, Ordering::Relaxed);
+    sender.join().expect("no panic");
+    wait_for(&running, "lidar", "by lease", 1);
+    let reported = stop(running);
+    let lost = reported.last().expect("a summary")["devices"][0].clone();
+    let episode = Episode::read(&place.path("out").join(&place.files("out")[0]));
+    let samples: Vec<Vec<u8>> = episode.topic("/rapid/lan/lidar").map(support::Message::payload).collect();
+    assert!(samples.len() > 20, "{}", samples.len());
+    assert!(samples.iter().all(|packet| packet.len() == 1000 && packet[4..].iter().all(|byte| *byte == 7)));
+    let numbers: Vec<u32> =
+        samples.iter().map(|packet| u32::from_le_bytes([packet[0], packet[1], packet[2], packet[3]])).collect();
+    assert!(numbers.windows(2).all(|pair| pair[0] < pair[1] && pair[1] % 10 != 9), "{numbers:?}");
+    assert!(lost["gaps"].as_u64().is_some_and(|gaps| gaps > 0), "what was too large is lost: {lost}");
+}
+
+/// A phone: connects, names its session, sends frames; connects again when that ends.
+fn phone(port: u16, sends: &AtomicBool) {
+    while sends.load(Ordering::Relaxed) {
+        std::thread::sleep(Duration::from_millis(20));
+        let Ok(mut stream) = TcpStream::connect(("127.0.0.1", port)) else { continue };
+        let mut send = |kind: u8, payload: &[u8]| {
+            let length = u32::try_from(payload.len()).expect("short").to_le_bytes();
+            stream.write_all(&[&length[..], &[kind, 0, 0, 0], payload].concat()).is_ok()
+        };
+        let begun = Instant::now();
+        let mut number = 0;
+        let mut goes = send(0, br#"{"sessionId":"s","deviceModel":"iPhone"}"#);
+        while goes && sends.load(Ordering::Relaxed) {
+            let picture = picture(number);
+            let mut frame = u32::try_from(picture.len()).expect("short").to_le_bytes().to_vec();
+            frame.extend((0_u8..16).flat_map(|index| (f32::from(index) / 2.0).to_le_bytes()));
+            frame.extend(begun.elapsed().as_secs_f64().to_le_bytes());
+            frame.extend(1.7e9_f64.to_le_bytes());
+            frame.extend(picture);
+            goes = send(3, b"{}") && send(1, &frame);
+            number += 1;
+            std::thread::sleep(Duration::from_millis(30));
+        }
+    }
+}
+
+#[test]
+fn a_phone_connects_and_sends_pictures_with_poses() {
+    for stream in ["image", "pose"] {
+        let (place, [port, probe]) = (Place::new(), free_ports());
+        let entry = format!(
+            "{RIG}[device.phone]\nnode = \"lan\"\nbit = 0\n[device.phone.lan]\nprotocol = \"iphone\"\n\
+             host = \"127.0.0.1\"\nport = {port}\nprobe_port = {probe}\nstream = {stream:?}\n\
+             width = {WIDTH}\nheight = {HEIGHT}\n"
+        );
+        place.write("devices.toml", &entry);
+        let running = place.start(&[&RUN[..], &["--record", "--out", "out"]].concat(), "begin");
+        let listener = Server::start(probe, drop);
+        let sends = Arc::new(AtomicBool::new(true));
+        let sender = std::thread::spawn({
+            let sends = Arc::clone(&sends);
+            move || phone(port, &sends)
+        });
+        wait_for(&running, "phone", "streaming", 1);
+        sends.store(false, Ordering::Relaxed);
+        drop(listener);
+        sender.join().expect("no panic");
+        wait_for(&running, "phone", "by lease", 1);
+        stop(running);
+        let episode = Episode::read(&place.path("out").join(&place.files("out")[0]));
+        let first = episode.topic("/rapid/lan/phone").next().expect("a sample").payload();
+        if stream == "pose" {
+            let numbers: Vec<f64> = first.as_chunks().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect();
+            assert_eq!(numbers, (0..16).map(|index| f64::from(index) / 2.0).collect::<Vec<_>>());
+        } else {
+            let length = usize::from(u16::from_be_bytes([first[4], first[5]]));
+            let reported: Value = serde_json::from_slice(&first[6..4 + length]).expect("a comment in JSON");
+            assert_eq!((reported["pose"][3].as_f64(), reported["wall_clock"].as_f64()), (Some(1.5), Some(1.7e9)));
+            assert_eq!([&first[..2], &first[4 + length..]].concat(), picture(0), "the picture is as it was");
+        }
+    }
+}
+
+#[test]
+fn a_picture_of_another_size_is_reported_with_the_fix() {
+    let (place, [port]) = (Place::new(), free_ports());
+    place.write("devices.toml", &format!("{RIG}{}", camera_entry("cam", 0, port)).replace("width = 64", "width = 640"));
+    let _server = Server::start(port, camera);
+    let running = place.start(&RUN, "begin");
+    wait_for(&running, "cam", "failed", 1);
+    let reported = stop(running);
+    let failed = reported.iter().find(|event| event["state"] == "failed").expect("failed");
+    let detail = failed["detail"].as_str().expect("why");
+    assert!(detail.contains("64x48") && detail.contains("[device.cam.lan]"), "{detail}");
+}
+
+#[test]
+fn entries_on_the_network_are_simulated_like_any_other() {
+    let place = Place::new();
+    let text = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/registry/valid/lan.toml"));
+    place.write("devices.toml", &text.expect("a registry"));
+    place.write("sim.toml", "[[event]]\nat = \"1h\"\nunplug = \"lidar\"\n");
+    let running = place.start(&[&["--sim", "sim.toml"], &RUN[..]].concat(), "begin");
+    for device in ["cam_lan", "lidar", "lidar_asked", "gopro", "cam_behind_adapter", "phone", "phone_pose"] {
+        wait_for(&running, device, "streaming", 1);
+    }
+    stop(running);
+}

@@ -1,0 +1,38 @@
+//! The program as a user starts it: each test starts the built binary with a folder and an instance of its own.
+//!
+//! One executable for all of them, because linking forty of them takes minutes. Its tests run side by side: whatever
+//! belongs to the process (environment, current folder, umask) is set for a child only, and what belongs to the machine
+//! (shared memory, ports) carries the name of the test's instance.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "what fails here fails a test")]
+
+#[path = "../support/mod.rs"]
+mod support;
+
+mod ablation;
+mod alone;
+mod binary;
+mod calibrate;
+mod docs;
+mod ends;
+mod hooks;
+mod hostile;
+mod infer;
+mod kill;
+mod lan;
+mod lan_gopro;
+mod lan_hostile;
+mod lan_mdns;
+mod many_devices;
+mod nodes;
+mod process;
+mod provenance;
+mod publishers;
+mod python;
+mod register;
+mod scenarios;
+mod second_run;
+mod shared_memory;
+mod stops;
+mod task;
+mod verdict;

@@ -1,0 +1,122 @@
+//! A run after another: the replay of a recording, and a start after a kill.
+
+#![allow(clippy::expect_used, reason = "what fails here fails a test")]
+
+use std::collections::BTreeMap;
+
+use crate::support::{self, Episode, Place, events};
+use rapid::registry::Registry;
+use rustix::process::Signal;
+
+/// Runs before the machine is given up: those in which the recording began after the first unplug or
+/// before every device delivered show nothing.
+const ATTEMPTS: usize = 5;
+
+fn masks(episode: &Episode) -> Vec<u64> {
+    episode.mask_edges().into_iter().map(|(_, mask)| mask).collect()
+}
+
+/// Records into `out` until the mask began with every bit; returns the episode's file.
+fn record(place: &Place, out: &str, arguments: &[&str]) -> String {
+    for attempt in 0..ATTEMPTS {
+        let folder = format!("{out}{attempt}");
+        let common = ["--headless", "--json", "--record", "--out", &folder];
+        let output = place.run(&[arguments, &common].concat());
+        let code = support::recorded_code(&String::from_utf8_lossy(&output.stdout));
+        assert_eq!(output.status.code(), code, "{}", String::from_utf8_lossy(&output.stderr));
+        let file = format!("{folder}/{}", place.files(&folder)[0]);
+        if masks(&Episode::read(&place.path(&file))).first() == Some(&7) {
+            return file;
+        }
+    }
+    panic!("in {ATTEMPTS} runs the recording never began with every device");
+}
+
+#[test]
+fn a_replay_recorded_again_holds_the_same_samples_at_the_same_distances() {
+    let place = Place::new();
+    let file = record(&place, "first", &["--sim", "--duration", "9s"]);
+    let original = Episode::read(&place.path(&file));
+    assert_eq!(masks(&original), [7, 5, 7]);
+    let file = record(&place, "second", &["replay", &file, "--duration", "7500ms"]);
+    let again = Episode::read(&place.path(&file));
+    assert_eq!(masks(&again), [7, 5, 7]);
+
+    let mut shifts = BTreeMap::new();
+    for device in Registry::builtin().devices {
+        let recorded: Vec<_> = original.topic(&device.topic).collect();
+        // Every payload of a simulated device is unlike every other.
+        let places: BTreeMap<Vec<u8>, usize> =
+            recorded.iter().enumerate().map(|(at, message)| (message.payload(), at)).collect();
+        assert_eq!(places.len(), recorded.len(), "{}", device.name);
+        let replayed: Vec<_> = again.topic(&device.topic).collect();
+        let found: Vec<usize> = replayed
+            .iter()
+            .map(|message| *places.get(&message.payload()).unwrap_or_else(|| panic!("{}: not recorded", device.name)))
+            .collect();
+        assert!(found.len() >= 60, "{}: {} samples", device.name, found.len());
+        for (message, at) in replayed.iter().zip(&found) {
+            let shift = i128::from(message.log_time) - i128::from(recorded[*at].log_time);
+            shifts.entry(shift).or_insert_with(Vec::new).push(device.name.clone());
+        }
+        // Contiguous, but for the moment at which the device was plugged in again.
+        let jumps = found.windows(2).filter(|pair| pair[1] != pair[0] + 1).count();
+        assert!(found.is_sorted_by(|a, b| a < b), "{}", device.name);
+        assert!(jumps <= usize::from(device.name == "tactile_tip"), "{}: {jumps} jumps", device.name);
+        for pair in replayed.windows(2) {
+            assert_eq!(pair[1].sequence, pair[0].sequence + 1, "{}", device.name);
+        }
+    }
+    // Capture times are those recorded, all moved by the same time, to the ns.
+    assert_eq!(shifts.len(), 1, "{:?}", shifts.iter().map(|(shift, of)| (shift, of.len())).collect::<Vec<_>>());
+}
+
+#[test]
+fn after_a_kill_the_next_run_takes_over_and_leaves_nothing_of_the_dead_one() {
+    let place = Place::new();
+    let arguments = ["--sim", "--headless", "--json", "--record", "--out", "out"];
+    let running = place.start(&arguments, "\"event\":\"recording\"");
+    running.signal(Signal::KILL);
+    assert_eq!(running.end().0, None);
+    // The counter of nodes has the same name in each run; every other file has the port's or node's own number in its
+    // name.
+    let own = |place: &Place| {
+        let mut files = place.shared_memory();
+        files.retain(|file| !file.ends_with(".global_mgmt"));
+        files
+    };
+    let dead = own(&place);
+    for kind in [".data", ".dynamic", ".connection"] {
+        assert!(dead.iter().any(|file| file.ends_with(kind)), "nothing is left to reclaim: {dead:?}");
+    }
+    let mask = std::fs::read(place.mask_file()).expect("the dead one's mask");
+    assert_ne!(mask[8], 0, "it died with devices present");
+
+    let mut running = place.start(&arguments, "\"event\":\"recording\"");
+    let alive = own(&place);
+    assert_eq!(alive.intersection(&dead).collect::<Vec<_>>(), Vec::<&String>::new());
+    // The demonstration pulls a camera: the file lives.
+    running.wait_for("\"mask\":\"0x05\"");
+    let json = std::fs::read_to_string(format!("{}.json", place.mask_file().display())).expect("JSON file");
+    let json: serde_json::Value = serde_json::from_str(&json).expect("JSON");
+    assert_eq!(json["pid"], running.pid());
+    running.signal(Signal::INT);
+    let (code, output, errors) = running.end();
+    assert_eq!(code, support::recorded_code(&output), "{errors}");
+    // Nothing but what became of the dead one's episode.
+    let printed = events(&output);
+    let about = |event: &serde_json::Value| event["text"].as_str().is_some_and(|text| text.contains(".mcap.partial: "));
+    assert!(!printed.iter().any(|event| event["event"] == "log" && !about(event)), "{output}");
+    assert_eq!(own(&place), std::collections::BTreeSet::new());
+    assert!(!place.mask_file().exists());
+    let files = place.files("out");
+    let whole = files
+        .iter()
+        .find(|file| file.ends_with("_001.mcap") || file.ends_with("_002.mcap"))
+        .expect("the second run's episode");
+    assert!(Episode::read(&place.path("out").join(whole)).topic("/rapid/mask").count() > 0);
+    assert!(
+        !files.iter().any(|file| file.ends_with(".mcap.partial")),
+        "the killed run's file is looked after: {files:?}"
+    );
+}

@@ -1,0 +1,167 @@
+//! The simulated task from the command line: demonstrations, and trials of the trained policy.
+
+#![allow(clippy::expect_used, reason = "what fails here fails a test")]
+
+use std::sync::Arc;
+
+use crate::support::{self, Episode, Place, events};
+use rapid::lockstep::timing::Timing;
+use rapid::lockstep::{Lockstep, STEP};
+use rapid::record::EpisodeRequest;
+use rapid::record::stepped::Stepped;
+use rapid::registry::Registry;
+use rapid::registry::scenario::Scenario;
+use rapid::status::Board;
+use rapid::time::{Stamp, WallClock};
+use serde_json::Value;
+
+/// The folder of the policy of the repository.
+const BUNDLE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/models/tactile-id");
+
+fn printed(place: &Place, arguments: &[&str]) -> Vec<Value> {
+    let output = place.run(&[&["--json"], arguments].concat());
+    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    events(&String::from_utf8_lossy(&output.stdout))
+}
+
+/// Payloads of a topic.
+fn payloads(episode: &Episode, topic: &str) -> Vec<Vec<u8>> {
+    episode.topic(topic).map(support::Message::payload).collect()
+}
+
+#[test]
+fn demonstrations_are_whole_episodes_and_the_same_seed_gives_the_same_one() {
+    let place = Place::new();
+    let record = |out: &str| {
+        let demonstrate = ["--sim", "task", "--expert", "--record", "--episodes", "2", "--seed", "1000", "--out", out];
+        printed(&place, &demonstrate)
+    };
+    let (first, second) = (record("a"), record("b"));
+    let words = |printed: &[Value], key: &str| printed.iter().map(|one| one[key].clone()).collect::<Vec<_>>();
+    assert_eq!(words(&first, "verdict"), ["GOOD", "GOOD"]);
+    assert_eq!(words(&first, "seed"), words(&second, "seed"));
+    let mut textures = words(&first, "texture");
+    textures.sort_by_key(ToString::to_string);
+    assert_eq!(textures, ["hexagonal", "triangular"], "one of each");
+
+    let read = |folder: &str| {
+        let files = place.files(folder);
+        assert_eq!(files.len(), 2);
+        Episode::read(&place.path(folder).join(&files[0]))
+    };
+    let (a, b) = (read("a"), read("b"));
+    for topic in ["/rapid/camera/wrist", "/rapid/camera/tactile", "/rapid/serial/arm", "/action"] {
+        assert!(!payloads(&a, topic).is_empty() && payloads(&a, topic) == payloads(&b, topic), "{topic}");
+    }
+    // Every tick has its samples, captured at that very moment, and the action that was taken on them.
+    let frames = a.frames();
+    let actions: Vec<u64> = a.topic("/action").map(|action| action.log_time).collect();
+    assert_eq!(frames.iter().map(|(message, _)| message.log_time).collect::<Vec<_>>(), actions);
+    for (message, frame) in &frames {
+        assert_eq!(frame.mask, 0b111);
+        assert!(frame.modalities.iter().all(|one| one.valid && one.age_ns.unwrap_or(0) == 0), "{}", message.log_time);
+    }
+}
+
+/// Whatever the phases of its sensors are, and wherever between two of their samples an episode begins.
+#[test]
+fn the_frames_of_the_rig_are_valid_whatever_the_phases_are() {
+    let place = Place::new();
+    let registry = Arc::new(Registry::task());
+    for seed in 0..12 {
+        let board = Arc::new(Board::new(&registry));
+        let mut recorder = Stepped::new(Arc::clone(&registry), board, WallClock::now());
+        let timings = Timing::draw(seed, &[true; 3]);
+        let scenario = Scenario::task(&registry, seed);
+        let mut rig = Lockstep::new(&registry, scenario, Stamp::now(), &timings).expect("a rig");
+        for _ in 0..3 {
+            rig.rest(&mut recorder).expect("a rest");
+        }
+        let out = place.path(&seed.to_string());
+        std::fs::create_dir(&out).expect("folder");
+        let request =
+            EpisodeRequest { out, task: "phases".into(), tags: Vec::new(), modules: Vec::new(), duration: None };
+        recorder.begin(&request, rig.now()).expect("an episode");
+        for _ in 0..30 {
+            rig.step(0.0, &mut recorder).expect("a step");
+            recorder.advance(rig.now());
+        }
+        let report = recorder.finish(rig.now()).expect("a report");
+        let frames = Episode::read(&report.file).frames().into_iter().map(|(_, frame)| frame).collect::<Vec<_>>();
+        assert_eq!(frames.len(), 30);
+        // The sample before the first tick is not of the episode, nor that after the last one.
+        for frame in &frames[1..29] {
+            let valid = frame.modalities.iter().all(|one| one.valid);
+            assert!(valid, "seed {seed}, frame {}: {timings:?}: {:?}", frame.index, frame.modalities);
+        }
+    }
+    assert!(STEP.as_millis() == 100);
+}
+
+/// The same of a run in real time: at each tick a sample of every device lies in the window, however late it came.
+#[test]
+fn a_run_in_real_time_captures_a_sample_for_every_tick() {
+    let place = Place::new();
+    let window = Registry::task().rig.sync_window.as_nanos();
+    for out in ["a", "b", "c"] {
+        printed(&place, &["--sim", "task", "--headless", "--record", "--duration", "2s", "--out", out]);
+        let episode = Episode::read(&place.path(out).join(&place.files(out)[0]));
+        let frames = episode.frames();
+        assert!(frames.len() >= 19, "{}", frames.len());
+        for topic in ["/rapid/camera/wrist", "/rapid/camera/tactile", "/rapid/serial/arm"] {
+            let captured: Vec<u64> = episode.topic(topic).map(|sample| sample.log_time).collect();
+            // Where a busy machine lost some, and before the first and after the last one, no tick can have one.
+            let pairs = captured.windows(2).filter(|pair| pair[1] - pair[0] < 150_000_000);
+            let mut seen = 0;
+            for pair in pairs {
+                for (tick, _) in frames.iter().filter(|(tick, _)| (pair[0]..pair[1]).contains(&tick.log_time)) {
+                    let nearest = (tick.log_time - pair[0]).min(pair[1] - tick.log_time);
+                    assert!(u128::from(nearest) <= window, "{topic}: {nearest} ns");
+                    seen += 1;
+                }
+            }
+            assert!(seen > 0, "{topic}: {} samples", captured.len());
+        }
+    }
+}
+
+#[test]
+fn trials_are_the_same_again_and_a_fixed_set_of_sensors_ends_those_in_which_one_is_pulled() {
+    let place = Place::new();
+    let trials = |more: &[&str]| {
+        let condition = ["--trials", "2", "--condition", "hot-unplug", "--condition", "hot-replug"];
+        printed(&place, &[&["eval", BUNDLE], &condition[..], more].concat())
+    };
+    let dynamic = trials(&[]);
+    assert_eq!(dynamic, trials(&[]));
+    let rows: Vec<&Value> = dynamic.iter().filter(|row| row["event"] == "condition").collect();
+    assert_eq!(rows.len(), 2);
+    for row in rows {
+        assert_eq!((&row["trials"], &row["crash"]), (&2.into(), &0.into()));
+        let ends = ["success", "wrong_bin", "incomplete"].map(|end| row[end].as_u64().expect("a count"));
+        assert_eq!(ends.iter().sum::<u64>(), 2);
+    }
+    // The sensor was missed: the policy was asked again, and acted at every tick but the first.
+    for trial in dynamic.iter().filter(|row| row["event"] == "trial") {
+        assert_eq!((&trial["counts"]["held_ticks"], &trial["failure"]), (&1.into(), &Value::Null), "{trial}");
+        assert!(trial["unplugged_at"].is_u64());
+    }
+    let fixed = trials(&["--static-config"]);
+    for row in fixed.iter().filter(|row| row["event"] == "condition") {
+        assert_eq!((&row["crash"], &row["status"]), (&2.into(), &"crash".into()));
+    }
+}
+
+#[test]
+fn the_expert_knows_the_task_alone_and_reports_it() {
+    let place = Place::new();
+    let refused = |arguments: &[&str]| {
+        let output = place.run(arguments);
+        assert_eq!(output.status.code(), Some(2));
+        String::from_utf8_lossy(&output.stderr).into_owned()
+    };
+    assert!(refused(&["--sim", "--expert", "--record"]).contains("--sim task --expert --record"));
+    assert!(refused(&["--sim", "task", "--expert"]).contains("--record"));
+    assert!(refused(&["--sim", "task", "--expert", "--record", "--duration", "3s"]).contains("--duration"));
+    assert!(refused(&["eval", BUNDLE, "--condition", "sometimes"]).contains("hot-unplug"));
+}

@@ -1,0 +1,135 @@
+//! What a user sees of real devices: the listing, the installed rules, raw formats recorded, and a
+//! wish that a camera cannot fulfil.
+
+use vbench::check::{assert_accounted, assert_lines, ended};
+use vbench::emu::frame::identity;
+use vbench::emu::spec::{DeviceSpec, Format};
+use vbench::proto;
+use vbench::recording::Message;
+use vbench::scenario::Scenario;
+
+const REGISTRY: &str = r#"
+[device.cam_wide]                  # the camera has no such picture size
+vid = "0x046d"
+pid = "0x0825"
+serial = "CAM00A1"
+node = "camera"
+topic = "/rapid/camera/wide"
+bit = 0
+[device.cam_wide.camera]
+width = 1280
+height = 720
+fps = 30
+format = "MJPG"
+
+[device.cam_raw]
+vid = "0x2bc5"
+pid = "0x0501"
+serial = "YUV1"
+node = "camera"
+topic = "/rapid/camera/raw"
+bit = 1
+[device.cam_raw.camera]
+width = 320
+height = 240
+fps = 15
+format = "YUYV"
+
+[device.force]
+vid = "0x0403"
+pid = "0x6001"
+serial_number = "FT1"
+node = "serial"
+topic = "/rapid/force"
+bit = 2
+[device.force.tty]
+baud = 115200
+framing = "line"
+parse = "csv"
+channels = 4
+"#;
+
+const SCRIPT: &str = r#"
+emu plug 0 1 2 3
+wait_for 60 attached 0 1 2 3 || fail 'not attached'
+wait_for 30 test -e /dev/video2 -a -e /dev/ttyUSB0 -a -e /dev/ttyACM0
+udevadm settle
+config='--config /tmp/bench/devices.toml'
+"${rapid[@]}" devices --formats $config >$out/devices.txt || fail 'rapid devices'
+"${rapid[@]}" devices --json $config >$out/devices.jsonl || fail 'rapid devices --json'
+"${rapid[@]}" artifacts --install $config >$out/install.txt 2>&1 || fail 'rapid artifacts --install'
+wait_for 30 test -e /dev/rapid/cam_raw -a -e /dev/rapid/force || fail 'no links'
+ls -l /dev/rapid >$out/links
+rapid_start --headless --record --out $out/rec $config --json
+await_rapid 60 '"event":"recording"' || fail 'not recording'
+for device in cam_raw force; do
+  wait_for 60 states 1 $device streaming || fail "$device does not stream"
+done
+wait_for 60 states 1 cam_wide failed || fail 'cam_wide does not fail'
+"${rapid[@]}" --headless --duration 1s $config >$out/second.txt 2>&1; echo $? >$out/second.rc
+# Held by rapid: nobody else can stream from it.
+"${usbemu[@]}" --read /dev/rapid/cam_raw 1 >$out/held.txt 2>&1
+sleep 2
+rapid_stop
+emu unplug 1 2
+wait_for 30 detached 1 2
+udevadm settle
+ls /dev/rapid >$out/left 2>/dev/null
+emu_quit
+exit 0
+"#;
+
+#[test]
+fn real_devices_are_listed_linked_and_recorded_and_an_unmet_request_is_reported() {
+    let outcome = Scenario::new("commands")
+        .device(DeviceSpec::uvc(0x046d, 0x0825).serial("CAM00A1").mode(Format::Mjpg, 640, 480, &[30]))
+        .device(DeviceSpec::uvc(0x2bc5, 0x0501).serial("YUV1").mode(Format::Yuyv, 320, 240, &[15]))
+        .device(DeviceSpec::ftdi(0x0403, 0x6001, 50.0).serial("FT1"))
+        .device(DeviceSpec::acm(0x2e8a, 0x000a, 10.0).serial("STRANGER"))
+        .registry(REGISTRY)
+        .script(SCRIPT)
+        .run()
+        .unwrap_or_else(|error| panic!("{error}"));
+    ended(&outcome);
+
+    let listing = outcome.file("devices.txt");
+    println!("{listing}");
+    for word in ["[device.cam_wide]", "[device.cam_raw]", "[device.force]", "STRANGER", "MJPG 640x480", "YUYV 320x240"]
+    {
+        assert!(listing.contains(word), "{word} not in:\n{listing}");
+    }
+    let objects: Vec<serde_json::Value> =
+        outcome.file("devices.jsonl").lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let entry = |serial: &str| {
+        let object = objects.iter().find(|object| object["serial"] == serial);
+        object.unwrap_or_else(|| panic!("{serial} not in {objects:?}"))["entry"].clone()
+    };
+    assert_eq!([entry("CAM00A1"), entry("YUV1"), entry("FT1")], ["cam_wide", "cam_raw", "force"]);
+    assert_eq!(entry("STRANGER"), serde_json::Value::Null);
+
+    // Stable names appear with the rules, and go with the devices.
+    println!("{}", outcome.file("links"));
+    for link in ["cam_raw -> ../video", "cam_wide -> ../video", "force -> ../ttyUSB0"] {
+        assert!(outcome.file("links").contains(link), "{link} not in:\n{}", outcome.file("links"));
+    }
+    assert_eq!(outcome.file("left").split_whitespace().collect::<Vec<_>>(), ["cam_wide"]);
+
+    let failed = outcome.rapid.iter().find(|line| line["device"] == "cam_wide" && line["state"] == "failed");
+    let detail = failed.expect("cam_wide has failed")["detail"].as_str().unwrap().to_owned();
+    println!("{detail}");
+    assert!(detail.contains("offers no MJPG 1280x720 at 30 fps; it offers MJPG 640x480"), "{detail}");
+
+    // A second rapid on the same rig ends at once and names the first.
+    assert_eq!(outcome.file("second.rc").trim(), "1");
+    assert!(outcome.file("second.txt").contains("another rapid (pid "), "{}", outcome.file("second.txt"));
+    assert!(outcome.file("held.txt").contains("error"), "{}", outcome.file("held.txt"));
+
+    let episode = outcome.episode().unwrap_or_else(|error| panic!("{error}"));
+    // foxglove.RawImage: data is field 6.
+    let number = |message: &Message| identity(proto::bytes(&message.data, 6)).map(|id| u64::from(id.number));
+    let pictures: Vec<u64> = episode.topic("/rapid/camera/raw").filter_map(number).collect();
+    assert_eq!(pictures.len(), episode.topic("/rapid/camera/raw").count(), "some pictures carry no number");
+    assert_accounted(&episode, "/rapid/camera/raw", pictures);
+    assert_lines(&episode, "/rapid/force");
+    assert_eq!(episode.topic("/rapid/camera/wide").count(), 0);
+}

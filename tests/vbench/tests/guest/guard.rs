@@ -1,0 +1,94 @@
+//! `kill -9` and SIGSTOP while `rapid` drives motors behind an adapter of each kind: its guard stops them before the motors'
+//! own time limit does.
+
+use std::time::Duration;
+
+use serde_json::Value;
+use vbench::check::{ms, play};
+use vbench::emu::can::adapter::Protocol;
+use vbench::emu::spec::DeviceSpec;
+use vbench::entries::{can, registry};
+use vbench::outcome::Outcome;
+use vbench::scenario::Scenario;
+
+/// An emulated processor is late by tens of ms now and then: time limits of these buses are wide.
+fn bus(adapter: &str) -> String {
+    format!(
+        r#"adapter = "{adapter}"
+protocol = "damiao"
+hz = 50
+timeout = "3s"
+silent_after = "1s"
+disable_after = "never"
+motors = [{{ name = "joint", slave = 0x05, master = 0x15, type = "DM4310", mode = "position", position = [-1.0, 1.0], other_fault = "limp" }}]"#
+    )
+}
+
+const SCRIPT: &str = r#"
+for round in 0:socketcan:KILL 1:slcan:KILL 2:damiao:KILL 0:socketcan:STOP; do
+  IFS=: read -r device kind signal <<<"$round"
+  # One actuator a run: the others are out.
+  cp /tmp/bench/devices.$kind.toml /tmp/bench/devices.toml
+  rapid_start --headless --config /tmp/bench/devices.toml --json
+  emu plug $device
+  wait_for 60 states 1 arm streaming || fail "$kind: the motor does not stream"
+  mark $kind.$signal
+  "${rapid[@]}" arm || fail 'rapid takes no order'
+  wait_for 30 told motor_enabled "\"device\":$device" || fail "$kind: the motor is not enabled"
+  wait_for 30 told commands_begin "\"device\":$device" || fail "$kind: no commands"
+  sleep 1
+  mark $kind.$signal.killed
+  awk '{ printf "%.0f\n", $1 * 1e9 }' /proc/uptime >$out/$kind.$signal
+  kill -$signal $rapid_pid
+  wait_for 60 told motor_disabled "\"device\":$device" || fail "$kind: the motor was not disabled"
+  # Longer than the motor's own limit.
+  sleep 4
+  emu ask $device
+  [ $signal = STOP ] && kill -KILL $rapid_pid
+  wait $rapid_pid
+  gone() { ! pgrep -x motor-guard >/dev/null; }
+  wait_for 30 gone || fail "$kind: its guard is left"
+  emu unplug $device
+  emu_done $device
+done
+emu_quit
+exit 0
+"#;
+
+/// The lines of the emulator's log from a word to the end of its round.
+fn round<'a>(outcome: &'a Outcome, word: &str) -> &'a [Value] {
+    let printed = |line: &Value, word: &str| line["action"] == "say" && line["word"] == word;
+    let from = outcome.emu.iter().position(|line| printed(line, word)).unwrap_or_else(|| panic!("no word {word}"));
+    let lines = &outcome.emu[from..];
+    let end = lines.iter().position(|line| line["action"] == "gone").unwrap_or(lines.len());
+    &lines[..end]
+}
+
+#[test]
+fn a_killed_program_leaves_no_motor_to_its_own_limit() {
+    let adapter = |protocol, serial| DeviceSpec::can(protocol).serial(serial).motor(0x05, 0x15, "DM4310");
+    let kinds = [("socketcan", "1d50:606f", "CAN1"), ("slcan", "ad50:60c4", "CAN2"), ("damiao", "2e88:4603", "CAN3")];
+    let mut scenario = Scenario::new("guard")
+        .device(adapter(Protocol::GsUsb, "CAN1"))
+        .device(adapter(Protocol::Slcan, "CAN2"))
+        .device(adapter(Protocol::Damiao, "CAN3"));
+    for (kind, model, serial) in kinds {
+        let text = registry(&[can("arm", "/rapid/arm_state", 0, model, serial, &bus(kind))]);
+        scenario = scenario.registry(&text).file(&format!("devices.{kind}.toml"), text);
+    }
+    let outcome = play(scenario.script(SCRIPT).limit(Duration::from_secs(180)));
+    assert_eq!(outcome.code, 0, "the guest's script: {}", outcome.log);
+    assert!(outcome.emulator_errors().is_empty(), "{:?}", outcome.emulator_errors());
+    for round_of in ["socketcan.KILL", "slcan.KILL", "damiao.KILL", "socketcan.STOP"] {
+        let lines = round(&outcome, &format!("{round_of}.killed"));
+        let first = |action: &str| lines.iter().find(|line| line["action"] == action);
+        let off = first("motor_disabled").and_then(|line| line["mono_ns"].as_u64());
+        let off = off.unwrap_or_else(|| panic!("{round_of}: not disabled: {lines:?}"));
+        assert_eq!(first("motor_timeout"), None, "{round_of}: the motor had to give up by itself");
+        assert_eq!(first("motor_enabled"), None, "{round_of}: enabled again");
+        let state = first("motor_state").unwrap_or_else(|| panic!("{round_of}: {lines:?}"));
+        assert_eq!(state["enabled"], false, "{round_of}: {state}");
+        let killed = outcome.file(round_of).trim().parse::<u64>().expect("a time");
+        println!("{round_of}: off {} ms after the signal", ms(off, killed));
+    }
+}

@@ -1,0 +1,22 @@
+//! Scenarios of the virtual bench, each in a boot of the guest unless its file describes another way.
+//!
+//! They wait for each other: one guest runs at a time ([`vbench::guest`]). While it does, another one is prepared or judged.
+
+mod accidents;
+mod adapters;
+mod brake;
+mod buses;
+mod calibrate;
+mod commands;
+mod deaf_child;
+mod endurance;
+mod guard;
+mod hub;
+mod kill;
+mod lan;
+mod motors;
+mod policy;
+mod scenarios;
+mod service;
+mod strings;
+mod unprivileged;

@@ -1,0 +1,271 @@
+//! `rapid` on the virtual bench, and first the bench against itself.
+//!
+//! Wall-clock times in a recording are compared with the emulator's: both run in one guest, on one clock.
+
+use vbench::check::{assert_lines, assert_whole, episode, ms, only, play, recorded, rises_after};
+use vbench::emu::spec::{DeviceSpec, Format};
+use vbench::entries::{camera, registry, scalars};
+use vbench::recording::{falls, missing};
+use vbench::scenario::Scenario;
+
+/// Two cameras of different formats and both serial kinds: nodes, udev properties, frames, and the way back.
+#[test]
+fn bench_shows_the_guest_real_devices() {
+    let script = r#"
+emu plug 0 1 2 3
+wait_for 60 attached 0 1 2 3 || fail 'not attached'
+wait_for 30 test -e /dev/video2 -a -e /dev/ttyACM0 -a -e /dev/ttyUSB0
+udevadm settle
+for node in video0 video2 ttyACM0 ttyUSB0; do
+  echo "$node $(property /dev/$node ID_SERIAL_SHORT) $(property /dev/$node ID_VENDOR_ID):$(property /dev/$node ID_MODEL_ID) $(property /dev/$node ID_V4L_CAPABILITIES)"
+done >$out/nodes
+"${usbemu[@]}" --read /dev/video0 90 >$out/mjpg.json
+"${usbemu[@]}" --read /dev/video2 45 >$out/yuyv.json
+for tty in ttyACM0 ttyUSB0; do
+  stty -F /dev/$tty raw -echo
+  timeout 120 head -n 50 /dev/$tty >$out/$tty.csv
+done
+emu silent 0 1
+sleep 1
+"${usbemu[@]}" --read /dev/video0 5 2>$out/silent.err
+emu silent 0 0
+"${usbemu[@]}" --read /dev/video0 5 >$out/again.json
+emu unplug 0 1 2 3
+wait_for 30 detached 0 1 2 3 || fail 'still attached'
+udevadm settle
+ls /dev | grep -E '^(video|ttyACM|ttyUSB)' >$out/left
+emu port 0 6
+emu plug 0
+wait_for 30 attached 6 || fail 'not in the other port'
+emu_quit
+exit 0
+"#;
+    let outcome = play(
+        Scenario::new("self")
+            .device(DeviceSpec::uvc(0x046d, 0x0825).serial("CAM00A1").mode(Format::Mjpg, 640, 480, &[30]))
+            .device(DeviceSpec::uvc(0x046d, 0x0825).mode(Format::Yuyv, 320, 240, &[15]))
+            .device(DeviceSpec::acm(0x2e8a, 0x000a, 100.0).serial("TOF1"))
+            .device(DeviceSpec::ftdi(0x0403, 0x6001, 50.0).serial("FT1"))
+            .script(script),
+    );
+    assert_eq!(outcome.code, 0, "{}", outcome.log);
+    assert!(outcome.emulator_errors().is_empty());
+
+    let nodes = outcome.file("nodes");
+    for line in ["video0 CAM00A1 046d:0825 :capture:", "ttyACM0 TOF1 2e8a:000a ", "ttyUSB0 FT1 0403:6001 "] {
+        assert!(nodes.lines().any(|found| found == line), "{line} not in:\n{nodes}");
+    }
+    // A device without a serial descriptor has no short serial either.
+    assert!(nodes.lines().any(|found| found == "video2  046d:0825 :capture:"), "{nodes}");
+
+    // The second stream of the first camera is the silent one.
+    let (mjpg, yuyv) = (outcome.streams(0), outcome.streams(1));
+    for (name, format, fps, stream) in [
+        ("mjpg.json", "MJPG", 30.0, mjpg[0]),
+        ("yuyv.json", "YUYV", 15.0, yuyv[0]),
+        ("again.json", "MJPG", 30.0, mjpg[2]),
+    ] {
+        let read: serde_json::Value = serde_json::from_str(&outcome.file(name)).unwrap();
+        println!("{name}: {read}, {stream:?}");
+        assert_eq!(read["format"], format);
+        assert_eq!([&read["damaged"], &read["holes"], &read["repeats"]], [0, 0, 0], "{read}");
+        // A frame is sent at its beat or within one after it; what a busy machine delays more is skipped and counted.
+        let beats = read["sent_in_ns"].as_f64().unwrap() * fps / 1e9;
+        let intervals = read["frames"].as_u64().unwrap() - 1;
+        assert!(intervals < stream.sent, "{stream:?}");
+        let most = (intervals + stream.skipped + 1) as f64;
+        assert!(beats > intervals as f64 - 1.0, "{intervals} frames within {beats} beats: faster than {fps} fps");
+        assert!(beats < most, "{intervals} frames took {beats} beats, of which {} were skipped", stream.skipped);
+    }
+    assert!(outcome.file("silent.err").contains("no frame within 15 s"), "{}", outcome.file("silent.err"));
+
+    for tty in ["ttyACM0.csv", "ttyUSB0.csv"] {
+        let text = outcome.file(tty);
+        // The first line may have been cut by opening the port.
+        let numbers: Vec<u64> =
+            text.lines().skip(1).map(|line| line.split(',').next().unwrap().parse().unwrap()).collect();
+        assert_eq!(numbers.len(), 49);
+        assert_eq!(missing(numbers), 0, "{tty}");
+    }
+    assert_eq!(outcome.file("left"), "", "nodes outlived their devices");
+    assert_eq!((outcome.actions("plug", 0).len(), outcome.actions("unplug", 0).len()), (2, 2));
+}
+
+const NONE: [u64; 0] = [];
+const WRIST: &str = "/rapid/camera/wrist";
+const SIDE: &str = "/rapid/camera/side";
+const TOF: &str = "/rapid/tof";
+
+/// Two cameras and a distance sensor, recorded for 20 s; the second camera is out from 5 s to 9 s.
+#[test]
+fn unplugging_one_device_leaves_the_others_whole() {
+    let registry = registry(&[
+        camera("cam_wrist", WRIST, 0, Some("CAM00A1"), (640, 480)),
+        camera("cam_side", SIDE, 1, Some("CAM00B2"), (320, 240)),
+        scalars("tof", TOF, 2, "2e8a:000a", "TOF1"),
+    ]);
+    let outcome = recorded(
+        Scenario::new("unplug")
+            .device(vga("CAM00A1"))
+            .device(DeviceSpec::uvc(0x046d, 0x0825).serial("CAM00B2").mode(Format::Mjpg, 320, 240, &[30]))
+            .device(DeviceSpec::acm(0x2e8a, 0x000a, 100.0).serial("TOF1"))
+            .registry(&registry)
+            .record(20, &["cam_wrist", "cam_side", "tof"])
+            .at(5_000, "unplug 1")
+            .at(9_000, "plug 1")
+            .until("states 2 cam_side streaming"),
+    );
+    let episode = episode(&outcome);
+    let edges = episode.mask_edges();
+    let unplugged = outcome.actions("unplug", 1)[0].real_ns;
+    let replugged = outcome.actions("plug", 1)[1].real_ns;
+
+    assert_eq!(falls(&edges, 0), NONE, "the wrist camera stayed plugged");
+    assert_eq!(falls(&edges, 2), NONE, "the sensor stayed plugged");
+    assert_eq!(outcome.actions("stream_on", 0).len(), 1, "the wrist camera was started once");
+    assert_eq!(outcome.actions("stream_off", 0).len(), 1, "the wrist camera was stopped once, at the end");
+    assert_whole(&episode, WRIST, ..);
+    assert_lines(&episode, TOF);
+
+    let fell = only(&falls(&edges, 1));
+    assert!(fell >= unplugged, "the bit fell {} ms before the unplug", (unplugged - fell) / 1_000_000);
+    println!("bit cleared {} ms after the unplug", (fell - unplugged) / 1_000_000);
+    assert!(fell < replugged, "the bit fell only after the replug");
+    let rose = only(&rises_after(&edges, 1, fell));
+    assert!(rose >= replugged, "the bit rose before the replug");
+    println!("bit set {} ms after the replug", (rose - replugged) / 1_000_000);
+
+    assert_eq!(episode.channels(SIDE).len(), 1, "the camera came back on another channel");
+    assert_whole(&episode, SIDE, ..fell);
+    assert_whole(&episode, SIDE, replugged..);
+    assert_eq!(episode.numbers(SIDE, fell..replugged), NONE, "frames of a camera that was not there");
+
+    // The same by a reader that shares no code with us: Python's mcap.
+    let read = independent_reader(&episode.path);
+    let edges = read["mask_edges"].as_array().expect("a list");
+    println!("read by Python: {edges:?}");
+    let masks: Vec<_> = edges.iter().map(|edge| edge["mask"].as_u64()).collect();
+    assert_eq!(masks, [Some(0b111), Some(0b101), Some(0b111)]);
+    let at = |edge: usize| edges[edge]["at"].as_f64().expect("seconds");
+    let between = (rose - fell) as f64 / 1e9;
+    assert!((at(2) - at(1) - between).abs() < 1e-3, "{} s instead of {between} s", at(2) - at(1));
+}
+
+/// What `tests/python/read_episode.py` reads in an episode, run by the Python of `make setup`.
+fn independent_reader(episode: &std::path::Path) -> serde_json::Value {
+    let home = || std::path::PathBuf::from(std::env::var_os("HOME").expect("a home directory"));
+    let cache = || std::env::var_os("XDG_CACHE_HOME").map_or_else(|| home().join(".cache"), Into::into);
+    let python = std::env::var_os("RAPID_PYTHON").map_or_else(|| cache().join("rapid/venv/bin/python"), Into::into);
+    let script = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../python/read_episode.py");
+    let read = std::process::Command::new(&python).arg(script).arg(episode).output();
+    let read = read.unwrap_or_else(|error| panic!("{}: {error}; run `make setup`", python.display()));
+    assert!(read.status.success(), "{}", String::from_utf8_lossy(&read.stderr));
+    serde_json::from_slice(&read.stdout).expect("JSON")
+}
+
+/// A camera is gone for 0.3 s, first back in its port, then in another: both times it streams again as the same modality.
+#[test]
+fn a_quick_replug_is_not_lost() {
+    let outcome = recorded(
+        Scenario::new("replug")
+            .device(vga("CAM00A1"))
+            .registry(&registry(&[camera("cam_wrist", WRIST, 0, Some("CAM00A1"), (640, 480))]))
+            .record(25, &["cam_wrist"])
+            .at(3_000, "unplug 0")
+            .at(3_300, "plug 0")
+            .at(12_000, "unplug 0")
+            .at(12_000, "port 0 5")
+            .at(12_300, "plug 0")
+            .until("states 3 cam_wrist streaming"),
+    );
+    let episode = episode(&outcome);
+    let edges = episode.mask_edges();
+    let plugs = outcome.actions("plug", 0);
+    let unplugs = outcome.actions("unplug", 0);
+    let fell = falls(&edges, 0);
+    assert_eq!(fell.len(), 2, "two unplugs, two falling edges: {edges:?}");
+    for ((fell, unplugged), replugged) in fell.iter().zip(&unplugs).zip(&plugs[1..]) {
+        assert!(*fell >= unplugged.real_ns);
+        let rose = *rises_after(&edges, 0, *fell).first().expect("the bit came back");
+        assert!(rose >= replugged.real_ns);
+        println!(
+            "out for 300 ms: cleared after {} ms, set {} ms after the replug",
+            ms(*fell, unplugged.real_ns),
+            ms(rose, replugged.real_ns)
+        );
+    }
+    assert_eq!(episode.channels(WRIST).len(), 1);
+    assert_whole(&episode, WRIST, ..unplugs[0].real_ns);
+    assert_whole(&episode, WRIST, plugs[1].real_ns..unplugs[1].real_ns);
+    assert_whole(&episode, WRIST, plugs[2].real_ns..);
+}
+
+/// Two units that differ by their ports alone fill two entries; each keeps its own when the other leaves, and gets it back.
+#[test]
+fn equal_units_keep_their_entries() {
+    let registry =
+        registry(&[camera("cam_left", WRIST, 0, None, (640, 480)), camera("cam_right", SIDE, 1, None, (640, 480))]);
+    let outcome = recorded(
+        Scenario::new("equal")
+            .device(vga(""))
+            .device(vga(""))
+            .registry(&registry)
+            .record(20, &["cam_left", "cam_right"])
+            .at(4_000, "unplug 1")
+            .at(8_000, "plug 1")
+            // Which entry the unit has is not known here.
+            .until("is 0x03 published mask"),
+    );
+    let episode = episode(&outcome);
+    let edges = episode.mask_edges();
+    let unit = |topic| {
+        let mut units: Vec<usize> =
+            episode.frames(topic).iter().filter_map(|frame| frame.id).map(|id| id.device()).collect();
+        units.dedup();
+        units
+    };
+    let (left, right) = (unit(WRIST), unit(SIDE));
+    assert!(left.len() == 1 && right.len() == 1 && left != right, "an entry changed its unit: {left:?} {right:?}");
+    let (moved, stayed) = if right == [1] { ((1, SIDE), (0, WRIST)) } else { ((0, WRIST), (1, SIDE)) };
+
+    assert_eq!(falls(&edges, stayed.0), NONE, "the unit that stayed lost its bit");
+    assert_whole(&episode, stayed.1, ..);
+    let fell = only(&falls(&edges, moved.0));
+    let replugged = outcome.actions("plug", 1)[1].real_ns;
+    assert!(fell >= outcome.actions("unplug", 1)[0].real_ns && fell < replugged);
+    assert!(only(&rises_after(&edges, moved.0, fell)) >= replugged);
+    assert_whole(&episode, moved.1, ..fell);
+    assert_whole(&episode, moved.1, replugged..);
+}
+
+/// A camera that stops sending without leaving is stalled, not absent: the mask speaks of plugs, not of data.
+#[test]
+fn silence_is_not_absence() {
+    let outcome = recorded(
+        Scenario::new("silence")
+            .device(vga("CAM00A1"))
+            .registry(&registry(&[camera("cam_wrist", WRIST, 0, Some("CAM00A1"), (640, 480))]))
+            .record(20, &["cam_wrist"])
+            .at(4_000, "silent 0 1")
+            .at(9_000, "silent 0 0")
+            .until("states 2 cam_wrist streaming"),
+    );
+    let episode = episode(&outcome);
+    assert_eq!(falls(&episode.mask_edges(), 0), NONE, "silence cleared the bit");
+    let states = outcome.states("cam_wrist");
+    let place =
+        |state: &str, from: usize| states.iter().skip(from).position(|found| *found == state).map(|at| at + from);
+    let streaming = place("streaming", 0).expect("streaming at first");
+    let stalled = place("stalled", streaming).unwrap_or_else(|| panic!("never stalled: {states:?}"));
+    assert!(place("streaming", stalled).is_some(), "never streaming again: {states:?}");
+    for gone in ["absent", "backoff", "failed"] {
+        assert_eq!(place(gone, streaming), None, "{states:?}");
+    }
+    let silent: Vec<u64> = outcome.actions("silent", 0).iter().map(|moment| moment.real_ns).collect();
+    assert_whole(&episode, WRIST, ..silent[0]);
+    assert_whole(&episode, WRIST, silent[1]..);
+}
+
+fn vga(serial: &str) -> DeviceSpec {
+    DeviceSpec::uvc(0x046d, 0x0825).serial(serial).mode(Format::Mjpg, 640, 480, &[30])
+}
