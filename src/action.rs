@@ -1,8 +1,8 @@
-//! Actions: what a policy, an expert or another program wants an actuator to do next.
+//! Actions: the next motion that a policy, an expert or another program requests of an actuator.
 //!
 //! An action travels as a sample of numbers, like the state of an arm: little-endian 64-bit floats in the
 //! order of the actuator's `[device.NAME.action]` table, in its units. Its capture time is the tick of
-//! the control grid it is the action of.
+//! the control grid that it belongs to.
 
 use std::os::fd::BorrowedFd;
 use std::sync::Arc;
@@ -18,7 +18,7 @@ pub const ACTION_TOPIC: &str = "/action";
 /// Numbers in an action, at most.
 pub const MAX_ACTION: usize = 64;
 
-/// May an actuator move? For screens and recordings.
+/// Whether an actuator may move. For screens and recordings.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Arming {
@@ -28,7 +28,7 @@ pub enum Arming {
     Arming,
     /// It follows actions.
     Armed,
-    /// It is armed and stays where it is: no action came in time.
+    /// It is armed and holds its position: no action arrived in time.
     Holding,
     /// It disabled itself, and takes no actions until it is armed again.
     Faulted,
@@ -48,16 +48,16 @@ impl Arming {
     }
 }
 
-/// What is asked of an actuator.
+/// An order to an actuator.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Order {
     /// It may move from now on.
     Arm,
-    /// Likewise; joints that are outside their limits are driven back into them first, slowly.
+    /// As above; joints that are outside their limits are first driven back into them, slowly.
     ArmBack,
-    /// It may not.
+    /// It may not move.
     Disarm,
-    /// It may not, and each joint stops as it is configured for an emergency stop.
+    /// It may not move, and each joint stops as it is configured for an emergency stop.
     Emergency(Trip),
 }
 
@@ -66,12 +66,12 @@ pub enum Order {
 pub struct Trip {
     /// Which stop, by its position in the registry, below [`MAX_STOPS`](crate::interlock::MAX_STOPS).
     pub stop: u8,
-    /// Its input was lost; otherwise it says stop.
+    /// Its input was lost; otherwise it reports stop.
     pub is_lost: bool,
 }
 
 impl Trip {
-    /// In words; `stops` are the names of all stops.
+    /// As text; `stops` are the names of all stops.
     #[must_use]
     pub fn text(self, stops: &[Arc<str>]) -> String {
         let name = stops.get(usize::from(self.stop)).map_or("?", |name| name);
@@ -79,10 +79,10 @@ impl Trip {
     }
 }
 
-/// Why a sample on the topic of actions moves nothing.
+/// Why a sample on the topic of actions is ignored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum NoAction {
-    /// It is no list of finite numbers.
+    /// It is not a list of finite numbers.
     #[error("an action is no list of 1 to {MAX_ACTION} finite 64-bit floats")]
     NoNumbers,
     /// A policy of this process drives the actuator.
@@ -90,23 +90,23 @@ pub enum NoAction {
     Foreign,
 }
 
-/// Where an actuator finds the action that it is to carry out: the topic of actions.
+/// Where an actuator reads the action to carry out: the topic of actions.
 pub trait ActionSource: std::fmt::Debug + Send + Sync {
-    /// Readable when an action may have come since the last call of [`Self::newest`]. A program may publish without it:
-    /// who waits for it also looks by the clock.
+    /// Readable when an action may have arrived since the last call of [`Self::newest`]. A program may publish without
+    /// ringing it: a caller that waits for it must also poll.
     fn bell(&self) -> Option<BorrowedFd<'_>>;
 
-    /// Writes the newest action that waits into `action` and forgets the older ones; gives it with the tick it
-    /// is the action of, or `None` if none waits.
+    /// Writes the newest pending action into `action` and discards older ones; returns it with the tick it belongs to,
+    /// or `None` if none is pending.
     ///
     /// # Errors
-    /// When nothing but what is no action, or is not to be followed, waited.
+    /// When all pending samples are invalid, or must not be followed.
     fn newest<'a>(&self, action: &'a mut [f64; MAX_ACTION]) -> Result<Option<(&'a [f64], Stamp)>, NoAction>;
 }
 
 /// Orders on their way to the actuator that carries them out.
 ///
-/// Invariant: neither a disarm nor an emergency stop is lost, and no arm is left of before them. Of several emergency
+/// Invariant: neither a disarm nor an emergency stop is lost, and no earlier arm survives them. Of several emergency
 /// stops the first is named.
 #[derive(Debug, Default)]
 pub struct OrderSlot {
@@ -119,16 +119,16 @@ impl OrderSlot {
     const ARM: u16 = 2;
     const EMERGENCY: u16 = 4;
     const LOST: u16 = 8;
-    /// The arm is one that drives joints back.
+    /// The arm drives joints back.
     const BACK: u16 = 16;
     const ANY_ARM: u16 = Self::ARM | Self::BACK;
-    /// Which stop is in the bits from here.
+    /// The stop's index is in the bits from here.
     const STOP: u32 = 8;
 
-    /// Leaves an order there.
+    /// Adds an order.
     pub fn give(&self, order: Order) {
         let left = |given: u16| match order {
-            // The newer arm counts.
+            // The newer arm replaces the older.
             Order::Arm => (given & !Self::ANY_ARM) | Self::ARM,
             Order::ArmBack => (given & !Self::ANY_ARM) | Self::BACK,
             Order::Disarm => (given & !Self::ANY_ARM) | Self::DISARM,
@@ -138,7 +138,7 @@ impl OrderSlot {
                 (given & Self::DISARM) | Self::EMERGENCY | cause
             }
         };
-        // It never refuses.
+        // The closure always returns a value.
         let _ = self.given.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |given| Some(left(given)));
         self.bell.ring();
     }
@@ -149,10 +149,10 @@ impl OrderSlot {
         &self.bell
     }
 
-    /// Takes what is there, in the order in which it is to be carried out. An emergency stop comes before a disarm,
-    /// which turns off also what an emergency stop would hold.
+    /// Takes the pending orders, in the order in which they are to be carried out. An emergency stop comes before a
+    /// disarm, which also turns off what an emergency stop would hold.
     pub fn take(&self) -> impl Iterator<Item = Order> + use<> {
-        // First: an order that comes in between rings again, for nothing.
+        // First: an order that arrives in between rings again, which is harmless.
         self.bell.silence();
         let given = self.given.swap(0, Ordering::SeqCst);
         let [stop, _] = (given >> Self::STOP).to_le_bytes();
@@ -167,12 +167,12 @@ impl OrderSlot {
     }
 }
 
-/// What an actuator reports beside its samples.
+/// What an actuator reports in addition to its samples.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ActuatorNotice {
-    /// May it move now?
+    /// Whether it may move now.
     pub arming: Arming,
-    /// What happened, for people.
+    /// What happened, as text for the user.
     pub text: String,
     /// It needs attention.
     pub is_problem: bool,
@@ -183,7 +183,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_stop_is_never_lost_and_no_arm_is_left_of_before_it() {
+    fn a_stop_is_never_lost_and_no_earlier_arm_survives_it() {
         use Order::{Arm, ArmBack, Disarm, Emergency};
         let [one, two] = [Trip { stop: 0, is_lost: false }, Trip { stop: 15, is_lost: true }].map(Emergency);
         let slot = OrderSlot::default();

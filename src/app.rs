@@ -1,10 +1,10 @@
-//! The program: starts the stages, runs them, and takes them down in order.
+//! The program: starts the stages, runs them, and shuts them down in order.
 //!
-//! Each stage is a tokio task that owns what must block behind it ([`stage`] has the table).
+//! Each stage is a tokio task that owns the threads that block for it ([`stage`] has the table).
 //!
-//! Taking down: the episode ends, the policy holds and actuators are disarmed, the last samples of the episode arrive,
+//! Shutdown: the episode ends, the policy holds and actuators are disarmed, the last samples of the episode arrive,
 //! streams stop, the recorder finishes its file, the programs of devices are waited for, the mask is 0 and its files
-//! are removed, the screen shows what was recorded and gives the terminal back.
+//! are removed, the screen shows what was recorded and restores the terminal.
 //!
 //! Invariant: only this module sees every stage.
 //! Invariant: whatever ends the run, an episode in progress is finished first.
@@ -73,9 +73,9 @@ pub enum Devices {
 pub enum Screen {
     /// The full-screen monitor.
     Monitor,
-    /// Lines for people.
+    /// Lines of text.
     Lines,
-    /// One JSON object a line.
+    /// One JSON object per line.
     Json,
 }
 
@@ -129,12 +129,12 @@ pub fn mask_path(instance: Option<&str>) -> PathBuf {
 pub async fn run(options: Options) -> Result<(), AppError> {
     let registry = Arc::new(options.registry.clone());
     let board = Arc::new(Board::new(&registry));
-    // Lines still on their way to standard error are waited for when this is dropped.
+    // Pending lines for standard error are waited for when this is dropped.
     let _log = logging::init(Arc::clone(&board), std::env::var("RAPID_LOG").ok().as_deref(), options.screen.stderr())?;
     if options.screen != Screen::Monitor {
         panics::to_log();
     }
-    // Before anything that a full or damaged machine may refuse.
+    // Before anything that can fail on a full or damaged machine.
     let (permission, _orders) = receive_orders(options.instance.as_deref(), options.arm, interlocks::of(&registry))?;
     let (signals, _fed) = (Signals::listen()?, Watchdog::feed());
 
@@ -154,13 +154,13 @@ pub async fn run(options: Options) -> Result<(), AppError> {
     let machine = Machine { registry, board, permission, signals, presence };
     let watchman = bus.watchman();
     let (mut running, mut conductor) = start(machine, &bus, options, episode).await?;
-    // In the background, and once a screen shows what it reports: nothing of this run waits for episodes that an earlier
-    // one left unfinished.
+    // In the background, and only once a screen shows what it reports: this run does not wait for episodes that an
+    // earlier one left unfinished.
     let _repairs = may_record.then(|| {
         let repairs = Repairs::start(conductor.episode.out.clone(), reserve, Arc::clone(&conductor.board));
         repairs.inspect_err(|error| tracing::warn!(%error, "unfinished episodes are not repaired")).ok()
     });
-    // A panic here ends the run like any other: what it leaves is taken down in order.
+    // A panic here ends the run like any other error: the shutdown is carried out in order.
     let conducted = async {
         tokio::select! {
             outcome = conductor.conduct(&mut running) => outcome,
@@ -183,7 +183,7 @@ struct Machine {
     presence: Presence,
 }
 
-/// Starts the stages and the screen. The bus is to outlive them.
+/// Starts the stages and the screen. The bus must outlive them.
 async fn start(
     machine: Machine,
     bus: &Bus,
@@ -195,9 +195,9 @@ async fn start(
     let (mut recording, recorder) = conductor::record(bus.inbox()?, config)?;
     let kind = options.screen;
     let others = || {
-        // Before the screen: errors until here appear on an ordinary terminal.
+        // Before the screen: errors up to here appear on an ordinary terminal.
         let (discovery, plugged) = discovery::start(options.devices, &registry)?;
-        // To the very end: a device that is being closed may still move.
+        // Until the very end: a device that is being closed may still move.
         let watched = Watched::begin(&registry, &permission, &board).map_err(AppError::Interlocks)?;
         let (commands, from_screen) = mpsc::channel(16);
         let screen = screen::start(kind, &board, commands, &permission, options.duration);
@@ -208,7 +208,7 @@ async fn start(
     let (discovery, plugged, watched, from_screen, screen, inference) = match others() {
         Ok(others) => others,
         Err(error) => {
-            // The recorder's thread gives the bus back before the bus is dropped: nothing of it is left behind.
+            // The recorder's thread releases the bus before the bus is dropped: no files of it remain.
             drop(recorder);
             let _ = recording.end().await;
             return Err(error);
@@ -244,8 +244,8 @@ async fn start(
     Ok((running, conductor))
 }
 
-/// Receives orders of other programs to arm and disarm motors, and disarms them at a signal, whatever else the run waits
-/// for.
+/// Receives orders of other programs to arm and disarm motors, and disarms them at a signal, regardless of what else
+/// the run waits for.
 fn receive_orders(
     instance: Option<&str>,
     arm: bool,
@@ -265,13 +265,12 @@ fn receive_orders(
     Ok((permission, orders))
 }
 
-/// The screen has limits of its own for a reader that does not read. This one is for a screen that is
-/// stuck: crossterm 0.29 reads without end from a terminal that was hung up at the wrong moment.
+/// The screen has limits for a reader that does not read. This one is for a screen that is stuck: crossterm 0.29 reads
+/// endlessly from a terminal that was hung up at the wrong moment.
 const LAST_OUTPUT: Duration = Duration::from_secs(10);
-/// A chunk that is being computed has this long; computing one takes a tenth of a second at most.
+/// Limit for a chunk that is being computed; computing one takes a tenth of a second at most.
 const LAST_CHUNK: Duration = Duration::from_secs(5);
-/// After a second signal, what is still to be shown has this long: enough for a terminal to be given
-/// back.
+/// Limit for the remaining output after a second signal: enough for the terminal to be restored.
 const LAST_OUTPUT_IN_A_HURRY: Duration = Duration::from_secs(1);
 
 /// The stages of a run, and where requests to it come from.
@@ -289,16 +288,16 @@ struct Running {
     requests: mpsc::UnboundedReceiver<Request>,
 }
 
-/// Takes everything down, in the order of the module's comment. The first error is the run's.
+/// Shuts everything down, in the order of the module's comment. The first error is the run's.
 async fn finish(
     mut running: Running,
     mut conductor: Conductor,
     mut outcome: Result<(), AppError>,
 ) -> Result<(), AppError> {
-    // Scripts read lines and JSON, and look at the exit code.
+    // Scripts read lines and JSON, and check the exit code.
     let judged = (conductor.record && running.kind != Screen::Monitor).then(|| Arc::clone(&conductor.board));
-    // First of all nothing moves any more, whoever publishes actions. A chunk that is being computed is waited for
-    // with the rest.
+    // First, all motion ends, whichever program publishes actions. A chunk that is being computed is waited for with
+    // the rest.
     running.permission.disarm(Stamp::now());
     running.watched.end();
     let policy_ended = async {
@@ -315,7 +314,7 @@ async fn finish(
         let finished = conductor.finish_episode().await;
         keep_first(&mut outcome, running.streaming.end().await);
         keep_first(&mut outcome, finished);
-        // The recorder's thread ends with its handle: it has nothing left to write.
+        // The recorder's thread ends when its handle is dropped: it has nothing left to write.
         drop(conductor);
         keep_first(&mut outcome, running.recording.end().await);
         keep_first(&mut outcome, running.discovery.end().await);
@@ -327,7 +326,7 @@ async fn finish(
         () = running.signals.second() => true,
     };
     if twice {
-        // What the rig waits for is skipped, the recorder's finish never.
+        // Waits of the rig are skipped, but the end of the recorder never.
         hurry.cancel();
         take_down.as_mut().await;
     }

@@ -6,21 +6,21 @@ use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 
 use rustix::event::{EventfdFlags, eventfd};
 
-/// See the module's comment. Where the system has no descriptor left it is mute: a thread that waits also looks by the
-/// clock.
+/// See the module's comment. If the system has no descriptor left it never rings: a thread that waits for it must also
+/// poll.
 #[derive(Debug)]
 pub struct Bell(Option<OwnedFd>);
 
 impl Bell {
-    /// Wakes who waits, now or the next time.
+    /// Wakes the waiter, now or the next time it waits.
     pub fn ring(&self) {
         if let Some(descriptor) = &self.0 {
-            // Fails only if it was rung 2^64 - 2 times and still rings.
+            // Fails only after 2^64 - 2 rings without a silence, when it still rings.
             let _ = rustix::io::write(descriptor, &1_u64.to_ne_bytes());
         }
     }
 
-    /// It rings no more until it is rung again. Call it before looking at what it was rung for.
+    /// It stops ringing until it is rung again. Call it before checking what it was rung for.
     pub fn silence(&self) {
         if let Some(descriptor) = &self.0 {
             let _ = rustix::io::read(descriptor, &mut [0; 8]);

@@ -1,4 +1,4 @@
-//! The command line: its grammar, help and examples, and nothing of what a command does.
+//! The command line: its grammar, help and examples, but not the commands themselves.
 //!
 //! Invariant: a command shows and accepts only the options that have an effect on it.
 
@@ -42,7 +42,7 @@ pub struct Cli {
     version: Option<bool>,
 }
 
-/// `rapid --version`; `-V` prints the first line alone.
+/// `rapid --version`; `-V` prints only the first line.
 const LONG_VERSION: &str =
     concat!(env!("CARGO_PKG_VERSION"), "\n", env!("RAPID_BUILT_WITH"), "\n", env!("RAPID_BUILT_WITH_CXX"));
 
@@ -64,7 +64,7 @@ Exit codes: 0 success, 1 failed while running, 2 invalid configuration or argume
             4 without the monitor: an episode is BAD, 130 interrupted twice";
 
 const RECOVER: &str = "\
-A run that may record does this by itself, in the background, for the files in its --out folder.
+A run that may record does this automatically, in the background, for the files in its --out folder.
 
 X.mcap.partial becomes X.mcap, and is kept as X.mcap.damaged if any of its data had to be left out. \
 A truncated or damaged X.mcap is repaired into X.recovered.mcap beside it. A file that is being written \
@@ -103,7 +103,7 @@ pub struct Global {
     help: Option<bool>,
 }
 
-/// The general options that have an effect on a command; the others are hidden there, and refused.
+/// The general options that have an effect on a command; the others are hidden there, and rejected.
 fn general_options(command: &str) -> &'static [&'static str] {
     match command {
         "devices" | "register" | "calibrate" => &["sim", "config", "json"],
@@ -288,7 +288,7 @@ impl Cli {
     /// Parses a command line, the name of the program first.
     ///
     /// # Errors
-    /// When it is invalid; help and version are such an "error" too.
+    /// When it is invalid; help and version are also such an "error".
     pub fn read(typed: impl IntoIterator<Item = OsString>) -> Result<Self, clap::Error> {
         let mut command = Self::grammar();
         let matches = command.try_get_matches_from_mut(typed).map_err(|error| explained(error, &mut command))?;
@@ -299,8 +299,8 @@ impl Cli {
         }
     }
 
-    /// What is parsed, and what help, completions and manual pages are made of: without the general options
-    /// that have no effect on a command.
+    /// The grammar for parsing, help, completions and manual pages: without the general options that have no effect on
+    /// a command.
     #[must_use]
     pub fn grammar() -> clap::Command {
         let command = Self::command();
@@ -319,7 +319,7 @@ impl Cli {
         require(command).mut_subcommand("replay", require)
     }
 
-    /// What cannot be meant, and the fix.
+    /// A combination of arguments that cannot be intended, and the fix.
     fn contradiction(&self, command: &clap::Command) -> Option<String> {
         let tags = match &self.command {
             Some(Command::Replay(replay)) => &replay.run.tag,
@@ -368,7 +368,7 @@ fn misplaced(matches: &ArgMatches, command: &clap::Command) -> Option<String> {
     Some(format!("--{option} is an option of a run, and --infer compares without one: leave one of them out"))
 }
 
-/// The error with its fix: where a file stands, and where an option of a run does.
+/// The error with its fix: where a file must be written, and where an option of a run.
 fn explained(error: clap::Error, command: &mut clap::Command) -> clap::Error {
     let context = |kind| match error.get(kind) {
         Some(ContextValue::String(word)) => Some(word.as_str()),
@@ -377,10 +377,10 @@ fn explained(error: clap::Error, command: &mut clap::Command) -> clap::Error {
     let text = if let Some(word) = context(ContextKind::InvalidSubcommand) {
         match word.rsplit_once('.') {
             Some((_, "toml")) => format!(
-                "{word:?} is no command; a scenario stands right after --sim (rapid --sim {word}), a registry after --config"
+                "{word:?} is not a command; a scenario stands right after --sim (rapid --sim {word}), a registry after --config"
             ),
             Some((_, "mcap" | "partial")) => {
-                format!("{word:?} is no command; an episode stands after a command: rapid inspect {word}")
+                format!("{word:?} is not a command; an episode stands after a command: rapid inspect {word}")
             }
             _ => return error,
         }
@@ -394,7 +394,7 @@ fn explained(error: clap::Error, command: &mut clap::Command) -> clap::Error {
     command.error(error.kind(), text)
 }
 
-/// A time in `range`, or else `wrong`; `example` is how times are written.
+/// A time in `range`, or else the error `wrong`; `example` shows the notation.
 fn time(text: &str, range: impl RangeBounds<Duration>, wrong: &str, example: &str) -> Result<Duration, String> {
     match humantime::parse_duration(text) {
         Ok(time) if range.contains(&time) => Ok(time),

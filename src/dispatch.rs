@@ -42,11 +42,11 @@ use crate::compare::CompareError;
 #[cfg(feature = "policy")]
 use crate::policy::bundle::BundleErrors;
 
-/// Tasks that are still running at the end have this long to finish.
+/// Tasks that are still running at the end must finish within this time.
 const TASKS_TIMEOUT: Duration = Duration::from_millis(500);
-/// The reader of standard error has this long to accept an error message: it may never read.
+/// The reader of standard error must accept an error message within this time: it may never read.
 const STDERR_TIMEOUT: Duration = Duration::from_secs(2);
-/// The mask's JSON file lists 64 devices at most; a larger file is another one.
+/// The mask's JSON file lists 64 devices at most; a larger file is not one.
 const LARGEST_JSON: u64 = 1 << 20;
 
 /// Runs a command line.
@@ -218,10 +218,10 @@ fn mask(global: &Global, watch: bool) -> Result<(), Failure> {
 fn recover(paths: Vec<PathBuf>, format: Format) -> Result<(), Failure> {
     let progress = io::stderr().is_terminal() && format == Format::Text;
     let stop = Arc::new(AtomicBool::new(false));
-    let asked = Arc::clone(&stop);
+    let requested = Arc::clone(&stop);
     let ended = block_on(async move {
         let mut work = tokio::task::spawn_blocking(move || {
-            commands::recover::run(&paths, format, progress, &asked, &mut io::stdout(), &mut io::stderr())
+            commands::recover::run(&paths, format, progress, &requested, &mut io::stdout(), &mut io::stderr())
         });
         let interrupted = tokio::select! {
             done = &mut work => return Ok(done),
@@ -294,7 +294,7 @@ fn check_writable(out: &Path) -> Result<(), RecordError> {
         .map_err(|error| RecordError::Io { path: out.to_owned(), source: error.into() })
 }
 
-/// Runs `work` on its own runtime, and then waits for nothing else: a thread that is still opening an
+/// Runs `work` on a separate runtime, and afterwards does not wait for other threads: one that is still opening an
 /// unresponsive device would delay the exit for as long as the kernel blocks it.
 fn block_on<T>(work: impl Future<Output = T>) -> Result<T, Failure> {
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().thread_name("worker").build()?;
@@ -328,7 +328,7 @@ fn registry_path(global: &Global) -> Result<PathBuf, Failure> {
     find_registry(global).ok_or_else(|| Failure::NoRegistry(usual_places()))
 }
 
-/// The registry named, or the first of the usual places where there is one.
+/// The registry named, or the first that exists in the usual places.
 fn find_registry(global: &Global) -> Option<PathBuf> {
     if let Some(path) = &global.config {
         return Some(path.clone());
@@ -350,7 +350,7 @@ fn register(global: &Global, args: &RegisterArgs, format: Format, out: &mut dyn 
     let target = Target::read(find_registry(global).unwrap_or_else(|| PathBuf::from("devices.toml")))?;
     let attached = match udev::enumerate() {
         _ if global.sim.is_some() => connected(global)?.1,
-        // An entry for a device that is not plugged in can be made on any machine.
+        // An entry for a device that is not plugged in can be created on any machine.
         Err(_) if args.vid.is_some() => Vec::new(),
         attached => attached?,
     };
@@ -503,10 +503,10 @@ impl Failure {
     }
 }
 
-/// The failure's text, or its cause where that is the limit of open files: the file that could not be opened then is
+/// The failure's text, or its cause if that is the limit of open files: then the file that could not be opened is
 /// not at fault.
 fn with_cause(text: String) -> String {
-    // EMFILE and ENFILE, in the words of the standard library.
+    // EMFILE and ENFILE, as worded by the standard library.
     if text.contains("(os error 24)") {
         let limit = rustix::process::getrlimit(rustix::process::Resource::Nofile).current;
         let limit = limit.map_or_else(String::new, |limit| format!(" of {limit} open files"));
@@ -536,7 +536,7 @@ mod tests {
             7
         });
         assert_eq!(done.expect("runtime"), 7);
-        // The device answers only now: a runtime that waited for it would not have reached this line.
+        // The device answers only now: a runtime that waited for it would not have got here.
         drop(release);
     }
 }
@@ -547,15 +547,15 @@ mod failure_tests {
     use crate::folder::FolderError;
 
     #[test]
-    fn at_the_limit_of_open_files_the_limit_is_named_and_not_the_file() {
+    fn at_the_limit_of_open_files_the_error_names_the_limit_and_not_the_file() {
         let of = |code| {
             let error = io::Error::from_raw_os_error(code);
             let folder = FolderError::Io { path: PathBuf::from("out"), error };
             with_cause(Failure::Folder(RecordError::Folder(folder)).to_string())
         };
-        let said = of(24);
-        assert!(said.contains("open files is reached") && said.contains("ulimit -n"), "{said}");
-        assert!(said.contains("LimitNOFILE=") && !said.contains("--out"), "{said}");
+        let text = of(24);
+        assert!(text.contains("open files is reached") && text.contains("ulimit -n"), "{text}");
+        assert!(text.contains("LimitNOFILE=") && !text.contains("--out"), "{text}");
         assert!(of(23).contains("fs.file-max"), "{}", of(23));
         assert!(of(13).contains("--out") && of(13).contains("Permission denied"), "{}", of(13));
     }

@@ -1,4 +1,4 @@
-//! Faults on order: how a test of the binary learns what a panic leaves behind.
+//! Injected faults: how a test of the binary examines the effects of a panic.
 //!
 //! `RAPID_FAULT=PLACE:FILE` makes the thread or task PLACE panic as soon as FILE exists.
 //!
@@ -15,19 +15,19 @@ mod order {
         Some((place.to_owned(), PathBuf::from(file)))
     });
 
-    /// Is this place to panic some time?
+    /// Whether a fault is configured for this place.
     pub(super) fn is_for(place: &str) -> bool {
         ORDER.as_ref().is_some_and(|(ordered, _)| ordered == place)
     }
 
-    /// Panics, if it is time.
+    /// Panics, if the fault is due.
     pub(super) fn strike(place: &str) {
         let due = ORDER.as_ref().is_some_and(|(ordered, file)| ordered == place && file.exists());
         assert!(!due, "fault ordered for {place}");
     }
 }
 
-/// Panics if that was ordered for `place`.
+/// Panics if a fault is configured for `place`.
 #[inline]
 pub fn point(place: &str) {
     #[cfg(debug_assertions)]
@@ -36,7 +36,7 @@ pub fn point(place: &str) {
     let _ = place;
 }
 
-/// The same for a task: a future that never ends, to be waited for beside what the task does.
+/// The same for a task: a future that never ends, to be awaited together with the task's work.
 pub async fn strike(place: &str) -> ! {
     #[cfg(debug_assertions)]
     if order::is_for(place) {

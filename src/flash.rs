@@ -1,8 +1,8 @@
 //! The pattern of flashes by which the latency of a camera is measured.
 //!
-//! Dark and lit in turn, for times that look random and never change: what a camera saw fits the
-//! pattern at one delay only. Whoever shows the pattern and whoever looks for it know it by its
-//! beginning alone.
+//! Dark and lit alternate, for pseudo-random times that never change: a camera's recording fits the
+//! pattern at one delay only. The beginning of the pattern is all that the display and the
+//! evaluation need to share.
 //!
 //! Invariant: a pure function of time.
 //! Invariant: never more than three flashes a second, the limit below which light is not known to
@@ -10,7 +10,7 @@
 
 use std::time::Duration;
 
-/// Dark before the first change: a camera adapts to it.
+/// Dark before the first change, for the camera to adapt.
 const DARK: Duration = Duration::from_secs(1);
 /// Least time between two changes.
 const SHORTEST: Duration = Duration::from_millis(200);
@@ -26,7 +26,7 @@ pub struct Change {
     pub lit: bool,
 }
 
-/// All changes, in the order of time, without end. Before the first it is dark.
+/// All changes, in the order of time, endless. Before the first it is dark.
 pub fn changes() -> impl Iterator<Item = Change> {
     let mut after = DARK;
     (0_u64..).map(move |index| {

@@ -1,12 +1,12 @@
-//! A folder held open: files in it are made, replaced and removed by name, wherever its path leads
-//! meanwhile.
+//! A folder held open: files in it are created, replaced and removed by name, even if its path leads
+//! elsewhere meanwhile.
 //!
 //! For folders that others may write to as well (/dev/shm, /tmp, a shared disk): a file or link
 //! that another user planted under a name we are about to use is never followed, opened or written to.
 //!
 //! Invariant: the last part of a name is never followed if it is a symbolic link; on the way to a
-//! folder only links of root and of this user are, as root none if so asked.
-//! Invariant: a file is written only if this call made it, and gets its name when it is whole.
+//! folder only links of root and of this user are followed, and none at all with [`Links::Refused`].
+//! Invariant: a file is written only if this call created it, and gets its name when it is complete.
 
 use std::ffi::{OsStr, OsString};
 use std::fs::File;
@@ -20,9 +20,9 @@ use rustix::io::Errno;
 
 use crate::time::realtime_ns;
 
-/// Links on one way before it is taken for a circle; as in Linux, see `path_resolution(7)`.
+/// Links on one path before it is taken for a loop; as in Linux, see `path_resolution(7)`.
 const MOST_LINKS: usize = 40;
-/// Names tried for a temporary file, should another program take them first.
+/// Names tried for a temporary file, in case another program takes them first.
 const TRIES: u32 = 8;
 
 /// Which symbolic links on the way to a folder are followed.
@@ -30,11 +30,11 @@ const TRIES: u32 = 8;
 pub enum Links {
     /// None.
     Refused,
-    /// Those that root or this user made: another's may be planted, and led elsewhere at any time.
+    /// Those that root or this user created: another user's may be planted, and redirected at any time.
     Own,
 }
 
-/// Which folders are made when they are missing.
+/// Which missing folders are created.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Missing {
     /// None: it is an error.
@@ -56,7 +56,7 @@ pub enum FolderError {
         /// Its owner.
         owner: u32,
     },
-    /// A part of the path is something else.
+    /// A part of the path is not a folder.
     #[error("{}: not a folder", .0.display())]
     NoFolder(PathBuf),
     /// The system refuses.
@@ -106,7 +106,7 @@ impl Folder {
     /// Opens the folder at `path`.
     ///
     /// # Errors
-    /// When it is not there and may not be made, or lies behind a link that is not followed.
+    /// When it does not exist and may not be created, or is behind a link that is not followed.
     pub fn open(path: &Path, links: Links, missing: Missing) -> Result<Self, FolderError> {
         let mut check = |link: &Path, stat: &Stat| {
             let is_link = FileType::from_raw_mode(stat.st_mode) == FileType::Symlink;
@@ -129,16 +129,16 @@ impl Folder {
         &self.path
     }
 
-    /// Its descriptor, to list it.
+    /// Its descriptor, for listing it.
     #[must_use]
     pub fn descriptor(&self) -> &OwnedFd {
         &self.open
     }
 
-    /// Makes a file that is not there yet, for writing; `mode` is subject to the umask.
+    /// Creates a file that does not exist yet, for writing; `mode` is subject to the umask.
     ///
     /// # Errors
-    /// `AlreadyExists` when anything has that name, a link that leads nowhere included.
+    /// `AlreadyExists` when anything has that name, including a dangling link.
     pub fn create_new(&self, name: impl AsRef<OsStr>, mode: u32) -> io::Result<File> {
         let flags = OFlags::RDWR | OFlags::CREATE | OFlags::EXCL | OFlags::NOFOLLOW | OFlags::CLOEXEC;
         let file = rustix::fs::openat(&self.open, name.as_ref(), flags, Mode::from_raw_mode(mode))?;
@@ -148,7 +148,7 @@ impl Folder {
     /// Opens an ordinary file for reading; does not wait for the other end of a pipe.
     ///
     /// # Errors
-    /// When there is none, or something else has that name.
+    /// When it does not exist, or is not an ordinary file.
     pub fn open_file(&self, name: impl AsRef<OsStr>) -> io::Result<File> {
         let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::NOCTTY | OFlags::CLOEXEC;
         let file = File::from(rustix::fs::openat(&self.open, name.as_ref(), flags, Mode::empty())?);
@@ -158,10 +158,10 @@ impl Folder {
         Ok(file)
     }
 
-    /// Gives `name` these contents and this mode, whole: a reader sees the old contents or all of the new.
+    /// Gives `name` these contents and this mode, atomically: a reader sees the old contents or all of the new.
     ///
     /// # Errors
-    /// When the disk does not take it, or the name belongs to something that cannot be replaced.
+    /// When the disk does not accept it, or the name belongs to something that cannot be replaced.
     pub fn replace(&self, name: impl AsRef<OsStr>, contents: &[u8], mode: u32, sync: Sync) -> io::Result<()> {
         let name = name.as_ref();
         let (temporary, mut file) = self.temporary(name)?;
@@ -184,7 +184,7 @@ impl Folder {
         begin.push(format!(".{}", std::process::id()));
         let mut temporary = begin.clone();
         temporary.push(".tmp");
-        // What a process of this number left behind goes. What is another user's stays, and is avoided.
+        // Leftovers of a process with this number are removed. Another user's file stays, and is avoided.
         let _ = self.remove(&temporary);
         for _ in 0..TRIES {
             match self.create_new(&temporary, 0o600) {
@@ -198,14 +198,14 @@ impl Folder {
         Err(io::ErrorKind::AlreadyExists.into())
     }
 
-    /// Renames a file; one that has the new name already stays as it is.
+    /// Renames a file; an existing file with the new name is not changed.
     ///
     /// # Errors
     /// `AlreadyExists` when the new name is taken.
     pub fn rename_new(&self, from: &OsStr, to: &OsStr) -> io::Result<()> {
         match rustix::fs::renameat_with(&self.open, from, &self.open, to, RenameFlags::NOREPLACE) {
             Ok(()) => Ok(()),
-            // A file system without the flag (NFS, some FUSE): looked at instead.
+            // A file system without the flag (NFS, some FUSE): checked instead.
             Err(Errno::INVAL | Errno::NOSYS | Errno::OPNOTSUPP) if !self.has(to) => {
                 Ok(rustix::fs::renameat(&self.open, from, &self.open, to)?)
             }
@@ -216,40 +216,40 @@ impl Folder {
     /// Removes a file or a link.
     ///
     /// # Errors
-    /// When there is none, or it may not be removed.
+    /// When it does not exist, or may not be removed.
     pub fn remove(&self, name: impl AsRef<OsStr>) -> io::Result<()> {
         Ok(rustix::fs::unlinkat(&self.open, name.as_ref(), AtFlags::empty())?)
     }
 
-    /// Has anything this name? A link that leads nowhere is something.
+    /// Whether anything has this name, including a dangling link.
     #[must_use]
     pub fn has(&self, name: impl AsRef<OsStr>) -> bool {
         !matches!(rustix::fs::statat(&self.open, name.as_ref(), AtFlags::SYMLINK_NOFOLLOW), Err(Errno::NOENT))
     }
 
-    /// Waits until names given in it are on the disk.
+    /// Waits until changes of names in it are on the disk.
     ///
     /// # Errors
-    /// When the file system cannot be asked for that.
+    /// When the file system does not support it.
     pub fn sync(&self) -> io::Result<()> {
         Ok(rustix::fs::fsync(&self.open)?)
     }
 }
 
-/// Does [`Folder::replace`] wait for the disk?
+/// Whether [`Folder::replace`] waits for the disk.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Sync {
-    /// Until the contents are on it.
+    /// It waits until the contents are on it.
     Wait,
-    /// No: the file lives in memory, or is written again soon.
+    /// It does not: the file is in memory, or is written again soon.
     Skip,
 }
 
-/// The text of an ordinary file at `path`, at most `limit` bytes of it: for files that others may
+/// The text of an ordinary file at `path`, at most `limit` bytes of it: for files that other users may
 /// have planted.
 ///
 /// # Errors
-/// When there is none, something else lies there, or it is not UTF-8.
+/// When it does not exist, is not an ordinary file, or is not UTF-8.
 pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
     let folder = path.parent().filter(|folder| *folder != Path::new("")).unwrap_or(Path::new("."));
     let folder = Folder::open(folder, Links::Own, Missing::Refused).map_err(io::Error::other)?;
@@ -258,31 +258,31 @@ pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
     Ok(text)
 }
 
-/// The way along a path, one part at a time: each is opened in the one before, so that nothing on the way can be
-/// exchanged between a look and a step. Links are followed.
+/// A walk along a path, one part at a time: each is opened in the one before, so that nothing on the way can be
+/// exchanged between a check and a step. Links are followed.
 pub(crate) struct Walk<'a> {
     missing: Missing,
-    /// Asked about each folder, link and file on the way before it is entered or followed.
+    /// Called for each folder, link and file on the way before it is entered or followed.
     check: &'a mut dyn FnMut(&Path, &Stat) -> Result<(), FolderError>,
-    /// As far as it has gone.
+    /// The path walked so far.
     shown: PathBuf,
     followed: usize,
 }
 
 impl<'a> Walk<'a> {
-    /// Makes what is `missing`, and goes as far as `check` allows.
+    /// Creates what is `missing`, and walks as far as `check` allows.
     pub(crate) fn new(missing: Missing, check: &'a mut dyn FnMut(&Path, &Stat) -> Result<(), FolderError>) -> Self {
         Self { missing, check, shown: PathBuf::new(), followed: 0 }
     }
 
-    /// What `path` leads to, opened only to be named (`O_PATH`).
+    /// The target of `path`, opened only as a reference (`O_PATH`).
     ///
     /// # Errors
-    /// When it is not there, or not allowed.
+    /// When it does not exist, or is not allowed.
     pub(crate) fn to(&mut self, path: &Path) -> Result<OwnedFd, FolderError> {
         let start = Path::new(if path.is_absolute() { "/" } else { "." });
         let (mut at, _) = self.enter(CWD, start)?;
-        // Still to go, the next part last.
+        // Remaining parts, the next part last.
         let mut rest = parts(path);
         self.shown = PathBuf::from(if path.is_absolute() { "/" } else { "" });
         while let Some(name) = rest.pop() {
@@ -303,7 +303,7 @@ impl<'a> Walk<'a> {
             };
             at = match kind {
                 FileType::Symlink => {
-                    // An empty name: the link that was opened, not what has its name by now.
+                    // An empty name: the link that was opened, not what has its name now.
                     let target = self.shown_error(rustix::fs::readlinkat(&next, "", Vec::new()))?;
                     let target = PathBuf::from(OsString::from_vec(target.into_bytes()));
                     self.followed += 1;
@@ -327,7 +327,7 @@ impl<'a> Walk<'a> {
         Ok(at)
     }
 
-    /// Opens `name`, a link itself and not what it leads to, and checks it.
+    /// Opens `name`, a link itself and not its target, and checks it.
     fn enter(&mut self, at: impl AsFd, name: &Path) -> Result<(OwnedFd, FileType), FolderError> {
         let flags = OFlags::PATH | OFlags::NOFOLLOW | OFlags::CLOEXEC;
         let next = self.shown_error(rustix::fs::openat(at, name, flags, Mode::empty()))?;
@@ -360,7 +360,7 @@ impl<'a> Walk<'a> {
     }
 }
 
-/// May `owner` change what is ours? Root and this user may.
+/// Whether files of this user may be changed by `owner`: root and this user may.
 #[must_use]
 pub fn is_trusted(owner: u32) -> bool {
     owner == 0 || owner == rustix::process::geteuid().as_raw()

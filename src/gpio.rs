@@ -1,7 +1,7 @@
 //! Lines of GPIO chips: inputs and outputs over the kernel's character devices (`linux/gpio.h`, version 2).
 //!
-//! Invariant: a line is ours alone while it is open; another program, and a second open here, are refused.
-//! Invariant: an open line that cannot be read or set any more is an error: its chip was unplugged, or hangs.
+//! Invariant: a line belongs to this process alone while it is open; another program, and a second open here, are
+//! refused. Invariant: an open line that can no longer be read or set is an error: its chip was unplugged, or hangs.
 
 use std::fs::File;
 use std::io;
@@ -23,34 +23,34 @@ const POLL: Duration = Duration::from_millis(5);
 
 /// A line that is read.
 ///
-/// A thread asks for its level, because a chip that hangs lets it wait for seconds; and asks again and again, because no
-/// event says that a chip hangs, and those on USB report no edges.
+/// A thread reads its level, because a hanging chip blocks a read for seconds; and it polls, because no event reports
+/// that a chip hangs, and those on USB report no edges.
 #[derive(Debug)]
 pub struct Input {
     shown: String,
-    /// A byte each time that the thread was answered, 0 or 1. The thread ends when this is dropped, or with an error, which
-    /// it sends as text behind a byte [`FAILED`].
+    /// A byte per level read by the thread, 0 or 1. The thread ends when this is dropped, or with an error, which it
+    /// sends as text after a byte [`FAILED`].
     levels: OwnedFd,
 }
 
 const FAILED: u8 = 2;
 
 impl Input {
-    /// Without a level for this long the chip does not answer; so long it may take on a machine that is busy with other
-    /// things.
+    /// Without a level for this long the chip is considered not to answer; on a busy machine an answer may take nearly
+    /// this long.
     pub const SILENCE: Duration = Duration::from_millis(200);
 
-    /// Opens `line` of `chip`, pulled to the level `pulled_high` where the chip can.
+    /// Opens `line` of `chip`, biased to the level `pulled_high` where the chip can.
     ///
     /// # Errors
-    /// Why it cannot be opened, for people.
+    /// Why it cannot be opened, as text for the user.
     pub fn open(chip: &Path, line: u32, pulled_high: bool) -> Result<Self, String> {
         let shown = chip.display().to_string();
         let bias = if pulled_high { Bias::PullUp } else { Bias::PullDown };
         let mut builder = Request::builder();
         builder.on_chip(chip).with_consumer("rapid").with_line(line).as_input().with_bias(bias);
         let request = builder.request().map_err(|error| why(&shown, &error))?;
-        let levels = ask(request, line, shown.clone()).map_err(|error| format!("{shown}: {error}"))?;
+        let levels = poll_levels(request, line, shown.clone()).map_err(|error| format!("{shown}: {error}"))?;
         Ok(Self { shown, levels })
     }
 
@@ -63,17 +63,17 @@ impl Input {
     /// Reports every level that was read since the last call, without waiting. `true` is high.
     ///
     /// # Errors
-    /// When it cannot be read any more, for people.
+    /// When it can no longer be read, as text for the user.
     pub fn take(&mut self, report: &mut dyn FnMut(bool)) -> Result<(), String> {
-        take_asked(&self.levels, &self.shown, report)
+        take_levels(&self.levels, &self.shown, report)
     }
 }
 
-fn take_asked(levels: &OwnedFd, shown: &str, report: &mut dyn FnMut(bool)) -> Result<(), String> {
+fn take_levels(levels: &OwnedFd, shown: &str, report: &mut dyn FnMut(bool)) -> Result<(), String> {
     let mut bytes = [0; 256];
     loop {
         let count = match rustix::io::read(levels, &mut bytes) {
-            Ok(0) => return Err(format!("{shown} is read no more")),
+            Ok(0) => return Err(format!("{shown} is no longer read")),
             Ok(count) => count,
             Err(Errno::AGAIN) => return Ok(()),
             Err(Errno::INTR) => continue,
@@ -88,18 +88,18 @@ fn take_asked(levels: &OwnedFd, shown: &str, report: &mut dyn FnMut(bool)) -> Re
     }
 }
 
-/// Starts the thread that asks for the levels of a line, every [`POLL`].
-fn ask(request: Request, line: u32, shown: String) -> io::Result<OwnedFd> {
+/// Starts the thread that reads the levels of a line, every [`POLL`].
+fn poll_levels(request: Request, line: u32, shown: String) -> io::Result<OwnedFd> {
     let (levels, out) = pipe_with(PipeFlags::CLOEXEC | PipeFlags::NONBLOCK)?;
     let work = move || {
-        // Without the right to it, the motors' thread warns.
+        // Without the privilege for it, the motors' thread warns.
         let _ = use_fifo(CONTROL_PRIORITY);
         loop {
             let (message, is_end) = match request.value(line) {
                 Ok(level) => (vec![u8::from(level == Value::Active)], false),
                 Err(error) => ([&[FAILED], why(&shown, &error).as_bytes()].concat(), true),
             };
-            // Of one that nothing is taken from, what comes out is old, and what is new follows.
+            // If the pipe is full its oldest levels are read first, and newer ones follow.
             let sent = rustix::io::write(&out, &message);
             if is_end || matches!(sent, Err(error) if error != Errno::AGAIN) {
                 return;
@@ -119,7 +119,7 @@ impl Output {
     /// Opens `line` of `chip`, and drives it to a level.
     ///
     /// # Errors
-    /// Why it cannot be opened, for people.
+    /// Why it cannot be opened, as text for the user.
     pub fn open(chip: &Path, line: u32, is_high: bool) -> Result<Self, String> {
         let shown = chip.display().to_string();
         let level = if is_high { Value::Active } else { Value::Inactive };
@@ -136,7 +136,7 @@ impl Output {
         Self(File::from(descriptor))
     }
 
-    /// What another process needs for [`Self::of`].
+    /// The descriptor that another process needs for [`Self::of`].
     #[must_use]
     pub fn fd(&self) -> BorrowedFd<'_> {
         self.0.as_fd()
@@ -154,7 +154,7 @@ impl Output {
     }
 }
 
-/// Why the kernel refused, for people.
+/// Why the kernel refused, as text for the user.
 fn why(shown: &str, error: &gpiocdev::Error) -> String {
     match error {
         gpiocdev::Error::Os(error) => text::not_opened(shown, "gpio", &io::Error::from_raw_os_error(error.0)),
@@ -167,7 +167,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_chip_that_is_not_there_or_none_is_named() {
+    fn a_missing_or_invalid_chip_is_named() {
         for opened in [
             |chip: &str| Input::open(Path::new(chip), 1, false).map(|_| ()),
             |chip: &str| Output::open(Path::new(chip), 1, false).map(|_| ()),
@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn a_descriptor_that_is_no_line_cannot_be_set() {
+    fn a_descriptor_that_is_not_a_line_cannot_be_set() {
         let output = Output::of(File::open("/dev/null").unwrap().into());
         assert!(output.set(true).is_err());
     }

@@ -1,19 +1,19 @@
-//! Interlocks: emergency stops and enabling switches, each with an input that has to run for the actuator to move.
+//! Interlocks: emergency stops and enabling switches, each with an input that must run for the actuator to move.
 //!
-//! | input says | emergency stop         | enabling switch        |
+//! | input      | emergency stop         | enabling switch        |
 //! |------------|------------------------|------------------------|
 //! | runs       | an arm is possible     | an arm is possible     |
 //! | stopped    | emergency stop         | disarm                 |
 //! | lost       | emergency stop         | disarm                 |
 //!
-//! What an input is read from, and when it is lost, is known to whoever reports it; who gives the orders is
+//! What an input is read from, and when it is lost, is known to the code that reports it; the orders are given by
 //! [`Permission`](crate::permission::Permission).
 //!
 //! Invariant: an input that has not reported yet is lost.
-//! Invariant: nothing here moves anything: an input that runs again alone permits an arm.
-//! Invariant: an input that has stopped runs again once nothing but that was reported for [`SETTLES_IN`]: a contact that
-//! chatters is one stop.
-//! Invariant: nothing here waits, locks or, but to refuse an arm, allocates.
+//! Invariant: nothing here moves anything: an input that runs again only permits an arm.
+//! Invariant: an input that has stopped runs again only after it has reported nothing else for [`SETTLES_IN`]: a
+//! chattering contact is one stop.
+//! Invariant: nothing here waits, locks or, except to refuse an arm, allocates.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
@@ -34,14 +34,14 @@ pub const SETTLES_IN: Duration = Duration::from_millis(100);
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum StopKind {
-    /// An emergency stop: the joints stop as each is configured, and stay so until an arm.
+    /// An emergency stop: the joints stop as each is configured, and stay stopped until an arm.
     Emergency,
     /// A switch that has to be held: released, the actuator is disarmed.
     Enabling,
 }
 
 impl StopKind {
-    /// What it is, for people.
+    /// Its kind, as text for the user.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -50,7 +50,7 @@ impl StopKind {
         }
     }
 
-    /// What an input of this state is doing, for people.
+    /// The state of an input of this kind, as text for the user.
     #[must_use]
     pub const fn word(self, state: InputState) -> &'static str {
         match (self, state) {
@@ -62,19 +62,19 @@ impl StopKind {
     }
 }
 
-/// What an input says.
+/// The state that an input reports.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum InputState {
     /// The actuator may move.
     Runs,
-    /// It may not.
+    /// It may not move.
     Stopped,
-    /// Nothing: it is unplugged, silent, or cannot be read.
+    /// Unknown: it is unplugged, silent, or cannot be read.
     Lost,
 }
 
-/// Which input keeps the actuator from being armed.
+/// The input that prevents the actuator from being armed.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Blocked {
     /// Its position in the registry.
@@ -83,7 +83,7 @@ pub struct Blocked {
     pub stop: Arc<str>,
     /// What it is.
     pub kind: StopKind,
-    /// What it says.
+    /// Its state.
     pub state: InputState,
 }
 
@@ -130,7 +130,7 @@ const fn state_of(code: u8) -> InputState {
 }
 
 impl Interlocks {
-    /// Of stops with these names, [`MAX_STOPS`] at most.
+    /// Stops with these names, [`MAX_STOPS`] at most.
     #[must_use]
     pub fn new<'a>(stops: impl Iterator<Item = (&'a str, StopKind)>) -> Self {
         let (names, all): (Vec<Arc<str>>, Vec<_>) = stops
@@ -147,13 +147,13 @@ impl Interlocks {
         &self.names
     }
 
-    /// What an input says.
+    /// The state of an input.
     #[must_use]
     pub fn state(&self, index: usize) -> InputState {
         self.all.get(index).map_or(InputState::Lost, |one| state_of(one.state.load(Ordering::SeqCst)))
     }
 
-    /// Does every input run?
+    /// Checks that every input runs.
     ///
     /// # Errors
     /// With the first that does not.
@@ -166,7 +166,7 @@ impl Interlocks {
         Err(Blocked { index, stop: self.names.get(index).cloned().unwrap_or_default(), kind, state })
     }
 
-    /// Notes what an input says. Says whether that is news.
+    /// Stores the state of an input. Returns whether it has changed.
     pub(crate) fn set(&self, index: usize, state: InputState, now: Stamp) -> bool {
         let code = match state {
             InputState::Runs => RUNS,
@@ -182,7 +182,7 @@ impl Interlocks {
         one.state.swap(code, Ordering::SeqCst) != code
     }
 
-    /// What an input that does not run orders.
+    /// The order that results from an input that does not run.
     pub(crate) fn order(&self, index: usize) -> Option<Order> {
         let trip =
             || Trip { stop: u8::try_from(index).unwrap_or(u8::MAX), is_lost: self.state(index) == InputState::Lost };

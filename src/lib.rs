@@ -4,40 +4,40 @@
 //! # The picture
 //!
 //! ```text
-//!  L5   main   dispatch   cli   commands         what was typed
-//!  L4   app                                      puts the stages together, and alone knows them all
-//!       tui   headless   logging                 what is shown: Snapshots and Events of `status`
-//!       lockstep   compare                       a rig on a virtual clock; a policy beside a recording
+//!  L5   main   dispatch   cli   commands         the command line
+//!  L4   app                                      connects the stages, and is the only one to know all of them
+//!       tui   headless   logging                 what is displayed: Snapshots and Events of `status`
+//!       lockstep   compare                       a rig on a virtual clock; a policy compared with a recording
 //!
-//!  L3   rig                                      owns every device's life, and the mask
-//!        |  slot: may it run?  stream: run it    presence: publish the mask
+//!  L3   rig                                      owns the life cycle of every device, and the mask
+//!        |  slot: state  stream: its data        presence: publish the mask
 //!        |                        |
 //!  L2   hotplug      driver ----> | ----> bus -------.          .---- sync
 //!       plugged,     bytes in             topics in  |          |     which sample belongs
-//!       pulled out                        shared     |          |     to which tick
+//!       unplugged                         shared     |          |     to which tick
 //!                                         memory     v          v
 //!  L3                                                record      one episode, one MCAP file
 //!                                                    policy      observations to actions, on the robot
 //!
 //!  L2   episode                                    an episode's file: schema, encoder, reader, index, repair
-//!       calibration                                how late a sensor is
-//!       orders                                     may motors move? what other programs say
-//!       interlocks                                 and what emergency stops and enabling switches say
+//!       calibration                                latency of a sensor
+//!       orders                                     orders of other programs to arm and disarm motors
+//!       interlocks                                 inputs of emergency stops and enabling switches
 //!
 //!  L1   registry                                 devices.toml, checked
-//!       status                                   the board every stage reports on
-//!       text   outlet                            words and lines for people
+//!       status                                   the board that every stage reports to
+//!       text   outlet                            formatting and output of text
 //!       folder                                   symlink-safe file access
 //!       control                                  motor control: limits, interpolation, arming
-//!       realtime                                 threads that keep a beat
-//!       panics                                   where their messages go
-//!       peer                                     who is at the other end of a socket
+//!       realtime                                 threads with a fixed period
+//!       panics                                   destination of panic messages
+//!       peer                                     identity of the peer of a socket
 //!  L0   modality   mask   sample   action   interlock   permission   time   random   provenance   flash   nouns
 //! ```
 //!
-//! The arrows are the way of the data. Imports point down only; the stages of L3 do not know one
-//! another, nor do the mechanisms of L2. Every third-party crate has one home. `tests/layering.rs`
-//! holds all this as a table and checks it.
+//! The arrows show the flow of data. Imports point down only; the stages of L3 do not depend on one
+//! another, nor do the mechanisms of L2. Every third-party crate is used by one module.
+//! `tests/layering.rs` holds all this as a table and checks it.
 //!
 //! A modality is what a policy would call one observation: a camera, the state of a motor. It has
 //! one number, [`modality::ModalityId`], which is its bit in the mask, its event on the bus, its index
@@ -47,61 +47,61 @@
 //!
 //! 1. A camera fills a buffer of the kernel; the descriptor becomes readable and wakes the device's
 //!    task. [`driver`] lends the buffer as a [`driver::Reading`], with the kernel's capture time.
-//! 2. `rig::stream` puts a [`sample::SampleHeader`] beside it and hands both to the topic's
-//!    [`bus::Writer`]: one copy, into shared memory, as the device gave it. Then it wakes whoever
-//!    waits; the event's number says which modality.
+//! 2. `rig::stream` adds a [`sample::SampleHeader`] and passes both to the topic's [`bus::Writer`]:
+//!    one copy, into shared memory, as the device delivered it. Then it wakes the waiting readers; the
+//!    number of the event identifies the modality.
 //! 3. The `writer` thread of [`record`] takes it from its [`bus::Inbox`] and writes it to the episode
 //!    straight from shared memory, stamped with its capture time.
-//! 4. Once per tick of the observation grid, [`sync`] chooses of each modality the sample nearest to
-//!    the tick, and the recorder writes which ones those were, with the mask, beside the samples.
+//! 4. Once per tick of the observation grid, [`sync`] chooses for each modality the sample nearest to
+//!    the tick, and the recorder writes the choice, with the mask, to the same file.
 //!
-//! Other programs subscribe to the same topics on the same terms.
+//! Other programs subscribe to the same topics in the same way.
 //!
 //! # One action
 //!
-//! 1. At each tick of the control grid, thread `grid` of [`policy::live`] takes what the bus brought, and
-//!    [`policy::observer`] chooses what is seen, with [`sync`]'s rules.
-//! 2. When a chunk is due, or a bit of the mask has changed, the samples go to thread `policy`, which makes
-//!    tensors of them and runs the encoder once and the denoiser step by step.
-//! 3. [`policy::horizon`] says which action of which chunk is that of the tick, or that there is none. It is
+//! 1. At each tick of the control grid, thread `grid` of [`policy::live`] takes new samples from the bus, and
+//!    [`policy::observer`] chooses the observations, with [`sync`]'s rules.
+//! 2. When a chunk is due, or a bit of the mask has changed, the samples go to thread `policy`, which converts
+//!    them to tensors and runs the encoder once and the denoiser step by step.
+//! 3. [`policy::horizon`] determines the action and chunk for the tick, or that there is none. The action is
 //!    published on the topic of actions.
-//! 4. The stream of the actuator hands it to its driver; the recorder writes it.
+//! 4. The stream of the actuator passes it to its driver; the recorder writes it.
 //!
 //! # One unplug
 //!
-//! 1. Three witnesses tell of a pulled cable: the stream's own error, the kernel's uevent, udev's
-//!    event. They come in any order, tens of milliseconds apart.
+//! 1. Three sources report a pulled cable: the stream's read error, the kernel's uevent, udev's
+//!    event. They arrive in any order, tens of milliseconds apart.
 //! 2. The first to reach the [`rig`] moves the slot of the device ([`rig::slot`], a pure state
 //!    machine) to `Absent`. Later reports carry an older [`sample::Epoch`], or repeat what is
-//!    known, and changes nothing.
+//!    known, and change nothing.
 //! 3. The bit is cleared and published at once, without waiting for the device or its task.
 //! 4. The topic stays: its recorder and every other subscriber continue and see a gap. A tick without
 //!    the device has its bit 0.
-//! 5. When a device of that identity comes back, the slot waits out the cooldown and opens it in a new
+//! 5. When a device of that identity returns, the slot waits for the cooldown and opens it in a new
 //!    epoch; with its first sample the bit is set again.
 //!
 //! # Invariants
 //!
 //! * A bit is set exactly while its device is attached and has sent a sample in this epoch. Late data
-//!   does not clear it; the slot says `Stalled`.
-//! * Only [`rig`] decides the mask, and nothing it does may hold up its publication. [`lockstep`] applies the
+//!   does not clear it; the slot is then `Stalled`.
+//! * Only [`rig`] decides the mask, and none of its work may delay the publication. [`lockstep`] applies the
 //!   same slots on its virtual clock.
-//! * Motors move only after an arm, and are turned off on every way out. Nothing is armed while an emergency stop or an
-//!   enabling switch does not say that it runs, and what it stops is stopped until a newer arm.
-//! * A writer never waits for a reader: who falls behind loses the oldest, and sees a hole in `seq`.
+//! * Motors move only after an arm, and are turned off on every exit path. No arm is given while an emergency stop or
+//!   an enabling switch does not report that it runs, and what it stops stays stopped until a newer arm.
+//! * A writer never waits for a reader: a slow reader loses the oldest samples, and sees a gap in `seq`.
 //!   What is lost is counted and reported.
-//! * Nothing downstream is re-wired on plug and unplug: topics live as long as the run.
+//! * Nothing downstream is reconnected on plug and unplug: topics live as long as the run.
 //! * A simulated device is a device: it enters as a hot-plug event and is opened as a driver, and
-//!   nothing beyond can tell.
-//! * Between two samples a stream allocates nothing, nor does iceoryx2 for it; it locks nothing and
-//!   logs nothing of its own.
-//! * Capture times are `CLOCK_MONOTONIC`; the wall clock is derived from it once an episode.
+//!   no other code can distinguish it.
+//! * Between two samples a stream does not allocate, nor does iceoryx2 for it; it neither locks nor
+//!   logs.
+//! * Capture times are `CLOCK_MONOTONIC`; the wall clock is derived from it once per episode.
 //! * A screen sees [`status::Snapshot`]s and sends [`status::Command`]s; it holds no handle into a
 //!   stage.
-//! * Bytes from devices and files never make the program panic. `unsafe` stands in [`driver`],
-//!   [`bus`], [`peer`] and the loader of onnxruntime alone.
+//! * Bytes from devices and files never make the program panic. `unsafe` occurs only in [`driver`],
+//!   [`bus`], [`peer`] and the loader of onnxruntime.
 
-// The whole program is linted with all features; with fewer, what only they use is left over.
+// The whole program is linted with all features; with fewer, code that only they use is unused.
 #![cfg_attr(
     not(all(feature = "lan", feature = "motors", feature = "policy")),
     allow(dead_code, unused_imports, unused_variables, clippy::match_same_arms, clippy::needless_pass_by_value)

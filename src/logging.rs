@@ -1,14 +1,14 @@
 //! Logging: where the program's own log lines go.
 //!
 //! Every line goes to the board, for the screen. Without a full-screen monitor, lines also go to
-//! standard error; with one, nothing but the monitor writes to the terminal.
+//! standard error; with one, only the monitor writes to the terminal.
 //!
 //! `RAPID_LOG` chooses what is logged, in the syntax of `tracing_subscriber::EnvFilter`, for example
-//! `RAPID_LOG=debug` or `RAPID_LOG=rapid::rig=trace,warn`. Without it the board gets what [`DEFAULT`]
-//! says, and standard error only warnings and errors: state changes are printed as events already.
-//! Messages of panics are logged whatever it says.
+//! `RAPID_LOG=debug` or `RAPID_LOG=rapid::rig=trace,warn`. Without it the board receives the lines of
+//! [`DEFAULT`], and standard error only warnings and errors: state changes are printed as events already.
+//! Panic messages are logged regardless of it.
 //!
-//! Invariant: who logs never waits for standard error: a reader that is behind loses lines, and is told how many.
+//! Invariant: logging never waits for standard error: a slow reader loses lines, and their number is reported to it.
 //! Invariant: a line has no control characters and no line breaks, and at most [`LONGEST`] characters.
 
 use std::fmt::{Debug, Write as _};
@@ -34,24 +34,24 @@ use crate::status::{Board, Level, LogLine};
 use crate::text;
 use crate::time::realtime_ns;
 
-/// What is logged without `RAPID_LOG`. iceoryx2 warns of what it then handles itself.
+/// What is logged without `RAPID_LOG`. iceoryx2 warns of errors that it then handles.
 pub const DEFAULT: &str = "warn,rapid=info,iceoryx2=error";
-/// Characters of a line; what is longer is cut.
+/// Most characters of a line; longer ones are cut.
 pub const LONGEST: usize = 2000;
 
-/// Lines the reader of standard error may be behind.
+/// Lines that may wait for the reader of standard error.
 const DEPTH: usize = 1024;
-/// How long the reader may take for the rest at the end.
+/// Time for the reader to take the rest at the end.
 const LAST: Duration = Duration::from_millis(500);
 
-/// What standard error gets.
+/// What is written to standard error.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Stderr {
     /// Nothing: a full-screen monitor has the terminal.
     Nothing,
-    /// Lines for people.
+    /// Lines of text.
     Text,
-    /// One JSON object a line: `{"event":"log","level":...,"text":...,"time":...}`.
+    /// One JSON object per line: `{"event":"log","level":...,"text":...,"time":...}`.
     Json,
 }
 
@@ -64,12 +64,12 @@ pub enum LoggingError {
     /// There is a log already.
     #[error("logging was started twice")]
     Twice(#[from] tracing_subscriber::util::TryInitError),
-    /// The system allows no further thread.
+    /// The system provides no further thread.
     #[error("the thread that writes the log: {0}")]
     Thread(#[from] io::Error),
 }
 
-/// Dropping it waits, for a moment, until standard error has taken what was logged.
+/// Dropping it waits, for a limited time, until standard error has taken what was logged.
 #[derive(Debug)]
 #[must_use = "dropped at once it waits for nothing"]
 pub struct Log(Option<SyncSender<Piece>>);
@@ -78,14 +78,14 @@ impl Drop for Log {
     fn drop(&mut self) {
         let Some(pieces) = self.0.take() else { return };
         let (done, is_done) = mpsc::channel();
-        // Where there is no room for this, the reader is not reading.
+        // If there is no room for this, the reader is not reading.
         if pieces.try_send(Piece::Flush(done)).is_ok() {
             let _ = is_done.recv_timeout(LAST);
         }
     }
 }
 
-/// What the thread `stderr` is sent.
+/// Messages to the thread `stderr`.
 #[derive(Debug)]
 enum Piece {
     Line(String),
@@ -98,7 +98,7 @@ fn spawn_writer(mut out: impl Write + Send + 'static) -> io::Result<SyncSender<P
     let (sender, pieces) = mpsc::sync_channel(DEPTH);
     std::thread::Builder::new().name("stderr".to_owned()).spawn(move || {
         for piece in pieces {
-            // There is nowhere left to report that the reader is gone, nor that none waits.
+            // There is no place left to report that the reader is gone, nor that no caller waits.
             let _ = match piece {
                 Piece::Line(line) => out.write_all(line.as_bytes()),
                 Piece::Flush(done) => done.send(()).map_err(io::Error::other),
@@ -129,7 +129,7 @@ fn filter_of(chosen: &str) -> Result<EnvFilter, ParseError> {
     Ok(EnvFilter::try_new(chosen)?.add_directive(format!("{}=error", panics::TARGET).parse()?))
 }
 
-/// Where formatted lines go.
+/// Receives formatted lines.
 trait Sink: 'static {
     fn take(&self, line: LogLine);
 }
@@ -144,10 +144,10 @@ impl Sink for Arc<Board> {
 struct StderrSink {
     form: Stderr,
     palette: crate::headless::style::Palette,
-    /// Erases a progress line that stands on the same terminal.
+    /// Erases a progress line on the same terminal.
     before: &'static str,
     pieces: SyncSender<Piece>,
-    /// Lines there was no room for, since the last that had some.
+    /// Lines lost for lack of room since the last that was sent.
     lost: AtomicU64,
 }
 
@@ -176,8 +176,8 @@ impl Sink for StderrSink {
         let mut text = self.render(&line);
         let lost = self.lost.swap(0, Ordering::Relaxed);
         if lost > 0 {
-            let told = format!("{lost} lines of the log lost: their reader was behind");
-            text.insert_str(0, &self.render(&LogLine { level: Level::Warn, text: told, ..line }));
+            let report = format!("{lost} lines of the log lost: their reader was behind");
+            text.insert_str(0, &self.render(&LogLine { level: Level::Warn, text: report, ..line }));
         }
         if self.pieces.try_send(Piece::Line(text)).is_err() {
             self.lost.fetch_add(lost + 1, Ordering::Relaxed);
@@ -185,12 +185,12 @@ impl Sink for StderrSink {
     }
 }
 
-/// The layer that makes one line of an event, its fields, and the fields of the spans around it.
+/// The layer that formats an event, its fields, and the fields of its spans as one line.
 struct Lines<S> {
     sink: S,
 }
 
-/// Fields of a span, as they stand at the end of a line.
+/// Fields of a span, as they appear at the end of a line.
 struct SpanFields(String);
 
 impl<S, K> Layer<S> for Lines<K>
@@ -202,7 +202,7 @@ where
         let Some(span) = context.span(id) else { return };
         let mut fields = Fields::default();
         attributes.record(&mut fields);
-        // A second layer of this kind sees the same span: the fields are the same.
+        // A second layer of this kind receives the same span: the fields are the same.
         span.extensions_mut().replace(SpanFields(fields.rest));
     }
 
@@ -258,7 +258,7 @@ impl Fields {
             "origin" => Ok(()),
             name => write!(self.rest, " {name}={value}"),
         };
-        // Only a value whose own formatting reports an error can get here; the rest is still a line.
+        // Only a value whose formatting fails gets here; the rest is still a line.
         if written.is_err() {
             self.rest.push_str(" (unprintable)");
         }

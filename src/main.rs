@@ -16,9 +16,9 @@ fn main() -> ExitCode {
     match rapid::cli::Cli::read(std::env::args_os()) {
         Ok(cli) => rapid::dispatch::dispatch(cli),
         Err(error) => {
-            // Help and version go to standard output and are no error.
+            // Help and version go to standard output and are not errors.
             let code = if error.use_stderr() { 2 } else { 0 };
-            // No error can be shown where even this cannot be written.
+            // If even this cannot be written, no error can be shown.
             let _ = error.print();
             ExitCode::from(code)
         }

@@ -1,7 +1,7 @@
 //! The Physical Mask: which modalities are physically present and running, one bit each.
 //!
-//! Owns the 64-bit value and its 32-byte record (paper, appendix "Physical Mask Data Format"). Who
-//! publishes it is `rig/presence`.
+//! Owns the 64-bit value and its 32-byte record (paper, appendix "Physical Mask Data Format"). It is
+//! published by `rig/presence`.
 //!
 //! Invariant: a bit is a [`ModalityId`]; nothing here decides when a bit changes.
 
@@ -19,7 +19,7 @@ pub const RECORD_LEN: usize = 32;
 const MAGIC: [u8; 4] = *b"RAPD";
 const VERSION: u8 = 1;
 
-/// One bit a modality: set exactly while its device is attached and its samples have begun.
+/// One bit per modality: set exactly while its device is attached and its samples have begun.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct PhysicalMask(pub u64);
@@ -28,7 +28,7 @@ impl PhysicalMask {
     /// No modality present.
     pub const EMPTY: Self = Self(0);
 
-    /// Is the modality present?
+    /// Whether the modality is present.
     #[must_use]
     pub const fn contains(self, id: ModalityId) -> bool {
         self.0 >> id.bit() & 1 == 1
@@ -63,7 +63,7 @@ impl PhysicalMask {
     }
 }
 
-/// A mask with the number of devices it stands for, which decides how many digits its text has.
+/// A mask with the number of devices it represents, which decides how many digits its text has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct SizedMask {
     /// The mask.
@@ -99,13 +99,13 @@ fn digits(mask: PhysicalMask, device_count: usize) -> usize {
 pub struct MaskRecord {
     /// Number of registered modalities.
     pub device_count: u8,
-    /// Even in a record that is whole.
+    /// Even in a complete record.
     pub generation: u16,
     /// The mask.
     pub mask: PhysicalMask,
     /// `CLOCK_REALTIME` of the publication, ns since 1970.
     pub realtime_ns: u64,
-    /// Publications so far, from 1.
+    /// Number of publications so far, from 1.
     pub sequence: u64,
 }
 
@@ -138,7 +138,7 @@ impl MaskRecord {
     /// Reads a record.
     ///
     /// # Errors
-    /// When the magic or the version is not ours.
+    /// When the magic or the version is unknown.
     pub fn from_bytes(bytes: &[u8; RECORD_LEN]) -> Result<Self, MaskRecordError> {
         let word = |at: usize| {
             let mut eight = [0; 8];

@@ -1,8 +1,8 @@
 //! Modalities: what a rig can observe, one entry of the registry each.
 //!
-//! Owns the names and numbers every other module speaks in. A [`ModalityId`] is at once the bit in
-//! the physical mask, the event id on the bus, the index into every per-modality array and the row
-//! on screen.
+//! Owns the names and numbers that every other module uses. A [`ModalityId`] is the bit in the
+//! physical mask, the event id on the bus, the index into every per-modality array and the row on
+//! screen.
 //!
 //! Invariant: an id is below [`MAX_MODALITIES`].
 
@@ -51,7 +51,7 @@ pub enum ModalityKind {
     Image,
     /// A vector of numbers per sample.
     Scalars,
-    /// Bytes that `rapid` passes on and records without looking into them.
+    /// Bytes that `rapid` forwards and records without interpreting them.
     Bytes,
 }
 

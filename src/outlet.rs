@@ -1,13 +1,13 @@
-//! Outlet: a terminal or a pipe that may be slow, behind a thread of its own.
+//! Outlet: a terminal or a pipe that may be slow, behind a separate thread.
 //!
-//! Invariant: who writes never waits for the reader at the other end longer than it chooses to.
+//! Invariant: the sender never waits for the reader at the other end longer than it chooses to.
 
 use std::io::{self, Write};
 use std::time::{Duration, Instant};
 
 use tokio::sync::{mpsc, oneshot};
 
-/// A thread that writes, in order, what it is sent.
+/// A thread that writes the pieces sent to it, in order.
 #[derive(Debug)]
 pub struct Outlet {
     sender: mpsc::Sender<Vec<u8>>,
@@ -18,10 +18,10 @@ impl Outlet {
     /// Starts the thread `name`, which takes up to `depth` pieces ahead of what `out` has taken.
     ///
     /// # Errors
-    /// When the system allows no further thread.
+    /// When the system provides no further thread.
     pub fn new(name: &str, depth: usize, mut out: impl Write + Send + 'static) -> io::Result<Self> {
         let (sender, mut pieces) = mpsc::channel::<Vec<u8>>(depth);
-        let (tell, ended) = oneshot::channel();
+        let (report, ended) = oneshot::channel();
         std::thread::Builder::new().name(name.to_owned()).spawn(move || {
             let mut outcome = Ok(());
             while let Some(piece) = pieces.blocking_recv() {
@@ -31,25 +31,25 @@ impl Outlet {
                 }
             }
             // The receiver may be gone.
-            let _ = tell.send(outcome);
+            let _ = report.send(outcome);
         })?;
         Ok(Self { sender, ended })
     }
 
-    /// Has everything sent so far been handed to the writer?
+    /// Whether everything sent so far has been passed to the writer.
     #[must_use]
     pub fn is_idle(&self) -> bool {
         self.sender.capacity() == self.sender.max_capacity()
     }
 
-    /// Is the other end gone?
+    /// Whether the other end is gone.
     #[must_use]
     pub fn is_closed(&self) -> bool {
         self.sender.is_closed()
     }
 
     /// Sends a piece if there is room; true if there was.
-    #[must_use = "what there is no room for is lost"]
+    #[must_use = "a piece without room is lost"]
     pub fn try_send(&self, piece: Vec<u8>) -> bool {
         self.sender.try_send(piece).is_ok()
     }
@@ -77,7 +77,7 @@ impl Outlet {
         }
     }
 
-    /// The same for a place where one cannot await: blocks, at most `within`.
+    /// The same for callers that cannot await: blocks, at most `within`.
     pub fn finish_blocking(self, within: Duration) {
         let Self { sender, mut ended } = self;
         drop(sender);
@@ -90,7 +90,7 @@ impl Outlet {
 
 /// Writes one text, and waits at most `within` for its reader.
 pub fn write_within(out: impl Write + Send + 'static, text: String, within: Duration) {
-    // Without a thread, or with a reader that is gone, there is nowhere left to say it.
+    // Without a thread, or with a reader that is gone, there is no place left to report it.
     let Ok(outlet) = Outlet::new("outlet", 1, out) else { return };
     let _ = outlet.try_send(text.into_bytes());
     outlet.finish_blocking(within);

@@ -1,32 +1,32 @@
 //! Panics: where their messages go while the rig runs.
 //!
-//! The hook that Rust brings writes to standard error and waits for its reader, before anything is
+//! Rust's default hook writes to standard error and waits for its reader, before anything is
 //! unwound: with a pipe that has no reader, the thread would block and its panic would go unnoticed.
 //! So messages go to the log, which waits for no reader. While a screen has the terminal
-//! they are kept as well, to be printed once it is given back.
+//! they are kept as well, to be printed once it is restored.
 //!
 //! Invariant: only this module sets the hook; it stays for the life of the process, as a hook cannot
-//! be taken out from between others.
+//! be removed from a chain of hooks.
 
 use std::backtrace::{Backtrace, BacktraceStatus};
 use std::panic::PanicHookInfo;
 use std::sync::{Mutex, MutexGuard, Once, PoisonError};
 
-/// The target of the log lines made here.
+/// The target of the log lines written here.
 pub const TARGET: &str = "rapid::panics";
 
-/// Name of the thread that moves motors. Its panics have no backtrace: that is made before anything is
+/// Name of the thread that moves motors. Its panics have no backtrace: that is created before anything is
 /// unwound, takes a good part of a second, and for that long the motors would continue.
 pub const CONTROL_THREAD: &str = "control";
 
 /// Where messages go.
 #[derive(Debug)]
 enum Goes {
-    /// To standard error, as Rust does it.
+    /// To standard error, as by Rust's hook.
     Stderr,
     /// To the log.
     Log,
-    /// To the log and here.
+    /// To the log and into this list.
     Kept(Vec<String>),
 }
 
@@ -59,17 +59,17 @@ fn set(to: Goes) {
             if matches!(*goes(), Goes::Stderr) {
                 return rust(info);
             }
-            tell(info);
+            report(info);
         }));
     });
     *goes() = to;
 }
 
-fn tell(info: &PanicHookInfo<'_>) {
+fn report(info: &PanicHookInfo<'_>) {
     let thread = std::thread::current();
     let message = format!("thread '{}' {info}", thread.name().unwrap_or("unnamed"));
     tracing::error!(target: TARGET, "{message}");
-    // Only if RUST_BACKTRACE asks for it; a line of the log is no place for all of it.
+    // Only if requested by RUST_BACKTRACE; it is split because one line cannot hold all of it.
     let backtrace = if thread.name() == Some(CONTROL_THREAD) { Backtrace::disabled() } else { Backtrace::capture() };
     if backtrace.status() == BacktraceStatus::Captured {
         for line in backtrace.to_string().lines() {

@@ -1,4 +1,4 @@
-//! Who is at the other end of a local socket, as the kernel reports it: `SO_PEERCRED`, unix(7).
+//! The identity of the other end of a local socket, as the kernel reports it: `SO_PEERCRED`, unix(7).
 
 use std::io;
 use std::mem::size_of;
@@ -8,21 +8,21 @@ use std::os::unix::net::UnixStream;
 /// See the module's comment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Peer {
-    /// Its process; `None` for one of a namespace of processes that is not seen from here.
+    /// Its process; `None` for one of a process namespace that is not visible from here.
     pub process: Option<u32>,
     /// Its user.
     pub user: u32,
 }
 
 impl Peer {
-    /// Whoever made the other end of `stream`, or listened there.
+    /// The process that created the other end of `stream`, or listened there.
     ///
     /// # Errors
-    /// When the kernel does not say.
+    /// When the kernel does not report it.
     pub fn of(stream: &UnixStream) -> io::Result<Self> {
         let mut found = libc::ucred { pid: 0, uid: 0, gid: 0 };
         let mut length = libc::socklen_t::try_from(size_of::<libc::ucred>()).unwrap_or_default();
-        // SAFETY: both outlive the call, and `length` is the size of `found`, of which any bytes are a value.
+        // SAFETY: both outlive the call, and `length` is the size of `found`, for which all bytes are valid.
         let outcome = unsafe {
             libc::getsockopt(
                 stream.as_raw_fd(),

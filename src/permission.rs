@@ -1,13 +1,13 @@
-//! Permission: may the actuator of this run move?
+//! Permission: whether the actuator of this run may move.
 //!
-//! Every order of a run is given here, whoever gives it: the operator at the screen, another program, an emergency stop or
-//! an enabling switch, the end of the run.
+//! Every order of a run is given here, whatever its source: the operator at the screen, another program, an emergency
+//! stop or an enabling switch, the end of the run.
 //!
 //! Invariant: a disarm holds for the rest of the run, whether or not an actuator is plugged in, until a newer arm.
-//! Invariant: an arm that was given before the last disarm arrived does nothing, in whatever order the two arrive. Nor does
-//! one that is older than [`VOID_AFTER`], or comes while no actuator is plugged in. A disarm is never refused.
+//! Invariant: an arm that was given before the last disarm arrived does nothing, in whatever order the two arrive. Nor
+//! does one that is older than [`VOID_AFTER`], or arrives while no actuator is plugged in. A disarm is never refused.
 //! Invariant: no arm is given while an input of an [`Interlock`](crate::interlock) does not run, nor one that was given
-//! before it stopped, whatever it says since.
+//! before it stopped, whatever it has reported since.
 //! Invariant: nothing here waits, locks or allocates.
 
 use std::sync::Arc;
@@ -19,7 +19,7 @@ use crate::bell::Bell;
 use crate::interlock::{Blocked, InputState, Interlocks};
 use crate::time::Stamp;
 
-/// An arm that took longer on its way does nothing.
+/// An arm that took longer to arrive does nothing.
 pub const VOID_AFTER: Duration = Duration::from_secs(1);
 
 /// See the module's comment.
@@ -27,11 +27,11 @@ pub const VOID_AFTER: Duration = Duration::from_secs(1);
 pub struct Permission {
     /// When the last disarm arrived; 0 before the first.
     disarmed: AtomicU64,
-    /// For the actuator.
+    /// Orders for the actuator.
     slot: OrderSlot,
     /// Actuators that are plugged in.
     actuators: AtomicUsize,
-    /// The actuator is to be armed when it is first plugged in: no other order came since.
+    /// The actuator is to be armed when it is first plugged in: no other order has arrived since.
     at_first_plug: AtomicBool,
     /// Emergency stops and enabling switches.
     interlocks: Interlocks,
@@ -40,25 +40,25 @@ pub struct Permission {
 /// Why an arm does nothing.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum Void {
-    /// Nothing is there that could move.
+    /// There is no actuator.
     #[error("no actuator is plugged in: plug it in, then arm it")]
     NoActuator,
-    /// It was long on its way.
+    /// It took too long to arrive.
     #[error("the order is {:.1} s old, and 1 s is allowed: give it again", .0.as_secs_f64())]
     Old(Duration),
-    /// A disarm came between.
+    /// A disarm arrived in between.
     #[error("a disarm came after this order was given: give it again if the actuator is to move")]
     Overtaken,
-    /// Its time has not come yet: it was given on another machine, or is made up.
+    /// Its time is in the future: it was given on another machine, or is forged.
     #[error("the order is of a later time than now")]
     Early,
-    /// An emergency stop or an enabling switch is in the way.
+    /// An emergency stop or an enabling switch prevents it.
     #[error(transparent)]
     Blocked(#[from] Blocked),
 }
 
 impl Permission {
-    /// Of a run that begins; `at_first_plug`: its actuator is to be armed when it is first plugged in.
+    /// For a run that begins; `at_first_plug`: its actuator is to be armed when it is first plugged in.
     #[must_use]
     pub fn new(at_first_plug: bool) -> Self {
         Self { at_first_plug: AtomicBool::new(at_first_plug), ..Self::default() }
@@ -76,8 +76,8 @@ impl Permission {
         &self.interlocks
     }
 
-    /// Input `index` of the interlocks has this state, as found out at `now`. Whatever does not run stops the actuator
-    /// before this returns. Says whether it is news.
+    /// Input `index` of the interlocks has this state, as determined at `now`. An input that does not run stops the
+    /// actuator before this returns. Returns whether the state has changed.
     pub fn report(&self, index: usize, state: InputState, now: Stamp) -> bool {
         let is_news = self.interlocks.set(index, state, now);
         if is_news && state != InputState::Runs {
@@ -89,7 +89,7 @@ impl Permission {
         is_news
     }
 
-    /// The actuator may not move, from `now` on. Says whether one is plugged in.
+    /// The actuator may not move, from `now` on. Returns whether one is plugged in.
     pub fn disarm(&self, now: Stamp) -> bool {
         self.at_first_plug.store(false, Ordering::SeqCst);
         // Before it is given: see `arm`.
@@ -128,7 +128,7 @@ impl Permission {
         }
         self.interlocks.check()?;
         self.slot.give(arm);
-        // What came meanwhile may have been given to the slot before this.
+        // A stop in the meantime may have been given to the slot before this.
         let blocked = self.interlocks.check();
         if let Err(blocked) = blocked {
             // Not always a disarm: a joint that is to hold at an emergency stop must not fall.
@@ -146,7 +146,8 @@ impl Permission {
         given.0 <= self.disarmed.load(Ordering::SeqCst)
     }
 
-    /// An actuator was plugged in: orders are for it until what is returned is dropped. What was given before is not.
+    /// An actuator was plugged in: it receives orders until the returned value is dropped, but none that were given
+    /// before.
     #[must_use]
     pub fn attend(self: &Arc<Self>) -> Attended {
         self.slot.take().for_each(drop);
@@ -155,30 +156,31 @@ impl Permission {
     }
 }
 
-/// An actuator that is plugged in, and what it is ordered.
+/// An actuator that is plugged in, and its orders.
 #[derive(Debug)]
 pub struct Attended(Arc<Permission>);
 
 impl Attended {
-    /// Is it to be armed now, without an order? At most once a run.
+    /// Whether it is to be armed now, without an order. At most once a run.
     ///
     /// # Errors
-    /// When it was to be, and an interlock is in the way.
+    /// When it was to be, and an interlock prevents it.
     pub fn is_to_be_armed(&self) -> Result<bool, Blocked> {
         let is_first = self.0.at_first_plug.swap(false, Ordering::SeqCst);
         if is_first { self.0.interlocks.check().map(|()| true) } else { Ok(false) }
     }
 
-    /// Names of the emergency stops that an order may be of.
+    /// Names of the emergency stops that an order may refer to.
     #[must_use]
     pub fn stops(&self) -> &Arc<[Arc<str>]> {
         self.0.interlocks.names()
     }
 
-    /// It could not be armed as [`Self::is_to_be_armed`] says: the next one is to be, unless an order came meanwhile.
+    /// It could not be armed as [`Self::is_to_be_armed`] requested: the next one is to be, unless an order came
+    /// meanwhile.
     pub fn was_not_armed(&self) {
         self.0.at_first_plug.store(true, Ordering::SeqCst);
-        // A disarm stores its time first, and then takes back what this gives: it is seen here, or comes after.
+        // A disarm stores its time first, and then reverts this: it is either seen here, or comes after.
         if self.0.disarmed.load(Ordering::SeqCst) != 0 {
             self.0.at_first_plug.store(false, Ordering::SeqCst);
         }
@@ -190,7 +192,7 @@ impl Attended {
         self.0.slot.bell()
     }
 
-    /// Takes what it was ordered since the last call, in the order in which it is to be carried out.
+    /// Takes its orders since the last call, in the order in which they are to be carried out.
     pub fn take(&self) -> impl Iterator<Item = Order> + use<> {
         self.0.slot.take()
     }

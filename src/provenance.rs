@@ -1,9 +1,9 @@
-//! Provenance: what was agreed with a device when it was opened, and through which driver.
+//! Provenance: what was negotiated with a device when it was opened, and through which driver.
 //!
-//! Plain data for the log, the events and the recording; who asks the device fills it in.
+//! Plain data for the log, the events and the recording; filled in by the code that queries the device.
 //!
-//! Invariant: everything here is what the device or the kernel answered, not what was wished; what
-//! they do not tell is absent.
+//! Invariant: everything here is what the device or the kernel answered, not what was requested; what
+//! they do not report is absent.
 
 use std::collections::BTreeMap;
 
@@ -14,12 +14,12 @@ use serde::Serialize;
 pub struct KernelDriver {
     /// Its name, for example `uvcvideo`, `cdc_acm`, `ftdi_sio`.
     pub name: String,
-    /// Its version, where it has one: drivers of V4L2 tell that of the kernel they belong to.
+    /// Its version, where it has one: drivers of V4L2 report that of the kernel they belong to.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub version: Option<String>,
 }
 
-/// What noticed first that a device was unplugged.
+/// What first noticed that a device was unplugged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum UnplugSource {
@@ -33,7 +33,7 @@ pub enum UnplugSource {
     Enumeration,
     /// A device on the network announced its end.
     Goodbye,
-    /// A device on the network was not heard for its lease, or refused a connection.
+    /// Nothing was received from a device on the network for its lease, or it refused a connection.
     Lease,
     /// The link to a device on the network is down.
     Link,
@@ -58,7 +58,7 @@ impl UnplugSource {
     }
 }
 
-/// What was agreed with a device when it was opened.
+/// What was negotiated with a device when it was opened.
 #[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct Negotiated {
     /// The driver that answered.
@@ -66,16 +66,16 @@ pub struct Negotiated {
     /// What the driver calls the device (V4L2 `card`).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub card: Option<String>,
-    /// Where the driver says the device is (V4L2 `bus_info`).
+    /// Where the driver reports the device to be (V4L2 `bus_info`).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub bus: Option<String>,
-    /// How its samples come.
+    /// The format of its samples.
     pub format: Option<Format>,
-    /// Controls and their values as read back, by the names `devices.toml` gives them.
+    /// Controls and their values as read back, by their names in `devices.toml`.
     pub controls: BTreeMap<String, i64>,
 }
 
-/// How the samples of a device come.
+/// The format of the samples of a device.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(untagged)]
 pub enum Format {
@@ -96,7 +96,7 @@ pub enum Format {
         /// Bits a second; absent where there is no line.
         #[serde(skip_serializing_if = "Option::is_none")]
         baud: Option<u32>,
-        /// Numbers in a message; 0 if it is not looked into.
+        /// Numbers in a message; 0 if it is not parsed.
         channels: usize,
         /// Messages a second, where it is known.
         #[serde(skip_serializing_if = "Option::is_none")]

@@ -1,8 +1,8 @@
-//! Seeded streams of numbers, the same on every machine and in every version: what they decide is
-//! recorded by its seed alone.
+//! Seeded streams of numbers, the same on every machine and in every version: the seed alone is
+//! enough to record what they decide.
 //!
-//! The generator is PCG XSL 128/64 (O'Neill 2014), whose output its crate promises to keep. Streams of
-//! one seed do not overlap: what draws more numbers in one place moves nothing in another.
+//! The generator is PCG XSL 128/64 (O'Neill 2014), whose output its crate guarantees to keep. Streams of
+//! one seed do not overlap: drawing more numbers from one does not affect another.
 
 use rand_distr::{Distribution, StandardNormal, StandardUniform};
 use rand_pcg::Pcg64;
@@ -18,7 +18,7 @@ impl Random {
         Self(Pcg64::new(seed.into(), stream.into()))
     }
 
-    /// Of the normal distribution with mean 0 and deviation 1.
+    /// A sample of the normal distribution with mean 0 and deviation 1.
     pub fn normal(&mut self) -> f32 {
         StandardNormal.sample(&mut self.0)
     }
@@ -57,12 +57,12 @@ mod tests {
         assert_eq!(draw(7, 1), draw(7, 1));
         assert_ne!(draw(7, 1), draw(7, 2));
         assert_ne!(draw(7, 1), draw(8, 1));
-        // Pinned: a recording names the seed and means these numbers.
+        // Pinned: a recording names the seed and relies on these numbers.
         assert_eq!(draw(7, 1), [877, 532, 87, 281]);
     }
 
     #[test]
-    fn numbers_lie_where_they_should() {
+    fn numbers_have_the_documented_distribution() {
         let mut random = Random::new(1, 0);
         let mut noise = vec![0.0; 20_000];
         random.fill_normal(&mut noise);

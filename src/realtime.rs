@@ -1,4 +1,4 @@
-//! Threads that keep a beat.
+//! Threads with real-time priority.
 
 use rustix::mm::{MlockAllFlags, mlockall};
 use rustix::process::{Resource, getrlimit};
@@ -7,16 +7,16 @@ use thread_priority::unix::{
 };
 use thread_priority::{ThreadPriority, ThreadPriorityValue};
 
-/// Of thread `mask`, which does almost nothing and comes before all others: above ordinary threads, below the
-/// kernel's own interrupt threads (50).
+/// For thread `mask`, which does almost nothing and comes before all others: above ordinary threads, below the
+/// kernel's interrupt threads (50).
 pub const MASK_PRIORITY: u8 = 40;
-/// Of thread `control`, which moves motors.
+/// For thread `control`, which moves motors.
 pub const CONTROL_PRIORITY: u8 = 30;
 
 /// Puts the calling thread under `SCHED_FIFO`.
 ///
 /// # Errors
-/// Without `CAP_SYS_NICE` or an `RLIMIT_RTPRIO` of this priority: why, for people.
+/// Without `CAP_SYS_NICE` or an `RLIMIT_RTPRIO` of this priority: why, as text for the user.
 pub fn use_fifo(priority: u8) -> Result<(), String> {
     let priority = ThreadPriorityValue::try_from(priority)?;
     let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
@@ -24,15 +24,15 @@ pub fn use_fifo(priority: u8) -> Result<(), String> {
         .map_err(|error| format!("{error:?}"))
 }
 
-/// Keeps every page of this process in memory from the first use of it on: a thread that keeps a beat is not to wait for a
-/// disk because another program needs memory.
+/// Keeps every page of this process in memory from its first use on: a periodic thread must not wait for a disk because
+/// another program needs memory.
 ///
 /// # Errors
-/// Without an unlimited `RLIMIT_MEMLOCK`, as less of it would make later allocations fail: why, for people.
+/// Without an unlimited `RLIMIT_MEMLOCK`, as less of it would make later allocations fail: why, as text for the user.
 pub fn lock_memory() -> Result<(), String> {
     if let Some(limit) = getrlimit(Resource::Memlock).current {
         return Err(format!("it may lock {} KiB of memory alone (`ulimit -l`)", limit >> 10));
     }
-    // Not before the first use: stacks and buffers are mostly room that is never used.
+    // Not before the first use: most of the space of stacks and buffers is never used.
     mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE | MlockAllFlags::ONFAULT).map_err(|error| error.to_string())
 }

@@ -1,12 +1,12 @@
-//! Samples: the header that travels beside every payload, and how payloads are encoded.
+//! Samples: the header that accompanies every payload, and how payloads are encoded.
 //!
-//! Owns the header's memory layout: other processes and other languages read it as it lies in
-//! shared memory, so a change of a field is a change of the interface.
+//! Owns the header's memory layout: other processes and other languages read it directly from shared
+//! memory, so a change of a field is a change of the interface.
 
 use serde::{Deserialize, Serialize};
 
-/// Incarnation of an attachment: +1 each time a device of a modality is started. What an older
-/// epoch reports changes nothing.
+/// Incarnation of an attachment: +1 each time a device of a modality is started. Reports from an older
+/// epoch change nothing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct Epoch(pub u32);
@@ -24,7 +24,7 @@ impl Epoch {
 #[repr(u32)]
 #[serde(rename_all = "lowercase")]
 pub enum Encoding {
-    /// Bytes as the device gave them.
+    /// Bytes as the device sent them.
     Bytes = 0,
     /// One JPEG picture.
     Mjpeg = 1,
@@ -39,7 +39,7 @@ pub enum Encoding {
 }
 
 impl Encoding {
-    /// The encoding of a number found in a header; `None` if it is not one of ours.
+    /// The encoding of a number found in a header; `None` if it is unknown.
     #[must_use]
     pub const fn from_raw(raw: u32) -> Option<Self> {
         Some(match raw {
@@ -59,20 +59,20 @@ pub const FLAG_ERROR: u32 = 1;
 /// Header flag: the capture time comes from the kernel or the device, not from the moment of arrival.
 pub const FLAG_DEVICE_TIME: u32 = 2;
 
-/// Travels beside every payload, as iceoryx2 user header. 56 bytes, native alignment 8.
+/// Accompanies every payload, as iceoryx2 user header. 56 bytes, native alignment 8.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[repr(C)]
 pub struct SampleHeader {
-    /// Counts the samples of this modality within a run of `rapid`, from 0, over all epochs: a hole
+    /// Counts the samples of this modality within a run of `rapid`, from 0, over all epochs: a gap
     /// is a lost sample, or several.
     pub seq: u64,
-    /// Of all holes in `seq` so far, the part that the device lost itself before `rapid` had the
-    /// samples; over all epochs. By as much as it grows over a hole, the hole is the device's; the
-    /// rest of it did not reach this reader.
+    /// Of all gaps in `seq` so far, the number of samples that the device lost before `rapid` received
+    /// them; over all epochs. Its increase over a gap is the part lost by the device; the rest did not
+    /// reach this reader.
     pub lost: u64,
-    /// Capture time, `CLOCK_MONOTONIC` ns; from the kernel where it gives one.
+    /// Capture time, `CLOCK_MONOTONIC` ns; from the kernel where it provides one.
     pub capture_ns: u64,
-    /// When `rapid` had the bytes in hand, `CLOCK_MONOTONIC` ns.
+    /// When `rapid` had received the bytes, `CLOCK_MONOTONIC` ns.
     pub recv_ns: u64,
     /// The modality's number.
     pub id: u32,

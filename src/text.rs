@@ -1,6 +1,6 @@
-//! Text for people: what fits in a column, and how durations, sizes, rates and times are written.
+//! Text for the user: what fits in a column, and how durations, sizes, rates and times are written.
 //!
-//! Owns the one place where text of a device becomes harmless to a terminal. Widths are columns of a
+//! Owns the one place where text of a device is made safe for a terminal. Widths are columns of a
 //! terminal, not bytes or characters.
 //!
 //! Invariant: no text is cut within a character, and nothing that moves a cursor or turns the
@@ -17,7 +17,7 @@ use serde_json::ser::Formatter;
 use unicode_segmentation::UnicodeSegmentation;
 use unicode_width::UnicodeWidthStr;
 
-/// What an open, a read or a write of a device that failed says to people; `group` is the one that may open it.
+/// The message about a failed open, read or write of a device; `group` is the one that may open it.
 #[must_use]
 pub fn not_opened(what: &str, group: &str, error: &io::Error) -> String {
     match Errno::from_io_error(error) {
@@ -46,19 +46,19 @@ pub fn plain(text: &str) -> Cow<'_, str> {
     if text.contains(is_unsafe) { Cow::Owned(text.replace(is_unsafe, " ")) } else { Cow::Borrowed(text) }
 }
 
-/// `value` as one line of JSON, without a line end, in which what [`plain`] takes out of a text is
-/// written as `\u` escapes: the same value to a program, harmless to a terminal.
+/// `value` as one line of JSON, without a line end, in which the characters that [`plain`] removes are
+/// written as `\u` escapes: the same value to a program, safe for a terminal.
 ///
 /// # Errors
-/// When `value` has no form in JSON: a map whose keys are no texts.
+/// When `value` cannot be represented in JSON: a map whose keys are not strings.
 pub fn json(value: &impl Serialize) -> serde_json::Result<String> {
     let mut line = Vec::new();
     value.serialize(&mut serde_json::Serializer::with_formatter(&mut line, Escaped))?;
     Ok(String::from_utf8_lossy(&line).into_owned())
 }
 
-/// A path in JSON, for `serialize_with`: a name that is no UTF-8, which serde refuses, has U+FFFD for
-/// what is not.
+/// A path in JSON, for `serialize_with`: in a name that is not UTF-8, which serde rejects, the invalid
+/// bytes become U+FFFD.
 ///
 /// # Errors
 /// Those of the serializer.
@@ -80,7 +80,7 @@ pub fn lossy_option<S: Serializer>(path: &Option<PathBuf>, serializer: S) -> Res
 struct Escaped;
 
 impl Formatter for Escaped {
-    /// A part of a text without what JSON escapes itself.
+    /// A part of a text without characters that JSON itself escapes.
     fn write_string_fragment<W: io::Write + ?Sized>(&mut self, out: &mut W, fragment: &str) -> io::Result<()> {
         let mut rest = fragment;
         while let Some(at) = rest.find(is_unsafe) {
@@ -151,7 +151,7 @@ pub fn clock(duration: Duration) -> String {
     if hours > 0 { format!("{hours}:{minutes:02}:{seconds:02}") } else { format!("{minutes:02}:{seconds:02}") }
 }
 
-/// An age to be read at a glance: `12 ms`, from one second `1.2 s`, from 100 seconds as a clock.
+/// An age, for quick reading: `12 ms`, from one second `1.2 s`, from 100 seconds as a clock.
 #[must_use]
 pub fn age(duration: Duration) -> String {
     match duration.as_millis() {
@@ -161,7 +161,7 @@ pub fn age(duration: Duration) -> String {
     }
 }
 
-/// A time in its largest unit, as one would say it: `3 s`, `12 min`, `2 h`.
+/// A time rounded down to its largest unit: `3 s`, `12 min`, `2 h`.
 #[must_use]
 pub fn about(duration: Duration) -> String {
     match duration.as_secs() {
@@ -180,7 +180,7 @@ pub fn size(bytes: u64) -> String {
     }
     let mut value = bytes as f64 / 1000.0;
     for unit in UNITS {
-        // What would be written as 1000.0 belongs to the next unit.
+        // What would be written as 1000.0 gets the next unit.
         if value < 999.95 {
             return format!("{value:.1} {unit}");
         }
@@ -189,7 +189,7 @@ pub fn size(bytes: u64) -> String {
     format!("{value:.1} EB")
 }
 
-/// A number with its thousands apart: `9,312`.
+/// A number with thousands separators: `9,312`.
 #[must_use]
 pub fn count(number: u64) -> String {
     let digits = number.to_string();
@@ -203,7 +203,7 @@ pub fn count(number: u64) -> String {
     text
 }
 
-/// So many of something: `1 message`, `9,312 messages`.
+/// A number with its noun: `1 message`, `9,312 messages`.
 #[must_use]
 pub fn counted(number: u64, what: &str) -> String {
     format!("{} {what}{}", count(number), if number == 1 { "" } else { "s" })
@@ -247,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn json_is_harmless_to_a_terminal_and_the_same_to_a_program() {
+    fn json_is_safe_for_a_terminal_and_unchanged_for_a_program() {
         let hostile = "a\u{9b}2J\u{7f}\u{202e}b\"\\\n\0ü\u{feff}";
         let line = json(&serde_json::json!({ "serial": hostile })).unwrap();
         assert_eq!(line, r#"{"serial":"a\u009b2J\u007f\u202eb\"\\\n\u0000ü\ufeff"}"#);
@@ -276,7 +276,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn a_column_is_exactly_as_wide_as_asked(text in ".*", columns in 0_usize..40) {
+        fn a_column_has_exactly_the_requested_width(text in ".*", columns in 0_usize..40) {
             let text = plain(&text).into_owned();
             prop_assert_eq!(width(&left(&text, columns, "~")), columns.max(width(&cut(&text, columns, "~"))));
             prop_assert!(width(&cut(&text, columns, "…")) <= columns);
@@ -284,7 +284,7 @@ mod tests {
         }
 
         #[test]
-        fn json_of_any_text_is_read_back_and_holds_nothing_unsafe(text in any::<String>()) {
+        fn json_of_any_text_round_trips_and_contains_nothing_unsafe(text in any::<String>()) {
             let line = json(&text).unwrap();
             prop_assert!(!line.contains(is_unsafe));
             prop_assert_eq!(serde_json::from_str::<String>(&line).unwrap(), text);

@@ -1,20 +1,19 @@
 //! Time: capture times on the monotonic clock, and their place on the wall clock.
 //!
-//! Owns the one reading of the system's clocks. A [`Stamp`] orders samples; the wall clock, which
-//! may be set at any moment, is only ever derived from it through a [`WallClock`] fixed at one
-//! moment.
+//! Owns the only code that reads the system's clocks. A [`Stamp`] orders samples; the wall clock, which
+//! may be set at any moment, is always derived from it through a [`WallClock`] fixed at one moment.
 
 use std::time::Duration;
 
 use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
 
-/// The wall clock was set if it moved by this against the monotonic clock: far more than reading the
-/// two can be wrong by, and less than anybody sets a clock by.
+/// The wall clock was set if it moved by this against the monotonic clock: far more than the error of
+/// reading both, and less than any deliberate change.
 pub const STEP: Duration = Duration::from_millis(10);
 /// Readings of a pair of clocks, at most.
 const TRIES: usize = 5;
-/// A reading that took no longer is exact enough.
+/// A reading that took no longer is accurate enough.
 const QUICK_NS: u64 = 20_000;
 
 /// A moment on `CLOCK_MONOTONIC`, in ns.
@@ -29,7 +28,7 @@ impl Stamp {
         Self(read(ClockId::Monotonic))
     }
 
-    /// This moment plus `duration`, at most the end of time.
+    /// This moment plus `duration`, saturating.
     #[must_use]
     pub fn after(self, duration: Duration) -> Self {
         Self(self.0.saturating_add(nanoseconds(duration)))
@@ -68,11 +67,11 @@ pub struct WallClock {
 }
 
 impl WallClock {
-    /// The relation as it is now.
+    /// The present relation.
     #[must_use]
     pub fn now() -> Self {
-        // The monotonic clock is read on both sides of the wall clock; their middle belongs to it.
-        // What holds this thread up in between makes it inexact: the quickest of a few tries counts.
+        // The monotonic clock is read before and after the wall clock; their mean corresponds to it.
+        // A preempted thread makes it inaccurate: the quickest of a few tries counts.
         let look = || {
             let before = read(ClockId::Monotonic);
             let wall = read(ClockId::Realtime);
@@ -110,7 +109,7 @@ impl WallClock {
 
 /// Notices that the wall clock was set.
 ///
-/// A clock that is slewed (NTP) is none that was set: the kernel slews both clocks alike, so that
+/// A clock that is slewed (NTP) was not set: the kernel slews both clocks equally, so that
 /// their relation stays. It changes when the wall clock is set, and by the time a machine sleeps.
 #[derive(Debug, Clone, Copy)]
 pub struct ClockWatch(WallClock);
@@ -122,7 +121,7 @@ impl ClockWatch {
         Self(clock)
     }
 
-    /// By how many ns the wall clock was set since the last step, forward or back; `None` if by less
+    /// By how many ns the wall clock was set since the last step, forward or backward; `None` if by less
     /// than [`STEP`].
     pub fn look(&mut self, now: WallClock) -> Option<i64> {
         let step = now.offset_ns - self.0.offset_ns;
@@ -161,7 +160,7 @@ const NS_PER_DAY: u64 = 86_400_000_000_000;
 /// The year is counted from March, so that the leap day is its last: then the months before any
 /// given one have 153 days for every five of them, and a cycle of 400 years has 146,097 days.
 const fn civil(days: u64) -> (u64, u64, u64) {
-    // 0000-03-01 lies 719,468 days before 1970-01-01.
+    // 0000-03-01 is 719,468 days before 1970-01-01.
     let shifted = days + 719_468;
     let (cycle, in_cycle) = (shifted / 146_097, shifted % 146_097);
     let year_of_cycle = (in_cycle - in_cycle / 1460 + in_cycle / 36_524 - in_cycle / 146_096) / 365;
@@ -201,7 +200,7 @@ mod tests {
         assert_eq!(look(5_300 * SECOND), Some(3_600_000_000_000));
         assert_eq!(look(5_300 * SECOND), None);
         assert_eq!(look(5_299 * SECOND), Some(-1_000_000_000));
-        // What is set in small steps is reported once they add up to one.
+        // Several small steps are reported once they add up to one of this size.
         assert_eq!(
             [4, 8, 12, 16].map(|ms| look(5_299 * SECOND + ms * 1_000_000)),
             [None, None, Some(12_000_000), None]

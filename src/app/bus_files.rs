@@ -1,5 +1,5 @@
-//! Reports when files of the bus are removed during a run: the run continues with the memory that it has, and no
-//! other program gets to it.
+//! Reports when files of the bus are removed during a run: the run continues with the memory it has mapped, which no
+//! other program can reach.
 
 use std::time::Duration;
 
@@ -7,7 +7,7 @@ use tokio::time::{MissedTickBehavior, interval};
 
 use crate::bus::Watchman;
 
-/// A look takes a system call for each of some dozens of files.
+/// A check takes a system call for each of some dozens of files.
 const LOOK: Duration = Duration::from_secs(1);
 
 /// Never ends. Cancel-safe.

@@ -1,4 +1,4 @@
-//! The conductor: carries out what the user, the command line and the clock request, until one of them requests the end.
+//! The conductor: carries out what the user, the command line and the clock request, until one of them ends the run.
 //!
 //! Invariant: the recorder alone knows whether an episode is in progress; the conductor asks it.
 
@@ -21,15 +21,15 @@ use crate::sample::Epoch;
 use crate::status::{Board, DeviceStatus, EpisodeEnd, Event, Level, SlotState, What};
 use crate::time::Stamp;
 
-/// An episode requested at the start begins when every attached device delivers, at the latest
-/// after this time.
+/// An episode requested at the start begins when every attached device delivers samples, and after this time at the
+/// latest.
 const SETTLE_LIMIT: Duration = Duration::from_secs(3);
 /// Devices that are attached at the start are known after this time.
 const SETTLE_LEAST: Duration = Duration::from_millis(100);
-/// How often that is checked.
+/// Interval of that check.
 const SETTLE_LOOK: Duration = Duration::from_millis(20);
 
-/// That no device is plugged in is reported after this time.
+/// If no device is plugged in, this is reported after this time.
 const NONE_AFTER: Duration = Duration::from_secs(3);
 /// The last samples of an episode have this long to arrive: the longest `latency` of a device is a second.
 const LAST_SAMPLES: Duration = Duration::from_secs(2);
@@ -42,12 +42,12 @@ pub(super) struct Conductor {
     pub(super) episode: EpisodeRequest,
     pub(super) record: bool,
     pub(super) duration: Option<Duration>,
-    /// An episode is still to begin, as soon as every device delivers.
+    /// An episode is still to begin, as soon as every device delivers samples.
     pub(super) begin_episode: bool,
 }
 
 impl Conductor {
-    /// Returns when the run is to end, and why if it is an error.
+    /// Returns when the run is to end, with the reason if it is an error.
     pub(super) async fn conduct(&mut self, running: &mut Running) -> Result<(), AppError> {
         let begun = Instant::now();
         let mut look = interval(SETTLE_LOOK);
@@ -57,40 +57,40 @@ impl Conductor {
             _ => None,
         };
         let mut has_looked = false;
-        // How the output ended, once it has no reader any more.
+        // How the output ended, once it has no reader.
         let mut output = Ok(());
         let mut bus_lost = pin!(bus::lost());
         loop {
             tokio::select! {
                 biased;
                 () = running.signals.next() => return output,
-                // The outcome is taken when everything is taken down.
+                // The outcome is taken during the shutdown.
                 () = running.streaming.ending.cancelled() => return output,
                 () = running.streaming.closed.cancelled() => return output,
                 error = &mut bus_lost => return Err(error.into()),
                 () = running.mask_ended.cancelled() => return Err(AppError::Panicked("thread `mask`")),
-                // It ends by itself only when it cannot continue.
+                // It ends without a request only when it cannot continue.
                 outcome = policy_ended(&mut running.inference) => return outcome,
                 outcome = running.screen.outcome() => match outcome {
                     Err(panicked @ AppError::Panicked(_)) => return Err(panicked),
-                    // An episode is worth more than its log lines, and continues without.
+                    // An episode is worth more than its log lines: the run continues without them.
                     outcome if self.record && running.kind != Screen::Monitor => output = outcome,
                     outcome => return outcome,
                 },
-                // Before requests: how the last episode ended comes before the next one.
+                // Before requests: the end of the last episode is handled before the next one begins.
                 event = self.events.recv() => {
                     if self.episode_ended(event)? { return output; }
                 }
                 Some(request) = running.requests.recv() => {
-                    // A slow disk takes its time to close a file: a signal does not wait for it. The recorder carries
-                    // the request out all the same, and its end is taken when everything is taken down.
+                    // A slow disk takes time to close a file: a signal does not wait for it. The recorder still carries
+                    // out the request, and its end is taken during the shutdown.
                     tokio::select! {
                         biased;
                         () = running.signals.next() => return output,
                         carried_out = self.carry_out(request) => if carried_out?.is_break() { return output },
                     }
                 }
-                // After the events: what became of its episode explains more.
+                // After the events: the end of its episode explains more.
                 outcome = running.recording.outcome() => return outcome.and(Err(AppError::Panicked("the recorder"))),
                 never = fault::strike("main") => never,
                 _ = look.tick(), if self.begin_episode => {
@@ -117,7 +117,7 @@ impl Conductor {
         Ok(ControlFlow::Continue(()))
     }
 
-    /// A run that waits for its first device looks like one that works. Events report devices that were unplugged.
+    /// A run that waits for its first device looks like one that works. Unplugged devices are reported by events.
     fn warn_if_none(&self) {
         let devices = self.board.snapshot().devices;
         let never = |device: &DeviceStatus| device.state == SlotState::Absent && device.epoch == Epoch::default();
@@ -127,20 +127,21 @@ impl Conductor {
         }
     }
 
-    /// Has every device that is attached delivered its first sample?
+    /// Whether every attached device has delivered its first sample.
     fn has_settled(&self, begun: Instant) -> bool {
         let waited = begun.elapsed();
         let opening = self.board.snapshot().devices.iter().any(|device| device.state == SlotState::Opening);
         waited >= SETTLE_LIMIT || (waited >= SETTLE_LEAST && !opening)
     }
 
-    /// Ends the episode in progress at the moment `at`, or begins one: also the one that waits for all to deliver.
+    /// Ends the episode in progress at the moment `at`, or begins one: also the one that waits for all devices to
+    /// deliver.
     async fn toggle(&mut self, at: Stamp) -> Result<(), AppError> {
         self.begin_episode = false;
         // How an episode ended is announced as an event and shown by the screen.
         let Err(RecordError::Idle) = self.recorder.stop_at(at).await else { return Ok(()) };
         if let Err(error) = self.recorder.start(self.episode.clone()).await {
-            // In the monitor, a full disk is no reason to leave: it is reported and can be fixed.
+            // In the monitor, a full disk is no reason to exit: it is reported and can be fixed.
             tracing::error!(%error, "the episode was not begun");
         }
         Ok(())
@@ -153,12 +154,12 @@ impl Conductor {
         }
     }
 
-    /// Fixes the end of the episode in progress to this moment, and waits until its last samples are written: those
-    /// captured before that may still be on their way.
+    /// Ends the episode in progress at this moment, and waits until its last samples are written: those captured before
+    /// may still be in transit.
     pub(super) async fn end_episode(&self) {
         self.recorder.end(Stamp::now());
         let mut episode = self.recorder.episode();
-        // A disk that stands still holds up the file, and nothing else.
+        // A stalled disk delays the file, and nothing else.
         let _ = timeout(LAST_SAMPLES, episode.wait_for(Option::is_none)).await;
     }
 
@@ -170,7 +171,7 @@ impl Conductor {
                 None => Ok(()),
             };
         }
-        // It may have ended by itself while the run did: how, is among the events not yet taken.
+        // It may have ended during the run without a request: the event that reports it may not be read yet.
         loop {
             let event = match self.events.try_recv() {
                 Ok(event) => Ok(event),
@@ -188,7 +189,7 @@ impl Conductor {
         let Some(EpisodeEnd { file, error }) = self.end_in(event).filter(|_| self.record) else { return Ok(false) };
         match error {
             Some(reason) => Err(AppError::Episode { file, reason }),
-            // The first episode was asked for on the command line; with a duration it was all.
+            // The first episode was requested on the command line; if a duration was given too, it was the whole run.
             None => Ok(self.duration.is_some()),
         }
     }

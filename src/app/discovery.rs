@@ -1,4 +1,4 @@
-//! Stage discovery: what is plugged in and unplugged, from the machine, the network or a scenario.
+//! Stage discovery: devices plugged in and unplugged, on this machine, on the network or in a scenario.
 
 use std::path::Path;
 
@@ -16,10 +16,10 @@ use crate::registry::Registry;
 
 /// Created by udev's daemon when it starts.
 const UDEV: &str = "/run/udev/control";
-/// Events that may wait for the rig, which takes them at once.
+/// Events that may wait for the rig, which takes them immediately.
 const DEPTH: usize = 64;
 
-/// Starts to watch; also what is handed to the rig, which ends when the stage does.
+/// Starts to watch; also returns the stream for the rig, which ends when the stage does.
 ///
 /// # Errors
 /// When plug events of this machine cannot be received.

@@ -46,7 +46,7 @@ pub enum AppError {
     /// The policy.
     #[error(transparent)]
     Policy(#[from] LoadError),
-    /// What the policy requires is not there.
+    /// What the policy requires is not present.
     #[error("the policy needs {0}: plug it in, or write --wait to start when it is there")]
     Required(String),
     /// The policy does not end.
@@ -55,18 +55,18 @@ pub enum AppError {
     /// An episode's file is not whole.
     #[error("{}: {reason}{}", file.display(), repair(file))]
     Episode {
-        /// What there is of it.
+        /// What exists of it.
         file: PathBuf,
         /// Why.
         reason: String,
     },
-    /// Other programs could not stop it.
+    /// Other programs could not stop the actuator.
     #[error("orders to the actuator cannot be received: {0}")]
     Orders(#[source] io::Error),
     /// Emergency stops would not be noticed.
     #[error("emergency stops cannot be read: {0}")]
     Interlocks(#[source] io::Error),
-    /// A run without a screen recorded something that is not to be used.
+    /// A run without a screen recorded an episode that must not be used.
     #[error("{}", bad(*count, file))]
     Bad {
         /// Episodes that are BAD.
@@ -88,7 +88,7 @@ fn bad(count: u64, file: &Path) -> String {
     format!("{file} is BAD{many}: its verdict above has the reasons; see `rapid inspect`")
 }
 
-/// What to do about a file that did not get its finished name; where it did, nothing.
+/// What to do about a file that did not get its finished name; empty if it did.
 fn repair(file: &Path) -> String {
     let is_finished = file.extension().is_some_and(|extension| extension == "mcap");
     if is_finished {

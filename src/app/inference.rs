@@ -1,5 +1,5 @@
-//! Stage inference: the policy of a run, loaded beside everything else, started when what it requires is there, ended
-//! first.
+//! Stage inference: the policy of a run, loaded in parallel with everything else, started when what it requires is
+//! present, ended first.
 //!
 //! Invariant: it never starts without what it requires.
 
@@ -22,9 +22,9 @@ use crate::policy::sampler::PolicyError;
 use crate::registry::Registry;
 use crate::status::{Board, Level, What};
 
-/// Devices attached at the start have this long to deliver.
+/// Devices attached at the start must deliver within this time.
 const SETTLE: Duration = Duration::from_secs(3);
-/// How often the mask is checked for that.
+/// Interval at which the mask is checked for that.
 const LOOK: Duration = Duration::from_millis(5);
 
 /// The policy of a run.
@@ -32,9 +32,9 @@ const LOOK: Duration = Duration::from_millis(5);
 pub struct PolicyOptions {
     /// The policy, checked against the registry, and how it acts.
     pub live: LiveOptions,
-    /// Wait for required devices instead of giving up.
+    /// Wait for required devices instead of failing.
     pub wait: bool,
-    /// Denoising steps instead of the bundle's own.
+    /// Denoising steps instead of those of the bundle.
     pub denoising_steps: Option<usize>,
     /// Library of onnxruntime instead of the built-in one.
     pub library: Option<PathBuf>,
@@ -51,8 +51,8 @@ pub enum LoadError {
     Policy(#[from] PolicyError),
 }
 
-/// Starts the stage: it loads the policy and starts it when everything it requires is there; when it is to be recorded,
-/// after the episode has begun, so that everything it observed is in it.
+/// Starts the stage: it loads the policy and starts it when everything it requires is present; when it is to be
+/// recorded, after the episode has begun, so that the file holds everything it observed.
 ///
 /// # Errors
 /// When it cannot read the bus.
@@ -75,7 +75,7 @@ pub(super) fn start(
     Ok(Stage::start("the policy", |stop| flight.run(stop)))
 }
 
-/// What must be there: the modalities the bundle requires, and what is moved.
+/// What must be present: the modalities the bundle requires, and the actuator.
 fn required(options: &PolicyOptions, registry: &Registry) -> Vec<(ModalityId, String)> {
     let observed = options.live.bundle.observations.iter().filter(|observation| observation.required);
     let moved = (!options.live.dry_run).then_some(&options.live.bundle.action.actuator);
@@ -128,14 +128,14 @@ impl Flight {
         match ended {
             Ok(Ok(())) if stop.is_cancelled() => Ok(()),
             Ok(Err(thread)) => Err(AppError::Panicked(thread)),
-            // It ends by itself only when one of its threads is gone.
+            // It ends without a request only when one of its threads has ended.
             Ok(Ok(())) | Err(_) => Err(AppError::Panicked("the policy")),
         }
     }
 
-    /// Waits until everything required is there, and the episode that it is to be recorded in, if it is; `false` if the
-    /// run is to end before. Unless it is to wait for devices, a missing one is an error after [`SETTLE`].
-    // Exclusive, as what reads the bus cannot be shared between threads.
+    /// Waits until everything required is present, and the episode has begun if the policy is to be recorded; `false`
+    /// if the run is to end before. Unless it is to wait for devices, a missing one is an error after [`SETTLE`].
+    // `&mut`, because the bus reader cannot be shared between threads.
     async fn settled(&mut self, stop: &CancellationToken) -> Result<bool, AppError> {
         let begun = Instant::now();
         let mut look = interval(LOOK);

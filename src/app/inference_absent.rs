@@ -1,4 +1,4 @@
-//! Stage inference of a program that was built without cargo feature `policy`: there is none to start.
+//! Stage inference of a program that was built without cargo feature `policy`: there is nothing to start.
 
 use std::sync::Arc;
 

@@ -1,7 +1,7 @@
-//! Requests of the screen, sorted by who carries them out.
+//! Requests of the screen, sorted by receiver.
 //!
-//! Invariant: a request to the rig never waits for a file: it does not pass through the conductor, which waits for files
-//! to be closed. Orders to the actuator take another way altogether ([`crate::permission`]).
+//! Invariant: a request to the rig never waits for a file: it does not pass through the conductor, which waits for
+//! files to be closed. Orders to the actuator take a separate path ([`crate::permission`]).
 
 use std::path::PathBuf;
 
@@ -22,7 +22,7 @@ pub(super) enum Request {
     Quit,
 }
 
-/// Sorts requests of the screen until it is gone. Those to the conductor wait in a queue without a limit: a hand types
+/// Sorts requests of the screen until it has ended. Those to the conductor wait in an unbounded queue: a person types
 /// them.
 pub(super) fn sorted(
     mut screen: mpsc::Receiver<Command>,
@@ -31,7 +31,7 @@ pub(super) fn sorted(
     let (conductor, requests) = mpsc::unbounded_channel();
     tokio::spawn(async move {
         while let Some(command) = screen.recv().await {
-            // Either is gone only when the run ends.
+            // A receiver is gone only when the run ends.
             let _ = match command {
                 Command::ToggleRecording => conductor.send(Request::ToggleRecording(Stamp::now())).is_ok(),
                 Command::DropEpisode(file) => conductor.send(Request::DropEpisode(file)).is_ok(),

@@ -14,7 +14,7 @@ use crate::permission::Permission;
 use crate::status::{Board, Command};
 use crate::tui::{self, TuiError};
 
-/// Starts the screen that was asked for.
+/// Starts the requested screen.
 pub(super) fn start(
     screen: Screen,
     board: &Arc<Board>,
@@ -27,7 +27,7 @@ pub(super) fn start(
         return Stage::start("the screen", |stop| async move {
             tokio::select! {
                 outcome = tui::run(board, commands, permission, stop) => match outcome {
-                    // As good as SIGHUP, which comes with it or a little later.
+                    // Equivalent to SIGHUP, which arrives with it or a little later.
                     Err(error @ TuiError::Gone(_)) => {
                         tracing::warn!(%error, "the run ends");
                         Ok(())
@@ -47,7 +47,7 @@ pub(super) fn start(
     Stage::start("the screen", |stop| {
         let run = headless::run(board, stop, options, std::io::stdout());
         async move {
-            // Lines cannot ask for anything.
+            // Lines of text cannot make requests.
             drop(commands);
             tokio::select! {
                 outcome = run => outcome.map_err(AppError::Output),

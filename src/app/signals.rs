@@ -4,12 +4,12 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 
 /// SIGINT, SIGTERM, SIGQUIT, and SIGHUP for a terminal that was closed: all of them end the run.
 ///
-/// Two that would end the process where it stands are taken: SIGPIPE by Rust's runtime, and SIGXFSZ
-/// here, so that a write beyond the limit for files (`ulimit -f`) is an error like any other.
+/// Two that would end the process immediately are handled: SIGPIPE by Rust's runtime, and SIGXFSZ here, so that a write
+/// beyond the limit for files (`ulimit -f`) is an error like any other.
 pub(crate) struct Signals {
     ends: [Signal; 4],
     _too_large: Signal,
-    /// How many came.
+    /// How many arrived.
     asked: u32,
 }
 
@@ -39,7 +39,7 @@ impl Signals {
         self.asked += 1;
     }
 
-    /// Waits for the second of the run: the first only asks for the end that may be coming anyway.
+    /// Waits for the second of the run: the first only requests the end, which may be in progress anyway.
     pub(super) async fn second(&mut self) {
         while self.asked < 2 {
             self.next().await;

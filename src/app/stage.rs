@@ -1,6 +1,6 @@
-//! A stage of a run: a tokio task that owns whatever must block behind it.
+//! A stage of a run: a tokio task that owns the threads that block on its behalf.
 //!
-//! | stage       | its task                                          | what blocks behind it                        |
+//! | stage       | its task                                          | what blocks for it                           |
 //! |-------------|---------------------------------------------------|----------------------------------------------|
 //! | discovery   | reads hot-plug events and hands them to streaming  | nothing: netlink and mDNS sockets are polled |
 //! | streaming   | the rig: slots, mask, a task for each device       | thread `mask`, threads of drivers            |
@@ -10,7 +10,7 @@
 //! Synchronisation is a pure function of samples and ticks ([`crate::sync`]), executed by recording and inference at
 //! their own ticks: a task between would add a hop and could only repeat what both compute from the same samples.
 //!
-//! Invariant: a stage that ended by itself and one that was stopped report how, once; a panic is an end like any other.
+//! Invariant: a stage reports once how it ended, whether it was stopped or not; a panic is an end like any other.
 //! Invariant: no stage blocks a worker of the runtime: threads are joined where blocking is allowed.
 
 use tokio::task::JoinHandle;
@@ -28,7 +28,7 @@ pub(super) struct Stage {
 }
 
 impl Stage {
-    /// Starts the task, which is to end when the token it is given is cancelled.
+    /// Starts the task, which must end when its token is cancelled.
     pub(super) fn start<F>(name: &'static str, run: impl FnOnce(CancellationToken) -> F) -> Self
     where
         F: Future<Output = Result<(), AppError>> + Send + 'static,
@@ -37,7 +37,7 @@ impl Stage {
         Self { name, task: Some(tokio::spawn(run(stop.clone()))), stop }
     }
 
-    /// Waits for the end of the task and takes the outcome; for ever if it is taken already. Cancel-safe.
+    /// Waits for the end of the task and takes the outcome; never returns if it is taken already. Cancel-safe.
     pub(super) async fn outcome(&mut self) -> Result<(), AppError> {
         let Some(task) = &mut self.task else { return std::future::pending().await };
         let outcome = task.await;
@@ -45,14 +45,14 @@ impl Stage {
         outcome.unwrap_or(Err(AppError::Panicked(self.name)))
     }
 
-    /// Asks the task to end. Does not wait.
-    pub(super) fn ask_to_end(&self) {
+    /// Requests the task to end. Does not wait.
+    pub(super) fn request_end(&self) {
         self.stop.cancel();
     }
 
-    /// Asks the task to end and waits; `Ok` if its outcome is taken already.
+    /// Requests the task to end and waits; `Ok` if its outcome is taken already.
     pub(super) async fn end(&mut self) -> Result<(), AppError> {
-        self.ask_to_end();
+        self.request_end();
         if self.task.is_some() { self.outcome().await } else { Ok(()) }
     }
 }
@@ -71,7 +71,7 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn a_stage_ends_when_asked_and_reports_once() {
+    async fn a_stage_ends_on_request_and_reports_once() {
         let mut stage = Stage::start("test", |stop| async move {
             stop.cancelled().await;
             Err(AppError::Stuck)
@@ -81,13 +81,13 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_panic_is_an_end_that_names_the_stage() {
+    async fn a_panic_ends_the_stage_with_an_error_that_names_it() {
         let mut stage = Stage::start("test", |_| async { panic!("ordered") });
         assert!(matches!(stage.outcome().await, Err(AppError::Panicked("test"))));
     }
 
     #[tokio::test]
-    async fn a_thread_that_panics_is_named() {
+    async fn a_panicked_thread_is_named() {
         let thread = std::thread::spawn(|| panic!("ordered"));
         assert!(matches!(join(thread, "thread `test`").await, Err(AppError::Panicked("thread `test`"))));
         join(std::thread::spawn(|| ()), "thread `test`").await.unwrap();

@@ -1,4 +1,4 @@
-//! Stage streaming: the rig, from the first device to the last program of one.
+//! Stage streaming: the rig, from the first device to the end of the last device program.
 
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
@@ -13,13 +13,13 @@ use crate::rig::{Rig, RigCommand};
 #[derive(Debug)]
 pub(super) struct Streaming {
     pub(super) stage: Stage,
-    /// Cancelled when the rig, by itself, begins to close its devices.
+    /// Cancelled when the rig begins to close its devices without a request.
     pub(super) ending: CancellationToken,
     /// Cancelled when all streams have ended, or the rig has panicked. Otherwise the mask is still published.
     pub(super) closed: CancellationToken,
     /// Cancelled when the mask is no longer needed.
     pub(super) release: CancellationToken,
-    /// Programs that are being ended are killed once this is cancelled.
+    /// Once this is cancelled, programs that are being ended are killed.
     pub(super) hurry: CancellationToken,
 }
 
@@ -30,7 +30,7 @@ impl Streaming {
         let (is_closed, released) = (closed.clone(), release.clone());
         let stage = Stage::start("the rig", |stop| async move {
             let mut rig = rig;
-            // By a panic too, and then before the rig is dropped and the mask ends: the cause is reported first.
+            // On a panic too, and then before the rig is dropped and the mask ends: the cause is reported first.
             let guard = is_closed.drop_guard();
             let outcome = tokio::select! {
                 outcome = rig.run(plugged, commands, stop) => outcome,
@@ -46,13 +46,13 @@ impl Streaming {
         Self { stage, ending, closed, release, hurry }
     }
 
-    /// Closes all devices and waits until they are. The mask stays published as it was.
+    /// Closes all devices and waits for it. The mask stays published as it was.
     pub(super) async fn close(&self) {
-        self.stage.ask_to_end();
+        self.stage.request_end();
         self.closed.cancelled().await;
     }
 
-    /// Waits for the programs of devices, and takes the mask back.
+    /// Waits for the programs of devices, and withdraws the mask.
     pub(super) async fn end(&mut self) -> Result<(), AppError> {
         self.release.cancel();
         self.stage.end().await

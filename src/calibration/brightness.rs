@@ -13,7 +13,7 @@ const LARGEST: usize = 8192;
 /// Why a picture has no brightness.
 #[derive(Debug, thiserror::Error)]
 pub enum BrightnessError {
-    /// It is no picture.
+    /// It is not a picture.
     #[error("the samples are no pictures")]
     NoPicture,
     /// It cannot be decoded.
@@ -24,7 +24,7 @@ pub enum BrightnessError {
 /// The mean luminance of a picture, 0 (black) to 255 (white).
 ///
 /// # Errors
-/// When the bytes are no picture, or a damaged one.
+/// When the bytes are not a picture, or a damaged one.
 pub fn brightness(encoding: Encoding, bytes: &[u8]) -> Result<f64, BrightnessError> {
     match encoding {
         Encoding::Grey => mean(bytes.iter()),
@@ -45,9 +45,9 @@ pub fn brightness(encoding: Encoding, bytes: &[u8]) -> Result<f64, BrightnessErr
     }
 }
 
-/// Makes `marked` the picture with the mark (segment APP0) that motion JPEG has in AVI files. Cameras
-/// leave out the Huffman tables and mean those of the standard (ITU-T T.81 K.3); the decoder takes
-/// these for what is missing when it finds the mark.
+/// Sets `marked` to the picture with the mark (segment APP0) that motion JPEG has in AVI files. Cameras leave out the
+/// Huffman tables and imply those of the standard (ITU-T T.81 K.3); with the mark, the decoder uses these in place of
+/// the missing ones.
 pub(crate) fn with_mark(jpeg: &[u8], marked: &mut Vec<u8>) {
     let (start, rest) = jpeg.split_at(jpeg.len().min(2));
     marked.clear();
@@ -110,7 +110,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn damaged_pictures_are_refused_or_shown_and_nothing_panics(
+        fn damaged_pictures_are_refused_or_decoded_without_a_panic(
             places in proptest::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..20), cut in any::<prop::sample::Index>(),
         ) {
             let mut bytes = jpeg(90);

@@ -1,34 +1,34 @@
 //! The latency of a camera that looked at a light.
 //!
 //! A picture stamped `t` is taken to show the mean of the light over its exposure `e`, whose middle
-//! lies at `t - latency`. What is fitted are differences from picture to picture, so that a camera
-//! that adapts slowly to the light does not move the result:
+//! lies at `t - latency`. The fit uses differences from picture to picture, so that a camera that
+//! adapts slowly to the light does not shift the result:
 //!
 //! `y(i) - y(i-1) = contrast * (light(i) - light(i-1)) + noise`
 //!
 //! by least squares, over a grid of latencies and exposures. The estimate is the mean of the
-//! latencies weighted by how likely each makes what was seen (Gaussian noise of the size of the best
-//! fit's residual, nothing known before), and the uncertainty follows from their spread.
+//! latencies weighted by the likelihood of the measurements (Gaussian noise of the size of the best
+//! fit's residual, uniform prior), and the uncertainty follows from their spread.
 
 use crate::time::Stamp;
 
-/// Latencies looked at, seconds. Below zero: a stamp taken before the exposure.
+/// Range of latencies considered, seconds. Below zero: a stamp taken before the exposure.
 const EARLIEST: f64 = -0.1;
 const LATEST: f64 = 1.0;
-/// With fewer pictures or flips there is no result.
+/// Below these numbers of pictures and flips there is no result.
 const LEAST_PICTURES: usize = 30;
 const LEAST_FLIPS: usize = 8;
-/// Least difference between dark and lit, of 255, that is no noise.
+/// Least difference between dark and lit, of 255, that is not noise.
 const LEAST_CONTRAST: f64 = 2.0;
-/// Least correlation; what is not the pattern stays below half of it.
+/// Least correlation; anything that is not the pattern stays below half of it.
 const LEAST_CORRELATION: f64 = 0.5;
-/// Another latency that fits so nearly as well makes the best one doubtful...
+/// Another latency that fits better than this share of the best makes the result ambiguous...
 const RIVAL: f64 = 0.8;
-/// ...if it lies further away than this, seconds.
+/// ...if it is further away than this, seconds.
 const RIVAL_DISTANCE: f64 = 0.15;
-/// The model is never better than this share of the contrast: light is not on or off at once.
+/// The model error is at least this share of the contrast: light does not switch instantly.
 const MODEL_ERROR: f64 = 0.005;
-/// Steps of the coarse grid and of the fine one a picture, and exposures looked at.
+/// Steps per picture of the coarse grid and of the fine one, and number of exposures tried.
 const COARSE: f64 = 4.0;
 const FINE: f64 = 64.0;
 const EXPOSURES: u32 = 8;
@@ -54,15 +54,15 @@ pub struct Seen {
 /// A measured latency.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
 pub struct Estimate {
-    /// From what happened to the capture time of the picture that shows it, ms.
+    /// From an event to the capture time of the picture that shows it, ms.
     pub latency_ms: f64,
-    /// Half width of the interval that holds the true value 95 times of 100, ms.
+    /// Half width of the 95 % interval of the true value, ms.
     pub uncertainty_ms: f64,
     /// How well the pictures follow the light, 0 to 1.
     pub correlation: f64,
     /// Difference between dark and lit, of 255.
     pub contrast: f64,
-    /// Pictures looked at.
+    /// Pictures evaluated.
     pub pictures: usize,
     /// Changes of the light.
     pub flips: usize,
@@ -71,7 +71,7 @@ pub struct Estimate {
 /// Why no latency can be determined.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum Refusal {
-    /// There is not enough to compare.
+    /// There is too little data.
     #[error("only {pictures} pictures and {flips} changes of the light: let it run longer")]
     TooFew {
         /// Pictures.
@@ -79,7 +79,7 @@ pub enum Refusal {
         /// Changes of the light.
         flips: usize,
     },
-    /// The pictures are as white as they can be, dark or lit.
+    /// The pictures are saturated, dark or lit.
     #[error("the pictures are white throughout: lower the exposure, or move the camera away from the light")]
     Saturated,
     /// The pictures do not change.
@@ -91,7 +91,7 @@ pub enum Refusal {
         /// Mean brightness, of 255.
         brightness: f64,
     },
-    /// The pictures change, and not as the light does.
+    /// The pictures change, but not with the light.
     #[error(
         "the pictures change, and not with the light (correlation {correlation:.2}): point the camera at it, hold it \
          still, and switch automatic exposure off"
@@ -110,11 +110,11 @@ pub enum Refusal {
     },
 }
 
-/// The latency of the camera that saw `seen` while the light changed as `flips` say; both in the
-/// order of time. Before the first flip the light was the opposite of what it became.
+/// The latency of the camera that recorded `seen` while the light changed at `flips`; both in the order of time. Before
+/// the first flip the light was in the opposite state.
 ///
 /// # Errors
-/// When the pictures do not follow the light, or too few are there to tell.
+/// When the pictures do not follow the light, or there are too few of them.
 pub fn estimate(flips: &[Flip], seen: &[Seen]) -> Result<Estimate, Refusal> {
     let scene = Scene::new(flips, seen).filter(|_| seen.len() >= LEAST_PICTURES && flips.len() >= LEAST_FLIPS);
     let Some(scene) = scene else { return Err(Refusal::TooFew { pictures: seen.len(), flips: flips.len() }) };
@@ -127,7 +127,7 @@ pub fn estimate(flips: &[Flip], seen: &[Seen]) -> Result<Estimate, Refusal> {
     Ok(Estimate { pictures: seen.len(), flips: flips.len(), ..fine })
 }
 
-/// How well a latency and an exposure explain what was seen.
+/// How well a latency and an exposure explain the measurements.
 #[derive(Debug, Clone, Copy)]
 struct Fit {
     residual: f64,
@@ -146,7 +146,7 @@ struct Scene {
     /// The usual time between two pictures.
     period: f64,
     mean: f64,
-    /// Brightness that all but a twentieth of the pictures are above, and below.
+    /// The 5th and 95th percentile of the brightness.
     range: (f64, f64),
 }
 
@@ -184,7 +184,7 @@ impl Scene {
     }
 
     fn check_contrast(&self) -> Result<(), Refusal> {
-        /// White, as far as a camera goes.
+        /// White, as far as a camera can measure.
         const WHITE: f64 = 250.0;
         let (dark, bright) = self.range;
         if bright - dark >= LEAST_CONTRAST {
@@ -193,7 +193,7 @@ impl Scene {
         Err(if dark >= WHITE { Refusal::Saturated } else { Refusal::Flat { brightness: self.mean } })
     }
 
-    /// For how long it was lit up to a moment.
+    /// How long the light was on until a moment.
     fn lit_until(&self, at: f64) -> f64 {
         let next = self.flips.partition_point(|(flip, ..)| *flip <= at);
         match next.checked_sub(1).and_then(|last| self.flips.get(last)) {
@@ -204,7 +204,7 @@ impl Scene {
     }
 
     fn light(&self, at: f64, exposure: f64) -> f64 {
-        // A moment is an exposure too short to matter.
+        // A single moment is treated as an exposure too short to matter.
         let half = exposure.max(1e-6) / 2.0;
         (self.lit_until(at + half) - self.lit_until(at - half)) / (2.0 * half)
     }
@@ -248,7 +248,7 @@ impl Scene {
         }
     }
 
-    /// The mean and the spread of the latencies around `near` that explain what was seen.
+    /// The mean and the spread of the latencies around `near` that explain the measurements.
     fn fine(&self, near: f64) -> Estimate {
         let step = self.period / FINE;
         let fits: Vec<(f64, Fit)> = (0..=EXPOSURES)

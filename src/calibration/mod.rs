@@ -1,10 +1,10 @@
-//! Measuring a sensor: what its samples showed, against what is known to have happened.
+//! Measuring a sensor: its samples against events known to have happened.
 //!
-//! `brightness` makes one number of a picture, `latency` finds the delay at which those numbers
+//! `brightness` reduces a picture to one number, `latency` finds the delay at which those numbers
 //! follow a light.
 //!
 //! Invariant: pure: no clock, no device, no file.
-//! Invariant: no bytes of a picture make this panic.
+//! Invariant: no bytes of a picture cause a panic.
 
 mod brightness;
 mod latency;

@@ -1,7 +1,7 @@
 //! `rapid ablation`: which configurations of a gripper are still to be recorded.
 //!
-//! The plan names fingers and sets of modalities; the episodes contain what has been recorded. The meaning of the words on
-//! a rig, and the configuration an episode belongs to, follow from both without I/O.
+//! The plan names fingers and sets of modalities; the episodes contain what has been recorded. The meaning of the words
+//! on a rig, and the configuration an episode belongs to, follow from both without I/O.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{self, Write};
@@ -17,7 +17,7 @@ use crate::registry::{DeviceSpec, Mount, NodeSpec, Registry, RegistryErrors, did
 use crate::status::Grade;
 use crate::text;
 
-/// Why no list is made.
+/// Why no list is printed.
 #[derive(Debug, thiserror::Error)]
 pub enum AblationError {
     /// The file of the plan is invalid.

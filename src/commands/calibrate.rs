@@ -41,7 +41,7 @@ pub enum CalibrateError {
     /// There is no such entry.
     #[error("--device {name}: no such entry; cameras are {}", listed(.cameras))]
     NoEntry {
-        /// What was asked for.
+        /// The requested name.
         name: String,
         /// The cameras of the registry.
         cameras: Vec<String>,
@@ -317,7 +317,7 @@ impl Measured {
 
 /// Where the kernel lists LEDs (Documentation/ABI/testing/sysfs-class-led).
 const LEDS: &str = "/sys/class/leds";
-/// How often a stop is checked for and the line of text updated.
+/// Interval at which a stop is checked for and the line of text updated.
 const POLL: Duration = Duration::from_millis(50);
 
 /// Why there is no light.

@@ -27,7 +27,7 @@ pub fn check(path: &Path, format: Format, out: &mut dyn Write) -> io::Result<Out
         lines.iter().try_for_each(|line| writeln!(out, "{}", text::json(line)?))?;
         return Ok(outcome);
     }
-    let counted = match &loaded {
+    let summary = match &loaded {
         Ok(loaded) => {
             table(loaded, out)?;
             format!("{}, ok", text::counted(loaded.registry.devices.len() as u64, "device"))
@@ -44,7 +44,7 @@ pub fn check(path: &Path, format: Format, out: &mut dyn Write) -> io::Result<Out
             Line::Error(error) => writeln!(out, "{error}")?,
         }
     }
-    writeln!(out, "{}: {counted}", text::plain(&path.display().to_string()))?;
+    writeln!(out, "{}: {summary}", text::plain(&path.display().to_string()))?;
     Ok(outcome)
 }
 

@@ -36,7 +36,7 @@ pub enum CompareFailure {
         /// What was allowed.
         tolerance: f64,
     },
-    /// A tolerance, and no difference to compare it with.
+    /// A tolerance was given, but there is no difference to compare it with.
     #[error("{file}: {why}, so there is no difference to compare with --tolerance")]
     Incomparable {
         /// The episode.
@@ -229,8 +229,8 @@ mod tests {
 
     #[test]
     fn numbers_are_short() {
-        for (value, said) in [(0.0, "0"), (0.0123, "0.0123"), (1.19e-7, "1.19e-7"), (f64::INFINITY, "inf")] {
-            assert_eq!(number(value), said);
+        for (value, text) in [(0.0, "0"), (0.0123, "0.0123"), (1.19e-7, "1.19e-7"), (f64::INFINITY, "inf")] {
+            assert_eq!(number(value), text);
         }
     }
 }

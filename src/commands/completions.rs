@@ -1,4 +1,4 @@
-//! `rapid completions` and `rapid man`: what a shell and `man` know of the commands.
+//! `rapid completions` and `rapid man`: completion scripts and manual pages of the commands.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -43,7 +43,7 @@ mod tests {
     use crate::cli::Cli;
 
     #[test]
-    fn each_shell_gets_a_script_that_knows_the_subcommands() {
+    fn each_shell_gets_a_script_with_the_subcommands() {
         for shell in [clap_complete::Shell::Bash, clap_complete::Shell::Zsh, clap_complete::Shell::Fish] {
             let mut script = Vec::new();
             completions(&mut Cli::grammar(), shell, &mut script).unwrap();

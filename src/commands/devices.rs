@@ -11,12 +11,12 @@ use crate::registry::{
 };
 use crate::text;
 
-/// One node that is plugged in.
+/// A node that is plugged in.
 #[derive(Debug, Clone, Serialize)]
 pub struct Plugged {
     /// Node, for example `/dev/video0`.
     pub node: String,
-    /// Its device, in the device's own words.
+    /// Its device, as the device describes itself.
     #[serde(flatten)]
     pub unit: Unit,
     /// The entry it matches, if any.
@@ -89,7 +89,7 @@ fn explain(assigner: &mut Assigner, registry: &Registry, attachment: &Attachment
     let mut why = assigner.explain(attachment).reasons;
     match assigner.attach(attachment) {
         Assignment::Entry(id) => (registry.device(id).map(|device| device.name.clone()), why),
-        // It matches, and something prevents its use.
+        // It matches, but something prevents its use.
         Assignment::Waiting { reason } | Assignment::WrongNode { reason } => {
             why.push(reason);
             (None, why)

@@ -60,7 +60,7 @@ pub fn layout(json: &str) -> Option<Vec<(u8, String)>> {
     Some(file.devices.into_iter().map(|device| (device.bit, device.name)).collect())
 }
 
-/// The record for people: the mask, its age, and one line per modality. `now_ns` is the current wall time.
+/// The record as text: the mask, its age, and one line per modality. `now_ns` is the current wall time.
 #[must_use]
 pub fn render(record: &MaskRecord, layout: Option<&Layout>, now_ns: u64, palette: Palette) -> String {
     let count = usize::from(record.device_count);
@@ -161,7 +161,7 @@ pub fn render_json(record: &MaskRecord, layout: Option<&Layout>, now_ns: u64) ->
 /// publisher that stops or returns is reported; at the start, a missing one is an error.
 ///
 /// # Errors
-/// When there is no record at the start, or the output cannot be written. A closed pipe is no error.
+/// When there is no record at the start, or the output cannot be written. A closed pipe is not an error.
 pub async fn run(
     mut read: impl FnMut() -> Result<MaskRecord, String>,
     names: impl Fn() -> Option<Vec<(u8, String)>>,

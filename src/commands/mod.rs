@@ -23,7 +23,7 @@ pub mod register;
 /// How a listing is written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Format {
-    /// For people.
+    /// Plain text.
     #[default]
     Text,
     /// One JSON object per line.

@@ -15,7 +15,7 @@ use crate::text;
 const EVERY: Duration = Duration::from_millis(100);
 const BLOCKS: usize = 20;
 
-/// `label ██████·········· 12/72  0:07 left`, drawn over itself; only on a terminal.
+/// `label ██████·········· 12/72  0:07 left`, redrawn in place; only on a terminal.
 #[derive(Debug)]
 pub struct Bar {
     label: &'static str,

@@ -20,13 +20,13 @@ pub struct Outcome {
 }
 
 impl Outcome {
-    /// Whether everything was repaired that can be.
+    /// Whether everything that can be repaired was.
     #[must_use]
     pub const fn is_done(self) -> bool {
         self.failed == 0 && self.bad_arguments == 0
     }
 
-    /// Whether some argument was no episode, and nothing worse happened.
+    /// Whether some argument was not an episode, and nothing worse happened.
     #[must_use]
     pub const fn is_bad_argument(self) -> bool {
         self.failed == 0 && self.bad_arguments > 0
@@ -34,9 +34,9 @@ impl Outcome {
 }
 
 /// Repairs every file of `paths` and every unfinished one of a folder among them. Results go to `out`, errors
-/// and, if wanted, the progress to `err`. `stop` interrupts the current file and skips the rest.
+/// and, if `progress` is set, the progress to `err`. `stop` interrupts the current file and skips the rest.
 ///
-/// A closed output leaves no file unrepaired, so its error is returned beside the outcome.
+/// A closed output leaves no file unrepaired, so its error is returned separately from the outcome.
 pub fn run(
     paths: &[PathBuf],
     format: Format,
@@ -78,7 +78,7 @@ pub fn run(
     report.end()
 }
 
-/// The files of a path to repair, and those only to check: a finished file is repaired only if it is named itself.
+/// The files of a path to repair, and those only to check: a finished file is repaired only if it is named explicitly.
 fn work_of(path: &Path) -> io::Result<(Vec<PathBuf>, Vec<PathBuf>)> {
     // Listed before anything is repaired: repaired files need no check.
     if path.is_dir() { Ok((left_behind(path)?, finished(path)?)) } else { Ok((vec![path.to_owned()], Vec::new())) }
@@ -89,13 +89,13 @@ struct Report<'a, O, E> {
     outcome: Outcome,
     format: Format,
     out: &'a mut O,
-    /// The first error of `out`: nothing more is written to it.
+    /// The first error of `out`, after which nothing more is written to it.
     written: io::Result<()>,
     err: &'a mut E,
 }
 
 impl<O: Write, E: Write> Report<'_, O, E> {
-    /// Does `work` on a file, showing its progress if wanted, until `stop` interrupts it.
+    /// Applies `work` to a file, showing its progress if requested, until `stop` interrupts it.
     fn with_progress<T>(
         &mut self,
         file: &Path,
@@ -118,7 +118,7 @@ impl<O: Write, E: Write> Report<'_, O, E> {
         done
     }
 
-    /// Reports a damaged finished file: it is kept as it is unless it is named itself.
+    /// Reports a damaged finished file: it is not changed unless it is named explicitly.
     fn damaged(&mut self, file: &Path) {
         let name = file.display();
         match self.format {
@@ -212,7 +212,7 @@ mod tests {
     fn a_damaged_finished_file_is_reported_with_the_fix() {
         let bytes = crate::episode::testing::episode(crate::episode::testing::options());
         let whole = crate::episode::recover::recover_bytes(&bytes).expect("an episode");
-        // The check value of the summary, before the magic number: every message can still be read.
+        // The check value of the summary, before the magic number: every message is still readable.
         let mut flipped = whole.clone();
         flipped[whole.len() - 10] ^= 1;
         for (what, bytes, is_named) in
@@ -233,7 +233,7 @@ mod tests {
             assert_eq!((text.contains(&command), text.contains("nothing to repair")), (is_named, !is_named), "{text}");
             assert_eq!(reported(folder.path(), Format::Json).contains("\"damaged\""), is_named, "{what}");
             assert_eq!(std::fs::read(&file).expect("the file"), bytes, "{what}");
-            // After the repair nothing is left to do.
+            // After the repair there is nothing left to repair.
             reported(&file, Format::Text);
             assert!(reported(folder.path(), Format::Text).contains("nothing to repair"), "{what}");
         }

@@ -1,8 +1,8 @@
-//! The chunks of a recorded policy, computed again from the samples that their events name.
+//! The chunks of a recorded policy, recomputed from the samples that their events name.
 //!
-//! Chunks are taken in the order in which the policy gave them, so that a picture that later ones are
-//! compared with is the same. A request that had no answer left no event: had it been the first with a
-//! picture, the reference is another one here, and the difference shows it.
+//! Chunks are processed in the order in which the policy produced them, so that the reference picture that later ones
+//! are compared with is the same. A request without an answer left no event: had it been the first with a picture, the
+//! reference differs here, and the difference shows it.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
@@ -25,13 +25,13 @@ use crate::sample::SampleHeader;
 pub struct Again {
     /// Chunks in the file.
     pub chunks: u64,
-    /// Those that were computed again.
+    /// Those that were recomputed.
     pub compared: u64,
-    /// Those whose samples are not all in the file: captured before the episode began, or lost.
+    /// Those with samples missing from the file: captured before the episode began, or lost.
     pub samples_missing: u64,
-    /// Those with a picture that is compared with one from before the episode began.
+    /// Those with a picture that is compared with one from before the beginning of the episode.
     pub reference_unknown: u64,
-    /// Those of other observations or another length than the policy's: another policy gave them.
+    /// Those with other observations or another length than the policy's: from another policy.
     pub unlike: u64,
     /// Those whose event cannot be read.
     pub unreadable: u64,
@@ -39,18 +39,18 @@ pub struct Again {
     pub failed: u64,
     /// Why, of the last of them.
     pub failure: Option<String>,
-    /// Between the chunks in the file and those computed again.
+    /// Between the chunks in the file and the recomputed ones.
     pub difference: Difference,
-    /// The actions in the file beside the chunks in the file.
+    /// The actions in the file compared with the chunks in the file.
     pub actions: Actions,
 }
 
-/// The published actions beside those of the chunks, brought within the limits.
+/// The published actions compared with those of the chunks, clamped to the limits.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Actions {
     /// Actions in the file.
     pub recorded: u64,
-    /// Those of whose tick a chunk speaks. The nearest counts, where an old chunk and a new one do.
+    /// Those whose tick a chunk covers. Where an old chunk and a new one do, the nearest counts.
     pub compared: u64,
     /// The others.
     pub without_chunk: u64,
@@ -59,7 +59,7 @@ pub struct Actions {
 }
 
 impl Again {
-    /// The largest difference of all that was compared; `None` if nothing was.
+    /// The largest of all differences; `None` if nothing was compared.
     #[must_use]
     pub fn largest(&self) -> Option<f64> {
         let actions = self.actions.difference.all.largest;
@@ -79,7 +79,7 @@ struct Work<'a> {
     devices: Vec<Option<usize>>,
     references: Vec<Reference>,
     samples: BTreeMap<Key, (SampleHeader, Vec<u8>)>,
-    /// How many of the chunks still to come are made of a sample that is in the file.
+    /// How many of the remaining chunks use a sample, for samples in the file.
     uses: BTreeMap<Key, u32>,
     chunk: Vec<f32>,
     again: Again,
@@ -132,7 +132,7 @@ pub(super) fn compare(
     let (mut reader, mut scratch) = (Reader::open(file)?, Scratch::default());
     loop {
         while let Some(chunk) = waiting.front().copied().filter(|chunk| work.is_ready(chunk)) {
-            if !ended.goes_on(total - waiting.len(), total) {
+            if !ended.advance(total - waiting.len(), total) {
                 return Ok(work.again);
             }
             work.compute(chunk);
@@ -154,13 +154,13 @@ pub(super) fn compare(
             work.samples.insert(key, (header(&message, &sample), sample.payload.to_vec()));
         }
     }
-    // The file has changed since it was looked through.
+    // The file has changed since the survey.
     work.again.samples_missing += waiting.len() as u64;
     Ok(work.again)
 }
 
 impl Work<'_> {
-    /// Is it of observations and of a length as this policy's?
+    /// Whether its observations and length match this policy's.
     fn is_like(&self, chunk: &RecordedChunk) -> bool {
         let (observations, steps) = (&self.bundle.observations, self.bundle.n_obs_steps);
         let same = |(samples, observation): (&RecordedSamples, &ObservationSpec)| {
@@ -171,7 +171,7 @@ impl Work<'_> {
             && chunk.actions.len() == self.chunk.len()
     }
 
-    /// The samples it is made of.
+    /// The samples it was computed from.
     fn keys(&self, chunk: &RecordedChunk) -> Vec<Key> {
         let of = |(samples, device): (&RecordedSamples, &Option<usize>)| {
             let device = *device;
@@ -181,7 +181,7 @@ impl Work<'_> {
         chunk.samples.iter().zip(&self.devices).flat_map(of).collect()
     }
 
-    /// Is there all of it that the file holds?
+    /// Whether all of its samples that the file holds have been read.
     fn is_ready(&self, chunk: &RecordedChunk) -> bool {
         self.keys(chunk).iter().all(|key| self.samples.contains_key(key) || !self.uses.contains_key(key))
     }
@@ -222,7 +222,7 @@ impl Work<'_> {
         }
     }
 
-    /// Makes the request of a chunk. Returns whether all of its samples are there.
+    /// Builds the request of a chunk. Returns whether all of its samples are there.
     fn fill(&mut self, chunk: &RecordedChunk) -> bool {
         let mut whole = true;
         self.request.tick = chunk.tick;
@@ -242,7 +242,7 @@ impl Work<'_> {
         whole
     }
 
-    /// Of a chunk that cannot be computed: its pictures are the references of later ones all the same.
+    /// For a chunk that cannot be computed: its pictures are still the references of later ones.
     fn take_references(&mut self, chunk: &RecordedChunk) {
         let present: Vec<bool> = (0..self.references.len()).map(|at| self.request.is_present(at)).collect();
         for at in 0..present.len() {
@@ -261,7 +261,7 @@ impl Work<'_> {
         }
     }
 
-    /// Puts the first picture of observation `at` in the place of all of its steps. Is it there?
+    /// Puts the first picture of observation `at` in all of its steps. Returns whether it is there.
     fn fill_with_first(&mut self, chunk: &RecordedChunk, at: usize) -> bool {
         let number = chunk.samples.get(at).and_then(|samples| samples.seqs.first());
         let there = |number: &u64| {
@@ -292,7 +292,7 @@ impl Work<'_> {
     }
 }
 
-/// The recorded actions beside the recorded chunks.
+/// The recorded actions compared with the recorded chunks.
 fn actions(survey: &Survey, bundle: &Bundle) -> Actions {
     let mut actions = Actions { difference: Difference::new(&bundle.action), ..Actions::default() };
     let chunks: BTreeMap<u64, &RecordedChunk> =
@@ -300,8 +300,8 @@ fn actions(survey: &Survey, bundle: &Bundle) -> Actions {
     for action in &survey.actions {
         actions.recorded += 1;
         let tick = u64::from(action.sequence);
-        let speaking = chunks.range(tick.saturating_sub(bundle.horizon as u64)..=tick);
-        let planned = speaking.filter_map(|(_, chunk)| planned(chunk, action, bundle));
+        let covering = chunks.range(tick.saturating_sub(bundle.horizon as u64)..=tick);
+        let planned = covering.filter_map(|(_, chunk)| planned(chunk, action, bundle));
         let apart = |planned: &Vec<f64>| {
             planned.iter().zip(&action.values).map(|(one, other)| distance(*one, *other)).fold(0.0, f64::max)
         };
@@ -333,14 +333,14 @@ fn planned(chunk: &RecordedChunk, action: &RecordedAction, bundle: &Bundle) -> O
     Some(clamped.collect())
 }
 
-/// Is the picture of an observation known with which the policy compared all later ones? It is the first one that the
-/// policy used. A recording may have begun later than that; then what it computed from is unknown, though every sample
-/// of the chunk is there.
+/// Whether the reference picture of an observation is known: the first one that the policy used, with which it compared
+/// all later ones. A recording may have begun after that; then the inputs of the policy are unknown, though every
+/// sample of the chunk is there.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Reference {
-    /// There is none: its pictures are looked at as they are, or it has none.
+    /// There is none: its pictures are used as they are, or it has none.
     None,
-    /// The next picture is it.
+    /// The next picture becomes the reference.
     Next,
     /// It was read.
     Known,
@@ -349,7 +349,7 @@ enum Reference {
 }
 
 impl Reference {
-    /// At the first chunk of the file, of every observation.
+    /// The state at the first chunk of the file, for every observation.
     fn all(survey: &Survey, bundle: &Bundle, registry: &Registry) -> Vec<Self> {
         let whole = holds_every_chunk(survey, bundle);
         let of = |observation: &ObservationSpec| {
@@ -357,7 +357,7 @@ impl Reference {
             if image.operation != Some(Operation::DiffToReference) {
                 return Self::None;
             }
-            // With the very first sample of the run in the file, none can have been used before.
+            // If the very first sample of the run is in the file, none can have been used before.
             let device = registry.named(&observation.modality);
             let first = || device.is_some_and(|device| survey.holds(&device.topic, 0));
             if whole || first() { Self::Next } else { Self::Lost }
@@ -366,15 +366,15 @@ impl Reference {
     }
 }
 
-/// Was the recording there before the policy's first chunk?
+/// Whether the recording began before the policy's first chunk.
 fn holds_every_chunk(survey: &Survey, bundle: &Bundle) -> bool {
     let Some(chunk) = survey.chunks.first() else { return true };
-    // Told when the policy is loaded.
+    // Reported when the policy is loaded.
     if survey.policy.is_some() || chunk.tick == 0 {
         return true;
     }
     let begun = chunk.observed_ns as f64 - chunk.tick as f64 * 1e9 / bundle.control_hz;
-    // Half a tick is more than what is lost in these numbers, and less than a chunk takes.
+    // Half a tick is more than the rounding error of these numbers, and less than a chunk takes.
     let slack = 0.5e9 / bundle.control_hz;
     survey.begin_monotonic_ns.is_some_and(|begin| begun + slack >= begin as f64)
 }

@@ -1,9 +1,9 @@
-//! A policy that watches an episode in which a person or another program acted: what it would have done at each tick, beside
-//! what was done.
+//! A policy that watches an episode in which a person or another program acted: what it would have done at each tick,
+//! compared with what was done.
 //!
-//! It is asked when a policy at the controls is asked, every `n_action_steps` ticks and when a modality comes
-//! or goes, its answer is there at once, and its actions are kept within the limits. It sees what the other one
-//! did, not the result of its own actions.
+//! Inference runs as for a policy in control, every `n_action_steps` ticks and when a modality appears or disappears;
+//! its answer is available immediately, and its actions are clamped to the limits. It observes the effects of the
+//! recorded actions, not of its own.
 //!
 //! The control grid begins with the episode. The action of a tick is the one captured nearest to it, at most
 //! half a tick away.
@@ -27,7 +27,7 @@ use crate::sample::{Epoch, SampleHeader};
 use crate::sync::Grid;
 use crate::time::Stamp;
 
-/// Of the policy's noise.
+/// Seed of the policy's noise.
 const SEED: u64 = 0;
 
 /// The result.
@@ -39,13 +39,13 @@ pub struct Beside {
     pub compared: u64,
     /// Those at which the policy alone acted.
     pub without_recorded: u64,
-    /// Those at which the policy would have held, by the reason.
+    /// Those at which the policy would have held, by reason.
     pub held: BTreeMap<String, u64>,
     /// Actions in the file.
     pub recorded: u64,
     /// What the policy's executor counted.
     pub counts: Counts,
-    /// Why the policy had no answer, the last time.
+    /// The last reason why the policy had no answer.
     pub failure: Option<String>,
     /// Between what the policy would have done and what was done.
     pub difference: Difference,
@@ -86,7 +86,7 @@ pub(super) fn compare(
             ..Beside::default()
         },
     };
-    // After so many ticks without anything received no action is left.
+    // After this many ticks without input no action is left.
     let idle = bundle.horizon as u64 + grid.ticks_before(Stamp(survey.begin_ns).after(bundle.max_observation_age));
     let mut received = Ordered::open(file, registry)?;
     let mut epochs = [Epoch::default(); MAX_MODALITIES];
@@ -95,7 +95,7 @@ pub(super) fn compare(
         let due = grid.ticks_before(Stamp(at));
         let end = due.min(watch.tick.saturating_add(idle));
         while watch.tick < end {
-            if !ended.goes_on(usize::try_from(watch.tick).unwrap_or(usize::MAX), survey.actions.len()) {
+            if !ended.advance(usize::try_from(watch.tick).unwrap_or(usize::MAX), survey.actions.len()) {
                 return Ok(watch.end());
             }
             watch.tick();
@@ -115,7 +115,7 @@ pub(super) fn compare(
             }
         }
     }
-    // The moment of the end is a tick too if there is an action at it.
+    // The moment of the end is also a tick if it has an action.
     if last.is_some_and(|last| grid.tick(watch.tick) == Stamp(last)) && watch.recorded.contains_key(&watch.tick) {
         watch.tick();
     }

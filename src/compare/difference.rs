@@ -1,12 +1,12 @@
-//! How far two runs of numbers are apart.
+//! How far two sequences of numbers are apart.
 //!
-//! Invariant: a number that is none lies infinitely far from every other, and not from itself.
+//! Invariant: NaN is infinitely far from every other value, and equal to itself.
 
 use serde::Serialize;
 
 use crate::policy::bundle::BundleAction;
 
-/// Distances of one kind.
+/// Statistics of distances.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
 pub struct Spread {
     /// Their mean.
@@ -25,7 +25,7 @@ impl Spread {
         if distance > self.largest {
             (self.largest, self.at_tick) = (distance, tick);
         }
-        // Once infinite, it stays so.
+        // Once infinite, the mean stays infinite.
         if self.mean.is_finite() {
             self.mean += (distance - self.mean) / self.values as f64;
         }
@@ -35,7 +35,7 @@ impl Spread {
 /// Distances of one axis.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct AxisDifference {
-    /// What it is called.
+    /// Its name.
     pub name: String,
     /// Unit of its distances.
     pub unit: String,
@@ -47,10 +47,10 @@ pub struct AxisDifference {
 /// Distances between actions.
 #[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct Difference {
-    /// Of all axes, whatever their units.
+    /// Over all axes, whatever their units.
     #[serde(flatten)]
     pub all: Spread,
-    /// Of each axis.
+    /// Per axis.
     pub axes: Vec<AxisDifference>,
 }
 
@@ -64,7 +64,7 @@ impl Difference {
         Self { all: Spread::default(), axes: action.names.iter().zip(&action.units).map(axis).collect() }
     }
 
-    /// Takes the action of `tick`, once and once more.
+    /// Takes the two versions of the action of `tick`.
     pub(super) fn take(&mut self, tick: u64, one: impl Iterator<Item = f64>, other: impl Iterator<Item = f64>) {
         for (axis, (one, other)) in self.axes.iter_mut().zip(one.zip(other)) {
             let distance = distance(one, other);

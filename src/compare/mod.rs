@@ -1,10 +1,10 @@
-//! A policy beside a recorded episode, without rig, bus or clock.
+//! A policy compared with a recorded episode, without rig, bus or clock.
 //!
-//! An episode that a policy recorded holds, for every chunk, which samples it was computed from and the seed
-//! of its noise: [`again`] computes each of them once more. In any other episode [`beside`] lets the
-//! policy watch, and holds what it would have done against what was done.
+//! An episode that a policy recorded holds, for every chunk, the samples it was computed from and the seed of its
+//! noise: [`again`] recomputes each of them. In any other episode [`beside`] lets the policy watch, and compares what
+//! it would have done with what was done.
 //!
-//! Invariant: memory holds samples of a few seconds, not the episode.
+//! Invariant: memory holds samples of a few seconds, not the whole episode.
 //! Invariant: what cannot be compared is counted with its reason, never compared with a guess.
 
 pub mod again;
@@ -51,7 +51,7 @@ pub enum CompareError {
         /// Why.
         errors: BundleErrors,
     },
-    /// Nothing in the file can be compared with.
+    /// Nothing in the file can be compared.
     #[error("{0}: holds neither chunks of a policy nor actions: there is nothing to compare with")]
     Nothing(String),
     /// The graphs.
@@ -59,11 +59,11 @@ pub enum CompareError {
     Policy(#[from] PolicyError),
 }
 
-/// A policy beside an episode.
+/// A policy compared with an episode.
 #[derive(Debug, Clone, Serialize)]
 #[serde(tag = "kind", rename_all = "snake_case")]
 pub enum Comparison {
-    /// A policy recorded the episode, and its chunks were computed again.
+    /// A policy recorded the episode, and its chunks were recomputed.
     Again(Again),
     /// A person or another program acted.
     Beside(Beside),
@@ -75,23 +75,23 @@ pub trait Watcher {
     fn at(&mut self, done: usize, total: usize) -> bool;
 }
 
-/// A comparison, and what is to be known of the file besides.
+/// A comparison, and other facts about the file.
 #[derive(Debug, Clone, Serialize)]
 pub struct Compared {
     /// The result.
     #[serde(flatten)]
     pub comparison: Comparison,
-    /// Name of the policy that recorded it, by the file.
+    /// Name of the policy that recorded it, as the file states it.
     pub recorded_policy: Option<String>,
-    /// What names the contents of its bundle.
+    /// Hash of the contents of its bundle.
     pub recorded_policy_hash: Option<String>,
-    /// What of the file could not be read.
+    /// Which part of the file could not be read.
     pub damage: Option<String>,
-    /// It was ended before its time.
+    /// It was interrupted.
     pub interrupted: bool,
 }
 
-/// Holds the policy of `bundle` against the episode in `file`. `steps` of denoising instead of the bundle's own.
+/// Compares the policy of `bundle` with the episode in `file`. `steps`: denoising steps instead of the bundle's own.
 ///
 /// # Errors
 /// When the file cannot be read or holds nothing to compare with, or the policy does not suit it.
@@ -136,7 +136,7 @@ struct Ended<'a> {
 }
 
 impl Ended<'_> {
-    fn goes_on(&mut self, done: usize, total: usize) -> bool {
+    fn advance(&mut self, done: usize, total: usize) -> bool {
         self.interrupted |= !self.watcher.at(done, total);
         !self.interrupted
     }

@@ -1,4 +1,4 @@
-//! How a comparison reads an episode: once for what it must know before it reads the samples, and then these in order.
+//! How a comparison reads an episode: once for what it must know before it reads the samples, and then those in order.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -16,10 +16,9 @@ use crate::modality::ModalityId;
 use crate::registry::Registry;
 use crate::sample::{Encoding, Epoch, SampleHeader};
 
-/// What of a sample's number a recorded message holds.
+/// The bits of a sample's number that a recorded message holds.
 pub(super) const SEQUENCE_BITS: u64 = 0xffff_ffff;
-/// By how much the order of the file may be another one: far more than the recorder takes from topic to
-/// topic.
+/// How far messages of the file may be out of order: far more than the recorder needs between topics.
 const SPAN_NS: u64 = 1_000_000_000;
 
 /// A first look through an episode.
@@ -39,26 +38,26 @@ pub(super) struct Survey {
     pub(super) unreadable: u64,
     /// The actions, in the order of the file.
     pub(super) actions: Vec<RecordedAction>,
-    /// Of each topic the numbers of its samples, ascending.
+    /// Per topic, the numbers of its samples, ascending.
     pub(super) samples: BTreeMap<String, Vec<u32>>,
-    /// What of the file could not be read.
+    /// Which part of the file could not be read.
     pub(super) damage: Option<String>,
 }
 
-/// A chunk as its event has it.
+/// A chunk as its event states it.
 #[derive(Debug, Clone, Deserialize)]
 pub(super) struct RecordedChunk {
     /// Tick of its observation on the control grid.
     pub(super) tick: u64,
-    /// When that was.
+    /// Time of that tick.
     pub(super) observed_ns: u64,
     /// What was present.
     mask: String,
-    /// Of the noise.
+    /// Seed of the noise.
     pub(super) seed: u64,
     /// The samples of each observation.
     pub(super) samples: Vec<RecordedSamples>,
-    /// What is no number is null.
+    /// Values that are not numbers are null.
     pub(super) actions: Vec<Option<f32>>,
 }
 
@@ -69,7 +68,7 @@ impl RecordedChunk {
     }
 }
 
-/// Which samples an observation was made of.
+/// The samples that an observation was computed from.
 #[derive(Debug, Clone, Deserialize)]
 pub(super) struct RecordedSamples {
     pub(super) modality: String,
@@ -79,9 +78,9 @@ pub(super) struct RecordedSamples {
 /// An action as it was published.
 #[derive(Debug, Clone)]
 pub(super) struct RecordedAction {
-    /// Its number, which of a policy's action is that of the tick.
+    /// Its sequence number; for a policy's action, that of the tick.
     pub(super) sequence: u32,
-    /// The tick it is the action of, wall time.
+    /// The tick it is the action for, wall time.
     pub(super) at_ns: u64,
     pub(super) values: Vec<f64>,
 }
@@ -138,19 +137,19 @@ impl Survey {
         Ok(survey)
     }
 
-    /// Did a policy record it?
+    /// Whether a policy recorded it.
     pub(super) fn is_of_a_policy(&self) -> bool {
         !self.chunks.is_empty() || self.unreadable > 0
     }
 
-    /// Is sample `number` of `topic` in the file?
+    /// Whether sample `number` of `topic` is in the file.
     pub(super) fn holds(&self, topic: &str, number: u64) -> bool {
         let sequence = u32::try_from(number & SEQUENCE_BITS).unwrap_or_default();
         self.samples.get(topic).is_some_and(|numbers| numbers.binary_search(&sequence).is_ok())
     }
 }
 
-/// What was received.
+/// One received item.
 #[derive(Debug)]
 pub(super) enum Received {
     Sample { id: ModalityId, header: SampleHeader, payload: Vec<u8> },
@@ -159,7 +158,7 @@ pub(super) enum Received {
 }
 
 /// The samples and masks of an episode in the order in which they were received. A file has them in the order in which
-/// they were written, which within a topic is that order, and between topics is nearly it.
+/// they were written: within a topic the same order, and between topics nearly so.
 #[derive(Debug)]
 pub(super) struct Ordered<'a> {
     reader: Reader<File>,
@@ -185,7 +184,7 @@ impl<'a> Ordered<'a> {
         Ok(Self { reader, scratch, registry, held: BTreeMap::new(), read: 0, newest: 0, ended: false })
     }
 
-    /// What was received next, and when, wall time; `None` at the end.
+    /// The next received item with its time, wall time; `None` at the end.
     pub(super) fn next(&mut self) -> Result<Option<(u64, Received)>, ReadError> {
         loop {
             let oldest = self.held.first_key_value().map(|((at, _), _)| *at);
@@ -220,7 +219,7 @@ fn received(message: &Message<'_>, registry: &Registry, scratch: &mut Scratch) -
     }
 }
 
-/// The header that a recorded sample had on the bus, as far as its message holds it.
+/// The header that a recorded sample had on the bus, as far as its message contains it.
 pub(super) fn header(message: &Message<'_>, sample: &Sample<'_>) -> SampleHeader {
     SampleHeader {
         seq: message.sequence.into(),

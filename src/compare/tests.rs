@@ -1,5 +1,5 @@
-//! A policy that can be worked out by hand records an episode of the simulated task in which the tactile sensor
-//! is pulled out and plugged in again; what is changed of the file must be found, and nothing else.
+//! A policy whose output can be computed by hand records an episode of the simulated task in which the tactile sensor
+//! is unplugged and plugged in again; changes made to the file must be found, and nothing else.
 
 #[path = "../../tests/support/onnx.rs"]
 mod onnx;
@@ -20,7 +20,7 @@ use crate::record::stepped::Stepped;
 use crate::status::Board;
 use crate::time::{Stamp, WallClock};
 
-/// Trial of which the noise is that of a policy that looks on.
+/// Trial with the same noise as a policy that watches.
 const SEED: u64 = 0;
 const ARM: &str = "/rapid/serial/arm";
 const TACTILE: &str = "/rapid/camera/tactile";
@@ -33,7 +33,7 @@ struct Recorded {
     trial: Trial,
 }
 
-/// Goes on to the end.
+/// Never interrupts.
 struct Patient;
 
 impl Watcher for Patient {
@@ -93,7 +93,7 @@ impl Recorded {
         Self { folder, bundle, environment, bytes, trial }
     }
 
-    /// The file with its messages changed by `edit`, which decides which of them are kept, and its metadata by `about`.
+    /// The file with its messages changed by `edit`, which decides which of them to keep, and its metadata by `about`.
     fn edited(
         &self,
         mut edit: impl FnMut(&mut Message) -> bool,
@@ -166,7 +166,7 @@ impl Recorded {
 }
 
 #[test]
-fn recorded_chunks_are_computed_again_and_changes_are_found() {
+fn recorded_chunks_are_recomputed_and_changes_are_found() {
     let recorded = Recorded::new();
     let chunks = recorded.chunks();
     assert_eq!(chunks.len() as u64, recorded.trial.counts.chunks);
@@ -184,7 +184,7 @@ fn recorded_chunks_are_computed_again_and_changes_are_found() {
     let actions = &whole.actions;
     assert_eq!((actions.compared, actions.without_chunk), (recorded.trial.counts.actions, 0), "{actions:?}");
 
-    // An action that is not that of the chunk.
+    // An action that differs from the chunk.
     let tick = 20;
     let edit = |message: &mut Message| {
         if message.topic == ACTION_TOPIC && message.sequence == tick {
@@ -208,7 +208,7 @@ fn recorded_chunks_are_computed_again_and_changes_are_found() {
     let changed = recorded.again(&recorded.edited(edit, |_| {}));
     assert!(changed.difference.all.largest > 1e-3 && changed.compared == whole.compared, "{changed:?}");
 
-    // Without them it cannot be computed, and the others can.
+    // Without them it cannot be computed, but the others can.
     let keep = |message: &mut Message| message.topic != ARM || u64::from(message.sequence) != number;
     let changed = recorded.again(&recorded.edited(keep, |_| {}));
     let made_of = |chunk: &&Value| chunk["samples"][2]["seqs"].as_array().unwrap().contains(&number.into());
@@ -218,20 +218,20 @@ fn recorded_chunks_are_computed_again_and_changes_are_found() {
 }
 
 #[test]
-fn the_picture_that_others_are_compared_with_is_the_first_one_or_unknown() {
+fn the_reference_picture_is_the_first_one_or_unknown() {
     let recorded = Recorded::new();
     let chunks = recorded.chunks();
     let feeling: Vec<&Value> = chunks.iter().filter(|chunk| Recorded::sample(chunk, 1).is_some()).collect();
     let total = chunks.len() as u64;
 
-    // The first chunk cannot be computed, its tactile picture is the reference all the same.
+    // The first chunk cannot be computed, but its tactile picture is still the reference.
     let arm = Recorded::sample(&chunks[0], 2).unwrap();
     let keep = |message: &mut Message| message.topic != ARM || u64::from(message.sequence) != arm;
     let changed = recorded.again(&recorded.edited(keep, |_| {}));
     assert_eq!((changed.samples_missing, changed.compared), (1, total - 1), "{changed:?}");
     assert!(changed.difference.all.largest < 1e-6, "{changed:?}");
 
-    // Without that picture all that is compared with it is unknown.
+    // Without that picture everything compared with it is unknown.
     let first = Recorded::sample(feeling[0], 1).unwrap();
     let keep = |message: &mut Message| message.topic != TACTILE || u64::from(message.sequence) != first;
     let changed = recorded.again(&recorded.edited(keep, |_| {}));
@@ -239,7 +239,7 @@ fn the_picture_that_others_are_compared_with_is_the_first_one_or_unknown() {
     assert_eq!(changed.compared, total - feeling.len() as u64);
     assert!(changed.difference.all.largest < 1e-6, "{changed:?}");
 
-    // The recording begins when the policy has long been running.
+    // The recording begins long after the policy.
     let begin = recorded.messages().into_iter().filter(Message::is_chunk).nth(1).unwrap().log_time;
     let keep = |message: &mut Message| message.log_time >= begin;
     let about = |about: &mut std::collections::BTreeMap<String, String>| {
@@ -258,12 +258,12 @@ fn the_picture_that_others_are_compared_with_is_the_first_one_or_unknown() {
 #[test]
 fn a_watching_policy_does_what_it_would_have_done() {
     let recorded = Recorded::new();
-    // Its own actions without its chunks; those of the ticks at which it was asked came from the chunk before.
-    let asked: Vec<u64> = recorded.chunks().iter().map(|chunk| chunk["tick"].as_u64().unwrap()).collect();
+    // Its own actions without its chunks; those of the inference ticks came from the chunk before.
+    let inferred: Vec<u64> = recorded.chunks().iter().map(|chunk| chunk["tick"].as_u64().unwrap()).collect();
     let mut kept = 0;
     let keep = |message: &mut Message| {
         let is_action = message.topic == ACTION_TOPIC;
-        let dropped = message.is_chunk() || is_action && asked.contains(&message.sequence.into());
+        let dropped = message.is_chunk() || is_action && inferred.contains(&message.sequence.into());
         kept += u64::from(is_action && !dropped);
         !dropped
     };
@@ -271,16 +271,16 @@ fn a_watching_policy_does_what_it_would_have_done() {
     let compared = recorded.compared(&bytes).unwrap();
     let Comparison::Beside(beside) = compared.comparison else { panic!("of a policy") };
     assert_eq!((beside.recorded, beside.compared, beside.held.len()), (kept, kept, 0), "{beside:?}");
-    assert_eq!((beside.ticks, beside.without_recorded), (recorded.trial.steps.into(), asked.len() as u64));
+    assert_eq!((beside.ticks, beside.without_recorded), (recorded.trial.steps.into(), inferred.len() as u64));
     assert!(beside.difference.all.largest < 1e-6, "{beside:?}");
 
     let tick = 30;
-    assert!(!asked.contains(&tick));
+    assert!(!inferred.contains(&tick));
     let edit = |message: &mut Message| {
         if message.topic == ACTION_TOPIC && u64::from(message.sequence) == tick {
             message.add(-0.5);
         }
-        !message.is_chunk() && (message.topic != ACTION_TOPIC || !asked.contains(&message.sequence.into()))
+        !message.is_chunk() && (message.topic != ACTION_TOPIC || !inferred.contains(&message.sequence.into()))
     };
     let Comparison::Beside(beside) = recorded.compared(&recorded.edited(edit, |_| {})).unwrap().comparison else {
         panic!("of a policy")
@@ -288,7 +288,7 @@ fn a_watching_policy_does_what_it_would_have_done() {
     let found = beside.difference.axes[0].spread;
     assert!((found.largest - 0.5).abs() < 1e-6 && found.at_tick == tick, "{found:?}");
 
-    // Without the mask nothing is there.
+    // Without the mask no modality is present.
     let keep = |message: &mut Message| !message.is_chunk() && message.topic != crate::mask::MASK_TOPIC;
     let Comparison::Beside(beside) = recorded.compared(&recorded.edited(keep, |_| {})).unwrap().comparison else {
         panic!("of a policy")

@@ -14,7 +14,7 @@ use crate::policy::horizon::WithoutMask;
 use crate::policy::live::LiveOptions;
 use crate::registry::Registry;
 
-/// The policy of a run, if one was asked for.
+/// The policy of a run, if one was requested.
 pub(super) fn policy_of(args: PolicyArgs, seed: u64, registry: &Registry) -> Result<Option<PolicyOptions>, Failure> {
     let Some(named) = args.infer else { return Ok(None) };
     let bundle = Bundle::open(named.as_deref()).map_err(Failure::Bundle)?;
@@ -66,9 +66,9 @@ fn interruptible<E: Into<Failure> + Send + 'static>(
     work: impl FnOnce(&dyn Fn() -> bool) -> Result<(), E> + Send + 'static,
 ) -> Result<(), Failure> {
     let stop = Arc::new(AtomicBool::new(false));
-    let asked = Arc::clone(&stop);
+    let requested = Arc::clone(&stop);
     block_on(async move {
-        let work = tokio::task::spawn_blocking(move || work(&|| asked.load(Ordering::Relaxed)));
+        let work = tokio::task::spawn_blocking(move || work(&|| requested.load(Ordering::Relaxed)));
         tokio::spawn(async move {
             // The piece of work in progress is finished first.
             if tokio::signal::ctrl_c().await.is_ok() {

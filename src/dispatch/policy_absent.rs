@@ -1,4 +1,4 @@
-//! Policies of a program that was built without cargo feature `policy`: each request is refused with the fix.
+//! Policies of a program that was built without cargo feature `policy`: each request is rejected with the fix.
 
 use super::Failure;
 use crate::app::PolicyOptions;

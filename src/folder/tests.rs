@@ -50,7 +50,7 @@ fn planted_files_are_neither_opened_nor_written_to() {
         assert_eq!(error.kind(), io::ErrorKind::AlreadyExists, "{kind}");
         let read = folder.open_file("name").map(|_| ());
         assert_eq!(read.is_ok(), matches!(kind, "file" | "hard link"), "{kind}: {read:?}");
-        // What can be replaced is; what it led to stays as it was.
+        // What can be replaced is; the target of a link stays unchanged.
         let replaced = folder.replace("name", b"ours", 0o640, Sync::Skip);
         assert_eq!(replaced.is_ok(), kind != "folder", "{kind}: {replaced:?}");
         if replaced.is_ok() {
@@ -70,7 +70,7 @@ fn a_taken_temporary_name_is_avoided() {
     let dir = tempfile::tempdir().unwrap();
     let folder = open(dir.path()).unwrap();
     let temporary = dir.path().join(format!(".name.{}.tmp", std::process::id()));
-    // A folder cannot be removed as a file can, as another user's file cannot.
+    // A folder cannot be removed like a file, just as another user's file cannot.
     fs::create_dir(&temporary).unwrap();
     folder.replace("name", b"ours", 0o644, Sync::Wait).unwrap();
     assert_eq!(fs::read_to_string(dir.path().join("name")).unwrap(), "ours");
@@ -78,7 +78,7 @@ fn a_taken_temporary_name_is_avoided() {
 }
 
 #[test]
-fn links_on_the_way_are_followed_by_owner() {
+fn links_on_the_way_are_followed_depending_on_their_owner() {
     let dir = tempfile::tempdir().unwrap();
     let real = dir.path().join("real/deep");
     fs::create_dir_all(&real).unwrap();
@@ -105,7 +105,7 @@ fn links_on_the_way_are_followed_by_owner() {
 }
 
 #[test]
-fn folders_are_made_as_far_as_asked() {
+fn only_the_permitted_missing_folders_are_created() {
     let dir = tempfile::tempdir().unwrap();
     let deep = dir.path().join("a/b");
     let error = Folder::open(&deep, Links::Own, Missing::Last).unwrap_err();
@@ -115,7 +115,7 @@ fn folders_are_made_as_far_as_asked() {
     fs::write(deep.join("file"), "").unwrap();
     let error = open(&deep.join("file")).unwrap_err();
     assert!(error.to_string().ends_with("file: not a folder"), "{error}");
-    // Held open, it is written to wherever it is by now.
+    // It is held open, so files are written to it wherever it has been moved.
     let folder = open(&deep).unwrap();
     fs::rename(&deep, dir.path().join("moved")).unwrap();
     symlink("/proc", &deep).unwrap();
@@ -124,7 +124,7 @@ fn folders_are_made_as_far_as_asked() {
 }
 
 #[test]
-fn only_so_much_of_a_planted_file_is_read() {
+fn a_planted_file_is_read_up_to_the_limit() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("file");
     fs::write(&path, "0123456789").unwrap();

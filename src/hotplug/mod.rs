@@ -1,10 +1,10 @@
-//! Hot-plug: a stream of what is plugged in and pulled out, whatever the source.
+//! Hot-plug: a stream of devices plugged in and unplugged, whatever the source.
 //!
-//! `udev` watches the machine, `lan` the network, `script` plays a scenario; all yield the same [`HotplugEvent`]s and
-//! nothing beyond can tell them apart.
+//! `udev` watches the machine, `lan` the network, `script` plays a scenario; all yield the same [`HotplugEvent`]s, and
+//! their consumers cannot distinguish them.
 //!
-//! Invariant: what is attached when the stream begins is told as `Added` before anything else.
-//! Invariant: a node told twice as `Added` without a removal between is the same attachment.
+//! Invariant: what is attached when the stream begins is reported as `Added` before anything else.
+//! Invariant: a node reported twice as `Added` without a removal in between is the same attachment.
 
 #[cfg(feature = "lan")]
 pub mod lan;
@@ -20,7 +20,7 @@ use crate::provenance::UnplugSource;
 use crate::registry::Attachment;
 use crate::time::Stamp;
 
-/// Something was plugged in or pulled out.
+/// A device was plugged in or unplugged.
 #[derive(Debug, Clone, PartialEq)]
 pub enum HotplugEvent {
     /// A node is there and may be opened: rules and permissions are in place.

@@ -16,7 +16,7 @@ use crate::registry::scenario::{self, Scenario, ScenarioAction, ScenarioDevice, 
 use crate::registry::{Attachment, DeviceNode, Unit};
 use crate::time::Stamp;
 
-/// Plays a [`Scenario`] on tokio's clock, from the moment it is made.
+/// Plays a [`Scenario`] on tokio's clock, from the moment it is created.
 #[derive(Debug)]
 pub struct Script {
     timeline: Timeline,
@@ -25,7 +25,7 @@ pub struct Script {
 }
 
 impl Script {
-    /// Begins: what is plugged at the start is told at once.
+    /// Begins: what is plugged at the start is reported at once.
     #[must_use]
     pub fn new(scenario: Scenario) -> Self {
         let begin = Instant::now();
@@ -33,16 +33,16 @@ impl Script {
     }
 }
 
-/// The events of a [`Scenario`] in their order, for whoever keeps the time.
+/// The events of a [`Scenario`] in their order, for a caller that keeps the time.
 #[derive(Debug)]
 pub struct Timeline {
     devices: Vec<ScenarioDevice>,
     plugged: HashMap<String, (PathBuf, Arc<SimDevice>)>,
-    /// Where the counter of an unplugged device stands: it goes on when it is plugged again.
+    /// The counter of an unplugged device: it continues when the device is plugged in again.
     sequences: HashMap<String, u32>,
     events: Vec<ScenarioEvent>,
     next: usize,
-    /// When the round of events in progress began, from the scenario's beginning.
+    /// When the current round of events began, from the scenario's beginning.
     round: Duration,
     repeat: Option<Duration>,
     begun: Stamp,
@@ -50,7 +50,7 @@ pub struct Timeline {
 }
 
 impl Timeline {
-    /// The scenario's beginning, at `begun`: what is plugged then are the first events.
+    /// The scenario's beginning, at `begun`: the first events report what is plugged in then.
     #[must_use]
     pub fn new(scenario: Scenario, begun: Stamp) -> Self {
         let mut timeline = Self {
@@ -70,7 +70,7 @@ impl Timeline {
         timeline
     }
 
-    /// The next event that has happened by `now`; the moment of the call may be later.
+    /// The next event that has happened by `now`, which may be in the past.
     pub fn next_by(&mut self, now: Stamp) -> Option<HotplugEvent> {
         loop {
             if let Some(event) = self.queue.pop_front() {
@@ -121,7 +121,7 @@ impl Timeline {
         }
     }
 
-    /// When the next event is due, from the beginning; `None` when the scenario is over.
+    /// When the next event is due, from the beginning; `None` when the scenario has ended.
     fn due(&mut self) -> Option<Duration> {
         if self.next == self.events.len() {
             let repeat = self.repeat.filter(|_| !self.events.is_empty())?;
@@ -156,8 +156,8 @@ impl Stream for Script {
             if let Some(event) = self.timeline.queue.pop_front() {
                 return Poll::Ready(Some(Ok(event)));
             }
-            // The stream of a finished scenario goes on without events, like that of a machine
-            // nobody plugs anything into.
+            // The stream of a finished scenario continues without events, like that of a machine whose
+            // devices do not change.
             let Some(due) = self.timeline.due() else { return Poll::Pending };
             let due = self.begin + due;
             self.timer.as_mut().reset(due);
@@ -223,7 +223,7 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn a_pulled_device_knows_it_at_once() {
+    async fn an_unplugged_device_is_notified_at_once() {
         let mut script = Script::new(Scenario {
             devices: vec![device("a", "1-1", true)],
             events: vec![event(5, "a", ScenarioAction::Silence), event(10, "a", ScenarioAction::Unplug)],

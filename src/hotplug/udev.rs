@@ -1,15 +1,15 @@
 //! The machine itself: kernel uevents for removal, udev's processed events for the node to open.
 //!
-//! The monitors listen before the devices are enumerated, so that nothing plugged in between is
-//! missed. A removal is told by whichever source is first (on the virtual bench the kernel's uevent
+//! The monitors listen before the devices are enumerated, so that nothing plugged in meanwhile is
+//! missed. A removal is reported by whichever source is first (on the virtual bench the kernel's uevent
 //! comes some 50 ms before udev's); an addition only by udev, once rules and permissions are in place.
 //!
-//! The kernel numbers its events. A node told by event N cannot be taken away by a removal before
-//! N, which only arrived late: kernel and udev speak on two sockets, and each has its own backlog (`Known`).
+//! The kernel numbers its events. A node reported by event N cannot be removed by a removal before
+//! N, which only arrived late: kernel and udev send on two sockets, each with its own backlog (`Known`).
 //!
-//! Invariant: a node in `Known` has been told as `Added` and not since as `Removed`.
+//! Invariant: a node in `Known` has been reported as `Added` and not since as `Removed`.
 //! Invariant: lost events are never silent: when a socket overflows, devices are enumerated again
-//! and the difference is told.
+//! and the difference is reported.
 
 use std::collections::{HashMap, VecDeque};
 use std::path::{Path, PathBuf};
@@ -41,7 +41,7 @@ impl UdevMonitor {
     /// Begins to listen, then enumerates what is there.
     ///
     /// # Errors
-    /// When the netlink sockets are not to be had or sysfs cannot be read.
+    /// When the netlink sockets are not available or sysfs cannot be read.
     pub fn open() -> Result<Self, HotplugError> {
         let mut monitor = Self {
             kernel: listen(MonitorBuilder::new_kernel())?,
@@ -53,9 +53,9 @@ impl UdevMonitor {
         Ok(monitor)
     }
 
-    /// Tells the difference between what is there and what is known.
+    /// Reports the difference between the devices that are present and those that are known.
     fn enumerate(&mut self) -> Result<(), HotplugError> {
-        // Read before the devices: an event up to here may tell of a device that is gone by now.
+        // Read before the devices: an event up to here may be about a device that is gone by now.
         let sequence = newest_event();
         self.queue.extend(self.known.enumerated(attached()?, sequence, Stamp::now()));
         Ok(())
@@ -81,7 +81,7 @@ impl UdevMonitor {
         Ok(())
     }
 
-    /// Moves what waits on a socket into the queue. Ready when the socket is drained and will wake us.
+    /// Moves pending events of a socket into the queue. Ready when the socket is drained and registered for a wakeup.
     fn poll_socket(&mut self, context: &mut Context<'_>, source: UnplugSource) -> Poll<Result<(), HotplugError>> {
         loop {
             let socket = if source == UnplugSource::Kernel { &self.kernel } else { &self.udev };
@@ -92,7 +92,7 @@ impl UdevMonitor {
                 match error.raw_os_error() {
                     Some(libc::ENOBUFS) => self.enumerate()?,
                     Some(libc::EAGAIN) => guard.clear_ready(),
-                    // A message that is not udev's: the next one may be.
+                    // A message that is not from udev: the next one may be.
                     _ => {}
                 }
                 continue;
@@ -139,7 +139,7 @@ fn listen(builder: std::io::Result<MonitorBuilder>) -> Result<AsyncFd<MonitorSoc
     Ok(AsyncFd::with_interest(builder.listen()?, Interest::READABLE)?)
 }
 
-/// Number of the newest event the kernel has sent; 0 where it does not say.
+/// Number of the newest event the kernel has sent; 0 where it is unknown.
 fn newest_event() -> u64 {
     let number = std::fs::read_to_string("/sys/kernel/uevent_seqnum").ok();
     number.and_then(|number| number.trim().parse().ok()).unwrap_or(0)
@@ -153,7 +153,7 @@ fn attached() -> Result<Vec<Present>, HotplugError> {
     enumerator.match_subsystem("usb")?;
     enumerator.match_is_initialized()?;
     let mut found: Vec<_> = enumerator.scan_devices()?.filter_map(|device| present(&device)).collect();
-    // In the order of ports, so that a start assigns equal units the same way each time.
+    // In the order of ports, so that equal units are assigned the same way at each start.
     found.sort_by(|a, b| {
         let (a, b) = (&a.attachment, &b.attachment);
         (a.unit.place(), &a.syspath).cmp(&(b.unit.place(), &b.syspath))
@@ -201,7 +201,7 @@ fn present(device: &Device) -> Option<Present> {
     Some(Present { attachment, device_number: text("devnum") })
 }
 
-/// `bcdDevice` as sysfs writes it, four digits (`0418`), the way it is read: `4.18`.
+/// `bcdDevice` as sysfs prints it, four digits (`0418`), in its usual form: `4.18`.
 fn release_number(digits: &str) -> String {
     match digits.split_at_checked(2) {
         Some((major, minor)) if digits.len() == 4 => format!("{}.{minor}", major.strip_prefix('0').unwrap_or(major)),
@@ -226,15 +226,15 @@ fn captures(device: &Device) -> bool {
     }
 }
 
-/// A node that is there.
+/// A node that is present.
 #[derive(Debug, Clone)]
 pub(super) struct Present {
     pub(super) attachment: Attachment,
-    /// Number the kernel gave the USB device; another after each plug.
+    /// Number the kernel gave the USB device; a new one after each plug.
     pub(super) device_number: Option<String>,
 }
 
-/// Must the devices be enumerated?
+/// Whether the devices must be enumerated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Look {
     Settled,
@@ -245,22 +245,22 @@ pub(super) enum Look {
 #[derive(Debug)]
 struct Node {
     device_number: Option<String>,
-    /// The event that told of it; 0 if an enumeration did.
+    /// The event that reported it; 0 if it was an enumeration.
     since: u64,
 }
 
-/// What has been told as attached, and what an event or an enumeration changes of it. Pure.
+/// What has been reported as attached, and what an event or an enumeration changes in it. Pure.
 #[derive(Debug, Default)]
 struct Known {
     nodes: HashMap<PathBuf, Node>,
-    /// The kernel's removal of a path whose udev events are still to come.
+    /// Paths that the kernel removed, with udev events for them still to come.
     removals: HashMap<PathBuf, u64>,
     /// The newest event before the last enumeration.
     enumerated: u64,
 }
 
 impl Known {
-    /// Takes what an enumeration found that began after event `sequence`; tells the difference,
+    /// Takes what an enumeration found that began after event `sequence`; reports the difference,
     /// removals first.
     pub(super) fn enumerated(&mut self, present: Vec<Present>, sequence: u64, now: Stamp) -> Vec<HotplugEvent> {
         self.enumerated = sequence;
@@ -312,11 +312,11 @@ impl Known {
 
     fn forget(&mut self, mut gone: Vec<PathBuf>, source: UnplugSource, now: Stamp) -> Vec<HotplugEvent> {
         gone.sort();
-        let tell = |syspath: PathBuf| {
+        let removal = |syspath: PathBuf| {
             self.nodes.remove(&syspath);
             HotplugEvent::Removed { syspath, noticed: now, source }
         };
-        gone.into_iter().map(tell).collect()
+        gone.into_iter().map(removal).collect()
     }
 
     /// `None` when the node is known.
@@ -366,10 +366,10 @@ mod known_tests {
     }
     use Step::{Added, Found, Kernel, Udev};
 
-    fn told(steps: &[Step]) -> Vec<String> {
+    fn events_of(steps: &[Step]) -> Vec<String> {
         let mut known = Known::default();
         let now = Stamp(1);
-        let mut told = Vec::new();
+        let mut reported = Vec::new();
         for step in steps {
             let (events, look) = match step {
                 Found(nodes, sequence) => {
@@ -380,19 +380,19 @@ mod known_tests {
                 Kernel(path, sequence) => known.removed(Path::new(path), *sequence, UnplugSource::Kernel, now),
                 Udev(path, sequence) => known.removed(Path::new(path), *sequence, UnplugSource::Udev, now),
             };
-            told.extend(events.iter().map(|event| match event {
+            reported.extend(events.iter().map(|event| match event {
                 HotplugEvent::Added(attachment) => format!("+{}", attachment.syspath.display()),
                 HotplugEvent::Removed { syspath, source, .. } => format!("-{} {}", syspath.display(), source.word()),
             }));
             if look == Look::Again {
-                told.push("look".into());
+                reported.push("look".into());
             }
         }
-        told
+        reported
     }
 
     #[test]
-    fn each_change_is_told_once_whatever_order_it_comes_in() {
+    fn each_change_is_reported_once_in_any_order() {
         let table: &[(&str, &[Step], &[&str])] = &[
             (
                 "the kernel first",
@@ -430,10 +430,10 @@ mod known_tests {
                 &[Added("1/a", 1, 5), Added("1/a", 2, 9)],
                 &["+1/a", "-1/a udev", "+1/a"],
             ),
-            ("told twice", &[Found(&[("1/a", 1)], 5), Added("1/a", 1, 5), Added("1/a", 1, 6)], &["+1/a"]),
+            ("reported twice", &[Found(&[("1/a", 1)], 5), Added("1/a", 1, 5), Added("1/a", 1, 6)], &["+1/a"]),
         ];
         for (name, steps, expected) in table {
-            assert_eq!(told(steps), *expected, "{name}");
+            assert_eq!(events_of(steps), *expected, "{name}");
         }
     }
 }

@@ -1,7 +1,7 @@
 //! A line of a GPIO chip.
 //!
-//! The line is pulled to the level that stops: where its wire is broken, it stops. Chips without resistors of their own
-//! need one beside the contact.
+//! The line is biased to the level that stops: a broken wire is a stop. Chips without bias resistors need an external
+//! one at the contact.
 
 use std::os::fd::BorrowedFd;
 
@@ -10,7 +10,7 @@ use crate::gpio::Input;
 use crate::interlock::InputState;
 use crate::registry::GpioInput;
 
-/// A line that is ours.
+/// A line that this process holds.
 #[derive(Debug)]
 pub(super) struct Gpio {
     input: Input,

@@ -11,7 +11,7 @@ use crate::interlock::InputState;
 use crate::registry::KeyInput;
 use crate::text::not_opened;
 
-/// The key is asked for at least this often.
+/// The key is queried at least this often.
 pub(super) const LOOK: Duration = Duration::from_millis(50);
 
 /// An open device.
@@ -29,9 +29,9 @@ impl Key {
         let code = KeyCode(spec.number);
         let has_key = |device: &Device| device.supported_keys().is_some_and(|keys| keys.contains(code));
         let shown = spec.device.clone();
-        let say = |error: std::io::Error| not_opened(&spec.device, "input", &error);
+        let fail = |error: std::io::Error| not_opened(&spec.device, "input", &error);
         let device = if shown.starts_with('/') {
-            Device::open(&shown).map_err(say)?
+            Device::open(&shown).map_err(fail)?
         } else {
             let mut named = evdev::enumerate().map(|(_, device)| device);
             named.find(|device| device.name() == Some(&shown) && has_key(device)).ok_or_else(|| {
@@ -44,7 +44,7 @@ impl Key {
         if !has_key(&device) {
             return Err(format!("{shown} has no key {}", spec.code));
         }
-        device.set_nonblocking(true).map_err(say)?;
+        device.set_nonblocking(true).map_err(fail)?;
         Ok(Self { device, shown, code, runs_while_pressed: spec.runs_while_pressed })
     }
 
@@ -54,21 +54,21 @@ impl Key {
 
     pub(super) fn take(&mut self, report: &mut dyn FnMut(InputState)) -> Result<(), String> {
         let Self { device, shown, code, runs_while_pressed } = self;
-        let say = |error: std::io::Error| not_opened(shown, "input", &error);
+        let fail = |error: std::io::Error| not_opened(shown, "input", &error);
         match device.fetch_events() {
-            // Where the kernel had no room for all, the crate makes up what has changed.
+            // After an overflow of the kernel's queue, the crate synthesizes the changes.
             Ok(events) => events.for_each(|event| judge(event, *code, *runs_while_pressed, report)),
             Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted) => {}
-            Err(error) => return Err(say(error)),
+            Err(error) => return Err(fail(error)),
         }
-        // Of a device that another program has grabbed no event comes.
-        let is_pressed = device.get_key_state().map_err(say)?.contains(*code);
+        // A device that another program has grabbed delivers no events.
+        let is_pressed = device.get_key_state().map_err(fail)?.contains(*code);
         report(state(is_pressed, *runs_while_pressed));
         Ok(())
     }
 }
 
-/// What an event says of the key: 1 is a press, 2 a press that lasts, 0 a release.
+/// The value of a key event: 1 is a press, 2 an autorepeat, 0 a release.
 fn judge(event: InputEvent, key: KeyCode, runs_while_pressed: bool, report: &mut dyn FnMut(InputState)) {
     if let EventSummary::Key(_, code, value) = event.destructure()
         && code == key
@@ -82,7 +82,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn of_all_events_those_of_the_key_count() {
+    fn only_events_of_the_key_count() {
         use InputState::{Runs, Stopped};
         let event = |kind: evdev::EventType, code: KeyCode, value| InputEvent::new(kind.0, code.0, value);
         let (key, absolute) = (evdev::EventType::KEY, evdev::EventType::ABSOLUTE);
@@ -94,16 +94,16 @@ mod tests {
             event(key, KeyCode::KEY_B, 0),
         ];
         for (runs_while_pressed, expected) in [(true, [Runs, Runs, Stopped]), (false, [Stopped, Stopped, Runs])] {
-            let mut said = Vec::new();
+            let mut states = Vec::new();
             for event in events {
-                judge(event, KeyCode::KEY_B, runs_while_pressed, &mut |state| said.push(state));
+                judge(event, KeyCode::KEY_B, runs_while_pressed, &mut |state| states.push(state));
             }
-            assert_eq!(said, expected);
+            assert_eq!(states, expected);
         }
     }
 
     #[test]
-    fn what_is_not_there_is_said() {
+    fn a_missing_device_or_key_is_reported() {
         let spec = |device: &str| KeyInput {
             device: device.to_owned(),
             code: "KEY_B".to_owned(),

@@ -1,6 +1,6 @@
-//! Lines of text on a serial port, sent again and again.
+//! Lines of text on a serial port, sent repeatedly.
 //!
-//! Invariant: what arrives before the first line end after opening is part of a line and says nothing.
+//! Invariant: what arrives before the first line end after opening is part of a line and is ignored.
 //! Invariant: memory is bounded, whatever the port sends.
 
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -14,10 +14,10 @@ use crate::interlock::InputState;
 use crate::registry::LineInput;
 use crate::text::not_opened;
 
-/// Longest line that is looked at; one that is longer is another than those that mean something.
+/// Longest line that is evaluated; a longer one cannot be one of the meaningful lines.
 const LONGEST: usize = 128;
 
-/// Reads in a row.
+/// Most reads in a row.
 const MOST_READS: usize = 64;
 
 /// An open port.
@@ -29,27 +29,27 @@ pub(super) struct Line {
 }
 
 impl Line {
-    /// Opens the port for ourselves alone, 8 bits without parity.
+    /// Opens the port exclusively, 8 bits without parity.
     pub(super) fn open(spec: &LineInput) -> Result<Self, String> {
         let shown = spec.path.display().to_string();
-        let say = |error: Errno| not_opened(&shown, "dialout", &error.into());
+        let fail = |error: Errno| not_opened(&shown, "dialout", &error.into());
         let flags = OFlags::RDONLY | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
-        let fd = open(&spec.path, flags, Mode::empty()).map_err(say)?;
-        flock(&fd, FlockOperation::NonBlockingLockExclusive).map_err(say)?;
-        ioctl_tiocexcl(&fd).map_err(say)?;
-        let mut settings = tcgetattr(&fd).map_err(say)?;
+        let fd = open(&spec.path, flags, Mode::empty()).map_err(fail)?;
+        flock(&fd, FlockOperation::NonBlockingLockExclusive).map_err(fail)?;
+        ioctl_tiocexcl(&fd).map_err(fail)?;
+        let mut settings = tcgetattr(&fd).map_err(fail)?;
         settings.make_raw();
         settings.control_modes |= ControlModes::CREAD | ControlModes::CLOCAL;
-        settings.set_speed(spec.baud).map_err(say)?;
-        tcsetattr(&fd, OptionalActions::Now, &settings).map_err(say)?;
-        // Whatever waited in the kernel is older than this opening.
-        tcflush(&fd, QueueSelector::IFlush).map_err(say)?;
+        settings.set_speed(spec.baud).map_err(fail)?;
+        tcsetattr(&fd, OptionalActions::Now, &settings).map_err(fail)?;
+        // Data that waited in the kernel is older than this opening.
+        tcflush(&fd, QueueSelector::IFlush).map_err(fail)?;
         Ok(Self { fd, shown, words: Words::new(spec) })
     }
 
     pub(super) fn take(&mut self, report: &mut dyn FnMut(InputState)) -> Result<(), String> {
         let mut bytes = [0; 256];
-        // A port that is flooded must not keep the thread from the end of the run.
+        // A flooded port must not delay the thread at the end of the run.
         for _ in 0..MOST_READS {
             match rustix::io::read(&self.fd, &mut bytes) {
                 Ok(0) => return Err(format!("{} is not plugged in", self.shown)),
@@ -62,7 +62,7 @@ impl Line {
         Ok(())
     }
 
-    /// Why it is silent, and what came all the same.
+    /// Why it is silent, and what was received nevertheless.
     pub(super) fn why_silent(&mut self) -> String {
         let Words { run, silence, unused, .. } = &mut self.words;
         match std::mem::take(unused) {
@@ -94,7 +94,7 @@ struct Words {
     /// The line began before the port was opened, or is too long.
     is_part: bool,
     is_first: bool,
-    /// Bytes since the last line that meant something.
+    /// Bytes since the last meaningful line.
     unused: u64,
 }
 
@@ -116,10 +116,10 @@ impl Words {
             self.unused += 1;
             match byte {
                 b'\n' => {
-                    let says = if self.is_part { None } else { Some(self.line.trim_ascii()) };
-                    let is_run = says == Some(self.run.as_bytes());
+                    let line = if self.is_part { None } else { Some(self.line.trim_ascii()) };
+                    let is_run = line == Some(self.run.as_bytes());
                     let is_stop = match &self.stop {
-                        Some(stop) => says == Some(stop.as_bytes()),
+                        Some(stop) => line == Some(stop.as_bytes()),
                         None => !is_run && !self.is_first,
                     };
                     if is_run || is_stop {
@@ -140,7 +140,7 @@ impl Words {
 mod tests {
     use super::*;
 
-    fn said(stop: Option<&str>, bytes: &[u8]) -> String {
+    fn states(stop: Option<&str>, bytes: &[u8]) -> String {
         let spec = LineInput {
             path: "/dev/null".into(),
             baud: 9600,
@@ -148,26 +148,26 @@ mod tests {
             stop: stop.map(str::to_owned),
             silence: Duration::from_millis(100),
         };
-        // However it is cut into pieces.
+        // Regardless of how it is split.
         let mut all = [1, 2, 7, 4096].map(|size| {
-            let (mut words, mut said) = (Words::new(&spec), String::new());
+            let (mut words, mut states) = (Words::new(&spec), String::new());
             for piece in bytes.chunks(size) {
                 words.feed(piece, &mut |state| {
-                    said.push(match state {
+                    states.push(match state {
                         InputState::Runs => 'r',
                         InputState::Stopped => 's',
                         InputState::Lost => 'l',
                     });
                 });
             }
-            said
+            states
         });
         assert!(all.iter().all(|one| *one == all[0]), "{all:?}");
         std::mem::take(&mut all[0])
     }
 
     #[test]
-    fn whatever_is_not_the_line_that_means_run_stops() {
+    fn any_line_but_the_run_line_stops() {
         let long = [b"\n", &[b'R'; 500][..], b"RUN\nRUN\n"].concat();
         for (bytes, all_others, only_stop) in [
             (&b"RUN\nRUN\nRUN\n"[..], "rr", "rr"),
@@ -177,8 +177,8 @@ mod tests {
             (b"\nR\xffN\nRUN", "s", ""),
             (&long, "sr", "r"),
         ] {
-            assert_eq!(said(None, bytes), all_others, "{}", bytes.escape_ascii());
-            assert_eq!(said(Some("STOP"), bytes), only_stop, "{}", bytes.escape_ascii());
+            assert_eq!(states(None, bytes), all_others, "{}", bytes.escape_ascii());
+            assert_eq!(states(Some("STOP"), bytes), only_stop, "{}", bytes.escape_ascii());
         }
     }
 }

@@ -1,12 +1,13 @@
 //! Emergency stops and enabling switches: where their inputs are read.
 //!
-//! A thread each, which sleeps until the kernel has something to read or the input has been silent for too long; of a
-//! number in the samples of a device the thread of [`tap`] only waits for silence, and the device's stream looks at the
-//! number. What an input says goes to the run's [`Permission`], which gives the orders, and then to the board.
+//! Each has a thread, which sleeps until the kernel has something to read or the input has been silent for too long;
+//! for a number in the samples of a device the thread of [`tap`] only waits for silence, and the device's stream
+//! evaluates the number. The state of an input goes to the run's [`Permission`], which gives the orders, and then to
+//! the board.
 //!
 //! Invariant: the order is given before anything is shown or logged.
-//! Invariant: an input is lost from the moment when it cannot be read until it says that it runs: unplugged, silent, held
-//! by another program, or read by a thread that panicked.
+//! Invariant: an input is lost from the moment when it cannot be read until it reports that it runs: unplugged, silent,
+//! held by another program, or read by a thread that panicked.
 
 mod gpio;
 mod key;
@@ -47,10 +48,10 @@ pub struct Watched {
 }
 
 impl Watched {
-    /// Reads the inputs of `registry` from now on, for `permission`, which was made of the same registry.
+    /// Reads the inputs of `registry` from now on, for `permission`, which was created from the same registry.
     ///
     /// # Errors
-    /// When the system gives no thread.
+    /// When the system provides no thread.
     pub fn begin(registry: &Registry, permission: &Arc<Permission>, board: &Arc<Board>) -> io::Result<Self> {
         let stop = Arc::new(eventfd(0, EventfdFlags::CLOEXEC)?);
         let mut watched = Self { stop, threads: Vec::new(), taps: Vec::new(), is_ending: Arc::default() };
@@ -66,7 +67,7 @@ impl Watched {
                 // As much of the name as the kernel keeps.
                 let name = format!("stop-{}", spec.name).chars().take(15).collect();
                 std::thread::Builder::new().name(name).spawn(move || {
-                    // Without the right to it, the motors' thread warns.
+                    // Without the privilege for it, the motors' thread warns.
                     let _ = use_fifo(CONTROL_PRIORITY);
                     work();
                 })
@@ -86,8 +87,8 @@ impl Watched {
         Ok(watched)
     }
 
-    /// The run ends and its devices are closed: that numbers of theirs are missing is not worth a word. They stop the
-    /// actuator as before.
+    /// The run ends and its devices are closed: missing numbers of theirs are not reported. They stop the actuator as
+    /// before.
     pub fn end(&self) {
         self.is_ending.store(true, Ordering::Relaxed);
     }
@@ -101,7 +102,7 @@ impl Watched {
 
 impl Drop for Watched {
     fn drop(&mut self) {
-        // Room for a number is always there.
+        // An eventfd always has room for a number.
         let _ = rustix::io::write(&self.stop, &1_u64.to_ne_bytes());
         for thread in self.threads.drain(..) {
             // Its panic has been reported.
@@ -110,7 +111,7 @@ impl Drop for Watched {
     }
 }
 
-/// Where one input's state goes.
+/// Receives the state of one input.
 #[derive(Debug, Clone)]
 struct Reporter {
     index: usize,
@@ -129,7 +130,7 @@ impl Reporter {
         }
     }
 
-    /// Held by a thread or task: one that panics leaves the input lost.
+    /// Held by a thread or task: if it panics, the input is lost.
     fn lost_at_a_panic(&self) -> LostAtPanic<'_> {
         LostAtPanic(self)
     }

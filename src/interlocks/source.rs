@@ -1,4 +1,4 @@
-//! An open input, whatever it is.
+//! An open input of any kind.
 
 use std::os::fd::{AsFd, BorrowedFd};
 use std::time::Duration;
@@ -22,7 +22,7 @@ impl Source {
     /// Opens it.
     ///
     /// # Errors
-    /// Why it cannot be opened, for people.
+    /// Why it cannot be opened, as text for the user.
     pub(super) fn open(input: &InterlockInput) -> Result<Self, String> {
         match input {
             InterlockInput::Key(key) => Ok(Self::Key(Box::new(Key::open(key)?))),
@@ -41,10 +41,10 @@ impl Source {
         }
     }
 
-    /// Reports every state that it has had since the last call, and what it is now where it can be asked, without waiting.
-    ///
+    /// Reports every state that it has had since the last call, and its present state where it can be queried, without
+    /// waiting.
     /// # Errors
-    /// When it cannot be read any more, for people.
+    /// When it can no longer be read, as text for the user.
     pub(super) fn take(&mut self, report: &mut dyn FnMut(InputState)) -> Result<(), String> {
         match self {
             Self::Key(key) => key.take(report),
@@ -53,7 +53,7 @@ impl Source {
         }
     }
 
-    /// How long after a call of [`Self::take`] the next one is due at the latest; `None` where it cannot be asked.
+    /// How long after a call of [`Self::take`] the next one is due at the latest; `None` where it cannot be queried.
     pub(super) const fn look_after(&self) -> Option<Duration> {
         match self {
             Self::Key(_) => Some(key::LOOK),
@@ -61,7 +61,7 @@ impl Source {
         }
     }
 
-    /// Why it is silent, for people.
+    /// Why it is silent, as text for the user.
     pub(super) fn why_silent(&mut self) -> String {
         match self {
             Self::Key(_) => String::new(),
@@ -70,7 +70,7 @@ impl Source {
         }
     }
 
-    /// Silent for this long it is lost; `None` where the kernel knows its state at all times.
+    /// After this long without data it is lost; `None` where the kernel knows its state at all times.
     pub(super) fn silence(&self) -> Option<Duration> {
         match self {
             Self::Key(_) => None,

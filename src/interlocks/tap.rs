@@ -1,9 +1,9 @@
 //! A number in the samples of a device that is an emergency stop or an enabling switch.
 //!
-//! The stream of the device looks at each sample before it publishes it; the thread of the tap sleeps until the number has
-//! been missing for too long.
+//! The stream of the device evaluates each sample before it publishes it; the thread of the tap sleeps until the number
+//! has been missing for too long.
 //!
-//! Invariant: to look at a sample that says the same as the one before takes no lock and no memory.
+//! Invariant: a sample with the same state as the one before is evaluated without a lock and without allocation.
 
 use std::os::fd::OwnedFd;
 use std::sync::Arc;
@@ -30,8 +30,8 @@ struct Inner {
     runs: Bound,
     silence: Duration,
     reporter: Reporter,
-    /// When the newest sample came; 0 while the input is lost.
-    heard: AtomicU64,
+    /// When the newest sample arrived; 0 while the input is lost.
+    received_at: AtomicU64,
     /// Wakes the thread with the first sample after a loss.
     found: OwnedFd,
 }
@@ -44,34 +44,34 @@ impl Tap {
             runs: spec.runs,
             silence: spec.silence,
             reporter,
-            heard: AtomicU64::new(0),
+            received_at: AtomicU64::new(0),
             found: eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?,
         })))
     }
 
-    /// Name of the device whose samples are looked at.
+    /// Name of the device whose samples are evaluated.
     #[must_use]
     pub fn device(&self) -> &str {
         &self.0.device
     }
 
-    /// A sample came.
+    /// A sample has arrived.
     pub fn look(&self, encoding: Encoding, bytes: &[u8]) {
         let tap = &*self.0;
         let Some(value) = (encoding == Encoding::F64).then(|| number(bytes, tap.index)).flatten() else {
             self.lose("its sample does not hold the number");
             return;
         };
-        if tap.heard.swap(Stamp::now().0.max(1), Ordering::SeqCst) == 0 {
-            // Room for a number is always there.
+        if tap.received_at.swap(Stamp::now().0.max(1), Ordering::SeqCst) == 0 {
+            // An eventfd always has room for a number.
             let _ = rustix::io::write(&tap.found, &1_u64.to_ne_bytes());
         }
         tap.reporter.report(if tap.runs.holds(value) { InputState::Runs } else { InputState::Stopped }, "");
     }
 
-    /// Nothing comes any more.
+    /// No samples arrive any more.
     pub fn lose(&self, why: &str) {
-        self.0.heard.store(0, Ordering::SeqCst);
+        self.0.received_at.store(0, Ordering::SeqCst);
         self.0.reporter.report(InputState::Lost, why);
     }
 
@@ -80,15 +80,15 @@ impl Tap {
         let _lost = self.0.reporter.lost_at_a_panic();
         let tap = &*self.0;
         loop {
-            let heard = tap.heard.load(Ordering::SeqCst);
-            let wake = (heard > 0).then(|| Stamp(heard).after(tap.silence));
+            let received_at = tap.received_at.load(Ordering::SeqCst);
+            let wake = (received_at > 0).then(|| Stamp(received_at).after(tap.silence));
             match wait(stop, Some(&tap.found), wake) {
                 Woken::Stop => return,
                 Woken::Ready(_) => {
                     let _ = rustix::io::read(&tap.found, &mut [0; 8]);
                 }
-                // Unless a sample came meanwhile.
-                Woken::Late if tap.heard.load(Ordering::SeqCst) == heard => {
+                // Unless a sample arrived meanwhile.
+                Woken::Late if tap.received_at.load(Ordering::SeqCst) == received_at => {
                     self.lose(&format!("no sample of {} for {:?}", tap.device, tap.silence));
                 }
                 Woken::Late => {}
@@ -102,7 +102,7 @@ fn number(bytes: &[u8], index: usize) -> Option<f64> {
     numbers.get(index).map(|number| f64::from_le_bytes(*number))
 }
 
-/// Loses what is tapped when it is dropped.
+/// Reports the taps as lost when it is dropped.
 #[must_use]
 pub fn lost_at_the_end(taps: &Arc<[Tap]>) -> impl Drop + use<> {
     Lost(Arc::clone(taps))

@@ -1,4 +1,4 @@
-//! Inputs over real descriptors: a pseudo terminal for a serial port, and samples as a stream hands them over.
+//! Inputs over real descriptors: a pseudo terminal for a serial port, and samples as a stream delivers them.
 
 use std::os::fd::OwnedFd;
 use std::time::{Duration, Instant};
@@ -77,8 +77,8 @@ impl Run {
         self.attended.take().collect()
     }
 
-    /// What was announced since the last call, in a word each.
-    fn told(&mut self) -> Vec<&'static str> {
+    /// The words of the announcements since the last call.
+    fn announced(&mut self) -> Vec<&'static str> {
         let events = std::iter::from_fn(|| self.events.try_recv().ok());
         events.filter_map(|event| if let What::Stop(stop) = event.what { Some(stop.word()) } else { None }).collect()
     }
@@ -94,11 +94,11 @@ fn pendant() -> (OwnedFd, String) {
     (port, path)
 }
 
-/// Sends a line again and again, as a pendant does, until `done`.
+/// Sends a line repeatedly, as a pendant does, until `done`.
 fn send(port: &OwnedFd, line: &str, mut done: impl FnMut() -> bool) {
     let end = Instant::now() + PATIENCE;
     while !done() {
-        // A port that nobody has opened yet is full some time.
+        // A port that no process has opened yet is full after a while.
         let _ = rustix::io::write(port, line.as_bytes());
         assert!(Instant::now() < end);
         std::thread::sleep(Duration::from_millis(10));
@@ -112,7 +112,7 @@ fn serial(path: &str) -> String {
 }
 
 #[test]
-fn a_serial_pendant_stops_by_value_by_silence_and_by_its_cable() {
+fn a_serial_pendant_stops_by_value_by_silence_and_by_unplugging() {
     let (port, path) = pendant();
     let mut run = run(&serial(&path));
     assert!(run.arm().unwrap_err().contains("pendant is lost"));
@@ -121,7 +121,7 @@ fn a_serial_pendant_stops_by_value_by_silence_and_by_its_cable() {
     assert_eq!(run.arm(), Ok(()));
     assert_eq!(run.orders(), [Order::Arm]);
 
-    // By value, at once, and though it runs again in the same breath.
+    // By value, at once, even though it runs again immediately after.
     rustix::io::write(&port, b"RUN\nSTOP\nRUN\n").unwrap();
     let begun = Instant::now();
     let orders = loop {
@@ -147,18 +147,18 @@ fn a_serial_pendant_stops_by_value_by_silence_and_by_its_cable() {
     send(&port, "RUN\n", || run.stop().state == InputState::Runs);
     assert_eq!(run.arm(), Ok(()));
 
-    // By its cable.
+    // By unplugging.
     drop(port);
     let gone = run.until(InputState::Lost);
     assert!(gone.detail.contains("plugged"), "{gone:?}");
     assert_eq!(run.orders(), [Order::Emergency(Trip { stop: 0, is_lost: true })]);
     assert!(run.arm().unwrap_err().contains("pendant is lost"));
-    let told = run.told();
-    assert!(told.ends_with(&["released", "pressed", "released", "lost", "released", "lost"]), "{told:?}");
+    let announced = run.announced();
+    assert!(announced.ends_with(&["released", "pressed", "released", "lost", "released", "lost"]), "{announced:?}");
 }
 
 #[test]
-fn a_serial_pendant_is_opened_when_it_is_plugged_in_and_by_one_alone() {
+fn a_serial_pendant_is_opened_when_plugged_in_and_exclusively() {
     let none = run(&serial("/dev/serial/by-id/none"));
     let why = none.until(InputState::Lost);
     let end = Instant::now() + PATIENCE;
@@ -173,7 +173,7 @@ fn a_serial_pendant_is_opened_when_it_is_plugged_in_and_by_one_alone() {
     let second = run(&serial(&path));
     while second.stop().detail.contains("not reported yet") {}
     assert!(second.stop().detail.contains("held by another program"), "{:?}", second.stop());
-    // It has it once the first has ended.
+    // It is available once the first has ended.
     drop(first);
     send(&port, "RUN\n", || second.stop().state == InputState::Runs);
 }
@@ -187,7 +187,7 @@ fn a_number_of_a_stream_stops_by_value_by_silence_and_by_the_end_of_its_stream()
     assert_eq!(taps[0].device(), "buttons");
     let bytes = |value: f64| [9.0_f64.to_le_bytes(), value.to_le_bytes()].concat();
     let look = |value: f64| taps[0].look(Encoding::F64, &bytes(value));
-    // Until what was a stop has settled.
+    // Until the stop has settled.
     let run_again = |run: &Run| {
         let end = Instant::now() + PATIENCE;
         while run.stop().state != InputState::Runs {
@@ -209,7 +209,7 @@ fn a_number_of_a_stream_stops_by_value_by_silence_and_by_the_end_of_its_stream()
     run_again(&run);
     assert_eq!((run.orders(), run.arm()), (vec![], Ok(())));
     assert_eq!(run.orders(), [Order::Arm]);
-    // What is no number, is missing, or is none of the stream's.
+    // Not a number, missing, or not of the stream.
     for bytes in [bytes(f64::NAN), bytes(1.0)[..15].to_vec(), Vec::new()] {
         run_again(&run);
         taps[0].look(Encoding::F64, &bytes);
@@ -221,14 +221,14 @@ fn a_number_of_a_stream_stops_by_value_by_silence_and_by_the_end_of_its_stream()
     run_again(&run);
     drop(tap::lost_at_the_end(&taps));
     assert_eq!((run.stop().detail.as_str(), run.orders()), ("buttons is no longer read", vec![Order::Disarm]));
-    let told = run.told();
-    assert!(told.starts_with(&["lost", "released", "held", "released"]), "{told:?}");
-    // What is lost at the end of a run is lost, and no word is made of it.
+    let announced = run.announced();
+    assert!(announced.starts_with(&["lost", "released", "held", "released"]), "{announced:?}");
+    // A loss at the end of a run takes effect but is not announced.
     run_again(&run);
-    run.told();
+    run.announced();
     run.watched.end();
     drop(tap::lost_at_the_end(&taps));
-    assert_eq!((run.told(), run.orders()), (vec![], vec![Order::Disarm]));
+    assert_eq!((run.announced(), run.orders()), (vec![], vec![Order::Disarm]));
 }
 
 #[test]
@@ -261,31 +261,36 @@ fn an_input_whose_thread_panics_is_lost() {
 }
 
 #[test]
-fn a_contact_that_chatters_is_one_stop() {
+fn a_chattering_contact_is_one_stop() {
     let (port, path) = pendant();
     let mut run = run(&serial(&path));
     send(&port, "RUN\n", || run.stop().state == InputState::Runs);
-    run.told();
+    run.announced();
     let chatter = "STOP\nRUN\n".repeat(100);
     for _ in 0..30 {
         let _ = rustix::io::write(&port, chatter.as_bytes());
         std::thread::sleep(Duration::from_millis(5));
     }
-    let told = run.told();
-    // A machine that stands still in between makes two stops of one.
-    assert!(told.starts_with(&["pressed"]) && told.len() < 20, "{}: {:?}", told.len(), &told[..told.len().min(20)]);
+    let announced = run.announced();
+    // If the machine stalls in between, one stop becomes two.
+    assert!(
+        announced.starts_with(&["pressed"]) && announced.len() < 20,
+        "{}: {:?}",
+        announced.len(),
+        &announced[..announced.len().min(20)]
+    );
     send(&port, "RUN\n", || run.stop().state == InputState::Runs);
 }
 
 #[test]
-fn a_port_on_which_something_else_comes_is_not_called_silent() {
+fn a_port_that_receives_other_bytes_is_not_reported_as_silent() {
     let (port, path) = pendant();
     let run = run(&serial(&path));
-    let run_says = |words: &str| run.stop().detail.contains(words);
-    send(&port, "RUN\r", || run_says("bytes came: check `baud`"));
+    let detail_has = |words: &str| run.stop().detail.contains(words);
+    send(&port, "RUN\r", || detail_has("bytes came: check `baud`"));
     send(&port, "RUN\n", || run.stop().state == InputState::Runs);
     let end = Instant::now() + PATIENCE;
-    while !run_says("nothing was received for") {
+    while !detail_has("nothing was received for") {
         assert!(Instant::now() < end, "{:?}", run.stop());
     }
 }

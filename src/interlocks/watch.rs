@@ -1,7 +1,7 @@
-//! The thread of an input: opens it, follows what it says, and opens it again when it was lost.
+//! The thread of an input: opens it, follows its state, and reopens it after a loss.
 //!
 //! Invariant: between two states it sleeps in the kernel, and wakes when there is something to read, when the input has
-//! been silent for too long, when it has to be asked, or at the end.
+//! been silent for too long, when it has to be queried, or at the end.
 
 use std::os::fd::{AsFd, OwnedFd};
 use std::time::Duration;
@@ -14,7 +14,7 @@ use crate::interlock::InputState;
 use crate::registry::InterlockInput;
 use crate::time::Stamp;
 
-/// How long after a loss an input is opened again.
+/// Time between a loss of an input and its reopening.
 const AGAIN: Duration = Duration::from_millis(500);
 
 /// Why a thread woke.
@@ -22,9 +22,9 @@ const AGAIN: Duration = Duration::from_millis(500);
 pub(super) enum Woken {
     /// The run ends.
     Stop,
-    /// There is something to read, or with `true` nothing will be any more.
+    /// There is something to read, or with `true` the input has ended.
     Ready(bool),
-    /// The moment has come.
+    /// The moment has been reached.
     Late,
 }
 
@@ -37,14 +37,14 @@ pub(super) fn wait(stop: &OwnedFd, input: Option<&dyn AsFd>, until: Option<Stamp
         all.extend(input.map(|input| PollFd::from_borrowed_fd(input.as_fd(), PollFlags::IN)));
         match poll(&mut all, limit.as_ref()) {
             Ok(_) | Err(rustix::io::Errno::INTR) => {}
-            // Without memory for a moment; asked again at once it would only be more.
+            // Out of memory for the moment; an immediate retry would only add to it.
             Err(_) => std::thread::sleep(Duration::from_millis(10)),
         }
         let mut happened = all.iter().map(PollFd::revents);
         if happened.next().is_some_and(|events| !events.is_empty()) {
             return Woken::Stop;
         }
-        // Before what there is to read: one that speaks again was silent all the same.
+        // Before the input is read: one that sends again has still been silent.
         if until.is_some_and(|until| Stamp::now() >= until) {
             return Woken::Late;
         }
@@ -73,7 +73,7 @@ pub(super) fn watch(input: &InterlockInput, reporter: &Reporter, stop: &OwnedFd)
 /// Why an open input was lost; `None` at the end of the run.
 fn follow(source: &mut Source, reporter: &Reporter, stop: &OwnedFd) -> Option<String> {
     let silence = source.silence();
-    let mut heard = Stamp::now();
+    let mut received_at = Stamp::now();
     let mut is_silent = false;
     loop {
         let mut has_reported = false;
@@ -85,10 +85,10 @@ fn follow(source: &mut Source, reporter: &Reporter, stop: &OwnedFd) -> Option<St
             return Some(why);
         }
         if has_reported {
-            (heard, is_silent) = (Stamp::now(), false);
+            (received_at, is_silent) = (Stamp::now(), false);
         }
         let look = source.look_after().map(|after| Stamp::now().after(after));
-        let until = look.or(silence.filter(|_| !is_silent).map(|silence| heard.after(silence)));
+        let until = look.or(silence.filter(|_| !is_silent).map(|silence| received_at.after(silence)));
         match wait(stop, Some(&source.fd()), until) {
             Woken::Stop => return None,
             Woken::Ready(false) => {}

@@ -39,7 +39,7 @@ fn a_line_has_message_fields_and_span_and_no_control_characters() {
 }
 
 #[test]
-fn by_default_others_are_only_heard_when_they_warn_and_iceoryx2_when_it_fails() {
+fn by_default_only_warnings_of_other_crates_and_errors_of_iceoryx2_are_logged() {
     let got = lines(DEFAULT, || {
         tracing::info!(target: "rapid::rig", "one");
         tracing::debug!(target: "rapid::rig", "no");
@@ -75,7 +75,7 @@ fn sink_to(form: Stderr, before: &'static str, out: impl Write + Send + 'static)
 }
 
 #[test]
-fn a_stalled_reader_blocks_no_writer_and_learns_what_it_lost() {
+fn a_stalled_reader_blocks_no_writer_and_is_informed_of_lost_lines() {
     let (mut reader, writer) = io::pipe().unwrap();
     let sink = sink_to(Stderr::Text, "", writer);
     let line = |text: String| LogLine { wall_ns: 0, level: Level::Warn, text };

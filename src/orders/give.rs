@@ -1,4 +1,4 @@
-//! The side of whoever gives an order.
+//! The side of the program that gives an order.
 
 use std::fs;
 use std::io::{self, BufRead, BufReader, ErrorKind, Read, Write};
@@ -14,15 +14,15 @@ use crate::peer::Peer;
 use crate::text::plain;
 use crate::time::Stamp;
 
-/// A run answers within milliseconds; one that is stopped does not.
+/// A run answers within milliseconds; a stopped process does not.
 const ANSWER_LIMIT: Duration = Duration::from_secs(2);
-/// How long a run is tried whose socket accepts nothing at the moment, where no other can be reached...
+/// How long a run is retried whose socket accepts no connection at the moment, if no other can be reached...
 const BUSY_LIMIT: Duration = Duration::from_secs(1);
 /// ...and how often.
 const BUSY_AGAIN: Duration = Duration::from_millis(2);
 /// The sockets of this network namespace, see proc(5). An abstract name begins with `@` there.
 const SOCKETS: &str = "/proc/net/unix";
-/// Of the flags there: it accepts connections (`__SO_ACCEPTCON`, linux/net.h).
+/// The flag there of a socket that accepts connections (`__SO_ACCEPTCON`, linux/net.h).
 const ACCEPTS: u32 = 1 << 16;
 
 /// Why an order was not carried out.
@@ -39,7 +39,7 @@ pub enum GiveError {
     /// Several runs.
     #[error("several runs are here (processes {0:?}): arm as the user of one of them, or name it with --instance")]
     Several(Vec<u32>),
-    /// The run answered so.
+    /// The run refused it.
     #[error("process {process}: {why}")]
     Refused {
         /// Its process.
@@ -58,7 +58,7 @@ pub enum GiveError {
         /// Why not.
         error: io::Error,
     },
-    /// What runs cannot be found out.
+    /// The running instances cannot be determined.
     #[error("{SOCKETS}: {0}")]
     Sockets(#[from] io::Error),
 }
@@ -85,22 +85,22 @@ impl std::fmt::Display for Other {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let Self { process, user, instance } = self;
         write!(f, "process {process} of user {user} does")?;
-        // Anybody may make a socket of any name.
+        // Any user can create a socket of any name.
         instance.iter().try_for_each(|name| write!(f, " (`--instance {}`)", plain(name)))
     }
 }
 
-/// Gives an order to the run of `instance`, and returns once it was carried out; a disarm to every one, if root gives it
-/// and several users run one.
+/// Gives an order to the run of `instance`, and returns once it was carried out; a disarm goes to every one, if root
+/// gives it and several users run one.
 ///
 /// # Errors
 /// When no run has carried it out.
 pub fn give(instance: Option<&str>, order: Order) -> Result<(), GiveError> {
     let given = Stamp::now();
-    // Names are bytes, and anybody's.
+    // Names are arbitrary bytes, chosen by any user.
     let sockets = String::from_utf8_lossy(&fs::read(SOCKETS)?).into_owned();
     let (runs, busy) = runs(&sockets, instance)?;
-    // Of a process that is no run of this user nothing is known but the name that it gave its socket.
+    // Of a process that is not a run of this user only the name of its socket is known.
     let busy = busy.into_iter().find(|process| is_of_this_user(*process));
     let unreached = busy.map(|process| GiveError::NoAnswer { process, error: ErrorKind::WouldBlock.into() });
     if runs.is_empty() {
@@ -114,13 +114,13 @@ pub fn give(instance: Option<&str>, order: Order) -> Result<(), GiveError> {
         if runs.len() > 1 {
             return Err(GiveError::Several(runs.iter().map(|run| run.process).collect()));
         }
-        // Nor is one of several armed because the other cannot be reached.
+        // If several run, one of them is not armed either while another cannot be reached.
         if let Some(error) = unreached {
             return Err(error);
         }
     }
     let sent: Vec<_> = runs.into_iter().map(|run| (run.process, run.send(order, given))).collect();
-    // Each has its order before the first is waited for.
+    // All of them receive the order before the first answer is waited for.
     sent.into_iter().try_for_each(|(process, sent)| {
         let why = sent.and_then(answer).map_err(|error| GiveError::NoAnswer { process, error })?;
         if why == DONE { Ok(()) } else { Err(GiveError::Refused { process, why }) }
@@ -146,10 +146,10 @@ impl Run {
     }
 }
 
-/// Those of this user; where root has none, everyone's. And the numbers of processes, as the names of their sockets have
-/// them, that accepted nothing.
+/// Those of this user; where root has none, everyone's. And the process numbers, taken from the names of their sockets,
+/// of those that accepted no connection.
 ///
-/// Anybody may make a socket with such a name, and let it accept nothing: none is waited for while another can be reached.
+/// Any user can create a socket with such a name and accept nothing: none is waited for while another can be reached.
 fn runs(sockets: &str, instance: Option<&str>) -> io::Result<(Vec<Run>, Vec<u32>)> {
     let mut names: Vec<&str> = sockets.lines().filter_map(|line| name_of(line, instance)).collect();
     let (mut ours, mut others) = (Vec::new(), Vec::new());
@@ -161,7 +161,7 @@ fn runs(sockets: &str, instance: Option<&str>) -> io::Result<(Vec<Run>, Vec<u32>
                 Ok(run) if run.user == this_user() => ours.push(run),
                 Ok(run) => others.push(run),
                 Err(error) if error.kind() == ErrorKind::WouldBlock => busy.push(name),
-                // One that has ended meanwhile is none.
+                // One that has ended meanwhile does not count.
                 Err(_) => {}
             }
         }
@@ -174,7 +174,7 @@ fn runs(sockets: &str, instance: Option<&str>) -> io::Result<(Vec<Run>, Vec<u32>
     }
 }
 
-/// Connects to the run that has this socket, without waiting.
+/// Connects to the run that owns this socket, without waiting.
 fn connect(name: &str) -> io::Result<Run> {
     let address = SocketAddrUnix::new_abstract_name(name.as_bytes())?;
     let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
@@ -185,7 +185,7 @@ fn connect(name: &str) -> io::Result<Run> {
     stream.set_read_timeout(Some(ANSWER_LIMIT))?;
     stream.set_write_timeout(Some(ANSWER_LIMIT))?;
     let Peer { process, user } = Peer::of(&stream)?;
-    // As it numbers itself, where its processes are not seen from here.
+    // The number in the socket's name, where its processes are not visible from here.
     let process = process.or_else(|| process_of(name)).unwrap_or_default();
     Ok(Run { stream, process, user })
 }
@@ -238,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn a_socket_whose_name_is_no_text_hinders_no_order() {
+    fn a_socket_whose_name_is_not_text_blocks_no_order() {
         let name = [format!("rapid-give-{}-", std::process::id()).as_bytes(), &[0xff, 0xfe]].concat();
         let _listener = listener(&name);
         let given = give(Some("no-such-rig"), Order::Disarm);

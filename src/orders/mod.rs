@@ -2,17 +2,17 @@
 //!
 //! They come over a socket of the abstract namespace, which needs neither a disk nor shared memory: a run can be
 //! stopped while /dev/shm, /tmp and the disk are full and its bus is damaged. [`receive`] is the run's side, [`give`]
-//! that of whoever gives an order.
+//! that of the sender.
 //!
-//! The name is `rapid/USER/INSTANCE/PROCESS`, numbers but for the instance, which is `-` where there is none (unix(7)).
-//! Anyone can make a socket of that name: who is at the other end is what the kernel says (`SO_PEERCRED`). An order is
-//! one line, `arm NS` or `disarm NS` with the time at which it was given (`CLOCK_MONOTONIC`, ns); the answer is one line,
-//! `done` or why not, and the connection is closed.
+//! The name is `rapid/USER/INSTANCE/PROCESS`, numbers except for the instance, which is `-` where there is none
+//! (unix(7)). Any user can create a socket of that name: the peer is identified by the kernel (`SO_PEERCRED`). An order
+//! is one line, `arm NS` or `disarm NS` with the time at which it was given (`CLOCK_MONOTONIC`, ns); the answer is one
+//! line, `done` or the reason of the refusal, and the connection is closed.
 //!
-//! Invariant: orders of this user and of root are taken, and of no one else; they are given to a run of this user, or by
-//! root to anyone's.
-//! Invariant: an arm counts only while who gave it waits for the answer, and within a second: see
-//! [`Permission`](crate::permission::Permission). A disarm counts however late it comes.
+//! Invariant: orders of this user and of root are accepted, and of no one else; they are given to a run of this user,
+//! or by root to anyone's.
+//! Invariant: an arm counts only while its sender waits for the answer, and within a second: see
+//! [`Permission`](crate::permission::Permission). A disarm counts however late it arrives.
 
 pub mod give;
 pub mod receive;
@@ -29,7 +29,7 @@ const LONGEST: usize = 256;
 /// The answer to an order that was carried out.
 const DONE: &str = "done";
 
-/// What the names of all runs of an instance have in common, but for the user.
+/// What the names of all runs of an instance have in common, except for the user.
 fn instance_part(instance: Option<&str>) -> &str {
     instance.unwrap_or("-")
 }
@@ -50,13 +50,13 @@ fn line(order: Order, given: Stamp) -> String {
     let word = match order {
         Order::Arm => "arm",
         Order::ArmBack => "arm-back",
-        // Of an emergency stop no other program gives more.
+        // An emergency stop is never sent to another program as more than a disarm.
         Order::Disarm | Order::Emergency(_) => "disarm",
     };
     format!("{word} {}\n", given.0)
 }
 
-/// What a line asks for, without its end.
+/// The order in a line, without its end.
 fn order(line: &str) -> Option<(Order, Stamp)> {
     let (word, given) = line.split_once(' ')?;
     let order = match word {

@@ -1,7 +1,7 @@
 //! The run's side: thread `orders`, which takes what comes over the socket.
 //!
-//! Invariant: it writes to no file and no terminal, and waits for no one: a connection that sends nothing, or does not
-//! read its answer, holds up no other.
+//! Invariant: it writes to no file and no terminal, and does not wait for a peer: a connection that sends nothing, or
+//! does not read its answer, delays no other.
 
 use std::io::{self, ErrorKind, Read, Write};
 use std::os::fd::{AsFd, OwnedFd};
@@ -18,9 +18,9 @@ use crate::peer::Peer;
 use crate::permission::Permission;
 use crate::time::Stamp;
 
-/// Connections at a time; of more the oldest is closed.
+/// Connections at a time; beyond that the oldest is closed.
 const CONNECTIONS: usize = 16;
-/// A connection that has sent no order for so long is closed.
+/// A connection that has sent no order for this long is closed.
 const PATIENCE: Duration = Duration::from_secs(2);
 
 /// Takes orders until it is dropped.
@@ -34,7 +34,7 @@ impl Orders {
     /// Takes orders for the run of `instance` from now on.
     ///
     /// # Errors
-    /// When the system gives no socket or no thread.
+    /// When the system provides no socket or no thread.
     pub fn receive(instance: Option<&str>, permission: Arc<Permission>) -> io::Result<Self> {
         let listener = UnixListener::bind_addr(&address(&name(this_user(), instance, std::process::id()))?)?;
         listener.set_nonblocking(true)?;
@@ -47,7 +47,7 @@ impl Orders {
 
 impl Drop for Orders {
     fn drop(&mut self) {
-        // Room for a number is always there.
+        // An eventfd always has room for a number.
         let _ = rustix::io::write(&self.stop, &1_u64.to_ne_bytes());
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
@@ -79,7 +79,7 @@ impl Desk {
                 let limit = (!self.waiting.is_empty()).then_some(&limit);
                 match poll(&mut all, limit) {
                     Ok(_) | Err(rustix::io::Errno::INTR) => {}
-                    // Without memory for a moment; asked again at once it would only be more.
+                    // Out of memory for the moment; an immediate retry would only add to it.
                     Err(_) => std::thread::sleep(Duration::from_millis(10)),
                 }
                 all.iter().map(|one| !one.revents().is_empty()).collect::<Vec<_>>()
@@ -118,7 +118,7 @@ impl Desk {
 }
 
 impl Waiting {
-    /// Takes what was sent. False when the connection is done with.
+    /// Reads what was sent. False when the connection is finished.
     fn take(&mut self, permission: &Permission) -> bool {
         let mut bytes = [0; LONGEST];
         match self.stream.read(&mut bytes) {
@@ -134,7 +134,7 @@ impl Waiting {
                 permission.disarm(Stamp::now());
                 DONE.to_owned()
             }
-            // Whoever gave it is dead, or waits no more.
+            // The sender has ended, or no longer waits.
             Some((Order::Arm | Order::ArmBack, _)) if self.is_left() => return false,
             Some((Order::ArmBack, given)) => {
                 permission.arm_back(given, Stamp::now()).map_or_else(|void| void.to_string(), |()| DONE.to_owned())
@@ -143,12 +143,12 @@ impl Waiting {
                 permission.arm(given, Stamp::now()).map_or_else(|void| void.to_string(), |()| DONE.to_owned())
             }
         };
-        // Room for a line is there, or there is no reader.
+        // There is room for a line, or there is no reader.
         let _ = self.stream.write_all(format!("{answer}\n").as_bytes());
         false
     }
 
-    /// Has the other end gone?
+    /// Whether the other end has closed.
     fn is_left(&self) -> bool {
         let mut one = [PollFd::from_borrowed_fd(self.stream.as_fd(), PollFlags::RDHUP)];
         let at_once = Timespec { tv_sec: 0, tv_nsec: 0 };
@@ -162,7 +162,7 @@ mod tests {
     use crate::orders::line;
 
     #[test]
-    fn an_order_to_arm_of_one_who_is_gone_does_nothing_and_one_to_disarm_does() {
+    fn an_arm_of_a_closed_connection_does_nothing_and_a_disarm_does() {
         let permission = Arc::new(Permission::default());
         let attended = permission.attend();
         for (order, is_gone, taken) in [

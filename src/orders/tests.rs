@@ -12,7 +12,7 @@ use super::*;
 use crate::permission::{Attended, Permission};
 use Order::{Arm, Disarm};
 
-/// A run's side, under an instance of its own.
+/// A run's side, under a separate instance.
 struct Run {
     instance: String,
     permission: Arc<Permission>,
@@ -41,7 +41,7 @@ fn taken(attended: &Attended) -> Vec<Order> {
     attended.take().collect()
 }
 
-/// What is answered to these bytes.
+/// The answer to these bytes.
 fn answered(stream: &mut UnixStream, bytes: &[u8]) -> String {
     stream.write_all(bytes).unwrap();
     let mut answer = String::new();
@@ -50,7 +50,7 @@ fn answered(stream: &mut UnixStream, bytes: &[u8]) -> String {
 }
 
 #[test]
-fn orders_are_carried_out_when_they_are_answered() {
+fn an_answered_order_has_been_carried_out() {
     let run = run("a");
     // A disarm needs no actuator, an arm does.
     assert_eq!(run.give(Disarm), Ok(()));
@@ -64,7 +64,7 @@ fn orders_are_carried_out_when_they_are_answered() {
 }
 
 #[test]
-fn without_a_run_there_is_an_error_at_once_and_after_its_end_too() {
+fn without_a_run_and_after_its_end_there_is_an_error_at_once() {
     let none = give(Some("orders-none"), Disarm).unwrap_err();
     assert!(matches!(none, GiveError::NoRun { .. }) && none.to_string().contains("orders-none"), "{none}");
     let run = run("b");
@@ -74,10 +74,10 @@ fn without_a_run_there_is_an_error_at_once_and_after_its_end_too() {
 }
 
 #[test]
-fn a_socket_that_accepts_nothing_holds_up_no_order() {
+fn a_socket_that_accepts_nothing_delays_no_order() {
     let run = run("busy");
     let attended = run.permission.attend();
-    // As anyone may make one: with room for no connection more.
+    // As any user can create one: with no room for another connection.
     let process = u32::MAX;
     let address = address(&name(this_user(), Some(&run.instance), process)).unwrap();
     let socket = socket_with(AddressFamily::UNIX, SocketType::STREAM, SocketFlags::NONBLOCK, None).unwrap();
@@ -94,14 +94,14 @@ fn a_socket_that_accepts_nothing_holds_up_no_order() {
     }
     assert_eq!(run.give(Disarm), Ok(()));
     assert_eq!(taken(&attended), [Disarm]);
-    // Alone it is no run, and that is found out.
+    // Alone it is not a run, and that is detected.
     let instance = run.instance.clone();
     drop(run);
     assert!(matches!(give(Some(&instance), Disarm), Err(GiveError::NoRun { .. })));
 }
 
 #[test]
-fn who_gives_an_order_to_no_run_learns_of_those_of_other_instances() {
+fn an_order_without_a_run_lists_those_of_other_instances() {
     let run = run("other");
     let why = give(Some("orders-none-at-all"), Disarm).unwrap_err().to_string();
     let process = std::process::id();
@@ -111,7 +111,7 @@ fn who_gives_an_order_to_no_run_learns_of_those_of_other_instances() {
 }
 
 #[test]
-fn an_arm_that_was_given_long_ago_or_is_to_come_does_nothing() {
+fn an_arm_from_the_past_or_the_future_does_nothing() {
     let run = run("c");
     let attended = run.permission.attend();
     let old = Stamp::now().before(std::time::Duration::from_secs(2));
@@ -120,14 +120,14 @@ fn an_arm_that_was_given_long_ago_or_is_to_come_does_nothing() {
     let early = answered(&mut run.connect(), line(Arm, Stamp(u64::MAX)).as_bytes());
     assert!(early.contains("later time"), "{early}");
     assert_eq!(taken(&attended), []);
-    // A disarm counts however old, and whoever waits for it.
+    // A disarm counts however old it is, and whether or not its sender waits.
     run.connect().write_all(line(Disarm, Stamp(0)).as_bytes()).unwrap();
     assert_eq!(answered(&mut run.connect(), b"disarm 1\n"), "done\n");
     assert_eq!(taken(&attended), [Disarm]);
 }
 
 #[test]
-fn what_is_no_order_moves_nothing_and_holds_up_nobody() {
+fn an_invalid_order_moves_nothing_and_delays_no_other() {
     let run = run("d");
     let attended = run.permission.attend();
     // More connections than are held, which send nothing, or half a line.
@@ -149,7 +149,7 @@ fn what_is_no_order_moves_nothing_and_holds_up_nobody() {
         let answer = answered(&mut run.connect(), bytes);
         assert!(answer.contains("not an order"), "{bytes:?}: {answer}");
     }
-    // It is closed at once: with bytes that nobody has read, which is an error here.
+    // It is closed at once: with unread bytes, which is an error here.
     let mut endless = run.connect();
     let _ = endless.write_all(&[b'x'; 4 * LONGEST]).and_then(|()| endless.read_to_string(&mut String::new()));
     assert_eq!(run.give(Disarm), Ok(()));
@@ -157,7 +157,7 @@ fn what_is_no_order_moves_nothing_and_holds_up_nobody() {
 }
 
 #[test]
-fn a_socket_of_that_name_that_does_not_answer_is_named_with_its_process() {
+fn an_unanswering_socket_of_that_name_is_named_with_its_process() {
     let instance = format!("orders-e-{}", std::process::id());
     let name = name(this_user(), Some(&instance), std::process::id());
     let listener = UnixListener::bind_addr(&address(&name).unwrap()).unwrap();

@@ -26,7 +26,7 @@ fn a_disarm_without_an_actuator_is_remembered_until_a_newer_arm() {
 }
 
 #[test]
-fn an_arm_that_is_old_early_or_for_nothing_does_nothing() {
+fn an_arm_that_is_too_old_or_early_or_without_an_actuator_does_nothing() {
     let permission = Arc::new(Permission::new(false));
     assert_eq!(permission.arm(at(1), at(1)), Err(Void::NoActuator));
     let attended = permission.attend();
@@ -36,7 +36,7 @@ fn an_arm_that_is_old_early_or_for_nothing_does_nothing() {
     assert_eq!(attended.take().count(), 0);
     assert_eq!(permission.arm(at(2), at(3)), Ok(()));
     drop(attended);
-    // Meant for the one that was unplugged.
+    // Intended for the one that was unplugged.
     assert_eq!(permission.attend().take().count(), 0);
 }
 
@@ -54,10 +54,10 @@ fn an_arm_at_the_first_plug_is_given_once_and_not_after_an_order() {
 }
 
 proptest! {
-    /// Whatever is given when, and however long it takes to arrive: what is left is disarmed, or an arm that was given
+    /// Whatever is given when, and however long it takes to arrive: the result is a disarm, or an arm that was given
     /// after the last disarm had arrived.
     #[test]
-    fn of_orders_that_cross_the_safer_counts(
+    fn of_crossing_orders_the_safer_one_counts(
         orders in prop::collection::vec((any::<bool>(), 0..2_000_u64, 0..1_500_u64), 1..12),
         looks in prop::collection::vec(any::<bool>(), 12),
     ) {
@@ -116,7 +116,7 @@ fn all_run(permission: &Permission) {
 }
 
 #[test]
-fn an_arm_is_refused_until_every_input_runs_and_says_why() {
+fn an_arm_is_refused_with_the_reason_until_every_input_runs() {
     let permission = with_stops(false);
     let attended = permission.attend();
     let why = |permission: &Permission| permission.arm(at(2), at(2)).map_err(|void| void.to_string());
@@ -136,7 +136,7 @@ fn an_arm_is_refused_until_every_input_runs_and_says_why() {
 }
 
 #[test]
-fn an_arm_of_before_a_trip_is_void_though_the_input_runs_again() {
+fn an_arm_given_before_a_trip_is_void_even_if_the_input_runs_again() {
     let permission = with_stops(false);
     let attended = permission.attend();
     all_run(&permission);
@@ -169,8 +169,8 @@ fn an_arm_at_the_first_plug_is_refused_too_and_does_not_wait_for_an_input() {
 }
 
 proptest! {
-    /// Whatever inputs and operators do: an actuator that carries out its orders is armed only while every input has run
-    /// without a break since the arm, and is stopped by the very call that reports anything else.
+    /// Whatever inputs and operators do: an actuator that carries out its orders is armed only while every input has
+    /// run without interruption since the arm, and is stopped by the same call that reports anything else.
     #[test]
     fn nothing_moves_unless_every_input_runs(
         steps in prop::collection::vec((0..5_usize, 0..3_u8, 0..3_u64), 1..60),

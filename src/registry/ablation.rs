@@ -6,11 +6,11 @@
 //! tag = "finger"                  # the tag that names the finger, the default
 //! fingers = ["rigid", "soft"]
 //! modalities = ["vision", "vision+tactile"]
-//! [words]                         # optional: the entries that a word of `modalities` means
+//! [words]                         # optional: the entries that a word of `modalities` stands for
 //! vision = ["cam_wrist"]
 //! ```
 //!
-//! Invariant: no text makes this panic; all problems are reported at once.
+//! Invariant: no text causes a panic; all problems are reported at once.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -29,9 +29,9 @@ pub struct AblationPlan {
     pub tag: String,
     /// Fingers, by the values of that tag.
     pub fingers: Vec<String>,
-    /// Sets of modalities, words with `+` between.
+    /// Sets of modalities: words separated by `+`.
     pub modalities: Vec<String>,
-    /// The entries that a word means.
+    /// The entries that a word stands for.
     pub words: BTreeMap<String, Vec<String>>,
 }
 
@@ -52,15 +52,15 @@ impl AblationPlan {
     /// Reads a plan.
     ///
     /// # Errors
-    /// When the file cannot be read or says something wrong: then all of it.
+    /// When the file cannot be read or is invalid: then all problems.
     pub fn load(path: &Path) -> Result<Self, RegistryErrors> {
-        Self::parse(&read_file(path, "write one, or say --finger and --modality")?, path)
+        Self::parse(&read_file(path, "write one, or give --finger and --modality")?, path)
     }
 
     /// Reads the text of a plan; `path` names it in messages.
     ///
     /// # Errors
-    /// All that is wrong with the text.
+    /// All problems of the text.
     pub fn parse(text: &str, path: &Path) -> Result<Self, RegistryErrors> {
         read(&file_label(Some(path), ""), text, |root| Ok(Self::of(root)))
     }
@@ -78,7 +78,7 @@ impl AblationPlan {
                 root.report(key, format!("{key} is empty"), "name at least one");
             }
             if let Some(twice) = list.iter().enumerate().find(|(at, word)| list.iter().take(*at).any(|w| w == *word)) {
-                root.report(key, format!("{:?} stands twice", twice.1), "remove one");
+                root.report(key, format!("{:?} is listed twice", twice.1), "remove one");
             }
         }
         if let Some(words) = root.table("words") {
@@ -107,9 +107,9 @@ mod tests {
         );
         assert_eq!(plan.words["vision"], ["cam"]);
         let wrong = "episodes = 0\nfingers = [\"a\", \"a\"]\nmodality = []\n";
-        let said = AblationPlan::parse(wrong, path).unwrap_err().to_string();
-        for expected in ["out of range", "\"a\" stands twice", "unknown key \"modality\"", "modalities is missing"] {
-            assert!(said.contains(expected), "{said}");
+        let errors = AblationPlan::parse(wrong, path).unwrap_err().to_string();
+        for expected in ["out of range", "\"a\" is listed twice", "unknown key \"modality\"", "modalities is missing"] {
+            assert!(errors.contains(expected), "{errors}");
         }
     }
 }

@@ -1,9 +1,9 @@
-//! Files that follow from the registry: udev rules, module descriptors, the systemd unit.
+//! Files generated from the registry: udev rules, module descriptors, the systemd unit.
 //!
 //! Pure: what to write, not where or how (`commands::artifacts` writes).
 //!
 //! Invariant: a serial number, which a device chose, can neither add a line to a file nor match
-//! more than itself; where a format cannot say it, the file says so in a comment.
+//! more than itself; where a format cannot express it, a comment in the file states so.
 
 mod rules;
 
@@ -16,7 +16,7 @@ use super::spec::{
 };
 use crate::modality::ModalityKind;
 
-/// First line of every file written here: a file that begins otherwise is not ours to remove.
+/// First line of every generated file: a file that begins otherwise must not be removed.
 pub const HEADER: &str = "# Written by `rapid artifacts` from devices.toml: change that file and run it again.";
 
 /// Folder of the descriptors among the artifacts.
@@ -31,11 +31,11 @@ pub struct Artifact {
     pub contents: String,
     /// Its permissions.
     pub mode: u32,
-    /// What it is for.
+    /// Its purpose.
     pub kind: ArtifactKind,
 }
 
-/// What a file is for; decides where it is installed.
+/// The purpose of a file; decides where it is installed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ArtifactKind {
     /// udev rules.
@@ -46,7 +46,7 @@ pub enum ArtifactKind {
     Descriptor,
 }
 
-/// Every file that follows from `registry`.
+/// Every file generated from `registry`.
 #[must_use]
 pub fn artifacts(registry: &Registry) -> Vec<Artifact> {
     let artifact = |path: PathBuf, contents, kind| Artifact { path, contents, mode: 0o644, kind };
@@ -62,8 +62,9 @@ pub fn artifacts(registry: &Registry) -> Vec<Artifact> {
     all
 }
 
-/// `descriptors/<name>.yaml`: what a module is, for people and for other programs (paper, appendix "Module Catalog":
-/// module, slot, sensors, bring-up). The descriptor of one entry; `stable_path` is the name the rules give it, if they can.
+/// `descriptors/<name>.yaml`: a description of a module, for people and for other programs (paper, appendix "Module
+/// Catalog": module, slot, sensors, bring-up). The descriptor of one entry; `stable_path` is its name by the rules, if
+/// any.
 fn descriptor(device: &DeviceSpec, stable_path: Option<&str>) -> String {
     let slot = device.mount.map_or_else(|| "null".to_owned(), |mount| quoted(&mount.to_string()));
     format!(
@@ -128,8 +129,8 @@ fn sensor(node: &NodeSpec) -> String {
     }
 }
 
-/// A YAML double-quoted scalar (YAML 1.2.2 section 7.3.1), in ASCII: readers disagree about line
-/// separators and non-characters.
+/// A YAML double-quoted scalar (YAML 1.2.2 section 7.3.1), in ASCII: parsers differ in their treatment of
+/// line separators and non-characters.
 fn quoted(text: &str) -> String {
     let mut quoted = String::with_capacity(text.len() + 2);
     quoted.push('"');
@@ -149,7 +150,7 @@ fn quoted(text: &str) -> String {
 /// Where the unit expects the registry.
 pub const SYSTEM_REGISTRY: &str = "/etc/rapid/devices.toml";
 
-/// Device nodes: the group that may open them, that of our rules or of udev's own, and what /proc/devices calls them.
+/// Device nodes: the group that may open them, set by our rules or by udev's, and their name in /proc/devices.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 struct Nodes {
     group: &'static str,
@@ -163,14 +164,14 @@ const KEYS: Nodes = Nodes { group: "input", kind: "char-input" };
 /// A stop, or the brake of a joint, is a line of a GPIO chip.
 const GPIO: Nodes = Nodes { group: "gpio", kind: "char-gpiochip" };
 
-/// What the entries of a registry need of the system.
+/// What the entries of a registry require of the system.
 #[derive(Debug, Default)]
 struct Needs {
     /// Kinds of sockets, besides those of udev, the journal and programs. A CAN adapter on a serial line has none.
     sockets: BTreeSet<&'static str>,
     /// Nodes that only some registries need.
     nodes: BTreeSet<Nodes>,
-    /// Programs of others run: nodes and hooks.
+    /// Other programs are run: nodes and hooks.
     programs: bool,
     /// Motors have a guard, which outlives the program.
     guard: bool,
@@ -218,7 +219,7 @@ impl Needs {
         needs
     }
 
-    /// Of nodes that only some registries need: commands that make their groups, the groups, and what is allowed.
+    /// For nodes that only some registries need: commands that create their groups, the groups, and the permissions.
     fn nodes(&self) -> (String, String, String) {
         let (mut make, mut groups, mut allow) = (String::new(), String::new(), String::new());
         for Nodes { group, kind } in &self.nodes {
@@ -232,13 +233,13 @@ impl Needs {
         (make, groups, allow)
     }
 
-    /// `RestrictAddressFamilies=`: udev speaks netlink, the journal and programs `AF_UNIX`.
+    /// `RestrictAddressFamilies=`: udev uses netlink, the journal and programs `AF_UNIX`.
     fn families(&self) -> String {
         let all = ["AF_UNIX", "AF_NETLINK"].into_iter().chain(self.sockets.iter().copied());
         all.collect::<Vec<_>>().join(" ")
     }
 
-    /// Settings that only some registries permit, a line each.
+    /// Settings that only some registries permit, one line each.
     fn only_without(&self) -> String {
         let network = if self.sockets.iter().any(|family| family.starts_with("AF_INET")) { "" } else { NO_NETWORK };
         let programs = if self.programs { PROGRAMS } else { "MemoryDenyWriteExecute=yes\n" };
@@ -246,21 +247,21 @@ impl Needs {
     }
 }
 
-/// Of a unit with a stop on a serial port of the board.
+/// For a unit with a stop on a serial port of the board.
 const UARTS: &str = "DeviceAllow=char-ttyS rw\nDeviceAllow=char-ttyAMA rw\n";
 
-/// Of a unit without sockets for the network.
+/// For a unit without sockets for the network.
 const NO_NETWORK: &str = "IPAddressDeny=any\n";
 
-/// Of a unit with motors.
+/// For a unit with motors.
 const GUARDED: &str = "\
-# Motors have a guard: a process of its own that stops them if rapid is killed. It ends by itself.
+# Motors have a guard: a separate process that stops them if rapid is killed. It needs no signal to exit.
 KillMode=process
-# What keeps the beat of the motors is not to wait for a disk because memory is short.
+# The thread that controls the motors must not wait for a disk when memory is short.
 LimitMEMLOCK=infinity
 ";
 
-/// What whoever has programs of their own should know.
+/// A hint for users with programs.
 const PROGRAMS: &str = "\
 # Programs run under these settings as well. One that needs the network gets it from `systemctl edit rapid`:
 #   [Service]
@@ -274,14 +275,14 @@ const PROGRAMS: &str = "\
 /// and groups follow from them. `systemd-analyze security` gives every unit 2.0 or better (a test, on every kind of
 /// registry).
 ///
-/// What the unit deliberately leaves out, as settings are named in systemd.exec(5):
+/// Settings that the unit deliberately omits, as named in systemd.exec(5):
 ///
 /// * `PrivateTmp`, `PrivateNetwork`, `PrivateDevices`: subscribers find the bus through `/tmp` and `/dev/shm`, udev
-///   reports through a netlink socket of the machine's network, and devices are what the program is for.
+///   reports through a netlink socket of the machine's network, and the program needs devices.
 /// * `RemoveIPC`: it would remove from `/dev/shm` what the bus shares with subscribers of the same user, and leave
 ///   the other half in `/tmp`.
-/// * `ProcSubset`: who holds the mask is in `/proc/locks`, routes are in `/proc/net`, the boot's id and the machine's
-///   name are in `/proc/sys`.
+/// * `ProcSubset`: the holder of the mask is in `/proc/locks`, routes are in `/proc/net`, the boot's id and the
+///   machine's name are in `/proc/sys`.
 /// * `RestrictRealtime`: the thread that publishes the mask runs with real-time priority.
 ///
 /// The unit. The rig's name is the only thing taken from the registry; its characters are letters,
@@ -320,13 +321,13 @@ UMask=0027
 # SIGINT ends the episode in progress and closes its file; that takes one fsync.
 KillSignal=SIGINT
 {kill_mode}TimeoutStopSec=30
-# An episode that is BAD is no failure of the service.
+# A BAD episode is not a failure of the service.
 SuccessExitStatus=4
 Restart=on-failure
 RestartSec=2
 # A rapid that hangs is killed, and started again.
 WatchdogSec=20
-# The thread `mask` asks for real-time scheduling.
+# The thread `mask` requests real-time scheduling.
 LimitRTPRIO=80
 
 # What it may touch: {touched}, its recordings, and the bus that other programs

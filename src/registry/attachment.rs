@@ -1,6 +1,6 @@
-//! A device that is physically there: what it says it is, and the node to open.
+//! An attached device: its identity as it reports it, and the node to open.
 //!
-//! Invariant: strings here come from the device and are not to be trusted.
+//! Invariant: strings here come from the device and are untrusted.
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -13,7 +13,7 @@ use super::scenario::{SimDevice, SimSource};
 use crate::provenance::KernelDriver;
 use crate::time::Stamp;
 
-/// What a USB device says it is, and where it is plugged in.
+/// The identity that a USB device reports, and where it is plugged in.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Default, Serialize)]
 pub struct UsbIdentity {
     /// Vendor id.
@@ -30,31 +30,31 @@ pub struct UsbIdentity {
     pub product: Option<String>,
     /// Manufacturer string, if it has one.
     pub manufacturer: Option<String>,
-    /// Release of the device, by which makers number their firmware: `bcdDevice` as `4.18`
+    /// Release of the device, used by makers to number their firmware: `bcdDevice` as `4.18`
     /// (USB 2.0, table 9-8).
     pub firmware: Option<String>,
 }
 
 /// A vendor or product id as `devices.toml` and `lsusb` write it: `046d`.
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "the signature serde asks for")]
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "the signature serde requires")]
 pub(super) fn usb_id<S: serde::Serializer>(id: &u16, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.collect_str(&format_args!("{id:04x}"))
 }
 
-/// What a device on the network says it is, and where it was found.
+/// The identity that a device on the network reports, and where it was found.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Default, Serialize)]
 pub struct LanIdentity {
-    /// The entry that asked for it: nobody else on the network is looked at.
+    /// The entry that it was found for: no other devices on the network are searched for.
     #[serde(skip)]
     pub entry: String,
-    /// Where it answers, for example `192.168.1.7:8080`.
+    /// Its address, for example `192.168.1.7:8080`.
     pub address: String,
-    /// Name of the service instance it announced, if it was found by that.
+    /// Name of the service instance it announced, if it was found by one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub instance: Option<String>,
 }
 
-/// What a device says it is.
+/// The identity that a device reports.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize)]
 #[serde(untagged)]
 pub enum Unit {
@@ -74,7 +74,7 @@ impl Unit {
         }
     }
 
-    /// What tells it from others of its model, if it says so: a serial number, or the name of its service.
+    /// What distinguishes it from others of its model, if it reports that: a serial number, or the name of its service.
     #[must_use]
     pub fn serial(&self) -> Option<&str> {
         match self {
@@ -92,7 +92,7 @@ impl Unit {
         }
     }
 
-    /// Where it is, for people.
+    /// Its location as text for the user.
     #[must_use]
     pub fn location(&self) -> String {
         let what = if self.usb().is_some() { "port" } else { "address" };
@@ -115,17 +115,17 @@ impl From<UsbIdentity> for Unit {
     }
 }
 
-/// When a device on the network was last heard of by its driver, for whoever keeps its lease.
+/// When the driver of a device on the network last received data from it, for the code that tracks its lease.
 #[derive(Debug, Clone, Default)]
 pub struct Heard(Arc<AtomicU64>);
 
 impl Heard {
-    /// It was heard of, now.
+    /// Data was received now.
     pub fn now(&self) {
         self.0.store(Stamp::now().0, Ordering::Relaxed);
     }
 
-    /// When that was; the beginning of time if it never was.
+    /// The time of the last data; zero if there was none.
     #[must_use]
     pub fn at(&self) -> Stamp {
         Stamp(self.0.load(Ordering::Relaxed))
@@ -133,7 +133,7 @@ impl Heard {
 }
 
 impl PartialEq for Heard {
-    /// Two nodes are the same whenever they were heard of.
+    /// Two nodes are equal regardless of when data was last received from them.
     fn eq(&self, _: &Self) -> bool {
         true
     }
@@ -153,9 +153,9 @@ pub enum DeviceNode {
     Net(String),
     /// A device on the network.
     Lan {
-        /// Where it is to be reached.
+        /// Its address.
         address: SocketAddr,
-        /// When its driver heard of it.
+        /// When its driver last received data from it.
         heard: Heard,
     },
     /// A simulated device.
@@ -165,8 +165,8 @@ pub enum DeviceNode {
 /// One node of one attached device.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Attachment {
-    /// Path of the node in sysfs, unique among attached nodes; it lies below the path of its USB
-    /// device, which is how a removal of either is recognised.
+    /// Path of the node in sysfs, unique among attached nodes; it is below the path of its USB
+    /// device, by which a removal of either is recognised.
     pub syspath: PathBuf,
     /// The node.
     pub node: DeviceNode,
@@ -177,7 +177,7 @@ pub struct Attachment {
 }
 
 impl Attachment {
-    /// Does the removal of `syspath` (a node, its USB device, or a hub above) take this node away?
+    /// Whether the removal of `syspath` (a node, its USB device, or a hub above) removes this node.
     #[must_use]
     pub fn is_under(&self, syspath: &Path) -> bool {
         self.syspath.starts_with(syspath)
@@ -185,13 +185,13 @@ impl Attachment {
 }
 
 impl DeviceNode {
-    /// Is it a topic of a recorded episode, which needs no program?
+    /// Whether it is a topic of a recorded episode, which needs no program.
     #[must_use]
     pub fn is_recording(&self) -> bool {
         matches!(self, Self::Sim(device) if matches!(device.source, SimSource::Replay { .. }))
     }
 
-    /// The node as shown to people.
+    /// The node as shown to the user.
     #[must_use]
     pub fn label(&self) -> String {
         match self {

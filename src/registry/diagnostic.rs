@@ -1,4 +1,4 @@
-//! Mistakes in a file that a person wrote, worded so that the person can fix them.
+//! Mistakes in a file written by a person, worded so that the person can fix them.
 //!
 //! Invariant: text taken from the file is shown escaped: no file can send control characters to a
 //! terminal.
@@ -42,7 +42,7 @@ impl fmt::Display for Diagnostic {
     }
 }
 
-/// Everything that is wrong in one file, in the order of the file. Never empty.
+/// All problems of one file, in the order of the file. Never empty.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{}", self.listing())]
 pub struct RegistryErrors {
@@ -65,7 +65,7 @@ impl RegistryErrors {
 /// The name in `known` that was probably meant by `given`.
 pub(super) fn nearest<'k>(given: &str, known: impl IntoIterator<Item = &'k str>) -> Option<&'k str> {
     let given = given.to_lowercase();
-    // Comparing takes the product of the lengths: no name we know is nearly this long.
+    // Comparing takes the product of the lengths: no known name is nearly this long.
     if given.len() > 100 {
         return None;
     }
@@ -78,7 +78,7 @@ pub(super) fn nearest<'k>(given: &str, known: impl IntoIterator<Item = &'k str>)
         .map(|(_, name)| name)
 }
 
-/// The fix for a name that is not known: the nearest one, or all there are.
+/// The fix for an unknown name: the nearest known one, or a list of all.
 pub(crate) fn did_you_mean<S: AsRef<str>>(given: &str, known: impl IntoIterator<Item = S>, what: &str) -> String {
     let known: Vec<S> = known.into_iter().collect();
     let known: Vec<&str> = known.iter().map(AsRef::as_ref).collect();

@@ -1,11 +1,11 @@
-//! Changing `devices.toml` without touching what a person wrote in it: entries are added at its end
-//! and taken out whole.
+//! Changing `devices.toml` without touching text that a person wrote in it: entries are added at its end
+//! and removed as a whole.
 //!
-//! Pure: from one text to the next; who writes the file parses it first.
+//! Pure: from one text to the next; the caller that writes the file parses it first.
 //!
-//! Invariant: every byte of the old text is in the new one, but for those of an entry taken out and of a key renamed.
-//! Invariant: a value, which a device may have chosen, is written as the TOML text that means it, and
-//! a comment is one line.
+//! Invariant: every byte of the old text is in the new one, except those of a removed entry and of a renamed key.
+//! Invariant: a value, which a device may have chosen, is written as TOML text that evaluates to it, and a comment is
+//! one line.
 
 use std::ops::Range;
 
@@ -20,7 +20,7 @@ pub enum Setting {
     Whole(i64),
     /// A list of texts.
     Texts(Vec<String>),
-    /// As a person typed it: a number, a list, true or false if TOML takes it for one, otherwise text.
+    /// As typed by a person: a number, a list, true or false if TOML parses it as one, otherwise text.
     Typed(String),
 }
 
@@ -31,19 +31,19 @@ pub struct NewEntry {
     pub name: String,
     /// Lines above it.
     pub comments: Vec<String>,
-    /// Keys and values in their order; `camera.width` stands in the table `[device.NAME.camera]`.
+    /// Keys and values in their order; `camera.width` goes into the table `[device.NAME.camera]`.
     pub keys: Vec<(String, Setting)>,
-    /// The entry is written as a comment, for a person to complete: why.
+    /// The reason why the entry is written as a comment, for a person to complete.
     pub held_back: Option<String>,
 }
 
 /// Why a text cannot be changed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum EditError {
-    /// It is no TOML.
+    /// It is not TOML.
     #[error("not TOML: {0}")]
     Syntax(String),
-    /// A key of a new entry is no key.
+    /// A key of a new entry is invalid.
     #[error("{key:?} cannot be set: {reason}")]
     Key {
         /// The key.
@@ -54,7 +54,7 @@ pub enum EditError {
     /// There is no such entry.
     #[error("no entry [device.{0}]")]
     NoEntry(String),
-    /// It is not written as a table of its own.
+    /// It is not written as a separate table.
     #[error("[device.{0}] is not written as a table under its own header: take it out by hand")]
     NoHeader(String),
 }
@@ -62,7 +62,7 @@ pub enum EditError {
 /// `text` with the entries at its end.
 ///
 /// # Errors
-/// When a key is none, or is given twice with different meanings.
+/// When a key is invalid, or is given twice with different meanings.
 pub fn append(text: &str, entries: &[NewEntry]) -> Result<String, EditError> {
     let mut added = String::new();
     for entry in entries {
@@ -74,7 +74,7 @@ pub fn append(text: &str, entries: &[NewEntry]) -> Result<String, EditError> {
         new.push('\n');
     }
     let added = if new.is_empty() { added.trim_start_matches('\n') } else { &added };
-    // A file from elsewhere keeps its kind of line ends.
+    // The existing kind of line ends is kept.
     if text.contains("\r\n") {
         new.push_str(&added.replace('\n', "\r\n"));
     } else {
@@ -83,7 +83,7 @@ pub fn append(text: &str, entries: &[NewEntry]) -> Result<String, EditError> {
     Ok(new)
 }
 
-/// The lines of one entry, each with its end.
+/// The lines of one entry, including line ends.
 ///
 /// # Errors
 /// As [`append`].
@@ -111,11 +111,11 @@ pub fn written(entry: &NewEntry) -> Result<String, EditError> {
     Ok(text)
 }
 
-/// `text` without the entry `name`: its tables, what is written among them, and the comment right
-/// above. Comments that an empty line parts from it stay.
+/// `text` without the entry `name`: its tables, the text between them, and the comment directly
+/// above. Comments separated from it by an empty line stay.
 ///
 /// # Errors
-/// When there is no such entry or it is not written under headers of its own.
+/// When there is no such entry or it is not written under separate headers.
 pub fn remove(text: &str, name: &str) -> Result<String, EditError> {
     let document = Document::parse(text).map_err(|error| EditError::Syntax(error.message().to_owned()))?;
     let entry = document.as_table().get("device").and_then(|devices| devices.get(name));
@@ -145,7 +145,7 @@ pub fn remove(text: &str, name: &str) -> Result<String, EditError> {
     for range in gone {
         new.push_str(text.get(at..range.start).unwrap_or_default());
         at = range.end;
-        // One of the two empty lines around it.
+        // One of the two empty lines around it is removed.
         if new.is_empty() || new.ends_with("\n\n") || new.ends_with("\n\r\n") {
             let rest = text.get(at..).unwrap_or_default();
             at += rest.len() - rest.strip_prefix("\r\n").or(rest.strip_prefix('\n')).unwrap_or(rest).len();
@@ -153,7 +153,7 @@ pub fn remove(text: &str, name: &str) -> Result<String, EditError> {
     }
     let rest = text.get(at..).unwrap_or_default();
     new.push_str(rest);
-    // The empty line that parted it from what was above.
+    // The empty line between it and the text above is removed.
     if rest.is_empty() {
         let end = new.trim_end_matches(['\n', '\r']).len();
         new.truncate(end);
@@ -165,7 +165,7 @@ pub fn remove(text: &str, name: &str) -> Result<String, EditError> {
 }
 
 /// `text` with each table of a serial line that has its old name, `[device.NAME.serial]`, under the present one,
-/// `[device.NAME.tty]`; one that is written as dotted keys stays, and so does a text that is no TOML.
+/// `[device.NAME.tty]`; one that is written as dotted keys stays, and so does a text that is not TOML.
 #[must_use]
 pub fn renamed(text: &str) -> String {
     let Ok(document) = Document::parse(text) else { return text.to_owned() };
@@ -185,13 +185,13 @@ pub fn renamed(text: &str) -> String {
     new
 }
 
-/// Does `text` name no device yet? False of a text that is no TOML.
+/// Whether `text` contains no device yet. False for a text that is not TOML.
 #[must_use]
 pub fn has_no_entries(text: &str) -> bool {
     Document::parse(text).is_ok_and(|document| !document.as_table().contains_key("device"))
 }
 
-/// A table under a header of its own.
+/// A table under a separate header.
 struct Placed {
     path: Vec<String>,
     header: Range<usize>,
@@ -223,7 +223,7 @@ fn end_of_values(table: &Table) -> Option<usize> {
     table.iter().filter_map(|(_, item)| end(item)).max()
 }
 
-/// Where the line of `at` begins, or the comment right above it.
+/// The beginning of the line of `at`, or of the comment directly above it.
 fn with_comment(text: &str, at: usize) -> usize {
     let line = |at: usize| text.get(..at).and_then(|before| before.rfind('\n')).map_or(0, |newline| newline + 1);
     let mut begin = line(at);
@@ -237,7 +237,7 @@ fn with_comment(text: &str, at: usize) -> usize {
     begin
 }
 
-/// The end of the line of `at`, and of the comment right below it.
+/// The end of the line of `at`, or of the comment directly below it.
 fn end_of_paragraph(text: &str, at: usize) -> usize {
     let after =
         |at: usize| text.get(at..).and_then(|rest| rest.find('\n')).map_or(text.len(), |newline| at + newline + 1);
@@ -260,7 +260,7 @@ fn put(device: &mut Table, key: &str, setting: &Setting) -> Result<(), EditError
     let mut table = device;
     for part in parts {
         let item = table.entry(part).or_insert_with(|| Item::Table(Table::new()));
-        table = item.as_table_mut().ok_or_else(|| refused("it lies in what is no table"))?;
+        table = item.as_table_mut().ok_or_else(|| refused("its parent is not a table"))?;
     }
     if table.contains_table(last) {
         return Err(refused("it is a table"));

@@ -1,19 +1,19 @@
-//! Which attached device is which entry of the registry.
+//! Matching attached devices to the entries of the registry.
 //!
-//! Pure: from what is attached and detached to the modality that begins or ends.
+//! Pure: from attached and detached devices to the modality that begins or ends.
 //!
 //! 1. A unit with the vid, pid and serial number of an entry belongs to that entry alone.
 //! 2. Otherwise a unit at the port of an entry that has a port and no serial number belongs to it.
-//! 3. A device on the network belongs to the entry that looked for it.
+//! 3. A device on the network belongs to the entry that it was found for.
 //! 4. Otherwise it is one of the interchangeable units of the entries with neither: it takes the
 //!    entry it had last, if that is free (recognised by its serial number if it has one, otherwise
-//!    by its port), or the free entry with the lowest bit, and stays there while plugged.
+//!    by its port), or the free entry with the lowest bit, and keeps it while plugged.
 //!
-//! A unit whose entry is taken waits: a device may be seen in its new port before its old port is
-//! seen empty. It begins when the entry is freed.
+//! A unit whose entry is taken waits: a device may appear in its new port before it disappears from its
+//! old one. It begins when the entry is freed.
 //!
 //! Invariant: an entry has at most one node, a node at most one entry.
-//! Invariant: two units never collapse into one entry, and one unit (one port) never takes two
+//! Invariant: two units are never assigned to one entry, and one unit (one port) never takes two
 //! entries of one kind.
 
 use std::collections::VecDeque;
@@ -24,24 +24,24 @@ use super::scenario::{SimSource, TaskPart};
 use super::spec::{DeviceSpec, IdentitySpec, NodeSpec, Opens, Registry};
 use crate::modality::ModalityId;
 
-/// What an attached node is to the rig.
+/// The result of matching an attached node.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Assignment {
     /// It is this entry.
     Entry(ModalityId),
-    /// It fits an entry that is taken, and takes over when that is freed.
+    /// It fits an entry that is taken, and is assigned to it when that is freed.
     Waiting {
-        /// For people.
+        /// As text for the user.
         reason: String,
     },
-    /// No entry means this device.
+    /// No entry matches this device.
     Unregistered {
-        /// For people: what the nearest entries ask for.
+        /// As text for the user: what the nearest entries require.
         reason: String,
     },
     /// Its device is registered, but this node is not the one the entry reads.
     WrongNode {
-        /// For people.
+        /// As text for the user.
         reason: String,
     },
 }
@@ -51,16 +51,16 @@ pub enum Assignment {
 pub struct Detached {
     /// Modalities whose node is gone, ascending by bit.
     pub freed: Vec<ModalityId>,
-    /// Nodes that waited and now are an entry, perhaps one just freed.
+    /// Nodes that waited and are now assigned, perhaps to an entry just freed.
     pub assigned: Vec<(ModalityId, Attachment)>,
 }
 
-/// What a node would be, for `rapid devices`.
+/// How a node would be matched, for `rapid devices`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Explanation {
     /// The entries it fits, best rule first.
     pub fits: Vec<ModalityId>,
-    /// Which entry and why, or what the nearest entries ask for; one line each.
+    /// Which entry and why, or what the nearest entries require; one line each.
     pub reasons: Vec<String>,
 }
 
@@ -71,7 +71,7 @@ pub struct Assigner {
     entries: Vec<Entry>,
     /// In the order they were attached.
     attached: Vec<Node>,
-    /// Which interchangeable unit had which entry last, oldest first.
+    /// The last entry of each interchangeable unit, oldest first.
     remembered: VecDeque<(UsbIdentity, ModalityId)>,
 }
 
@@ -81,11 +81,11 @@ struct Node {
     assigned: Option<ModalityId>,
 }
 
-/// A rig never sees more units of one kind than this; a device that makes up serial numbers does.
+/// A rig never has more units of one kind than this; a device that invents serial numbers may.
 const MOST_REMEMBERED: usize = 256;
 
 impl Assigner {
-    /// With nothing attached.
+    /// Without attached nodes.
     #[must_use]
     pub fn new(registry: &Registry) -> Self {
         let mut entries: Vec<_> = registry.devices.iter().map(Entry::new).collect();
@@ -93,8 +93,8 @@ impl Assigner {
         Self { entries, attached: Vec::new(), remembered: VecDeque::new() }
     }
 
-    /// Is another device known at this node's path? Its removal was missed: detach that path first,
-    /// to learn which modality ends.
+    /// Whether another device is known at this node's path. Then its removal was missed: detach that path first,
+    /// to find out which modality ends.
     #[must_use]
     pub fn replaces(&self, attachment: &Attachment) -> bool {
         self.attached
@@ -102,7 +102,7 @@ impl Assigner {
             .any(|node| node.attachment.syspath == attachment.syspath && node.attachment.unit != attachment.unit)
     }
 
-    /// A node is there. Reported twice, the same node gives the same answer.
+    /// A node was attached. The same node reported twice gives the same result.
     pub fn attach(&mut self, attachment: &Attachment) -> Assignment {
         let known = self.attached.iter().position(|node| node.attachment.syspath == attachment.syspath);
         if let Some(node) = known.and_then(|index| self.attached.get_mut(index)) {
@@ -118,7 +118,7 @@ impl Assigner {
         let assignment = self.choose(attachment);
         let assigned = match &assignment {
             Assignment::Entry(id) => Some(*id),
-            // Kept: it may begin when an entry is freed.
+            // Kept: it may be assigned when an entry is freed.
             Assignment::Waiting { .. } | Assignment::WrongNode { .. } => None,
             Assignment::Unregistered { .. } => return assignment,
         };
@@ -141,13 +141,13 @@ impl Assigner {
         detached
     }
 
-    /// The node that is entry `id` now.
+    /// The node that is assigned to entry `id` now.
     #[must_use]
     pub fn attached_as(&self, id: ModalityId) -> Option<&Attachment> {
         self.attached.iter().find(|node| node.assigned == Some(id)).map(|node| &node.attachment)
     }
 
-    /// What a node would be if every entry were free.
+    /// How a node would be matched if every entry were free.
     #[must_use]
     pub fn explain(&self, attachment: &Attachment) -> Explanation {
         let fitting = self.fitting(attachment);
@@ -200,7 +200,7 @@ impl Assigner {
         }
     }
 
-    /// The entries a node fits by the best rule that applies, ascending by bit.
+    /// The entries that a node fits by the best applicable rule, ascending by bit.
     fn fitting(&self, attachment: &Attachment) -> Vec<(Rule, &Entry)> {
         let fits: Vec<_> = self
             .entries
@@ -212,7 +212,7 @@ impl Assigner {
         fits.into_iter().filter(|(rule, _)| Some(*rule) == best).collect()
     }
 
-    /// Another node of the same unit that already is an entry this one fits: a camera may offer
+    /// Another node of the same unit that is already assigned to an entry this one fits: a camera may have
     /// several capture nodes.
     fn other_node(&self, attachment: &Attachment) -> Option<&Node> {
         let usb = attachment.unit.usb()?;
@@ -226,7 +226,7 @@ impl Assigner {
 
     fn refuse(&self, attachment: &Attachment) -> Assignment {
         let entry = self.entries.iter().find(|entry| rule(entry, &attachment.unit).is_some());
-        // Hubs and keyboards are USB devices too: only one that an entry nearly means is worth a word.
+        // Hubs and keyboards are USB devices too: only one that nearly matches an entry is reported.
         let nearly = |entry: &Entry| entry.opens == Some(Opens::Usb) && entry.is_model(&attachment.unit);
         if entry.is_none() && matches!(attachment.node, DeviceNode::Usb(_)) && !self.entries.iter().any(nearly) {
             return Assignment::WrongNode { reason: format!("no entry reads {}", attachment.node.label()) };
@@ -246,12 +246,13 @@ impl Assigner {
             .iter()
             .filter(|entry| entry.is_model(&attachment.unit))
             .filter_map(|entry| Some((entry, entry.identity.usb()?)))
-            .map(|(entry, wished)| {
+            .map(|(entry, expected)| {
                 let name = &entry.name;
-                match (&wished.serial, &wished.port) {
+                match (&expected.serial, &expected.port) {
                     (Some(serial), _) if usb.serial.as_deref() != Some(serial) => {
-                        let says = usb.serial.as_ref().map_or("has none".to_owned(), |own| format!("says {own:?}"));
-                        format!("vid:pid match [device.{name}], but its serial is {serial:?} and this unit {says}")
+                        let reported =
+                            usb.serial.as_ref().map_or("has none".to_owned(), |own| format!("reports {own:?}"));
+                        format!("vid:pid match [device.{name}], but its serial is {serial:?} and this unit {reported}")
                     }
                     (None, Some(port)) if *port != usb.port => {
                         format!(
@@ -276,7 +277,7 @@ impl Assigner {
             let found = self.remembered.iter().rev().filter(|(past, _)| model(past) && same(past));
             found.map(|(_, id)| *id).collect()
         };
-        // Cheap devices share one serial number: the port distinguishes twins.
+        // Cheap devices share one serial number: the port distinguishes identical units.
         let mut ids = newest(&|past| past.serial == usb.serial && past.port == usb.port);
         if usb.serial.is_some() {
             ids.extend(newest(&|past| past.serial == usb.serial));
@@ -297,7 +298,7 @@ impl Assigner {
         self.attached.push(node);
     }
 
-    /// Gives free entries to the nodes that wait, those that came first first.
+    /// Assigns free entries to the nodes that wait, in the order of their arrival.
     fn promote(&mut self) -> Vec<(ModalityId, Attachment)> {
         let mut begun = Vec::new();
         let waiting: Vec<Attachment> =
@@ -323,7 +324,7 @@ struct Entry {
     is_process: bool,
 }
 
-/// The rule of the module above by which a unit fits an entry.
+/// The rule of the module's comment by which a unit fits an entry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Rule {
     Serial,
@@ -352,10 +353,10 @@ impl Entry {
         }
     }
 
-    /// Of the model of this unit?
+    /// Whether the model matches this unit.
     fn is_model(&self, unit: &Unit) -> bool {
-        let (Some(wished), Some(usb)) = (self.identity.usb(), unit.usb()) else { return false };
-        (wished.vid, wished.pid) == (usb.vid, usb.pid)
+        let (Some(expected), Some(usb)) = (self.identity.usb(), unit.usb()) else { return false };
+        (expected.vid, expected.pid) == (usb.vid, usb.pid)
     }
 
     fn reads(&self, node: &DeviceNode) -> bool {
@@ -366,7 +367,7 @@ impl Entry {
             DeviceNode::Net(_) => self.opens == Some(Opens::Net),
             DeviceNode::Lan { .. } => self.opens.is_none(),
             DeviceNode::Sim(device) => match device.source {
-                // What stands for a device that has neither a picture's node nor a line sends as if it had.
+                // A simulated device without a picture node or a line sends as if it had one.
                 SimSource::Camera { .. } | SimSource::Serial { .. }
                     if matches!(self.opens, None | Some(Opens::Net)) =>
                 {
@@ -379,7 +380,7 @@ impl Entry {
                     self.opens == Some(Opens::Tty) && !self.is_process
                 }
                 SimSource::Process => self.is_process,
-                // A recorded topic stands for whatever recorded it.
+                // A recorded topic is read in place of the device that was recorded.
                 SimSource::Replay { .. } => true,
             },
         }
@@ -387,15 +388,15 @@ impl Entry {
 }
 
 fn rule(entry: &Entry, unit: &Unit) -> Option<Rule> {
-    let (wished, usb) = match (&entry.identity, unit) {
-        (IdentitySpec::Usb(wished), Unit::Usb(usb)) => (wished, usb),
+    let (expected, usb) = match (&entry.identity, unit) {
+        (IdentitySpec::Usb(expected), Unit::Usb(usb)) => (expected, usb),
         (IdentitySpec::Lan {}, Unit::Lan(lan)) => return (lan.entry == entry.name).then_some(Rule::Lan),
         _ => return None,
     };
-    if (wished.vid, wished.pid) != (usb.vid, usb.pid) {
+    if (expected.vid, expected.pid) != (usb.vid, usb.pid) {
         return None;
     }
-    match (&wished.serial, &wished.port) {
+    match (&expected.serial, &expected.port) {
         (Some(serial), _) => (usb.serial.as_ref() == Some(serial)).then_some(Rule::Serial),
         (None, Some(port)) => (usb.port == *port).then_some(Rule::Port),
         (None, None) => Some(Rule::Model),

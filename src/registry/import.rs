@@ -1,11 +1,11 @@
-//! Reading the registry and the mask layout of `rapid_driver`, for their devices to be taken over.
+//! Reading the registry and the mask layout of `rapid_driver`, for importing their devices.
 //!
 //! `registry.toml` is a list of `[[device]]` with `name`, `backend` (`usb`, the default, or `mdns`),
 //! `vid`, `pid`, `serial`, `service_type` and shell commands; every value is text and may be empty.
 //! `mask_layout.toml` has `device_order = [names]`, whose index is the bit. (`aod321/rapid_driver`,
 //! `src/registry.rs` and `src/mask/layout.rs`.)
 //!
-//! Invariant: no text makes this panic; all problems of a text are reported at once.
+//! Invariant: no text causes a panic; all problems of a text are reported at once.
 
 use std::path::Path;
 
@@ -16,7 +16,7 @@ use super::spec::Hooks;
 /// A `[[device]]` of `rapid_driver`.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Foreign {
-    /// Its name, which may be none of ours.
+    /// Its name, which may be invalid here.
     pub name: String,
     /// USB vendor and product id, if it is found by USB.
     pub usb: Option<(u16, u16)>,
@@ -31,14 +31,14 @@ pub struct Foreign {
 /// Reads a `registry.toml`; `path` names it in messages.
 ///
 /// # Errors
-/// All that is wrong with the text.
+/// All problems of the text.
 pub fn devices(text: &str, path: &Path) -> Result<Vec<Foreign>, RegistryErrors> {
     let label = file_label(Some(path), "");
     read(&label, text, |root| {
         let wrong = |message: &str, fix: &str| Err(RegistryErrors::whole_file(label.clone(), message, fix));
         if root.is_table("device") {
             let fix = "it has [device.NAME] tables, as a devices.toml of rapid: use it with --config";
-            return wrong("this is no registry of rapid_driver", fix);
+            return wrong("this is not a registry of rapid_driver", fix);
         }
         if !root.has("device") {
             let fix = "it lists devices as [[device]]; its usual place is ~/.config/rapid_driver/registry.toml";
@@ -91,7 +91,7 @@ fn device(section: &Section<'_>) -> Foreign {
 /// Reads a `mask_layout.toml`: names in the order of their bits.
 ///
 /// # Errors
-/// All that is wrong with the text.
+/// All problems of the text.
 pub fn layout(text: &str, path: &Path) -> Result<Vec<String>, RegistryErrors> {
     let label = file_label(Some(path), "");
     read(&label, text, |root| {
@@ -110,7 +110,7 @@ mod tests {
     const PATH: &str = "registry.toml";
 
     #[test]
-    fn devices_are_read_as_they_are_written() {
+    fn devices_are_read() {
         let text = "[[device]]\nname = \"cam_left\"\nvid = \"046d\"\npid = \"082d\"\nserial = \"ABC\"\n\
             on_attach = \"python3 cam.py --dev $DEVICE_NODE\"\non_detach = \"\"\n\n\
             [[device]]\nname = \"iPhone\"\nbackend = \"mdns\"\nservice_type = \"_iphonevio._tcp\"\nsensor_type = \"pose\"\n";
@@ -126,7 +126,7 @@ mod tests {
     fn mistakes_are_named_with_their_place() {
         for (text, expected) in [
             ("", "no [[device]] in it"),
-            ("[device.cam]\nvid = \"1\"\n", "this is no registry of rapid_driver"),
+            ("[device.cam]\nvid = \"1\"\n", "this is not a registry of rapid_driver"),
             ("[[device]]\nvid = \"1\"\npid = \"2\"\n", "registry.toml:1:1: [device 1] name is missing"),
             ("[[device]]\nname = \"a\"\n", "[device 1] vid is missing"),
             (

@@ -1,8 +1,8 @@
-//! The registry: `devices.toml`, the single point where a device is made known.
+//! The registry: `devices.toml`, the only place where devices are declared.
 //!
-//! Text -> `section` (tables with positions) -> `parse` -> [`Registry`]; from it follow which
-//! attached device is which entry (`identity`), what a simulation plays (`scenario_file`) and the
-//! files udev and systemd read (`artifacts`).
+//! Text -> `section` (tables with positions) -> `parse` -> [`Registry`]; from it are derived the assignment of
+//! attached devices to entries (`identity`), the content of a simulation (`scenario_file`) and the
+//! files read by udev and systemd (`artifacts`).
 
 pub mod ablation;
 pub mod artifacts;

@@ -1,9 +1,9 @@
-//! From the text of `devices.toml` to a [`Registry`], or to everything that is wrong with it.
+//! From the text of `devices.toml` to a [`Registry`], or to a list of all its problems.
 //!
-//! Text -> [`toml::de::DeTable`] -> one draft an entry (`device`) -> checks between entries
+//! Text -> [`toml::de::DeTable`] -> one draft per entry (`device`) -> checks between entries
 //! (here) -> depths within the memory budget, and whether the window around each tick fits the rates (here).
 //!
-//! Invariant: no text makes this panic.
+//! Invariant: no text causes a panic.
 //! Invariant: all problems of a file are reported at once, each with its place and a fix.
 
 mod device;
@@ -31,18 +31,18 @@ use verdict::Whose;
 pub(super) use identity::is_port;
 pub use identity::{like_a_name, name_problem};
 
-/// The registry used when there is no file: the rig `rapid --sim` simulates.
+/// The registry used when there is no file: the rig that `rapid --sim` simulates.
 pub const BUILTIN: &str = include_str!("../../devices.toml");
 
 /// Topics `rapid` publishes itself.
 const OWN_TOPICS: [&str; 5] = ["/rapid/mask", "/rapid/frame", "/rapid/event", "/rapid/log", "/action"];
 
-/// A registry, and what should be known about it.
+/// A registry, and the warnings about it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Loaded {
     /// The registry.
     pub registry: Registry,
-    /// What works but will surprise.
+    /// What works but may be unexpected.
     pub warnings: Vec<Diagnostic>,
 }
 
@@ -50,8 +50,8 @@ impl Registry {
     /// Reads `devices.toml`.
     ///
     /// # Errors
-    /// When the file cannot be read, may be changed by other users while we are root, or says
-    /// something that is wrong: then all of it.
+    /// When the file cannot be read, may be changed by other users while this process is root, or is invalid: then all
+    /// problems.
     pub fn load(path: &Path) -> Result<Loaded, RegistryErrors> {
         let text = read_file(
             path,
@@ -59,7 +59,7 @@ impl Registry {
                                     devices.toml of the repository, or name another with --config FILE",
         )?;
         let mut loaded = Self::parse(&text, Some(path))?;
-        // As root it would have been refused.
+        // As root it would have been rejected.
         if let Ok(Some(reason)) = distrust(path) {
             let (file, message, fix) = (file_label(Some(path), ""), reason.to_string(), Some(reason.fix()));
             loaded.warnings.insert(0, Diagnostic { file, line: 0, column: 0, entry: None, message, fix });
@@ -67,11 +67,11 @@ impl Registry {
         Ok(loaded)
     }
 
-    /// Reads the text of a `devices.toml`; `path` names it in messages, and programs are looked for
-    /// beside it. Without a path they are not looked for: nothing of such a registry will be run.
+    /// Reads the text of a `devices.toml`; `path` names it in messages, and programs are searched for
+    /// beside it. Without a path they are not searched for: no program of such a registry will be run.
     ///
     /// # Errors
-    /// All that is wrong with the text.
+    /// All problems of the text.
     pub fn parse(text: &str, path: Option<&Path>) -> Result<Loaded, RegistryErrors> {
         let file = file_label(path, "devices.toml");
         let programs = path.map_or(Programs::Nowhere, Programs::Beside);
@@ -93,7 +93,7 @@ impl Registry {
     }
 }
 
-/// What the tables of the text say.
+/// The content of the tables of the text.
 fn registry(root: &Section<'_>, programs: Programs<'_>, file: &str) -> Result<Registry, RegistryErrors> {
     root.allow(&["rig", "verdict", "device", "module", "stop"]);
     let section = root.table("rig");
@@ -167,11 +167,11 @@ fn rig(section: Option<&Section<'_>>) -> RigSpec {
     rig
 }
 
-/// One draft an entry, in the order of the file.
+/// One draft per entry, in the order of the file.
 fn drafts<'a>(root: &Section<'a>, programs: Programs<'_>) -> Vec<Draft<'a>> {
     if let Some((at, ..)) = root.fields().iter().find(|(_, key, value)| *key == "device" && value.get_ref().is_array())
     {
-        let fix = "write each entry as a table of its own, [device.NAME], without `name =`";
+        let fix = "write each entry as a separate table, [device.NAME], without `name =`";
         root.report_at(*at, "[[device]] lists belong to rapid_driver's registry", fix);
         return Vec::new();
     }
@@ -193,7 +193,7 @@ fn drafts<'a>(root: &Section<'a>, programs: Programs<'_>) -> Vec<Draft<'a>> {
     drafts
 }
 
-/// Two entries may not mean the same unit: the same serial number, or the same port where there is
+/// Two entries may not identify the same unit: the same serial number, or the same port where there is
 /// no serial number. Entries with neither are interchangeable units and may repeat. A composite
 /// device may have one entry for its camera and one for its serial line.
 fn check_identities(drafts: &[Draft<'_>]) {
@@ -252,7 +252,7 @@ fn check_topics(drafts: &[Draft<'_>]) {
     }
 }
 
-/// The entries that every episode has to have samples of.
+/// The entries of which every episode must contain samples.
 fn expected(rig: &Section<'_>, drafts: &[Draft<'_>]) -> Vec<String> {
     let expected = rig.texts("expect").unwrap_or_default();
     for (index, name) in expected.iter().enumerate() {
@@ -266,28 +266,28 @@ fn expected(rig: &Section<'_>, drafts: &[Draft<'_>]) -> Vec<String> {
     expected
 }
 
-/// What the entries are called.
+/// Names of the entries.
 fn names<'d>(drafts: &'d [Draft<'_>]) -> impl Iterator<Item = &'d str> {
     drafts.iter().map(|draft| draft.name.as_str())
 }
 
-/// An action has no name of a device in it: it means the one actuator there is.
+/// An action contains no device name: it is for the only actuator.
 fn check_actuators(drafts: &[Draft<'_>]) {
     let mut actuators = drafts.iter().filter(|draft| draft.action.is_some());
     let Some(first) = actuators.next() else { return };
     for draft in actuators {
         let message = format!("[{}] is an actuator already, and a rig has one", first.section.entry);
-        let fix = "remove one of the two action tables; the motors of a CAN bus have one without being asked";
+        let fix = "remove one of the two action tables; the motors of a CAN bus have one automatically";
         draft.section.report("action", message, fix);
     }
 }
 
-/// Gives entries without a bit the lowest free one, in the order of the file, after all bits that
-/// are written down are taken.
+/// Gives entries without a bit the lowest free one, in the order of the file, after all explicit bits
+/// are taken.
 fn assign_bits(drafts: &mut [Draft<'_>]) {
     let written: Vec<u8> = drafts.iter().filter_map(|draft| draft.bit).collect();
     let mut free = (0..64).filter(move |bit| !written.contains(bit));
-    // Bits that are written, and their lines.
+    // Explicit bits, and their lines.
     let mut taken: Vec<(u8, usize)> = Vec::new();
     for draft in drafts {
         let section = &draft.section;
@@ -302,7 +302,7 @@ fn assign_bits(drafts: &mut [Draft<'_>]) {
             draft.id = ModalityId::new(bit);
             continue;
         }
-        // A bit that was written and is wrong has been reported; there is nothing to give.
+        // An explicit but invalid bit has been reported; none is assigned.
         if section.has("bit") {
             continue;
         }
@@ -317,9 +317,8 @@ fn assign_bits(drafts: &mut [Draft<'_>]) {
 /// Fewer pictures than this cannot cover the pauses of a writer.
 const LEAST_CAMERA_DEPTH: u64 = 8;
 
-/// Lowers the default depths of cameras, all in proportion, until the topics fit into `budget`.
-/// Depths written in the file stay. Too much even so is a problem that names the largest topics.
-/// What was lowered is warned of.
+/// Lowers the default depths of cameras, all in proportion, until the topics fit into `budget`. Depths written in the
+/// file stay. If the total is still too large, a problem names the largest topics. Lowered depths cause a warning.
 fn fit(drafts: &mut [Draft<'_>], budget: u64, root: &Section<'_>) {
     let scaled = |draft: &Draft<'_>, permille: u64| {
         if draft.depth_written || draft.kind != Some(device::Kind::Camera) {
@@ -389,7 +388,7 @@ fn report(drafts: &[Draft<'_>], total: u64, budget: u64, root: &Section<'_>) {
 fn warn_of_narrow_window(devices: &[(Section<'_>, DeviceSpec)], window: Duration) {
     for (section, device) in devices {
         let (Some(hz), Some(least)) = (device.verdict.hz, device.verdict.suspect.valid) else { continue };
-        // A tick has a sample if one lies within the window before or after it, wherever the two stand to each other.
+        // A tick has a sample if one lies within the window before or after it, whatever their phase.
         let share = hz * 2.0 * window.as_secs_f64();
         if share >= least.min(1.0) {
             continue;

@@ -1,7 +1,7 @@
-//! Scenarios: which simulated devices there are and when they are plugged, unplugged or fall silent.
+//! Scenarios: the simulated devices and when they are plugged, unplugged or become silent.
 //!
 //! A simulated device enters like a real one: by a hot-plug event whose [`Attachment`] carries a
-//! [`SimDevice`], opened by `driver::open`. Nothing beyond knows the difference.
+//! [`SimDevice`], opened by `driver::open`. No other code distinguishes them.
 //!
 //! [`Attachment`]: super::Attachment
 
@@ -20,7 +20,7 @@ use crate::time::Stamp;
 pub struct Scenario {
     /// The devices that can be plugged.
     pub devices: Vec<ScenarioDevice>,
-    /// What happens, ascending by time; the order in the file decides between equal times.
+    /// Its events, ascending by time; the order in the file decides between equal times.
     pub events: Vec<ScenarioEvent>,
     /// After this time the events begin again, if given.
     pub repeat: Option<Duration>,
@@ -29,42 +29,42 @@ pub struct Scenario {
 /// A device of a scenario.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ScenarioDevice {
-    /// Name within the scenario; the registry entry it stands for unless `usb` says otherwise.
+    /// Name within the scenario; the registry entry it simulates unless `usb` states otherwise.
     pub name: String,
-    /// What it says it is when plugged.
+    /// The identity it reports when plugged.
     pub usb: UsbIdentity,
-    /// It is on the network and says this instead; only its port is of use then.
+    /// It is on the network and reports this instead; then only the port of `usb` is used.
     pub lan: Option<LanIdentity>,
-    /// What it sends.
+    /// The data it sends.
     pub source: SimSource,
     /// Plugged when the scenario begins.
     pub plugged: bool,
-    /// What it does wrong.
+    /// Its faults.
     pub faults: SimFaults,
 }
 
-/// What a simulated device does wrong while it is plugged in.
+/// Faults of a simulated device while it is plugged in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct SimFaults {
-    /// From this moment of the scenario on it sends the same bytes again and again.
+    /// From this moment of the scenario on it sends the same bytes repeatedly.
     pub freeze_at: Option<Duration>,
-    /// Every so many samples one is cut in the middle.
+    /// After this number of samples one is truncated.
     pub truncate_every: Option<u64>,
-    /// Every so many samples one is sent twice.
+    /// After this number of samples one is sent twice.
     pub duplicate_every: Option<u64>,
-    /// Every so many samples one is lost by the device, which says so.
+    /// After this number of samples one is lost by the device, which reports it.
     pub lose_every: Option<u64>,
-    /// Samples arrive so long after their capture.
+    /// Samples arrive this long after their capture.
     pub delay: Duration,
-    /// A camera's pictures show the light as it was so long before their capture time.
+    /// A camera's pictures show the light as it was this long before their capture time.
     pub latency: Duration,
-    /// Its clock runs fast by so many parts in a million, slow if negative.
+    /// Its clock is fast by this many parts per million, slow if negative.
     pub clock_ppm: i64,
-    /// Closing it takes so long.
+    /// Time needed to close it.
     pub close: Duration,
 }
 
-/// What a simulated device sends.
+/// The data that a simulated device sends.
 #[derive(Debug, Clone, PartialEq)]
 pub enum SimSource {
     /// JPEG pictures of these dimensions in pixels; bytes are a function of seed and sequence.
@@ -75,9 +75,9 @@ pub enum SimSource {
         height: u32,
         /// Frames per second.
         fps: u32,
-        /// Chooses the pictures.
+        /// Determines the pictures.
         seed: u64,
-        /// Least size of a picture; what it lacks is filled up. 0: as the encoder makes it.
+        /// Least size of a picture, which is padded to it. 0: as the encoder produces it.
         bytes: usize,
     },
     /// Vectors of numbers; values are a function of seed and sequence.
@@ -86,17 +86,17 @@ pub enum SimSource {
         channels: usize,
         /// Samples per second.
         hz: u32,
-        /// Chooses the values.
+        /// Determines the values.
         seed: u64,
     },
     /// A part of the simulated task.
     Task {
-        /// Which.
+        /// Which part.
         part: TaskPart,
-        /// The trial it stands in, with the other parts.
+        /// The trial it takes part in, with the other parts.
         scene: Arc<Scene>,
     },
-    /// Nothing of its own: the program of the entry runs as it would for a real device.
+    /// No data: the program of the entry runs as it would for a real device.
     Process,
     /// The samples of one topic of a recorded episode, at their recorded distances in time.
     Replay {
@@ -104,7 +104,7 @@ pub enum SimSource {
         file: PathBuf,
         /// The topic in it.
         topic: String,
-        /// Wall time of the episode's beginning as recorded, ns: moment zero of the scenario.
+        /// Wall time of the episode's beginning as recorded, ns: time zero of the scenario.
         begin_ns: u64,
     },
 }
@@ -116,11 +116,11 @@ pub enum TaskPart {
     Wrist,
     /// The camera behind the gel of the fingertip.
     Tactile,
-    /// The arm with its gripper: tells its state, and is the actuator.
+    /// The arm with its gripper: reports its state, and is the actuator.
     Arm,
 }
 
-/// What the devices of one simulated task share. What it holds is the driver's own.
+/// State shared by the devices of one simulated task. Its content belongs to the driver.
 #[derive(Debug)]
 pub struct Scene {
     /// Number of the trial.
@@ -135,13 +135,13 @@ impl PartialEq for Scene {
     }
 }
 
-/// What stands for the kernel's driver of a simulated device.
+/// Reported in place of the kernel's driver of a simulated device.
 #[must_use]
 pub fn driver() -> KernelDriver {
     KernelDriver { name: "rapid-sim".to_owned(), version: Some(env!("CARGO_PKG_VERSION").to_owned()) }
 }
 
-/// Something that happens in a scenario.
+/// An event of a scenario.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ScenarioEvent {
     /// When, from the beginning.
@@ -152,7 +152,7 @@ pub struct ScenarioEvent {
     pub action: ScenarioAction,
 }
 
-/// What can happen to a simulated device.
+/// The kinds of events of a simulated device.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum ScenarioAction {
     /// Plugged in, into another port if one is given.
@@ -160,60 +160,60 @@ pub enum ScenarioAction {
         /// Port path; the device's last one if absent.
         port: Option<String>,
     },
-    /// Pulled out.
+    /// Unplugged.
     Unplug,
-    /// Stays attached and sends nothing more.
+    /// Stays attached and sends nothing.
     Silence,
     /// Sends again.
     Resume,
 }
 
-/// A simulated device that is plugged in: its cable, shared between the script that pulls it and
+/// A simulated device that is plugged in: its cable, shared between the script that unplugs it and
 /// the driver that reads it.
 #[derive(Debug)]
 pub struct SimDevice {
     /// Name within the scenario.
     pub name: String,
-    /// What it sends.
+    /// The data it sends.
     pub source: SimSource,
-    /// What it does wrong.
+    /// Its faults.
     pub faults: SimFaults,
-    /// The scenario's moment zero.
+    /// The scenario's time zero.
     pub begun: Stamp,
     unplugged: AtomicBool,
     silent: AtomicBool,
-    /// Episodes it was told to record by itself, and of how many of them it was told the end.
+    /// The number of recording commands it received, and of commands to end one.
     episodes: (AtomicU32, AtomicU32),
-    /// Next sequence number; it goes on over a replug, as a device with its own counter would.
+    /// Next sequence number; it continues over a replug, like that of a device with its own counter.
     pub sequence: AtomicU32,
-    /// What a camera looks at.
+    /// The light that a camera records.
     pub light: SimLight,
 }
 
-/// A light in front of a simulated camera, and how it was switched. Without a first change there is
+/// A light in front of a simulated camera, and its changes. Without a first change there is
 /// none.
 #[derive(Debug, Default)]
 pub struct SimLight(Mutex<Vec<(Stamp, bool)>>);
 
 impl SimLight {
-    /// It is lit from this moment on, or dark; moments come in the order of time.
+    /// It is lit from this moment on, or dark; moments must be in the order of time.
     pub fn switch(&self, at: Stamp, lit: bool) {
         self.changes().push((at, lit));
     }
 
-    /// Was it lit at this moment? Dark before the first change.
+    /// Whether it was lit at this moment. Dark before the first change.
     #[must_use]
     pub fn was_lit(&self, at: Stamp) -> bool {
         self.changes().iter().rev().find(|(since, _)| *since <= at).is_some_and(|(_, lit)| *lit)
     }
 
-    /// Is there one?
+    /// Whether there is one.
     #[must_use]
     pub fn is_there(&self) -> bool {
         !self.changes().is_empty()
     }
 
-    /// Whole values: a poisoned lock guards nothing broken.
+    /// Whole values: a poisoned lock guards no broken state.
     fn changes(&self) -> MutexGuard<'_, Vec<(Stamp, bool)>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -236,41 +236,41 @@ impl SimDevice {
         }
     }
 
-    /// The same device, doing this wrong.
+    /// The same device, with these faults.
     #[must_use]
     pub fn with_faults(self, faults: SimFaults) -> Self {
         Self { faults, ..self }
     }
 
-    /// Pulls the cable: the next read says so.
+    /// Pulls the cable: the next read reports it.
     pub fn unplug(&self) {
         self.unplugged.store(true, Ordering::Release);
     }
 
-    /// Is the cable pulled?
+    /// Whether the cable is pulled.
     #[must_use]
     pub fn is_unplugged(&self) -> bool {
         self.unplugged.load(Ordering::Acquire)
     }
 
-    /// Makes the device stop or go on sending.
+    /// Makes the device stop or resume sending.
     pub fn set_silent(&self, silent: bool) {
         self.silent.store(silent, Ordering::Release);
     }
 
-    /// Does it send nothing?
+    /// Whether it sends nothing.
     #[must_use]
     pub fn is_silent(&self) -> bool {
         self.silent.load(Ordering::Acquire)
     }
 
-    /// Tells it to record by itself, or to end that.
+    /// Commands it to record, or to end that.
     pub fn record(&self, record: bool) {
         let (begun, over) = &self.episodes;
         if record { begun } else { over }.fetch_add(1, Ordering::AcqRel);
     }
 
-    /// How often it was told to record, and how often to end that.
+    /// How many recording commands it received, and how many to end one.
     #[must_use]
     pub fn recordings(&self) -> (u32, u32) {
         let (begun, over) = &self.episodes;

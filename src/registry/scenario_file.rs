@@ -1,4 +1,4 @@
-//! Scenario files: TOML that says which simulated devices there are and what happens to them.
+//! Scenario files: TOML that lists simulated devices and events.
 //!
 //! ```toml
 //! repeat = "12s"              # optional: after this time the events begin again
@@ -7,23 +7,23 @@
 //! name = "tactile_tip"        # an entry of the registry, whose identity and format it takes
 //! seed = 7                    # chooses the pictures or values; default: the entry's bit
 //! hz = 100                    # rate; default: the camera's fps, 100 for a serial line
-//! bytes = "60kB"              # a camera's pictures are filled up to this size, as real scenes fill them
+//! bytes = "60kB"              # a camera's pictures are padded to this size, like pictures of real scenes
 //! plugged = false             # when the scenario begins; default true
-//! serial = "OTHER"            # also vid, pid, port, firmware, manufacturer, product: what it says it
-//!                             # is; serial = "" for none
+//! serial = "OTHER"            # also vid, pid, port, firmware, manufacturer, product: the identity it
+//!                             # reports; serial = "" for none
 //!
 //! [[device]]
 //! name = "spare"              # any name, with
 //! like = "tactile_tip"        # the entry whose format it takes
-//! [device.fault]              # optional: what the device above does wrong
+//! [device.fault]              # optional: faults of the device above
 //! freeze_at = "3s"            # from then on it sends the same bytes
-//! truncate_every = 10         # one sample in ten is cut in the middle
+//! truncate_every = 10         # one sample in ten is truncated
 //! duplicate_every = 10        # one in ten is sent twice
-//! lose_every = 10             # one in ten is lost, and the device says so
-//! delay = "200ms"             # samples arrive so long after their capture
-//! latency = "35ms"            # pictures show the light of `rapid calibrate` so long before their capture
-//! clock_ppm = 500             # its clock runs fast, or slow if negative
-//! close = "2s"                # closing it takes so long, as ending the recording of a GoPro does
+//! lose_every = 10             # one in ten is lost, and the device reports it
+//! delay = "200ms"             # samples arrive this long after their capture
+//! latency = "35ms"            # pictures show the light of `rapid calibrate` this long before their capture
+//! clock_ppm = 500             # its clock is fast, or slow if negative
+//! close = "2s"                # time needed to close it, as for ending the recording of a GoPro
 //!
 //! [[event]]                   # exactly one of plug, unplug, silence, resume
 //! at = "3s"
@@ -37,9 +37,9 @@
 //!
 //! An entry without a serial number or port gets an invented one: `SIM-<name>`, a port of bus 9.
 //!
-//! Invariant: no text makes this panic; all problems are reported at once.
-//! Invariant: in a scenario that was accepted a device is only plugged while unplugged and the
-//! reverse, at every repetition.
+//! Invariant: no text causes a panic; all problems are reported at once.
+//! Invariant: in an accepted scenario a device is only plugged while unplugged and unplugged while
+//! plugged, at every repetition.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -70,7 +70,7 @@ const DEVICE_KEYS: [&str; 14] = [
 ];
 const ACTIONS: [&str; 4] = ["plug", "unplug", "silence", "resume"];
 const EVENT_KEYS: [&str; 6] = ["at", "plug", "unplug", "silence", "resume", "port"];
-/// What a simulated camera adds to each picture, at the most: its name.
+/// Most bytes that a simulated camera adds to each picture: its name.
 const PICTURE_NAME_BYTES: usize = 64;
 const LONGEST: Duration = Duration::from_hours(7 * 24);
 
@@ -78,7 +78,7 @@ impl Scenario {
     /// Reads a scenario file for the devices of `registry`.
     ///
     /// # Errors
-    /// When the file cannot be read or says something wrong: then all of it.
+    /// When the file cannot be read or is invalid: then all problems.
     pub fn load(path: &Path, registry: &Registry) -> Result<Self, RegistryErrors> {
         let text = read_file(path, "`rapid --sim` without a file plays the demonstration; name a scenario file")?;
         Self::parse(&text, Some(path), registry)
@@ -87,7 +87,7 @@ impl Scenario {
     /// Reads the text of a scenario; `path` names it in messages.
     ///
     /// # Errors
-    /// All that is wrong with the text.
+    /// All problems of the text.
     pub fn parse(text: &str, path: Option<&Path>, registry: &Registry) -> Result<Self, RegistryErrors> {
         read(&file_label(path, "scenario"), text, |root| {
             root.allow(&["repeat", "device", "event"]);
@@ -102,14 +102,14 @@ impl Scenario {
         })
     }
 
-    /// Every entry is plugged in, and nothing happens.
+    /// Every entry is plugged in, and there are no events.
     #[must_use]
     pub(super) fn quiet(registry: &Registry) -> Self {
         Self { devices: every_entry(registry), events: Vec::new(), repeat: None }
     }
 
-    /// What `rapid --sim` plays without a file: everything is plugged; the second camera, or for
-    /// want of one the last device, is pulled at 3 s and plugged again at 6 s, every 12 s.
+    /// What `rapid --sim` plays without a file: everything is plugged; the second camera, or if
+    /// there is none the last device, is unplugged at 3 s and plugged again at 6 s, every 12 s.
     #[must_use]
     pub fn demo(registry: &Registry) -> Self {
         let mut cameras = registry.devices.iter().filter(|device| matches!(device.node, NodeSpec::Camera(_)));
@@ -141,13 +141,13 @@ fn devices(root: &Section<'_>, registry: &Registry) -> Vec<ScenarioDevice> {
         let Some(device) = device(&section, registry) else { continue };
         if devices.iter().any(|earlier: &ScenarioDevice| earlier.name == device.name) {
             let message = format!("{:?} is already a device of this scenario", device.name);
-            let fix = format!("give it a name of its own and like = {:?}", device.name);
+            let fix = format!("give it another name and like = {:?}", device.name);
             section.report("name", message, fix);
         }
         if !device.usb.port.is_empty() {
             if let Some(line) = ports.get(&device.usb.port) {
                 let message = format!("port {} is already that of the device on line {line}", device.usb.port);
-                section.report("port", message, "give each device a port of its own: port = \"1-4\"");
+                section.report("port", message, "give each device a separate port: port = \"1-4\"");
             }
             ports.insert(device.usb.port.clone(), section.line());
         }
@@ -188,7 +188,7 @@ fn device(section: &Section<'_>, registry: &Registry) -> Option<ScenarioDevice> 
     device.usb.vid = section.usb_id("vid").unwrap_or(device.usb.vid);
     device.usb.pid = section.usb_id("pid").unwrap_or(device.usb.pid);
     if let Some(serial) = section.text("serial") {
-        // What a device says of itself is no mistake of the file, whatever it is.
+        // The identity that a device reports is never a mistake of the file.
         device.usb.serial = (!serial.is_empty()).then(|| serial.to_owned());
     }
     if let Some(port) = port(section) {
@@ -212,7 +212,7 @@ fn faults(section: &Section<'_>) -> SimFaults {
     let mut known = every.to_vec();
     known.extend(["freeze_at", "delay", "latency", "clock_ppm", "close"]);
     table.allow(&known);
-    // At least 2: of a device all of whose samples are lost none ever comes.
+    // At least 2: a device that loses all samples would send none.
     let [truncate_every, duplicate_every, lose_every] = every.map(|key| table.integer(key, 2..=1_000_000));
     SimFaults {
         freeze_at: table.duration("freeze_at", Duration::ZERO..=LONGEST),
@@ -235,7 +235,7 @@ fn port(section: &Section<'_>) -> Option<String> {
     section.refuse("port", format!("{port:?} is not a USB port path"), fix)
 }
 
-/// An event and where the file says it.
+/// An event and its position in the file.
 struct Placed<'a> {
     section: Section<'a>,
     key: &'static str,
@@ -274,9 +274,9 @@ fn event<'a>(section: Section<'a>, devices: &[ScenarioDevice]) -> Option<Placed<
     Some(Placed { section, key, event })
 }
 
-/// Plays the events once on paper.
+/// Checks the sequence of the events.
 fn check_order(events: &[Placed<'_>], devices: &[ScenarioDevice], repeat: Option<Duration>) {
-    // Device to its port while plugged, and its port now or last.
+    // Devices with their port while plugged, and their present or last port.
     let begin: BTreeMap<&str, bool> = devices.iter().map(|device| (device.name.as_str(), device.plugged)).collect();
     let mut plugged = begin.clone();
     let mut ports: BTreeMap<&str, &str> =
@@ -327,7 +327,7 @@ fn check_order(events: &[Placed<'_>], devices: &[ScenarioDevice], repeat: Option
     }
 }
 
-/// Rate of a simulated serial line, Hz: that of a usual motor controller's state.
+/// Rate of a simulated serial line, Hz: typical for the state of a motor controller.
 const SERIAL_HZ: u32 = 100;
 
 /// A simulated device with an entry's identity and format; its port may still be empty.
@@ -339,20 +339,20 @@ fn standing_for(spec: &DeviceSpec, name: &str) -> ScenarioDevice {
             SimSource::Camera { width, height, fps, seed, bytes: 0 }
         }
         (.., [channels]) => SimSource::Serial { channels: *channels as usize, hz: SERIAL_HZ, seed },
-        // What sends bytes has no channels: a number of its messages a second is all that is written here.
+        // A device that sends bytes has no channels: only a number of messages a second is written here.
         _ => SimSource::Serial { channels: 1, hz: SERIAL_HZ, seed },
     };
-    let wished = spec.identity.usb();
-    let lan = wished.is_none().then(|| LanIdentity {
+    let expected = spec.identity.usb();
+    let lan = expected.is_none().then(|| LanIdentity {
         entry: spec.name.clone(),
         address: format!("sim:{name}"),
         instance: None,
     });
     let usb = UsbIdentity {
-        vid: wished.map_or(0, |wished| wished.vid),
-        pid: wished.map_or(0, |wished| wished.pid),
+        vid: expected.map_or(0, |expected| expected.vid),
+        pid: expected.map_or(0, |expected| expected.pid),
         serial: Some(spec.identity.serial().map_or_else(|| format!("SIM-{name}"), str::to_owned)),
-        port: wished.and_then(|wished| wished.port.clone()).unwrap_or_default(),
+        port: expected.and_then(|expected| expected.port.clone()).unwrap_or_default(),
         product: Some(format!("simulated {}", spec.name)),
         manufacturer: Some("rapid".to_owned()),
         firmware: Some("1.00".to_owned()),
@@ -360,7 +360,7 @@ fn standing_for(spec: &DeviceSpec, name: &str) -> ScenarioDevice {
     ScenarioDevice { name: name.to_owned(), usb, lan, source, plugged: true, faults: SimFaults::default() }
 }
 
-/// Ports of a bus no rig has, for devices whose port nothing says.
+/// Ports of a bus no rig has, for devices without a declared port.
 fn invent_ports(devices: &mut [ScenarioDevice]) {
     let mut taken: Vec<String> = devices.iter().map(|device| device.usb.port.clone()).collect();
     for device in devices.iter_mut().filter(|device| device.usb.port.is_empty()) {

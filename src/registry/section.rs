@@ -1,9 +1,9 @@
-//! Getting the text of a configuration file, safely, and reading TOML tables by name, with every problem noted at its
-//! line and column.
+//! Reading the text of a configuration file safely, and TOML tables by key, with every problem noted at its line and
+//! column.
 //!
-//! A getter returns `None` both for a key that is absent and for one whose value was wrong and has
-//! been reported: the reader continues with the default either way, so that one look finds all
-//! problems, and the result is thrown away if there were any.
+//! A getter returns `None` both for an absent key and for an invalid value, which has
+//! been reported: the reader continues with the default either way, so that one pass finds all
+//! problems, and the result is discarded if there were any.
 
 use std::cell::RefCell;
 use std::fs::{File, OpenOptions};
@@ -20,7 +20,7 @@ use super::diagnostic::{Diagnostic, RegistryErrors, did_you_mean};
 use super::trust::distrust;
 use super::units::{parse_duration, parse_size, show_duration, show_size};
 
-/// The problems found so far in one text, and what works but will surprise.
+/// The problems found so far in one text, and what works but may be unexpected.
 #[derive(Debug)]
 struct Problems<'a> {
     file: String,
@@ -31,7 +31,7 @@ struct Problems<'a> {
     warnings: RefCell<Vec<Diagnostic>>,
 }
 
-/// A file with more problems than this is no registry; reading ends there.
+/// A file with more problems than this is not a registry; reading ends there.
 const MOST_PROBLEMS: usize = 500;
 
 impl<'a> Problems<'a> {
@@ -70,7 +70,7 @@ impl<'a> Problems<'a> {
     }
 }
 
-/// What `reader` makes of a TOML text, or all problems that were noted. `file` names it in messages.
+/// The result of `reader` for a TOML text, or all problems that were noted. `file` names it in messages.
 pub(super) fn read<T>(
     file: &str,
     text: &str,
@@ -87,20 +87,20 @@ pub(super) fn read<T>(
 
 /// How a file is named in messages.
 pub(super) fn file_label(path: Option<&Path>, otherwise: &str) -> String {
-    // A path may hold any byte: what would not print is escaped.
+    // A path may contain any byte: unprintable ones are escaped.
     let shown = path.map_or_else(|| otherwise.to_owned(), |path| path.display().to_string());
     printable(&shown)
 }
 
-/// Reads a TOML text. Syntax errors are noted; with any of them the table is not to be used.
+/// Parses a TOML text. Syntax errors are noted; with any of them the table must not be used.
 fn parsed<'a>(text: &'a str, problems: &Problems<'a>) -> Spanned<DeTable<'a>> {
-    /// More than this many follow from one another.
+    /// Further errors are mostly consequences.
     const SHOWN: usize = 10;
     let (table, errors) = DeTable::parse_recoverable(text);
     let source: Vec<&str> = if errors.is_empty() { Vec::new() } else { text.lines().map(str::trim).collect() };
     let line_at = |line: usize| source.get(line.saturating_sub(1)).copied().unwrap_or_default();
     let mut lines = Vec::new();
-    // Until this line a table that stands twice makes each of its keys a duplicate.
+    // Up to this line a repeated table makes each of its keys a duplicate.
     let mut repeated_until = 0;
     for error in errors {
         if lines.len() == SHOWN {
@@ -109,7 +109,7 @@ fn parsed<'a>(text: &'a str, problems: &Problems<'a>) -> Spanned<DeTable<'a>> {
         let at = error.span().map_or(0, |span| span.start);
         let (line, _) = problems.position(at);
         let duplicate = error.message() == "duplicate key";
-        // The rest of a line that is wrong is wrong in consequence.
+        // Further errors of the same line are consequences.
         if lines.contains(&line) || (duplicate && line < repeated_until) {
             continue;
         }
@@ -120,7 +120,7 @@ fn parsed<'a>(text: &'a str, problems: &Problems<'a>) -> Spanned<DeTable<'a>> {
         }
         let earlier = source.iter().take(line - 1).position(|earlier| *earlier == line_at(line));
         let message = match earlier.filter(|_| duplicate) {
-            Some(earlier) => format!("not TOML: the same stands already on line {}", earlier + 1),
+            Some(earlier) => format!("not TOML: already defined on line {}", earlier + 1),
             None => format!("not TOML: {}", printable(error.message().trim_end_matches(", expected nothing"))),
         };
         problems.report(at, "", message, syntax_fix(error.message(), line_at(line)));
@@ -134,11 +134,11 @@ fn syntax_fix(message: &str, source: &str) -> String {
     let is_serial_table = (message == "duplicate key" && source.starts_with('[') && source.contains("serial"))
         || (message.starts_with("cannot extend value") && source.contains("serial."));
     if is_serial_table {
-        "a key can stand only once in an entry: `serial` is the device's serial number, and the table of a serial line is \
+        "a key may appear only once in an entry: `serial` is the device's serial number, and the table of a serial line is \
          called [device.NAME.tty]"
             .to_owned()
     } else if message == "duplicate key" {
-        "a name can stand only once: rename or remove one of the two".to_owned()
+        "a name may appear only once: rename or remove one of the two".to_owned()
     } else if matches!(key.trim(), "vid" | "pid") && digits.bytes().all(|b| b.is_ascii_hexdigit()) && !digits.is_empty()
     {
         format!("write USB ids as text: {} = \"{digits}\"", key.trim())
@@ -203,12 +203,12 @@ impl<'a> Section<'a> {
         self.field(key).is_some_and(|value| value.get_ref().is_table())
     }
 
-    /// Where the value of `key` stands, or the table if it has none.
+    /// Position of the value of `key`, or of the table if it has none.
     pub(super) fn at_of(&self, key: &str) -> usize {
         self.field(key).map_or(self.at, |value| value.span().start)
     }
 
-    /// The line where the value of `key` stands.
+    /// The line of the value of `key`.
     pub(super) fn line_of(&self, key: &str) -> usize {
         self.problems.position(self.at_of(key)).0
     }
@@ -233,19 +233,19 @@ impl<'a> Section<'a> {
         self.problems.report(at, &self.child(name), message, fix);
     }
 
-    /// Notes a problem with `key`, which has no value then.
+    /// Notes a problem with `key`, which then has no value.
     pub(super) fn refuse<T>(&self, key: &str, message: impl Into<String>, fix: impl Into<String>) -> Option<T> {
         self.report(key, message, fix);
         None
     }
 
-    /// Notes at a byte offset of the text what works but will surprise.
+    /// Notes at a byte offset of the text what works but may be unexpected.
     pub(super) fn warn_at(&self, at: usize, message: impl Into<String>, fix: impl Into<String>) {
         let diagnostic = self.problems.diagnostic(at, &self.entry, message.into(), fix.into());
         self.problems.warnings.borrow_mut().push(diagnostic);
     }
 
-    /// Notes the tables of `keys`, which are those of other kinds of node; `own` is the one of this kind, `what`.
+    /// Notes the tables of `keys`, which are for other kinds of node; `own` is the one for this kind, `what`.
     pub(super) fn no_tables(&self, keys: &[&str], what: &str, own: &str) {
         for key in keys.iter().filter(|key| self.is_table(key)) {
             let message = format!("{what} has no table [{}]", self.child(key));
@@ -253,17 +253,17 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// What works but will surprise, as far as it was noted.
+    /// What works but may be unexpected, as noted so far.
     pub(super) fn warnings(&self) -> Vec<Diagnostic> {
         self.problems.warnings.take()
     }
 
-    /// Notes that a key must be there.
+    /// Notes that a required key is missing.
     pub(super) fn missing(&self, key: &str, fix: &str) {
         self.report_at(self.at, format!("{key} is missing"), fix);
     }
 
-    /// Notes that a key must be there, if it is not.
+    /// Notes that a required key is missing, if it is.
     pub(super) fn need(&self, key: &str, fix: &str) {
         if !self.has(key) {
             self.missing(key, fix);
@@ -429,7 +429,7 @@ impl<'a> Section<'a> {
         Some(sections)
     }
 
-    /// The name of a table below this one, quoted where TOML would have to quote it.
+    /// The name of a table below this one, quoted where TOML requires it.
     pub(super) fn child(&self, key: &str) -> String {
         let bare = !key.is_empty() && key.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'_' || b == b'-');
         let key = if bare { key.to_owned() } else { format!("{key:?}") };
@@ -465,10 +465,10 @@ fn as_f64(value: &DeValue<'_>) -> Option<f64> {
 /// No registry is this large; the wrong file may be.
 const LARGEST: u64 = 1 << 20;
 
-/// The text of a file a person wrote. `when_missing` is the fix when there is none.
+/// The text of a file written by a person. `when_missing` is the fix when there is none.
 ///
 /// # Errors
-/// When it cannot be read, is no ordinary file of text, or may be changed by others while we are root.
+/// When it cannot be read, is not an ordinary text file, or may be changed by others while this process is root.
 pub fn read_file(path: &Path, when_missing: &str) -> Result<String, RegistryErrors> {
     let label = file_label(Some(path), "");
     let problem = |message: String, fix: String| RegistryErrors::whole_file(label.clone(), message, fix);
@@ -491,7 +491,7 @@ pub fn read_file(path: &Path, when_missing: &str) -> Result<String, RegistryErro
     if !metadata.is_file() {
         return Err(problem("it is not a regular file".to_owned(), "name a file on disk".to_owned()));
     }
-    // As root we run with rights that whoever may change the file would gain.
+    // As root, a user who may change the file would gain the rights of this process.
     if rustix::process::geteuid().is_root()
         && let Some(reason) = distrust(path).map_err(cannot_read)?
     {

@@ -1,10 +1,10 @@
-//! What `devices.toml` says once it has been checked: nothing downstream validates again.
+//! The content of a checked `devices.toml`: no other code validates it again.
 //!
 //! Invariant: every value here is within the range its comment states; names, topics and bits are
-//! unique; no two entries of one kind of node mean the same unit; `Registry::devices` is in
+//! unique; no two entries of one kind of node identify the same unit; `Registry::devices` is in
 //! ascending order of bit.
 //!
-//! Every default of the limits of the verdict has its reason here; `[verdict]` changes it for all devices,
+//! The reason for every default limit of the verdict is given here; `[verdict]` changes it for all devices,
 //! `[device.NAME.verdict]` for one.
 
 mod lan;
@@ -25,17 +25,17 @@ pub use motors::{
     BrakeSpec, DamiaoSpec, MAX_MOTORS, MotionSpec, MotorKind, MotorMode, MotorSpec, Stop, StopSpec, WatchSpec,
 };
 
-/// Samples that the pool of a topic holds beyond its depth: what 8 subscribers hold back, 4 each, the
-/// one being written, and one that is on its way out. The bus reserves them.
+/// Samples that the pool of a topic holds beyond its depth: those that 8 subscribers hold, 4 each, the
+/// one being written, and one that is about to be replaced. The bus reserves them.
 pub const POOL_SPARE: usize = MAX_SUBSCRIBERS * MAX_BORROWED + 2;
 /// Programs that may subscribe to a topic at once: recorder, policy, and others'.
 pub const MAX_SUBSCRIBERS: usize = 8;
-/// Samples a subscriber may hold without giving them back.
+/// Samples a subscriber may hold without returning them.
 pub const MAX_BORROWED: usize = 4;
-/// Shared memory beside the payload of each sample, bytes: our header, and at most this much for that
+/// Shared memory in addition to the payload of each sample, bytes: our header, and at most this much for that
 /// of iceoryx2 0.10 and for alignment.
 pub(super) const SAMPLE_OVERHEAD: usize = size_of::<SampleHeader>() + 64;
-/// Shared memory of the mask's topic and of iceoryx2's own books, bytes; part of the budget.
+/// Shared memory of the mask's topic and of iceoryx2's management data, bytes; part of the budget.
 pub(super) const RESERVED_BYTES: u64 = 512 << 10;
 
 /// A checked `devices.toml`.
@@ -43,9 +43,9 @@ pub(super) const RESERVED_BYTES: u64 = 512 << 10;
 pub struct Registry {
     /// The `[rig]` table.
     pub rig: RigSpec,
-    /// One entry a modality, ascending by bit, at least one, at most 64.
+    /// One entry per modality, ascending by bit, at least one, at most 64.
     pub devices: Vec<DeviceSpec>,
-    /// What can be mounted, in the order of the file.
+    /// The modules that can be mounted, in the order of the file.
     pub modules: Vec<ModuleSpec>,
     /// Emergency stops and enabling switches, in the order of the file, at most 16.
     pub stops: Vec<InterlockSpec>,
@@ -69,7 +69,7 @@ pub struct RigSpec {
     pub cooldown: Duration,
     /// Upper bound of the shared memory all topics may reserve, bytes, default 512 MiB.
     pub memory_budget: u64,
-    /// What recording leaves free on its disk, bytes; `None` is the smaller of 1 GiB and a twentieth
+    /// Space that recording leaves free on its disk, bytes; `None` is the smaller of 1 GiB and a twentieth
     /// of the disk.
     pub disk_reserve: Option<u64>,
     /// Names of the entries without whose samples an episode is SUSPECT; none by default.
@@ -91,8 +91,8 @@ pub struct DeviceSpec {
     pub topic: String,
     /// Where on the gripper the module sits.
     pub mount: Option<Mount>,
-    /// No sample for this long while attached: the slot says Stalled. At least 10 ms; default the
-    /// larger of 500 ms and 10 sample periods. Of a program, its `heartbeat`, default 2 s.
+    /// Without a sample for this long while attached, the slot is Stalled. At least 10 ms; default the
+    /// larger of 500 ms and 10 sample periods. For a program, its `heartbeat`, default 2 s.
     pub stall_after: Duration,
     /// Largest payload in bytes.
     pub max_bytes: usize,
@@ -100,24 +100,24 @@ pub struct DeviceSpec {
     pub depth: usize,
     /// What an observation holds when the device is attached but no sample lies in the window.
     pub when_stale: WhenStale,
-    /// What a sample captured at `t` shows happened at `t - latency`; up to 1 s, default 0. Taken
-    /// off when samples are aligned, and there alone.
+    /// A sample captured at `t` shows events of `t - latency`; up to 1 s, default 0. Only subtracted
+    /// when samples are aligned.
     pub latency: Duration,
-    /// What the verdict on its part of an episode is made of.
+    /// Limits for the verdict on its part of an episode.
     pub verdict: VerdictSpec,
     /// The device is an actuator, and takes these actions.
     pub action: Option<ActionSpec>,
-    /// What is run when something happens to it.
+    /// Programs that are run at its events.
     pub hooks: Hooks,
 }
 
-/// `[device.NAME.action]`: the limits of an actuator's actions. All lists have one entry an axis, `1..=64` of
+/// `[device.NAME.action]`: the limits of an actuator's actions. All lists have one entry per axis, `1..=64` of
 /// them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ActionSpec {
-    /// What each axis is called.
+    /// Name of each axis.
     pub names: Vec<String>,
-    /// Its unit, for people.
+    /// Its unit, as text for the user.
     pub units: Vec<String>,
     /// Lowest target, finite.
     pub min: Vec<f64>,
@@ -125,13 +125,13 @@ pub struct ActionSpec {
     pub max: Vec<f64>,
 }
 
-/// Which device an entry means.
+/// Which device an entry identifies.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize)]
 #[serde(untagged)]
 pub enum IdentitySpec {
     /// A USB device.
     Usb(UsbSpec),
-    /// A device on the network: [`NodeSpec::Lan`] says where it is looked for.
+    /// A device on the network: [`NodeSpec::Lan`] states how it is found.
     Lan {},
 }
 
@@ -152,7 +152,7 @@ impl IdentitySpec {
     }
 }
 
-/// Which USB device an entry means.
+/// Which USB device an entry identifies.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize)]
 pub struct UsbSpec {
     /// USB vendor id.
@@ -197,7 +197,7 @@ pub struct CameraSpec {
     pub controls: Vec<(String, i64)>,
 }
 
-/// Pixel formats a camera may be asked for, by their V4L2 names.
+/// Pixel formats that can be requested of a camera, by their V4L2 names.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "UPPERCASE")]
 pub enum PixelFormat {
@@ -214,9 +214,9 @@ pub enum PixelFormat {
 pub struct SerialSpec {
     /// Bits per second, default 115200.
     pub baud: u32,
-    /// Where one message ends and the next begins, default `line`.
+    /// How messages are delimited, default `line`.
     pub framing: Framing,
-    /// What a message holds, default `csv`.
+    /// Content of a message, default `csv`.
     pub parse: Parse,
     /// Numbers in a message, `1..=1024`; 0 with `Parse::Raw`.
     pub channels: usize,
@@ -225,31 +225,31 @@ pub struct SerialSpec {
 /// `node = "PROGRAM"` with `[device.NAME.process]`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ProcessSpec {
-    /// The program: an absolute path, or the name as it is written where nothing is to be run (a
+    /// The program: an absolute path, or the name as written if nothing is to be run (a
     /// registry read from an episode).
     pub program: PathBuf,
     /// Its arguments, none by default.
     pub args: Vec<String>,
     /// Which node of the device it opens, default [`Opens::Usb`].
     pub opens: Opens,
-    /// What its samples hold, default bytes.
+    /// Content of its samples, default bytes.
     pub kind: ModalityKind,
     /// Image: `[height, width]`. Scalars: `[channels]`. Bytes: empty.
     pub shape: Vec<u32>,
 }
 
-/// The node of its USB device that a program opens. The program starts when udev has that node in
-/// place, and is given its path.
+/// The node of its USB device that a program opens. The program starts when udev has created that
+/// node, and receives its path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Opens {
     /// The V4L2 capture node.
     Video,
     /// The serial line.
     Tty,
-    /// The USB device itself, `/dev/bus/usb/...`: for programs that use libusb or find the device
+    /// The USB device itself, `/dev/bus/usb/...`: for programs that use libusb or search for the device
     /// themselves.
     Usb,
-    /// Its network interface, which has no path: `can` and `lan` read it, no program.
+    /// Its network interface, which has no path: read by `can` and `lan`, not by a program.
     Net,
 }
 
@@ -273,11 +273,11 @@ pub enum Parse {
     Json,
     /// Little-endian 32-bit floats.
     F32le,
-    /// Not looked into.
+    /// Not parsed.
     Raw,
 }
 
-/// Where a module sits (paper, section "Modular hardware").
+/// Position of a module (paper, section "Modular hardware").
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Mount {
@@ -302,7 +302,7 @@ pub enum WhenStale {
 }
 
 impl DeviceSpec {
-    /// What this device adds to an observation.
+    /// The modality that this device provides.
     #[must_use]
     pub fn modality(&self) -> Modality {
         Modality { name: self.name.clone(), kind: self.node.modality_kind(), shape: self.node.shape() }
@@ -323,7 +323,7 @@ impl NodeSpec {
         }
     }
 
-    /// What its pictures are, if it sends any and the entry says so.
+    /// The format of its pictures, if it sends any and the entry states it.
     #[must_use]
     pub fn picture(&self) -> Option<LanPicture> {
         match self {
@@ -347,7 +347,7 @@ impl NodeSpec {
         }
     }
 
-    /// What samples of a device that is read like this hold.
+    /// Content of the samples of a device that is read like this.
     #[must_use]
     pub fn modality_kind(&self) -> ModalityKind {
         match self {
@@ -381,12 +381,12 @@ impl Registry {
     }
 }
 
-/// What a user wants run when something happens to a device: the hooks of an entry; by default none.
+/// Programs to run at events of a device: the hooks of an entry; by default none.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Hooks {
     /// `on_attach`: the device was attached. Its node is opened meanwhile.
     pub attach: Option<Hook>,
-    /// `on_detach`: it was removed, and the program that read it, if one did, has ended.
+    /// `on_detach`: it was removed, and the program that read it, if any, has ended.
     pub detach: Option<Hook>,
     /// `on_record_start`: an episode begins, or the device was attached during one.
     pub record_start: Option<Hook>,
@@ -394,7 +394,7 @@ pub struct Hooks {
     pub record_stop: Option<Hook>,
 }
 
-/// A program and its arguments; no shell reads them.
+/// A program and its arguments; run without a shell.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Hook {
     /// As in [`ProcessSpec::program`].
@@ -413,15 +413,15 @@ impl Hooks {
         Self::KEYS.into_iter().zip(hooks).filter_map(|(key, hook)| Some((key, hook.as_ref()?)))
     }
 
-    /// Is there none?
+    /// Whether there is none.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.all().next().is_none()
     }
 }
 
-/// `[module.NAME]`: something that is mounted on the gripper, of those that bear sensors and those that are mechanics alone (paper, section "Module
-/// Catalog").
+/// `[module.NAME]`: a part that is mounted on the gripper, either with sensors or purely mechanical (paper, section
+/// "Module Catalog").
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct ModuleSpec {
     /// Its name, as a modality's.
@@ -443,10 +443,10 @@ pub enum ModuleError {
     Unknown {
         /// The name that was given.
         name: String,
-        /// What there is.
+        /// The known modules.
         fix: String,
     },
-    /// Two of one slot.
+    /// Two in one slot.
     #[error("--module {first} and --module {second} both sit in the slot {mount}: name the one that is mounted")]
     SameSlot {
         /// One.
@@ -461,13 +461,13 @@ pub enum ModuleError {
 /// The modules of these names.
 ///
 /// # Errors
-/// When one is not known, or two sit in one slot.
+/// When one is unknown, or two are in one slot.
 pub fn mounted<'a>(modules: &'a [ModuleSpec], names: &[String]) -> Result<Vec<&'a ModuleSpec>, ModuleError> {
     let mut found: Vec<&ModuleSpec> = Vec::new();
     for name in names {
         let Some(module) = modules.iter().find(|module| module.name == *name) else {
             let fix = if modules.is_empty() {
-                "it names no modules: write one, or say it with --tag".to_owned()
+                "it names no modules: write one, or use --tag".to_owned()
             } else {
                 crate::registry::did_you_mean(name, modules.iter().map(|module| &module.name), "modules are")
             };
@@ -488,11 +488,11 @@ pub fn mounted<'a>(modules: &'a [ModuleSpec], names: &[String]) -> Result<Vec<&'
 /// transistors and of its winding °C, and its error code.
 pub const MOTOR_CHANNELS: usize = 6;
 
-/// Bytes that stand for one frame in a sample of [`CanProtocol::Raw`].
+/// Bytes per frame in a sample of [`CanProtocol::Raw`].
 pub const CAN_RECORD: usize = 24;
 /// Frames in such a sample, at most.
 pub const CAN_BATCH: usize = 128;
-/// A controller that left the bus after too many errors is made to return after this many ms.
+/// A controller that left the bus after too many errors is restarted after this many ms.
 pub const CAN_RESTART_MS: u32 = 100;
 /// Bit rates that slcan has a name for, `S0` to `S8`.
 pub const SLCAN_BITRATES: [u32; 9] = [10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000];
@@ -500,7 +500,7 @@ pub const SLCAN_BITRATES: [u32; 9] = [10_000, 20_000, 50_000, 100_000, 125_000, 
 /// `[device.NAME.can]`: a CAN adapter and what is behind it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CanSpec {
-    /// How the adapter is spoken to, default `SocketCAN`.
+    /// How the adapter is accessed, default `SocketCAN`.
     pub adapter: CanAdapter,
     /// Bits a second on the bus, `10_000..=1_000_000`, default 1,000,000.
     pub bitrate: u32,
@@ -508,12 +508,12 @@ pub struct CanSpec {
     pub protocol: CanProtocol,
 }
 
-/// How a CAN adapter is spoken to.
+/// How a CAN adapter is accessed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum CanAdapter {
     /// The kernel has a driver for it, which makes it a network interface.
     SocketCan,
-    /// A serial line that speaks slcan (Lawicel's protocol).
+    /// A serial line with the protocol slcan (Lawicel).
     Slcan,
     /// A serial line with the framing of Damiao's adapter.
     Damiao,
@@ -522,7 +522,7 @@ pub enum CanAdapter {
 /// What is on the bus.
 #[derive(Debug, Clone, PartialEq)]
 pub enum CanProtocol {
-    /// Frames, not looked into. None is sent.
+    /// Frames, not parsed. None is sent.
     Raw,
     /// Damiao's motors.
     Damiao(DamiaoSpec),
@@ -539,7 +539,7 @@ impl CanSpec {
     }
 }
 
-/// Gives a type the words for its values: a table that the parser reads, the word of a value, and that as its text.
+/// Gives a type the words for its values: a table for the parser, the word of a value, and `Display` with that word.
 macro_rules! words {
     ($($(#[$doc:meta])* $type:ident, $count:literal: $($word:literal = $value:ident),+ $(; $more:literal = $other:ident)?;)+) => {$(
         impl $type {
@@ -671,7 +671,7 @@ pub enum InterlockInput {
 /// `key = { ... }`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct KeyInput {
-    /// The device: an absolute path, or the name that it gives itself.
+    /// The device: an absolute path, or the name that it reports.
     pub device: String,
     /// The key's name in `linux/input-event-codes.h`.
     pub code: String,
@@ -688,8 +688,8 @@ pub struct GpioInput {
     pub chip: PathBuf,
     /// Its line.
     pub line: u32,
-    /// The actuator may move while the line is high; otherwise while it is low. The line is pulled the other way, so
-    /// that a broken wire stops.
+    /// The actuator may move while the line is high; otherwise while it is low. The line is biased to the other level,
+    /// so that a broken wire stops.
     pub runs_while_high: bool,
 }
 
@@ -700,9 +700,10 @@ pub struct LineInput {
     pub path: PathBuf,
     /// Bits a second, default 115200.
     pub baud: u32,
-    /// The line that says that the actuator may move.
+    /// The line that means that the actuator may move.
     pub run: String,
-    /// The line that says that it may not; then any other than the two is left out. Without it every other line says so.
+    /// The line that means that it may not; then lines other than the two are ignored. Without it every other line
+    /// means so.
     pub stop: Option<String>,
     /// Without one of the two for this long the input is lost.
     pub silence: Duration,
@@ -732,7 +733,7 @@ pub enum Bound {
 }
 
 impl Bound {
-    /// Is `value` on this side? One that is no number is not.
+    /// Whether `value` is on this side. NaN is not.
     #[must_use]
     pub fn holds(self, value: f64) -> bool {
         match self {
@@ -769,69 +770,70 @@ impl fmt::Display for InterlockInput {
     }
 }
 
-/// How much of what can go wrong an episode may have before it gets a grade: the limits of one. A figure beyond its limit earns the grade; `None` is a check that is off.
+/// How many defects an episode may have before it gets a grade: the limits of one grade. A figure beyond its limit
+/// leads to the grade; `None` is a check that is off.
 ///
-/// Shares are of the samples that should be there, `0.0..=1.0`.
+/// Shares are of the expected samples, `0.0..=1.0`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Limits {
-    /// Samples the device lost before `rapid` had them.
+    /// Samples the device lost before `rapid` received them.
     pub lost: Option<f64>,
     /// Samples lost between the driver and the file.
     pub dropped: Option<f64>,
-    /// Samples that the driver called damaged, and JPEG pictures without their beginning or end.
+    /// Samples that the driver reported as damaged, and JPEG pictures without their beginning or end.
     pub damaged: Option<f64>,
     /// Samples with a non-increasing sequence number or capture time.
     pub duplicate: Option<f64>,
-    /// Samples that are byte for byte the one before.
+    /// Samples that are byte-identical to the one before.
     pub repeated: Option<f64>,
-    /// Longest time in which every sample is byte for byte the one before.
+    /// Longest time in which every sample is byte-identical to the one before.
     pub frozen: Option<Duration>,
     /// Samples that came too late for their frame.
     pub late: Option<f64>,
-    /// Longest time without a sample while the device was there.
+    /// Longest time without a sample while the device was attached.
     pub gap: Option<Duration>,
     /// Longest time in which the device was plugged in and did not run.
     pub opening: Option<Duration>,
-    /// Change of the stamps against this machine's clock over the episode, and how far they lie in
+    /// Change of the stamps against this machine's clock over the episode, and how far they are in
     /// the future.
     pub clock: Option<Duration>,
-    /// Least rate while the device was there, as a share of the nominal one.
+    /// Least rate while the device was attached, as a share of the nominal one.
     pub rate: Option<f64>,
-    /// Least share of the ticks at which the device was there that have a sample of it in `sync_window`.
+    /// Least share of the ticks while the device was attached that have a sample of it in `sync_window`.
     pub valid: Option<f64>,
 }
 
-/// What the verdict on a modality is made of.
+/// Limits for the verdict on a modality.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct VerdictSpec {
     /// Beyond these the episode is SUSPECT.
     pub suspect: Limits,
     /// Beyond these it is BAD.
     pub bad: Limits,
-    /// Samples a second the device should send, if anything says so: a camera's `fps`, or `hz`.
+    /// Nominal samples per second of the device, if known: a camera's `fps`, or `hz`.
     pub hz: Option<f64>,
 }
 
 impl VerdictSpec {
-    /// The limits of a modality of which the registry says nothing else.
+    /// The default limits of a modality.
     ///
-    /// * lost 1 %, 5 %: one picture in a hundred is a hole that a neighbour fills; from some 2 to 5 %
-    ///   on other recorders call a rig overloaded.
+    /// * lost 1 %, 5 %: one missing picture in a hundred is replaced by a neighbour; other recorders call a
+    ///   rig overloaded from some 2 to 5 % on.
     /// * dropped 0, 5 %: this machine could not keep up, which it always should.
-    /// * damaged 1 %, 5 %: as good as lost. A camera's first picture after it was plugged in often is.
+    /// * damaged 1 %, 5 %: equivalent to lost. A camera's first picture after a plug often is.
     /// * duplicate 0.1 %, 5 %: a stamp that does not increase puts a sample into the wrong frame.
     /// * repeated 10 %, 60 %: a camera that sends every second picture twice (50 %) runs at half its
-    ///   rate; more than that stands still.
-    /// * frozen 500 ms, 2 s: a live sensor has noise, and no two pictures of it are equal. Only of
+    ///   rate; with more than that it has stopped.
+    /// * frozen 500 ms, 2 s: a live sensor has noise, and no two pictures of it are equal. Only for
     ///   images: numbers and bytes may well be constant.
-    /// * late 1 %, 20 %: the frame went without them, although the file has them.
-    /// * gap `stall_after`, ten times that: longer is what the monitor calls stalled.
-    /// * opening 5 s, off: two of them a replugged device is made to wait, and a slow camera takes
+    /// * late 1 %, 20 %: they are missing from their frame, although the file has them.
+    /// * gap `stall_after`, ten times that: from this length on the monitor shows stalled.
+    /// * opening 5 s, off: two of them are the cooldown of a replugged device, and a slow camera takes
     ///   another two. Longer is a node that does not start. How bad that is depends on the task.
     /// * clock 10 ms, 100 ms: less than half the usual window of 25 ms cannot move many samples into
     ///   another frame.
-    /// * valid 90 %, 50 %: a policy learns from what the frames hold, and of a tick without a valid sample that is
-    ///   an old one or nothing. A device slower than twice `sync_window` misses ticks by its phase alone.
+    /// * valid 90 %, 50 %: a policy is trained on the content of the frames, and a tick without a valid sample has
+    ///   an old one or none. A device slower than twice `sync_window` misses ticks by its phase alone.
     /// * rate 90 %, 50 %: in poor light cameras expose longer and halve their rate.
     #[must_use]
     pub fn of(kind: ModalityKind, stall_after: Duration, hz: Option<f64>) -> Self {
@@ -867,7 +869,7 @@ impl VerdictSpec {
         Self { suspect, bad, hz }
     }
 
-    /// Does anything here want to know whether two payloads are equal?
+    /// Whether any check here compares payloads for equality.
     #[must_use]
     pub fn compares(&self) -> bool {
         [self.suspect, self.bad].iter().any(|limits| limits.frozen.is_some() || limits.repeated.is_some())

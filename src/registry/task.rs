@@ -1,4 +1,4 @@
-//! The rig of the simulated task: its registry, and what of it is plugged in when a trial begins.
+//! The rig of the simulated task: its registry, and the devices plugged in when a trial begins.
 
 use std::sync::{Arc, OnceLock};
 
@@ -7,7 +7,7 @@ use super::spec::Registry;
 
 const TEXT: &str = include_str!("task.toml");
 
-/// The entries of the registry and which part of the task each of them is.
+/// The entries of the registry with the part of the task that each of them is.
 pub const PARTS: [(&str, TaskPart); 3] =
     [("cam_wrist", TaskPart::Wrist), ("tactile_tip", TaskPart::Tactile), ("arm", TaskPart::Arm)];
 
@@ -24,7 +24,7 @@ impl Registry {
 }
 
 impl Scenario {
-    /// Trial `seed` of the simulated task, for [`Registry::task`]: everything is plugged in, and stays so.
+    /// Trial `seed` of the simulated task, for [`Registry::task`]: everything is plugged in, and stays plugged in.
     #[must_use]
     pub fn task(registry: &Registry, seed: u64) -> Self {
         let scene = Arc::new(Scene { seed, trial: OnceLock::new() });

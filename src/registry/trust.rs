@@ -1,15 +1,15 @@
-//! Trust: may anybody but root and this user change what a path leads to?
+//! Trust: whether any user other than root and this user may change the target of a path.
 //!
-//! A file can be exchanged by whoever may write to it, to a folder on the way to it, or to a link on
-//! that way. What root reads or runs must not depend on such a file: it would lend root's rights to
-//! whoever wrote it. The same rule as OpenSSH's for its key files (`StrictModes`, `safe_path()`).
+//! A file can be exchanged by any user who may write to it, to a folder on the way to it, or to a link on
+//! that way. Files that root reads or runs must not depend on such a file: it would grant root's rights to
+//! its writer. The same rule as OpenSSH's for its key files (`StrictModes`, `safe_path()`).
 //!
-//! As root only root is trusted; otherwise root and this user. A folder anybody may write to is as
-//! good as another if it is sticky, as /tmp is: there only the owner of an entry, or of the folder,
-//! can take the entry away. An access control list shows in the bits of the group (acl(5)).
+//! As root only root is trusted; otherwise root and this user. A folder that any user may write to is
+//! acceptable if it is sticky, like /tmp: there only the owner of an entry, or of the folder,
+//! can remove the entry. An access control list is visible in the bits of the group (acl(5)).
 //!
-//! Invariant: a path without an objection cannot be changed between the look at it and its use, by
-//! anybody who is not trusted.
+//! Invariant: a path without an objection cannot be changed between the check and its use by an
+//! untrusted user.
 
 use std::fmt;
 use std::io;
@@ -19,10 +19,10 @@ use rustix::fs::{FileType, Stat};
 
 use crate::folder::{FolderError, Missing, Walk};
 
-/// Why what a path leads to cannot be trusted. As text, the reason without the file's own name.
+/// Why the target of a path cannot be trusted. As text, the reason without the file's own name.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Distrust {
-    /// What others can change.
+    /// The object that others can change.
     place: Place,
     /// Its path.
     path: PathBuf,
@@ -45,7 +45,7 @@ enum Why {
 }
 
 impl Distrust {
-    /// What to do about it, in words for a shell.
+    /// The fix, with shell commands where possible.
     #[must_use]
     pub fn fix(&self) -> String {
         let path = shown(&self.path);
@@ -70,22 +70,22 @@ impl fmt::Display for Distrust {
                 write!(f, "other users may write to the folder {path} (mode {mode:04o}) and {gain}")
             }
             (Place::Link, Why::Owner(uid)) => write!(f, "the link {path} belongs to user {uid}, who {gain}"),
-            // The mode of a link means nothing.
+            // The mode of a link has no meaning.
             (Place::Link, Why::Mode(_)) => write!(f, "others {gain}"),
         }
     }
 }
 
-/// Looks at a file and at everything on the way to it: the first reason not to trust it, if any.
+/// Checks a file and everything on the way to it: the first reason not to trust it, if any.
 ///
-/// To be asked of a registry and of every program it names: as root an objection is a refusal, for
+/// To be called for a registry and for every program it names: as root an objection is an error, for
 /// another user a warning.
 ///
 /// # Errors
-/// When there is no such file, or its folder may not be looked at.
+/// When there is no such file, or its folder may not be accessed.
 pub fn distrust(path: &Path) -> io::Result<Option<Distrust>> {
     let euid = rustix::process::geteuid().as_raw();
-    // The way to the working folder is part of the way.
+    // The path to the working folder is part of the way.
     let path = if path.is_absolute() { path.to_owned() } else { std::env::current_dir()?.join(path) };
     let mut found = None;
     let mut check = |part: &Path, stat: &Stat| {
@@ -97,7 +97,7 @@ pub fn distrust(path: &Path) -> io::Result<Option<Distrust>> {
         let bits = Bits { mode: stat.st_mode & 0o7777, owner: stat.st_uid, group: stat.st_gid };
         let Some(why) = judge(place, bits, euid) else { return Ok(()) };
         found = Some(Distrust { place, path: part.to_owned(), why });
-        // Goes no further.
+        // Stops the walk.
         Err(FolderError::NoFolder(part.to_owned()))
     };
     let walked = Walk::new(Missing::Refused, &mut check).to(&path);
@@ -205,13 +205,13 @@ mod tests {
         fs::set_permissions(&file, PermissionsExt::from_mode(0o666)).unwrap();
         symlink(&file, tree.at("absolute")).unwrap();
         assert_eq!(found(&tree.at("absolute")), Some((Place::File, file.clone())));
-        let said = distrust(&tree.at("absolute")).unwrap().unwrap();
-        assert_eq!(said.to_string(), "other users may write to it (mode 0666)");
-        assert_eq!(said.fix(), format!("chmod go-w {}", file.display()));
+        let reason = distrust(&tree.at("absolute")).unwrap().unwrap();
+        assert_eq!(reason.to_string(), "other users may write to it (mode 0666)");
+        assert_eq!(reason.fix(), format!("chmod go-w {}", file.display()));
     }
 
     #[test]
-    fn a_circle_of_links_and_a_missing_file_are_errors() {
+    fn a_loop_of_links_and_a_missing_file_are_errors() {
         let (tree, _) = Tree::new();
         symlink("two", tree.at("one")).unwrap();
         symlink("one", tree.at("two")).unwrap();

@@ -17,7 +17,7 @@ const SIZES: [(&str, u64); 9] = [
     ("TiB", 1 << 40),
 ];
 
-/// `25ms`, `1.5s`, `2 min`. `None` without a unit, or when it is no duration.
+/// `25ms`, `1.5s`, `2 min`. `None` without a unit, or when it is not a duration.
 #[must_use]
 pub fn parse_duration(text: &str) -> Option<Duration> {
     let (number, unit) = split(text)?;
@@ -28,7 +28,7 @@ pub fn parse_duration(text: &str) -> Option<Duration> {
     (0.0..=1e18).contains(&nanoseconds).then(|| Duration::from_nanos(nanoseconds as u64))
 }
 
-/// `512MiB`, `64 KiB`, `2MB`. `None` without a unit, or when it is no size.
+/// `512MiB`, `64 KiB`, `2MB`. `None` without a unit, or when it is not a size.
 #[must_use]
 pub fn parse_size(text: &str) -> Option<u64> {
     let (number, unit) = split(text)?;
@@ -59,7 +59,7 @@ pub fn show_duration(duration: Duration) -> String {
     if nanoseconds == 0 { "0s".to_owned() } else { format!("{nanoseconds}ns") }
 }
 
-/// A size in the largest binary unit of which it is at least one, to one decimal.
+/// A size in the largest binary unit in which it is at least one, to one decimal.
 #[must_use]
 pub fn show_size(bytes: u64) -> String {
     for (unit, shift) in [("TiB", 40), ("GiB", 30), ("MiB", 20), ("KiB", 10)] {

@@ -106,7 +106,7 @@ fn plugged_devices_are_reported_with_any_registry() {
         "[[device]]\nname = \"cam_wrist\"\n[[device]]\nname = \"other\"\nlike = \"cam_wrist\"\nserial = \"CAM00B7\"\n",
     );
     let stranger = text(&place.run(&["--sim=stranger.toml", "devices"]).stdout);
-    assert!(stranger.contains("its serial is \"CAM00A1\" and this unit says \"CAM00B7\""), "{stranger}");
+    assert!(stranger.contains("its serial is \"CAM00A1\" and this unit reports \"CAM00B7\""), "{stranger}");
     place.write("wrong.toml", "[device.cam]\nvid = \"046d\"\npid = \"0825\"\nnode = \"camra\"\n");
     let wrong = place.run(&["devices", "--config", "wrong.toml"]);
     assert_eq!(wrong.status.code(), Some(2));

@@ -14,7 +14,7 @@ use crate::registry::Registry;
 use crate::sample::{Epoch, SampleHeader};
 use crate::status::{Grade, Level, Snapshot, Verdict};
 
-/// How long a condition may take to come true.
+/// How long a condition may take to hold.
 const PATIENCE: Duration = Duration::from_secs(30);
 
 /// A bus on which nothing is published.
@@ -31,7 +31,7 @@ impl Source for Quiet {
     }
 }
 
-/// A file that its disk loses at the end.
+/// A file whose disk fails at the end.
 struct Lost(File);
 
 impl io::Write for Lost {
@@ -118,7 +118,7 @@ fn idle_stage() -> Stage {
     Stage::start("idle", |_| std::future::pending())
 }
 
-/// Waits until the file being recorded, if any, is as it should be.
+/// Waits until the file being recorded, if any, meets the condition.
 async fn until(board: &Board, what: &str, holds: impl Fn(Option<&str>) -> bool) {
     let begun = std::time::Instant::now();
     loop {
@@ -126,13 +126,13 @@ async fn until(board: &Board, what: &str, holds: impl Fn(Option<&str>) -> bool) 
         if holds(recording.as_ref().and_then(|recording| recording.file.to_str())) {
             return;
         }
-        assert!(begun.elapsed() < PATIENCE, "{what} does not come true: {recording:?}");
+        assert!(begun.elapsed() < PATIENCE, "{what} does not hold: {recording:?}");
         std::thread::sleep(Duration::from_millis(1));
         tokio::task::yield_now().await;
     }
 }
 
-/// Lets everything else do what it can: the clock of the tests advances when no task has work.
+/// Lets all other tasks do what they can: the clock of the tests advances when no task has work.
 async fn idle() {
     tokio::time::sleep(2 * SETTLE_LIMIT).await;
 }
@@ -202,7 +202,7 @@ fn ended(error: Option<&str>) -> What {
     }
 }
 
-/// More events than wait for a reader.
+/// More events than the channel buffers for a reader.
 fn flood(board: &Board) {
     for _ in 0..10_000 {
         board.announce(What::Log { level: Level::Info, text: String::new() });
@@ -252,30 +252,30 @@ async fn moment(board: &Board, keys: &mpsc::UnboundedSender<Request>) -> PathBuf
 async fn when(board: &Board, what: &str, holds: impl Fn(&Snapshot) -> bool) {
     let begun = std::time::Instant::now();
     while !holds(&board.snapshot()) {
-        assert!(begun.elapsed() < PATIENCE, "{what} does not come true: {:?}", board.snapshot());
+        assert!(begun.elapsed() < PATIENCE, "{what} does not hold: {:?}", board.snapshot());
         tokio::time::sleep(Duration::from_millis(1)).await;
     }
 }
 
 #[tokio::test]
-async fn the_last_episode_is_dropped_when_asked_for_and_no_other() {
+async fn only_the_last_episode_is_dropped_on_request() {
     let mut bench = Bench::new(false, None, |file| Box::new(file));
     let keys = async {
         let first = moment(&bench.board, &bench.keys).await;
         let second = moment(&bench.board, &bench.keys).await;
-        // Not the last one; a file that is no episode.
+        // Not the last one; and a file that is not an episode.
         let foreign = first.with_file_name("notes.mcap");
         std::fs::write(&foreign, "precious").unwrap();
         for file in [&first, &foreign] {
             bench.keys.send(Request::DropEpisode(file.clone())).unwrap();
         }
-        // What is asked for is done in turn: both were refused when this one has begun.
+        // Requests are carried out in order: both were refused by the time this one has begun.
         let third = moment(&bench.board, &bench.keys).await;
         assert!(first.exists() && foreign.exists() && second.exists());
         bench.keys.send(Request::DropEpisode(third.clone())).unwrap();
         when(&bench.board, "its file is gone", |snapshot| snapshot.last_episode.is_none()).await;
         assert!(!third.exists() && bench.board.snapshot().short_episode.is_none());
-        // One that is asked for when the next has begun.
+        // A request for one after the next has begun.
         let fourth = moment(&bench.board, &bench.keys).await;
         bench.keys.send(Request::ToggleRecording(Stamp::now())).unwrap();
         bench.keys.send(Request::DropEpisode(fourth.clone())).unwrap();

@@ -1,4 +1,4 @@
-//! Cameras made of numbers, whose latency is known.
+//! Simulated cameras with a known latency.
 
 use std::time::Duration;
 
@@ -37,7 +37,7 @@ const CAMERA: Camera = Camera {
     seed: 1,
 };
 
-/// Numbers from 0 to 1 that look random.
+/// Pseudo-random numbers from 0 to 1.
 fn random(state: &mut u64) -> f64 {
     *state ^= *state << 13;
     *state ^= *state >> 7;
@@ -68,7 +68,7 @@ fn seen(camera: Camera, seconds: u64) -> Vec<Seen> {
         let light = flash::lit_share(span(middle - half), span(middle + half));
         let (depth, time) = camera.adapts;
         level += (light - level) / (camera.fps * time).max(1.0);
-        // The sum of twelve is near enough to a Gaussian.
+        // The sum of twelve is close enough to a Gaussian.
         let noise = (0..12).map(|_| random(&mut state)).sum::<f64>() - 6.0;
         let brightness = 30.0 + camera.contrast * (light - depth * level + camera.noise * noise);
         if random(&mut state) >= camera.dropped {
@@ -91,7 +91,7 @@ fn near(camera: Camera, within_ms: f64) {
 }
 
 #[test]
-fn the_latency_comes_out_to_a_few_milliseconds() {
+fn the_latency_is_found_to_a_few_milliseconds() {
     near(CAMERA, 1.0);
     near(Camera { latency_ms: 0.0, ..CAMERA }, 1.0);
     near(Camera { latency_ms: -20.0, ..CAMERA }, 1.0);
@@ -104,7 +104,7 @@ fn the_latency_comes_out_to_a_few_milliseconds() {
 }
 
 #[test]
-fn the_uncertainty_holds_the_truth_nearly_always() {
+fn the_uncertainty_interval_nearly_always_contains_the_true_value() {
     let mut held = 0;
     let cases = 60;
     for seed in 0..cases {
@@ -117,7 +117,7 @@ fn the_uncertainty_holds_the_truth_nearly_always() {
 }
 
 #[test]
-fn a_screen_that_is_late_by_chance_adds_its_mean() {
+fn a_random_delay_of_the_screen_adds_its_mean() {
     // A display shows a change at its next refresh, 0 to 16.7 ms later.
     let mut state = 77;
     let mut late = flips(12);
@@ -129,7 +129,7 @@ fn a_screen_that_is_late_by_chance_adds_its_mean() {
 }
 
 #[test]
-fn what_does_not_follow_the_light_is_refused_with_a_reason() {
+fn pictures_that_do_not_follow_the_light_are_refused_with_a_reason() {
     let of = |seen: Vec<Seen>| estimate(&flips(12), &seen).unwrap_err();
     let level = |brightness: f64, spread: f64| {
         let mut state = 5;
@@ -142,7 +142,7 @@ fn what_does_not_follow_the_light_is_refused_with_a_reason() {
     assert!(matches!(of(level(120.0, 0.5)), Refusal::Flat { .. }));
     assert_eq!(of(level(254.0, 0.5)), Refusal::Saturated);
     assert!(matches!(of(level(120.0, 80.0)), Refusal::Unlike { correlation } if correlation < 0.35));
-    // A lamp that blinks by itself.
+    // A lamp that blinks on its own.
     let mut blinking = seen(CAMERA, 13);
     for seen in &mut blinking {
         seen.brightness = if seen.at.0 / 400_000_000 % 2 == 0 { 20.0 } else { 200.0 };
@@ -150,7 +150,7 @@ fn what_does_not_follow_the_light_is_refused_with_a_reason() {
     assert!(matches!(of(blinking), Refusal::Unlike { .. }));
     assert!(matches!(of(seen(CAMERA, 0)), Refusal::TooFew { pictures: 0..30, flips: 8.. }));
     assert!(matches!(estimate(&[], &seen(CAMERA, 13)), Err(Refusal::TooFew { flips: 0, .. })));
-    // A light that went on and off in even steps fits at every other one of them.
+    // A light that switches at regular intervals fits at every second one of them.
     let even: Vec<_> = (0..40_u64)
         .map(|index| Flip { at: BEGIN.after(Duration::from_millis(index * 150)), lit: index % 2 == 0 })
         .collect();
@@ -180,7 +180,7 @@ proptest! {
     }
 
     #[test]
-    fn no_numbers_make_it_panic(
+    fn no_input_causes_a_panic(
         flips in proptest::collection::vec((any::<u64>(), any::<bool>()), 0..30),
         seen in proptest::collection::vec((any::<u64>(), any::<f64>()), 0..60),
     ) {

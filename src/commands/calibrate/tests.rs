@@ -42,7 +42,7 @@ fn the_result_names_what_it_includes_and_the_line_to_write() {
 }
 
 #[test]
-fn the_delay_of_the_light_is_subtracted_and_no_negative_latency_is_written() {
+fn the_delay_of_the_light_is_subtracted_and_a_negative_latency_becomes_zero() {
     let text = printed(ESTIMATE, &Chosen::Terminal, 15, "0ms");
     assert!(
         text.contains("latency 33.3 ms") && text.contains("15.0 ms of the light") && text.contains("\"33ms\""),

@@ -144,7 +144,7 @@ fn json_distinguishes_plugged_and_missing() {
 }
 
 #[test]
-fn text_of_a_device_is_harmless_and_keeps_the_columns() {
+fn text_of_a_device_is_sanitized_and_keeps_the_columns() {
     let hostile = usb((0x046d, 0x0825), Some("A\x1b[2J\"\n"), "1-2", Some("red\x1b[31m\nline"));
     let attached = [attachment(DeviceNode::Video("/dev/video0".into()), hostile)];
     let text = text(Entries::NoFile, &attached);

@@ -85,7 +85,7 @@ pub(super) struct Interface {
     pub(super) name: String,
     /// `up`, `down` or `unknown`
     pub(super) state: String,
-    /// Bits per second; not in sysfs, see [`ask_can`].
+    /// Bits per second; not in sysfs, see [`query_can`].
     pub(super) bitrate: Option<u32>,
     /// It left the bus after too many errors.
     pub(super) bus_off: bool,
@@ -202,7 +202,7 @@ fn limits(root: &Path) -> (Option<u64>, Option<u64>) {
 
 /// Queries the kernel for properties of CAN interfaces that are not in sysfs.
 #[cfg(feature = "motors")]
-pub(super) fn ask_can(interfaces: &mut [Interface]) {
+pub(super) fn query_can(interfaces: &mut [Interface]) {
     for interface in interfaces {
         if let Ok(seen) = netlink::look(&interface.name) {
             (interface.bitrate, interface.bus_off) = (seen.bitrate, seen.bus_off);
@@ -228,8 +228,8 @@ fn interfaces(root: &Path, usb: &[UsbDevice]) -> Vec<Interface> {
     names(&class).iter().filter_map(can).collect()
 }
 
-/// A USB device of `/sys/bus/usb/devices`. Names there: `usb1` is a root hub, `1-2.3` the device in port 3 of the hub in
-/// port 2 of bus 1; names with a colon are interfaces.
+/// A USB device of `/sys/bus/usb/devices`. Names there: `usb1` is a root hub, `1-2.3` the device in port 3 of the hub
+/// in port 2 of bus 1; names with a colon are interfaces.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(super) struct UsbDevice {
     /// Its port: `1-2.3`, or `usb1` for a root hub.

@@ -1,8 +1,8 @@
 //! From facts about the host to findings, with a fix for each problem.
 //!
-//! Whether the cameras of one bus fit into its bandwidth: a camera reserves bandwidth for isochronous transfers when it is
-//! started; the kernel refuses it if too little is left. The reservation depends on the camera's firmware: it is estimated
-//! here by the size of its pictures. For compressed pictures only an upper limit is known.
+//! Whether the cameras of one bus fit into its bandwidth: a camera reserves bandwidth for isochronous transfers when it
+//! is started; the kernel refuses it if too little is left. The reservation depends on the camera's firmware: it is
+//! estimated here by the size of its pictures. For compressed pictures only an upper limit is known.
 //!
 //! Pure: facts and registry in, findings out.
 
@@ -133,7 +133,7 @@ fn subsystem(entry: &DeviceSpec) -> Option<(&'static str, &'static str)> {
     }
 }
 
-/// A rate, for people.
+/// A rate as text.
 pub(super) fn megabytes(bytes: f64) -> String {
     format!("{:.1} MB/s", bytes / 1e6)
 }
@@ -183,11 +183,11 @@ fn bus(bus: u32, mbit: f64, loads: &[CameraLoad]) -> Finding {
 fn speeds(plugged: &[(&DeviceSpec, &UsbDevice)]) -> Vec<Finding> {
     let slow =
         plugged.iter().filter(|(entry, device)| matches!(entry.node, NodeSpec::Camera(_)) && device.mbit < SLOWEST);
-    let say = |(entry, device): &(&DeviceSpec, &UsbDevice)| {
+    let finding = |(entry, device): &(&DeviceSpec, &UsbDevice)| {
         let what = format!("[device.{}] runs at {} Mbit/s, too slow for pictures", entry.name, device.mbit);
         Finding::bad("speed", what, format!("use another cable, port or hub: it is at port {}", device.port))
     };
-    slow.map(say).collect()
+    slow.map(finding).collect()
 }
 
 /// Units with the same serial number cannot be distinguished by it.
@@ -352,12 +352,12 @@ pub(super) fn can(facts: &Facts, entries: &[DeviceSpec], plugged: &[(&DeviceSpec
                 format!("{name} is down; rapid brings it up only if it is permitted to"),
                 fix,
             ));
-        } else if let (Some(own), Some(wished)) = (interface.bitrate, bitrate)
-            && own != wished
+        } else if let (Some(own), Some(declared)) = (interface.bitrate, bitrate)
+            && own != declared
         {
-            let what = format!("{name} runs at {own} bit/s, and its entry declares {wished}");
+            let what = format!("{name} runs at {own} bit/s, and its entry declares {declared}");
             let fix = format!(
-                "sudo ip link set {name} down && sudo ip link set {name} up type can bitrate {wished}; or correct the entry"
+                "sudo ip link set {name} down && sudo ip link set {name} up type can bitrate {declared}; or correct the entry"
             );
             found.push(Finding::bad("can", what, fix));
         } else {
@@ -499,14 +499,14 @@ fn most(entry: &DeviceSpec) -> Option<f64> {
     }
 }
 
-/// Payload that isochronous transfers of one high-speed bus carry at most, bytes a second: 80 % of 480
-/// Mbit/s (USB 2.0, 5.6.4), of which 38 bytes a transaction of 1024 are overhead (5.6.3).
+/// Most payload of the isochronous transfers of one high-speed bus, bytes per second: 80 % of 480 Mbit/s
+/// (USB 2.0, 5.6.4), with 38 bytes of overhead per transaction of 1024 (5.6.3).
 const HIGH_SPEED: f64 = 0.8 * 60e6 * 1024.0 / 1062.0;
-/// Of one endpoint: three transactions of 1024 bytes in each of 8000 microframes (5.6.3).
+/// For one endpoint: three transactions of 1024 bytes in each of 8000 microframes (5.6.3).
 const ONE_ENDPOINT: f64 = 3.0 * 1024.0 * 8000.0;
-/// Of a full-speed bus, and of one endpoint: 1023 bytes a millisecond (5.6.3).
+/// For a full-speed bus, and for one endpoint: 1023 bytes per millisecond (5.6.3).
 const FULL_SPEED: f64 = 1023.0 * 1000.0;
-/// Of a bus of 5 Gbit/s: 500 MB/s remain of its coding, 80 % of them for payload.
+/// For a bus of 5 Gbit/s: 500 MB/s remain after its encoding, 80 % of them for payload.
 const SUPER_SPEED: f64 = 0.8 * 500e6;
 
 /// Rates and sizes that cameras usually offer, largest first.
@@ -578,7 +578,7 @@ impl fmt::Display for CameraLoad {
     }
 }
 
-/// Payload a second that cameras on a bus of this speed can have together.
+/// Total payload in bytes per second of the cameras on a bus of this speed.
 #[must_use]
 pub(super) fn budget(mbit: f64) -> f64 {
     match mbit {
@@ -588,7 +588,7 @@ pub(super) fn budget(mbit: f64) -> f64 {
     }
 }
 
-/// And one of them.
+/// The same for one camera.
 #[must_use]
 pub(super) fn endpoint(mbit: f64) -> f64 {
     match mbit {
@@ -598,13 +598,13 @@ pub(super) fn endpoint(mbit: f64) -> f64 {
     }
 }
 
-/// What the cameras of one bus of this speed take of it, bytes a second.
+/// The part of it that the cameras of one bus of this speed use, bytes per second.
 #[must_use]
 pub(super) fn taken(loads: &[CameraLoad], mbit: f64) -> f64 {
     loads.iter().map(|load| load.reserves(mbit)).sum()
 }
 
-/// Settings that fit a bus of this speed: the most demanding camera gives way first. Only those that
+/// Settings that fit a bus of this speed: the most demanding camera is reduced first. Only those that
 /// change; `None` if nothing fits.
 #[must_use]
 pub(super) fn fitting(loads: &[CameraLoad], mbit: f64) -> Option<Vec<CameraLoad>> {
@@ -633,9 +633,9 @@ mod tests {
     }
 
     #[test]
-    fn what_fits_a_bus() {
+    fn suggested_settings_for_a_bus() {
         use PixelFormat::{Grey, Mjpg, Yuyv};
-        let said = |loads: &[CameraLoad], mbit: f64| match fitting(loads, mbit) {
+        let suggested = |loads: &[CameraLoad], mbit: f64| match fitting(loads, mbit) {
             None => "nothing fits".to_owned(),
             Some(lower) => lower.iter().map(ToString::to_string).collect::<Vec<_>>().join(", "),
         };
@@ -647,21 +647,21 @@ mod tests {
                 480.0,
                 "[device.cam] 640x480@30 GREY",
             ),
-            // More than one endpoint carries, though the bus would.
+            // More than one endpoint can carry, though the bus could.
             (vec![load(1280, 720, 30, Yuyv)], 480.0, "[device.cam] 800x600@15 YUYV"),
             (vec![load(1280, 720, 30, Grey)], 480.0, "[device.cam] 1280x720@25 GREY"),
-            // What a compressed picture takes is not known: it reserves an endpoint at the most.
+            // The size of compressed pictures is unknown: they reserve one endpoint at most.
             (vec![load(1920, 1080, 30, Mjpg)], 480.0, ""),
             (vec![load(320, 240, 30, Yuyv)], 12.0, "[device.cam] 320x240@5 YUYV"),
             (vec![load(640, 480, 60, Yuyv); 4], 5000.0, ""),
         ] {
-            assert_eq!(said(&loads, mbit), expected, "{loads:?} at {mbit}");
+            assert_eq!(suggested(&loads, mbit), expected, "{loads:?} at {mbit}");
         }
     }
 
     proptest! {
         #[test]
-        fn what_is_said_to_fit_does(
+        fn suggested_settings_fit(
             cameras in proptest::collection::vec((1_u32..4000, 1_u32..3000, 1_u32..200, 0_usize..3), 1..6),
             mbit in prop::sample::select(vec![1.5, 12.0, 480.0, 5000.0, 10_000.0]),
         ) {

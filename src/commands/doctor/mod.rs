@@ -32,7 +32,7 @@ pub fn doctor(
 ) -> io::Result<bool> {
     let mut facts = facts::collect(Path::new("/"));
     #[cfg(feature = "motors")]
-    facts::ask_can(&mut facts.can);
+    facts::query_can(&mut facts.can);
     facts.disk = disk(episodes);
     report(&facts, registry, format, out)
 }

@@ -1,4 +1,4 @@
-//! The doctor on trees that are made up, and its judgement on facts.
+//! The doctor on simulated machines, and its judgement on facts.
 
 use std::fs;
 use std::os::unix::fs::symlink;
@@ -61,7 +61,7 @@ impl Tree {
     }
 }
 
-/// The rig of the repository on one bus, with a stranger and a twin.
+/// The rig of the repository on one bus, with an unknown device and a duplicate.
 fn machine() -> Tree {
     let tree = Tree::new();
     tree.usb("usb1", ("1d6b", "0002"), "480", None, "xHCI Host Controller");
@@ -73,7 +73,7 @@ fn machine() -> Tree {
     tree.usb("usb2", ("1d6b", "0003"), "5000", None, "xHCI Host Controller");
     tree.write("sys/bus/usb/devices/1-1.2/power/control", "auto\n");
     tree.write("sys/bus/usb/devices/1-1.2:1.0/x", "");
-    // A device that goes away while it is looked at.
+    // A device that disappears while it is read.
     tree.write("sys/bus/usb/devices/1-4/idVendor", "1234\n");
     tree.node("video4linux", "video0", "1-1.2");
     tree.node("tty", "ttyACM0", "1-2");
@@ -94,7 +94,7 @@ fn machine() -> Tree {
     tree
 }
 
-/// What a test machine cannot be made to say.
+/// Sets the facts that a test machine cannot simulate.
 fn settled(mut facts: Facts) -> Facts {
     facts.user = User { is_root: false, groups: vec!["dialout".into()] };
     facts.shared_memory = Some((8 << 30, 256 << 20));
@@ -107,7 +107,7 @@ fn settled(mut facts: Facts) -> Facts {
     facts
 }
 
-fn said(facts: &Facts, registry: Result<&Registry, &str>, format: Format) -> (String, bool) {
+fn reported(facts: &Facts, registry: Result<&Registry, &str>, format: Format) -> (String, bool) {
     let mut out = Vec::new();
     let well = report(facts, registry, format, &mut out).unwrap();
     (String::from_utf8(out).unwrap(), well)
@@ -118,10 +118,10 @@ fn the_report_on_a_machine_with_everything_wrong() {
     let tree = machine();
     let facts = settled(collect(tree.root()));
     let registry = Registry::builtin();
-    let (text, well) = said(&facts, Ok(&registry), Format::Text);
+    let (text, well) = reported(&facts, Ok(&registry), Format::Text);
     assert!(!well);
     assert_snapshot!(text);
-    let (json, _) = said(&facts, Ok(&registry), Format::Json);
+    let (json, _) = reported(&facts, Ok(&registry), Format::Json);
     assert!(!json.contains('\u{1b}'));
     let lines: Vec<serde_json::Value> = json.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     assert_eq!(lines.iter().filter(|line| line["event"] == "usb").count(), 7);
@@ -129,17 +129,17 @@ fn the_report_on_a_machine_with_everything_wrong() {
 }
 
 #[test]
-fn a_machine_without_anything_is_told_of_too() {
+fn a_machine_without_any_device_is_reported() {
     let tree = Tree::new();
     let facts = collect(tree.root());
     assert_eq!((facts.usb.len(), facts.nodes.len(), facts.can.len()), (0, 0, 0));
-    let (text, well) = said(&facts, Err("no devices.toml"), Format::Text);
+    let (text, well) = reported(&facts, Err("no devices.toml"), Format::Text);
     assert!(!well);
     assert!(text.contains("no USB bus") && text.contains("BAD   registry   no devices.toml"), "{text}");
 }
 
 #[test]
-fn hostile_files_are_read_as_far_as_they_make_sense() {
+fn malformed_files_are_read_as_far_as_they_are_valid() {
     let tree = Tree::new();
     tree.usb("1-1", ("zzzz", "0825"), "480", None, "x");
     tree.usb("1-2", ("046d", "0825"), "NaN", None, "x");
@@ -148,11 +148,11 @@ fn hostile_files_are_read_as_far_as_they_make_sense() {
     fs::write(tree.root().join("sys/bus/usb/devices/1-3/product"), [0xff, 0xfe, b'\n']).unwrap();
     let facts = collect(tree.root());
     assert_eq!(facts.usb.iter().map(|device| device.port.as_str()).collect::<Vec<_>>(), ["1-3"]);
-    let (text, _) = said(&facts, Err("none"), Format::Text);
+    let (text, _) = reported(&facts, Err("none"), Format::Text);
     assert!(text.lines().all(|line| line.len() < 400), "{text}");
 }
 
-/// A machine where everything is as it should be.
+/// A machine without problems.
 fn well() -> (Registry, Facts) {
     let registry = Registry::parse(BUILTIN, None).unwrap().registry;
     let usb = |port: &str, mbit, ids: (u16, u16), serial: &str| UsbDevice {
@@ -199,7 +199,7 @@ fn well() -> (Registry, Facts) {
     (registry, facts)
 }
 
-/// What is not as it should be: levels and subjects.
+/// The problems: levels and subjects.
 fn wrong(facts: &Facts, registry: &Registry) -> Vec<String> {
     let rules = artifacts(registry).swap_remove(0).contents;
     judge::judge(facts, Some(registry), Some(&rules))
@@ -220,7 +220,7 @@ fn can(state: &str) -> Interface {
 type Change = fn(&mut Facts);
 
 #[test]
-fn one_thing_wrong_is_one_finding() {
+fn one_problem_is_one_finding() {
     let (registry, facts) = well();
     assert_eq!(wrong(&facts, &registry), Vec::<String>::new());
     let cases: [(Change, &str); 20] = [
@@ -298,7 +298,7 @@ fn one_thing_wrong_is_one_finding() {
 }
 
 #[test]
-fn an_exact_unit_is_not_taken_by_an_entry_that_takes_any() {
+fn an_exact_unit_is_not_assigned_to_an_entry_that_matches_any() {
     let entry = |name: &str, bit: u8, more: &str| {
         format!("[device.{name}]\nvid = \"1\"\npid = \"2\"\nnode = \"camera\"\nbit = {bit}\n{more}\n")
     };
@@ -318,7 +318,7 @@ fn an_exact_unit_is_not_taken_by_an_entry_that_takes_any() {
 }
 
 #[test]
-fn a_can_adapter_that_is_a_serial_line_is_looked_at_as_one() {
+fn a_can_adapter_on_a_serial_line_is_checked_as_one() {
     let text =
         "[device.arm]\nvid = \"1\"\npid = \"2\"\nnode = \"can\"\nbit = 0\n[device.arm.can]\nadapter = \"slcan\"\n";
     let registry = Registry::parse(text, None).unwrap().registry;
@@ -339,22 +339,22 @@ fn a_can_adapter_that_is_a_serial_line_is_looked_at_as_one() {
 }
 
 #[test]
-fn what_only_a_device_knows_is_not_said_to_be_the_most() {
+fn a_rate_that_only_the_device_knows_is_not_reported_as_the_maximum() {
     let camera = "[device.cam]\nnode = \"lan\"\nbit = 0\nmax_bytes = \"100KiB\"\n[device.cam.lan]\nprotocol = \"mjpeg\"\nhost = \"192.0.2.1\"\nfps = 10\n";
     let lidar = "[device.lidar]\nnode = \"lan\"\nbit = 1\n[device.lidar.lan]\nprotocol = \"udp\"\nhost = \"192.0.2.2\"\nport = 2368\n";
     let disk = Some(Disk { folder: "/data".into(), free: 10 << 30, size: 20 << 30, rate: Ok(500e6) });
     let facts = Facts { disk, ..Facts::default() };
-    let said = |text: &str| -> Vec<String> {
+    let disk_findings = |text: &str| -> Vec<String> {
         let registry = Registry::parse(text, None).unwrap().registry;
         let found = judge::judge(&facts, Some(&registry), None).into_iter();
         found.filter(|finding| finding.about == "disk").map(|finding| finding.what).collect()
     };
     let none = judge::judge(&facts, None, None).into_iter().find(|finding| finding.about == "disk").unwrap();
     assert!(none.what.contains("at most 0.0 MB/s"), "{}", none.what);
-    let known = said(camera);
+    let known = disk_findings(camera);
     assert_eq!(known[0], "/data took 500.0 MB/s; the devices send at most 1.0 MB/s (estimated)");
     assert!(known[1].ends_with("min of everything at most"), "{known:?}");
-    let unknown = said(&format!("{camera}{lidar}"));
+    let unknown = disk_findings(&format!("{camera}{lidar}"));
     assert_eq!(
         unknown[0],
         "/data took 500.0 MB/s; the devices send 1.0 MB/s (estimated) and what [device.lidar] may send"
@@ -399,7 +399,7 @@ fn cameras_over_the_bandwidth_get_a_suggested_format() {
 }
 
 #[test]
-fn the_disk_is_tried_and_nothing_is_left_behind() {
+fn the_disk_is_tested_and_no_file_is_left_behind() {
     let folder = tempfile::tempdir().unwrap();
     let disk = disk(&folder.path().join("episodes/that/are/not/there")).unwrap();
     assert_eq!(disk.folder, folder.path());
@@ -423,7 +423,7 @@ fn a_bus_at_another_bitrate_than_configured_is_bad() {
         let facts = Facts { usb: vec![usb.clone()], can: vec![interface], ..Facts::default() };
         let found = judge::judge(&facts, Some(&registry), None);
         let found = found.iter().find(|finding| finding.about == "can").unwrap();
-        let said = format!("{:?}: {}", found.level, found.what);
-        assert!(said.starts_with(expected), "{said}");
+        let finding = format!("{:?}: {}", found.level, found.what);
+        assert!(finding.starts_with(expected), "{finding}");
     }
 }

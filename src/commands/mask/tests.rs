@@ -34,7 +34,7 @@ fn the_mask_is_shown_with_names_and_age() {
 }
 
 #[test]
-fn json_has_the_same_facts() {
+fn json_contains_the_same_data() {
     let text = render_json(&record(5, 42, NOW - 1_500_000), Some(&names()), NOW).unwrap();
     let object: serde_json::Value = serde_json::from_str(&text).unwrap();
     assert_eq!(object["mask"], "0x05");
@@ -45,7 +45,7 @@ fn json_has_the_same_facts() {
     assert_eq!(object["stale"], false);
     assert_eq!(object["devices"][1]["online"], false);
     assert_eq!(object["time"], "2023-11-14T22:13:20.121Z");
-    // A clock set back does not make an age below zero.
+    // After the clock is set back an age is not negative.
     assert!(render_json(&record(5, 42, NOW + 5), None, NOW).unwrap().contains("\"age_ms\":0.0"));
 }
 
@@ -69,7 +69,7 @@ async fn a_watch_prints_changes_and_the_publishers_end_and_return() {
             4..=6 => Ok(record(1, look.get(), at)),
             7 => Ok(record(6, 7, at)),
             8..=9 => Err("no such file".to_owned()),
-            // A new publisher begins to count again, with the same mask.
+            // A new publisher begins to count from 1, with the same mask.
             10..=12 => Ok(record(6, look.get() - 9, at)),
             _ => {
                 stop.cancel();

@@ -52,7 +52,7 @@ pub(super) fn choose(
         ([unit], _) if is_described => Ok(Selection::Unit(Box::new((*unit).clone()))),
         ([], _) if args.vid.is_some() && args.pid.is_some() => Ok(Selection::NotPlugged),
         ([], Some(talk)) => {
-            talk.say(if is_described {
+            talk.print(if is_described {
                 "No such device is plugged in, or it is already registered. `rapid devices` lists connected devices."
             } else {
                 "No unregistered device is plugged in. `rapid devices` lists connected devices."
@@ -60,11 +60,11 @@ pub(super) fn choose(
             Ok(Selection::Nothing)
         }
         (units, Some(talk)) => {
-            talk.say("Plugged in and not registered:\n")?;
+            talk.print("Plugged in and not registered:\n")?;
             for (at, unit) in units.iter().enumerate() {
-                talk.say(&format!("  {}  {}", at + 1, line(unit)))?;
+                talk.print(&format!("  {}  {}", at + 1, line(unit)))?;
             }
-            talk.say("")?;
+            talk.print("")?;
             let most = units.len();
             let which = talk.ask("Which one", Some("1"), |answer| {
                 let number = answer.parse::<usize>().ok().and_then(|number| number.checked_sub(1));
@@ -173,12 +173,12 @@ pub(super) fn identity(
     match &unit.own_serial {
         Some(_) if !unit.has_twin => return Ok(usual.into_iter().collect()),
         Some(_) => {
-            talk.say("There is another unit of this model: identify this one by its serial number or by its port.")?;
+            talk.print("There is another unit of this model: identify this one by its serial number or by its port.")?;
         }
         None if unit.usb.serial.is_some() => {
-            talk.say("Its serial number is not unique or not printable: identify it by its port.")?;
+            talk.print("Its serial number is not unique or not printable: identify it by its port.")?;
         }
-        None => talk.say("It has no serial number: the entry can match this port, or any unit of the model.")?,
+        None => talk.print("It has no serial number: the entry can match this port, or any unit of the model.")?,
     }
     let words: &[&str] = if unit.own_serial.is_some() { &["serial", "port"] } else { &["port", "any"] };
     let default = usual.as_ref().map_or("any", |(key, _)| key);
@@ -219,13 +219,13 @@ pub(super) async fn settings(
         keys.extend(match listen(path, baud).await {
             Ok(Some(found)) => found,
             Ok(None) => {
-                talk.say(
+                talk.print(
                     "It sends no lines of numbers: it is registered as raw, and its bytes are recorded unchanged.",
                 )?;
                 vec![("tty.parse".to_owned(), Setting::Text("raw".to_owned()))]
             }
             Err(error) => {
-                talk.say(&format!("It cannot be read: {error}"))?;
+                talk.print(&format!("It cannot be read: {error}"))?;
                 vec![("tty.parse".to_owned(), Setting::Text("raw".to_owned()))]
             }
         });

@@ -73,7 +73,7 @@ impl Reader {
                 return Err(format!("it is found by mDNS ({service}), whose protocol is unknown"));
             };
             let text = |key: &str, value: &str| (format!("lan.{key}"), Setting::Text(value.to_owned()));
-            // Its pictures are large and few: sized by their pixels they would use most of the shared memory.
+            // Its pictures are large and few: a size computed from their pixels would use most of the shared memory.
             let size = (*protocol == "iphone").then(|| ("max_bytes".to_owned(), Setting::Text("2MiB".to_owned())));
             return Ok(Self {
                 node: "lan".to_owned(),
@@ -92,7 +92,7 @@ impl Reader {
             suggested(&attachment.node, camera.as_ref())
         };
         match (read, node) {
-            (Some((word, attachment)), wished) if wished.is_none_or(|wished| wished == word) => {
+            (Some((word, attachment)), requested) if requested.is_none_or(|requested| requested == word) => {
                 Ok(Self { node: word.to_owned(), settings: settings(attachment) })
             }
             (_, Some(node)) => Ok(Self { node: node.to_owned(), settings: Vec::new() }),

@@ -1,6 +1,6 @@
 //! `rapid register` and `rapid unregister`: entries of `devices.toml` for connected devices.
 //!
-//! Missing values are asked for on a terminal.
+//! Missing values are requested on a terminal.
 //!
 //! Invariant: nothing is written that the parser rejects.
 //! Invariant: the file is replaced atomically, and only if it has not changed since it was read.
@@ -146,7 +146,7 @@ pub async fn register(
         if let Some(spec) = parsed.registry.named(&entry.name) {
             let report = read(spec, &node.node).await;
             match (talk.as_mut(), format) {
-                (Some(talk), _) => talk.say(&report)?,
+                (Some(talk), _) => talk.print(&report)?,
                 (None, Format::Text) => writeln!(out, "{}", text::plain(&report))?,
                 (None, Format::Json) => {}
             }
@@ -158,7 +158,7 @@ pub async fn register(
 /// Removes an entry.
 ///
 /// # Errors
-/// When there is no such entry, or the rest would be no valid registry.
+/// When there is no such entry, or the rest would not be a valid registry.
 pub fn unregister(
     target: &Target,
     args: &UnregisterArgs,
@@ -181,7 +181,7 @@ pub fn unregister(
     if let Some(mut talk) = talk.filter(|_| !args.yes && !args.dry_run)
         && !talk.agrees(&format!("Remove [device.{}] from {}", args.name, target.path.display()))?
     {
-        talk.say("Nothing was written.")?;
+        talk.print("Nothing was written.")?;
         return Ok(());
     }
     let mut written_files = Vec::new();
@@ -217,9 +217,9 @@ fn commit(
     let written: Vec<String> = entries.iter().map(edit::written).collect::<Result<_, _>>()?;
     let shown = written.join("\n");
     if let Some(talk) = talk.filter(|_| !args.yes && !args.dry_run) {
-        talk.say(&format!("\n{shown}"))?;
+        talk.print(&format!("\n{shown}"))?;
         if !talk.agrees(&format!("Add this to {}", target.path.display()))? {
-            talk.say("Nothing was written.")?;
+            talk.print("Nothing was written.")?;
             return Ok(());
         }
     } else if format == Format::Text {
@@ -274,7 +274,7 @@ pub struct Dialogue<'a> {
 
 impl Dialogue<'_> {
     /// Prints one or several lines.
-    fn say(&mut self, line: &str) -> io::Result<()> {
+    fn print(&mut self, line: &str) -> io::Result<()> {
         for line in line.split('\n') {
             writeln!(self.out, "{}", text::plain(line))?;
         }
@@ -306,7 +306,7 @@ impl Dialogue<'_> {
             };
             match take(answer) {
                 Ok(taken) => return Ok(taken),
-                Err(why) => self.say(&format!("  {why}"))?,
+                Err(why) => self.print(&format!("  {why}"))?,
             }
         }
     }
@@ -402,7 +402,7 @@ impl Target {
 const READING: Duration = Duration::from_secs(2);
 /// A device that takes longer to open has failed.
 const OPENING: Duration = Duration::from_secs(5);
-/// Samples that are enough.
+/// Number of samples that is enough.
 const ENOUGH: u32 = 200;
 /// Lines of a serial device that are examined.
 const LINES: usize = 20;

@@ -1,4 +1,4 @@
-//! The dialogue, with answers from a text.
+//! The dialogue, with answers from a string.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -34,7 +34,7 @@ fn arguments(words: &str) -> RegisterArgs {
     }
 }
 
-/// A `devices.toml` in a folder of its own.
+/// A `devices.toml` in a separate folder.
 struct Bench {
     folder: tempfile::TempDir,
 }
@@ -54,7 +54,7 @@ impl Bench {
         Target::read(self.folder.path().join("devices.toml")).unwrap()
     }
 
-    /// What was said and how it ended.
+    /// The printed dialogue, and the result.
     fn register(
         &self,
         words: &str,
@@ -62,14 +62,14 @@ impl Bench {
         answers: Option<&str>,
     ) -> (String, Result<(), RegisterError>) {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-        let (mut said, mut out) = (Vec::new(), Vec::new());
+        let (mut dialogue, mut out) = (Vec::new(), Vec::new());
         let mut input = answers.unwrap_or_default().as_bytes();
-        let talk = answers.map(|_| Dialogue { input: &mut input, out: &mut said });
+        let talk = answers.map(|_| Dialogue { input: &mut input, out: &mut dialogue });
         let (target, args) = (self.target(), arguments(words));
         let work = register(&target, attached, &args, talk, Format::Text, &mut out);
         let done = runtime.block_on(work);
-        said.extend(out);
-        (String::from_utf8(said).unwrap(), done)
+        dialogue.extend(out);
+        (String::from_utf8(dialogue).unwrap(), done)
     }
 }
 
@@ -78,7 +78,7 @@ fn the_dialogue_asks_until_the_answers_make_an_entry() {
     let bench = Bench::new();
     let attached = [serial_line(None, "1-4"), serial_line(None, "1-5")];
     let answers = "7\n2\nBad Name\nmotor_state\nforce\n\nany port\nport\nmiddle\ntip\ny\n";
-    let (said, done) = bench.register("", &attached, Some(answers));
+    let (dialogue, done) = bench.register("", &attached, Some(answers));
     done.unwrap();
     for expected in [
         "  2  1209:0002  port 1-5  no serial",
@@ -90,9 +90,9 @@ fn the_dialogue_asks_until_the_answers_make_an_entry() {
         "Test: ",
         "first values",
     ] {
-        assert!(said.contains(expected), "{expected:?} in {said}");
+        assert!(dialogue.contains(expected), "{expected:?} in {dialogue}");
     }
-    assert!(!said.contains('\u{1b}'));
+    assert!(!dialogue.contains('\u{1b}'));
     let text = bench.text();
     assert!(text.starts_with(BUILTIN));
     let entry = "\n# Force [2J Sensor [device.evil]\n[device.force]\nvid = \"1209\"\npid = \"0002\"\nport = \"1-5\"\n\
@@ -103,22 +103,22 @@ fn the_dialogue_asks_until_the_answers_make_an_entry() {
 }
 
 #[test]
-fn without_the_last_yes_nothing_is_written() {
+fn without_the_final_confirmation_nothing_is_written() {
     let bench = Bench::new();
     let attached = [serial_line(Some("F1"), "1-4")];
     for (answers, expected) in [("1\nforce\n\n\nn\n", None), ("1\nforce\n", Some("no answer")), ("", Some("no answer"))]
     {
-        let (said, done) = bench.register("", &attached, Some(answers));
+        let (dialogue, done) = bench.register("", &attached, Some(answers));
         match (done, expected) {
-            (Ok(()), None) => assert!(said.contains("Nothing was written."), "{said}"),
+            (Ok(()), None) => assert!(dialogue.contains("Nothing was written."), "{dialogue}"),
             (Err(error), Some(expected)) => assert!(error.to_string().contains(expected), "{error}"),
             (done, _) => panic!("{answers:?}: {done:?}"),
         }
         assert_eq!(bench.text(), BUILTIN);
     }
-    let (said, done) = bench.register("", &[], Some(""));
+    let (dialogue, done) = bench.register("", &[], Some(""));
     done.unwrap();
-    assert!(said.contains("No unregistered device is plugged in"), "{said}");
+    assert!(dialogue.contains("No unregistered device is plugged in"), "{dialogue}");
 }
 
 #[test]
@@ -130,7 +130,7 @@ fn non_interactive_runs_list_the_missing_fields() {
         ("--vid 1209 --pid 2 --name force", "name one with --serial or --port"),
         ("--vid 1209 --pid 2 --serial F2", "--name must be given"),
         ("--vid 1209 --pid 3 --name force", "--node must be given"),
-        ("--vid 1209 --pid 2 --serial F2 --name motor_state", "the same stands already"),
+        ("--vid 1209 --pid 2 --serial F2 --name motor_state", "already defined"),
         ("--vid 1209 --pid 2 --serial F2 --name Force", "\"Force\" cannot be a modality's name"),
         (
             "--vid 046d --pid 0825 --serial CAM00A1 --name other --node camera",
@@ -155,10 +155,10 @@ fn non_interactive_runs_list_the_missing_fields() {
 }
 
 #[test]
-fn a_file_that_changed_meanwhile_is_left_alone() {
+fn a_file_that_changed_meanwhile_is_not_overwritten() {
     let bench = Bench::new();
     let target = bench.target();
-    let other = format!("{BUILTIN}\n# somebody else's line\n");
+    let other = format!("{BUILTIN}\n# another program's line\n");
     std::fs::write(&target.path, &other).unwrap();
     let args = UnregisterArgs { name: "motor_state".into(), yes: true, dry_run: false };
     let error = unregister(&target, &args, None, Format::Text, &mut Vec::new()).unwrap_err();
@@ -219,7 +219,7 @@ fn devices_of_rapid_driver_become_entries_or_comments() {
     let registry = bench.target().registry.unwrap();
     assert_eq!(registry.devices.len(), 5);
     assert_eq!(registry.named("force_l").map(|device| device.id.bit()), Some(4));
-    // Told how they are read, the others come in as well; the first is an entry by now.
+    // With the driver given, the others are imported too; the first is already an entry by now.
     let again = bench.register(&format!("--import {} --node camera", foreign.display()), &[], None).1.unwrap_err();
-    assert!(again.to_string().contains("the same stands already"), "{again}");
+    assert!(again.to_string().contains("already defined"), "{again}");
 }

@@ -118,7 +118,7 @@ impl Candidate {
         self.nodes.iter().find(|node| kind(node) == Some(word))
     }
 
-    /// The key and value by which an entry means this unit and no other, where that can be said.
+    /// The key and value by which an entry matches this unit and no other, if there are any.
     #[must_use]
     pub fn identity(&self) -> Option<(&'static str, String)> {
         match &self.own_serial {

@@ -3,12 +3,12 @@
 //! Rule syntax: udev(7). A match value in double quotes is a shell glob if it contains `*`, `?` or
 //! `[`, alternatives are separated by `|`, and `\"` stands for a quote (systemd,
 //! `src/udev/udev-rules.c`: `rule_line_add_token`, `udev_rule_parse_value`). Match values undergo
-//! no `%` or `$` substitution; assigned values do, but those are only names we have validated.
+//! no `%` or `$` substitution; assigned values do, but those are only names that have been validated.
 //!
-//! A network interface has no node and no name of ours. That of a CAN adapter is brought up with the bit
-//! rate of its entry at each plug, which only root may do. `RUN` starts the program itself, no shell, with
-//! words split at spaces; the one word that comes from outside is `$name`, the name that the interface has
-//! after udev's rules, which the kernel takes without spaces and `/` and which no device chooses.
+//! A network interface has no node and gets no name here. That of a CAN adapter is brought up with the bit rate of its
+//! entry at each plug, which only root may do. `RUN` starts the program itself, without a shell, with arguments split
+//! at spaces; the only argument from outside is `$name`, the name that the interface has after udev's rules, for which
+//! the kernel permits neither spaces nor `/` and which no device chooses.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -19,7 +19,7 @@ use crate::registry::spec::{
     CAN_RESTART_MS, CanProtocol, CanSpec, DeviceSpec, GpioInput, InterlockInput, NodeSpec, Opens, Registry, UsbSpec,
 };
 
-/// What `linux/if_arp.h` calls a CAN interface (`ARPHRD_CAN`).
+/// The number of a CAN interface in `linux/if_arp.h` (`ARPHRD_CAN`).
 const ARPHRD_CAN: u32 = 280;
 
 /// The rules of a whole registry.
@@ -47,7 +47,7 @@ pub(super) fn rules(registry: &Registry) -> String {
         };
     }
     for (chip, users) in chips(registry) {
-        // A name of a chip as the kernel gives it; any other is a link made by an operator's rule.
+        // The kernel's name of a chip; any other is a link created by an operator's rule.
         let chip = chip.to_str().and_then(|chip| chip.strip_prefix("/dev/gpiochip"));
         if let Some(number) =
             chip.filter(|number| (1..=5).contains(&number.len()) && number.bytes().all(|byte| byte.is_ascii_digit()))
@@ -59,7 +59,7 @@ pub(super) fn rules(registry: &Registry) -> String {
     text
 }
 
-/// GPIO chips, and what each is for: several lines of one may be in use.
+/// GPIO chips with their users: several lines of one may be in use.
 fn chips(registry: &Registry) -> BTreeMap<&Path, Vec<String>> {
     let stops = registry.stops.iter().filter_map(|stop| match &stop.input {
         InterlockInput::Gpio(GpioInput { chip, .. }) => Some((format!("stop {}", stop.name), chip.as_path())),
@@ -79,16 +79,16 @@ fn chips(registry: &Registry) -> BTreeMap<&Path, Vec<String>> {
     chips
 }
 
-/// The matches that single out the node of an entry's unit, or why there are none.
+/// The matches that identify the node of an entry's unit, or why there are none.
 pub(super) fn identify(registry: &Registry, device: &DeviceSpec) -> Result<String, String> {
-    let Some(usb) = device.identity.usb() else { return Err("it is no USB device".to_owned()) };
+    let Some(usb) = device.identity.usb() else { return Err("it is not a USB device".to_owned()) };
     if device.node.opens() == Opens::Net {
         return Err("a network interface has no path".to_owned());
     }
     single_out(registry, device, usb)
 }
 
-/// The matches that single out an entry's unit among all others, or why there are none.
+/// The matches that identify an entry's unit among all others, or why there are none.
 fn single_out(registry: &Registry, device: &DeviceSpec, usb: &UsbSpec) -> Result<String, String> {
     if let Some(serial) = &usb.serial {
         return match quoted_match(serial) {
@@ -130,9 +130,9 @@ fn rule(device: &DeviceSpec, usb: &UsbSpec, identity: &str) -> String {
     )
 }
 
-/// Brings up the CAN interface of a unit when it is plugged in. Not every driver returns from bus-off by itself, `gs_usb`
-/// among them: the kernels of today (seen with 6.1.192) refuse the whole command that asks for it ("Device doesn't
-/// support restart from Bus Off"). So that command is one of its own, and its failure leaves the other to be run.
+/// Brings up the CAN interface of a unit when it is plugged in. Not every driver returns from bus-off automatically,
+/// `gs_usb` among them: current kernels (tested with 6.1.192) then refuse the whole command that requests it ("Device
+/// doesn't support restart from Bus Off"). So it is a separate command, whose failure does not prevent the other.
 fn bring_up(usb: &UsbSpec, identity: &str, bitrate: u32) -> String {
     format!(
         "ACTION==\"add\", SUBSYSTEM==\"net\", ATTR{{type}}==\"{ARPHRD_CAN}\", ATTRS{{idVendor}}==\"{:04x}\", \
@@ -150,8 +150,8 @@ fn subsystem(device: &DeviceSpec) -> &'static str {
     }
 }
 
-/// The keys that match an attribute of the USB device and its name. Those that also look at parents
-/// would match the devices behind a hub with the hub's.
+/// The keys that match an attribute of the USB device and its name. Keys that also match parents
+/// would match the devices behind a hub by the hub's attributes.
 fn keys(device: &DeviceSpec) -> (&'static str, &'static str) {
     match device.node.opens() {
         Opens::Usb => ("ATTR", "KERNEL"),
@@ -159,8 +159,8 @@ fn keys(device: &DeviceSpec) -> (&'static str, &'static str) {
     }
 }
 
-/// `value` as a pattern that matches exactly itself. `None` where that cannot be written in a way
-/// every version of udev reads alike: quotes and backslashes, whose treatment changed with the
+/// `value` as a pattern that matches exactly itself. `None` if it cannot be written in a way
+/// that every version of udev parses identically: quotes and backslashes, whose treatment changed between
 /// versions, `|`, which always separates, and everything but printable ASCII.
 fn quoted_match(value: &str) -> Option<String> {
     // An empty pattern matches devices without the attribute.
@@ -188,7 +188,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_pattern_matches_itself_or_is_not_written() {
+    fn a_pattern_matches_only_itself_or_is_omitted() {
         for (value, expected) in [
             ("CAM00A1", Some("CAM00A1")),
             ("a b%k$env{X}'#,=", Some("a b%k$env{X}'#,=")),

@@ -24,7 +24,7 @@ fn with_serial(serial: &str) -> Registry {
 }
 
 #[test]
-fn the_repository_holds_what_devices_toml_gives() {
+fn the_repository_contains_the_artifacts_of_devices_toml() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("udev");
     let all = artifacts(&Registry::builtin());
     for artifact in &all {
@@ -40,7 +40,7 @@ fn the_repository_holds_what_devices_toml_gives() {
 }
 
 #[test]
-fn a_unit_is_named_by_serial_by_port_or_as_the_only_one_of_its_model() {
+fn a_unit_is_matched_by_serial_by_port_or_as_the_only_one_of_its_model() {
     let text = r#"
         [device.one]
         vid = "0001"
@@ -94,7 +94,7 @@ fn a_can_interface_is_brought_up_with_the_bit_rate_of_its_entry() {
     );
     let unit = text_of(&all, "rapid.service");
     assert_eq!(families(&unit), ["AF_UNIX", "AF_NETLINK", "AF_CAN"], "{unit}");
-    // An adapter that is a serial line is one like any other.
+    // An adapter on a serial line is treated like any other serial line.
     let slcan = format!("{text}adapter = \"slcan\"\n");
     let line = text_of(&artifacts(&Registry::parse(&slcan, None).unwrap().registry), "99-rapid.rules");
     assert!(rule_lines(&line)[0].starts_with("SUBSYSTEM==\"tty\"") && !line.contains("RUN+="), "{line}");
@@ -119,7 +119,7 @@ fn the_service_may_open_usb_devices_only_where_a_program_does() {
 }
 
 #[test]
-fn the_service_may_open_keys_and_gpio_chips_only_where_a_stop_is_one() {
+fn the_service_may_open_keys_and_gpio_chips_only_where_a_stop_needs_them() {
     let key = "[stop.pedal]\nkind = \"enabling\"\nkey = { device = \"a pedal\", code = \"KEY_B\" }\n";
     let gpio = "[stop.door]\nkind = \"emergency\"\n\
                 gpio = { chip = \"/dev/gpiochip3\", line = 1, runs_while = \"low\" }\n";
@@ -145,7 +145,7 @@ fn the_service_may_open_keys_and_gpio_chips_only_where_a_stop_is_one() {
 }
 
 #[test]
-fn a_chip_that_several_lines_are_used_of_has_one_rule() {
+fn a_chip_with_several_used_lines_has_one_rule() {
     let motor = |name: &str, slave: u8| {
         format!(
             "{{ name = \"{name}\", slave = {slave}, type = \"DM4310\", kp = 1, kd = 1, position = [0, 1], \
@@ -194,7 +194,7 @@ fn the_service_may_open_the_chips_of_brakes_and_the_serial_ports_of_the_board_wh
     }
 }
 
-/// Entries of every kind that differs in what the service must be able to do: a name, the entry, and the kinds of
+/// Entries of every kind that differs in its requirements on the service: a name, the entry, and the kinds of
 /// sockets it needs besides those of udev and the journal.
 const KINDS: &[(&str, &str, &[&str])] = &[
     ("camera", "vid = \"1\"\npid = \"1\"\nnode = \"camera\"", &[]),
@@ -258,13 +258,13 @@ fn the_service_may_open_the_kinds_of_sockets_that_its_entries_need_and_no_others
         assert_eq!(found.len(), expected.len(), "{rig:?}: {found:?}");
         let is_network = expected.iter().any(|family| family.starts_with("AF_INET"));
         assert_eq!(unit.contains("\nIPAddressDeny=any\n"), !is_network, "{rig:?}: {unit}");
-        // Interpreters and their like make code as they run; what we run ourselves does not.
+        // Interpreters generate code at run time; rapid itself does not.
         let has_programs = rig.iter().any(|kind| ["program", "hook"].contains(kind));
         assert_eq!(unit.contains("\nMemoryDenyWriteExecute=yes\n"), !has_programs, "{rig:?}: {unit}");
     }
 }
 
-/// By `systemd-analyze security`: 0 is the best, 10 the worst. Reads the unit alone, no systemd has to run.
+/// By `systemd-analyze security`: 0 is the best, 10 the worst. Only reads the unit; systemd need not run.
 #[test]
 fn the_exposure_of_every_unit_is_2_or_better() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -282,13 +282,13 @@ fn the_exposure_of_every_unit_is_2_or_better() {
         let complaints: Vec<_> = report.lines().filter(|line| line.starts_with('\u{2717}')).collect();
         let errors = String::from_utf8_lossy(&judged.stderr);
         assert!(judged.status.success() && overall.is_some(), "{rig:?}: {errors}{complaints:#?}");
-        // An unknown setting or a misspelt value would be passed over with a warning.
+        // An unknown setting or a misspelt value would only cause a warning.
         assert_eq!(errors, "", "{rig:?}");
     }
 }
 
 #[test]
-fn what_the_service_writes_is_for_its_group_to_read_and_for_nobody_else() {
+fn files_of_the_service_are_readable_by_its_group_and_by_no_one_else() {
     for rig in rigs() {
         let unit = text_of(&artifacts(&registry_of(&rig)), "rapid.service");
         for setting in ["UMask=0027", "StateDirectoryMode=0750", "User=rapid"] {
@@ -310,7 +310,7 @@ fn strings<'y>(yaml: &'y Yaml, keys: &[&str]) -> Option<&'y str> {
     keys.iter().fold(yaml, |yaml, key| &yaml[*key]).as_str()
 }
 
-/// Shell glob of the three characters we write (`[x]`) against a text.
+/// Shell glob of the three characters that are escaped here (`[x]`) against a text.
 fn matches_exactly(pattern: &str, text: &str) -> bool {
     let mut literal = String::new();
     let mut rest = pattern;

@@ -1,4 +1,4 @@
-//! Changes of a text, with what stays.
+//! Changes of a text, and the parts that must stay.
 
 use proptest::prelude::*;
 
@@ -50,12 +50,12 @@ fn the_old_name_of_a_serial_line_s_table_is_replaced_and_nothing_else() {
 }
 
 #[test]
-fn keys_that_are_none_are_refused() {
+fn invalid_keys_are_refused() {
     for (first, second, reason) in [
         ("a b", "x", "write letters"),
         ("", "x", "write letters"),
         ("camera..width", "x", "write letters"),
-        ("serial", "serial.baud", "what is no table"),
+        ("serial", "serial.baud", "is not a table"),
         ("serial.baud", "serial", "it is a table"),
         ("a\n[device.evil]\nb", "x", "write letters"),
     ] {
@@ -124,7 +124,7 @@ fn an_entry_in_two_places_is_removed_from_both() {
 
 proptest! {
     #[test]
-    fn whatever_a_device_says_stays_a_value_or_a_comment(serial in any::<String>(), product in any::<String>()) {
+    fn any_text_of_a_device_stays_a_value_or_a_comment(serial in any::<String>(), product in any::<String>()) {
         let keys = vec![("serial".to_owned(), Setting::Text(serial.clone()))];
         let hostile = NewEntry { name: "x".into(), comments: vec![product], keys, held_back: None };
         let text = append("[rig]\nname = \"a\"\n", &[hostile]).unwrap();
@@ -135,7 +135,7 @@ proptest! {
     }
 
     #[test]
-    fn no_text_makes_it_panic(text in "[a-z\\[\\]\\.\"=# \n\r]{0,80}", name in "[a-z]{0,3}") {
+    fn no_text_causes_a_panic(text in "[a-z\\[\\]\\.\"=# \n\r]{0,80}", name in "[a-z]{0,3}") {
         let _ = remove(&text, &name);
     }
 }

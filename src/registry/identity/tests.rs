@@ -105,7 +105,7 @@ fn an_unknown_unit_of_a_known_model_names_the_difference() {
     };
     assert_eq!(
         reason,
-        "vid:pid match [device.by_serial], but its serial is \"A\" and this unit says \"B\\n\"; \
+        "vid:pid match [device.by_serial], but its serial is \"A\" and this unit reports \"B\\n\"; \
          vid:pid match [device.by_port], but its port is 1-9 and this unit is at \"1-2\""
     );
     assert_eq!(
@@ -163,7 +163,7 @@ fn twins_with_one_serial_number_stay_separate_by_port() {
     assigner.detach(Path::new("/sys/devices/usb1"));
     assert_eq!(assigner.attach(&video(0, unit(2, Some("0001"), "1-5"))), entry(2));
     assert_eq!(assigner.attach(&video(1, unit(2, Some("0001"), "1-4"))), entry(3));
-    // In the other order what was plugged last is not what comes back first.
+    // In the other order the last one plugged is not the first one to return.
     assigner.detach(Path::new("/sys/devices/usb1"));
     assert_eq!(assigner.attach(&video(0, unit(2, Some("0001"), "1-5"))), entry(2));
 }
@@ -243,7 +243,7 @@ fn any_step() -> impl Strategy<Value = Step> {
     prop_oneof![3 => attach, 2 => detach.prop_map(Step::Detach)]
 }
 
-/// What the rig believes, built only from what the assigner said.
+/// The state of the rig, derived only from the assigner's reports.
 #[derive(Default)]
 struct Believed(Vec<(ModalityId, Attachment)>);
 
@@ -286,13 +286,13 @@ proptest! {
             prop_assert_eq!(ids.len(), believed.0.len(), "an entry has two nodes");
             prop_assert_eq!(paths.len(), believed.0.len(), "a node has two entries");
             for entry in &registry().devices {
-                let said = believed.0.iter().find(|(id, _)| *id == entry.id).map(|(_, node)| node);
-                prop_assert_eq!(assigner.attached_as(entry.id), said);
+                let derived = believed.0.iter().find(|(id, _)| *id == entry.id).map(|(_, node)| node);
+                prop_assert_eq!(assigner.attached_as(entry.id), derived);
             }
             for (id, node) in &believed.0 {
                 prop_assert!(assigner.explain(node).fits.contains(id), "{} does not fit", id);
             }
-            // As many interchangeable cameras run as there are units and entries for.
+            // The number of running interchangeable cameras is limited only by units and entries.
             let units: BTreeSet<_> = assigner
                 .attached
                 .iter()

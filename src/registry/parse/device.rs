@@ -1,7 +1,7 @@
 //! One `[device.NAME]` table.
 //!
-//! Of what `rapid` reads itself, motors behind a CAN adapter alone move, and each of them is an axis without a table
-//! `[device.NAME.action]`; a program may move what it likes.
+//! Of the devices that `rapid` reads itself, only motors behind a CAN adapter move, and each of them is an axis without
+//! a table `[device.NAME.action]`; a program may move anything.
 
 use std::path::Path;
 use std::time::Duration;
@@ -21,9 +21,9 @@ use crate::registry::spec::{
 /// Kinds of node this version has a driver for.
 pub(super) const BUILT_IN: [(&str, Kind); 4] =
     [("camera", Kind::Camera), ("serial", Kind::Serial), ("can", Kind::Can), ("lan", Kind::Lan)];
-/// Says that `on_attach` is the program that reads the device.
+/// States that `on_attach` is the program that reads the device.
 const PROCESS: &str = "process";
-/// Keys that say which device an entry means.
+/// Keys that state which device an entry identifies.
 pub(super) const IDENTITY_KEYS: [&str; 5] = ["vid", "pid", "serial", "serial_number", "port"];
 const KEYS: [&str; 9] = ["node", "topic", "bit", "slot", "stall_after", "max_bytes", "depth", "when_stale", "latency"];
 const TABLES: [&str; 7] = ["camera", "tty", "can", "lan", "process", "verdict", "action"];
@@ -31,7 +31,7 @@ const TABLES: [&str; 7] = ["camera", "tty", "can", "lan", "process", "verdict", 
 /// The mask is 64 bits wide.
 const HIGHEST_BIT: i64 = 63;
 
-/// More than any sensor takes; every frame of an episode waits for the longest latency of the rig.
+/// More than any sensor needs; every frame of an episode waits for the longest latency of the rig.
 const LONGEST_LATENCY: Duration = Duration::from_secs(1);
 
 /// How a device is read, without the settings.
@@ -59,7 +59,7 @@ pub(super) struct Draft<'a> {
     stall_after: Duration,
     pub(super) max_bytes: u64,
     pub(super) depth: u64,
-    /// The depth was written in the file and is not ours to lower.
+    /// The depth was written in the file and must not be lowered.
     pub(super) depth_written: bool,
     when_stale: WhenStale,
     latency: Duration,
@@ -69,13 +69,13 @@ pub(super) struct Draft<'a> {
 }
 
 impl<'d> Draft<'d> {
-    /// The entry, with what `[verdict]` says for all; `None` only if a problem with it was reported.
+    /// The entry, with the settings of `[verdict]`; `None` only if a problem with it was reported.
     pub(super) fn finish(self, rig: &VerdictTable) -> Option<(Section<'d>, DeviceSpec)> {
         let node = self.node?;
         let fps = node.picture().map(|picture| f64::from(picture.fps));
         let mut usual = VerdictSpec::of(node.modality_kind(), self.stall_after, fps);
         if node::is_gopro(&node) {
-            // Its samples are looks at its state, once a second, and no observation: its pictures are in the clip.
+            // Its samples report its state once a second, and are not observations: its pictures are in the clip.
             (usual.suspect.valid, usual.bad.valid) = (None, None);
         }
         let spec = DeviceSpec {
@@ -210,17 +210,17 @@ fn kind(section: &Section<'_>) -> Option<Kind> {
     if text == PROCESS && !section.has("on_attach") {
         let fix = "write node = the name of the program, for example node = \"tactile_publisher\", or add on_attach = \
                    [\"tactile_publisher\", \"argument\"]";
-        return section.refuse("node", "node \"process\" does not say which program".to_owned(), fix);
+        return section.refuse("node", "node \"process\" does not name the program".to_owned(), fix);
     }
     Some(BUILT_IN.iter().find(|(name, _)| *name == text).map_or(Kind::Process, |(_, kind)| *kind))
 }
 
-/// Is `on_attach` the program that reads the device?
+/// Whether `on_attach` is the program that reads the device.
 fn attach_is_node(section: &Section<'_>) -> bool {
     section.has("on_attach") && section.word("node") == Some(PROCESS)
 }
 
-/// The program that reads the device: what `node` names, or with `node = "process"` what `on_attach` does.
+/// The program that reads the device: named by `node`, or with `node = "process"` by `on_attach`.
 fn program(section: &Section<'_>, programs: Programs<'_>) -> Option<Hook> {
     if attach_is_node(section) {
         return program::hook(section, "on_attach", programs);
@@ -238,7 +238,7 @@ pub(super) fn default_topic(kind: Option<Kind>, name: &str) -> String {
 }
 
 fn topic(section: &Section<'_>) -> Option<String> {
-    /// Longest name of an iceoryx2 service is 255 bytes.
+    /// The longest name of an iceoryx2 service is 255 bytes.
     const LONGEST: usize = 200;
     let topic = section.text("topic")?;
     let legal = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '/');
@@ -258,7 +258,7 @@ fn topic(section: &Section<'_>) -> Option<String> {
 
 const ACTION_KEYS: [&str; 4] = ["names", "units", "min", "max"];
 
-/// Reads the table; `None` without one, or if a problem with it was reported. One of a device that does not `move`
+/// Reads the table; `None` without one, or if a problem with it was reported. A table for a device that does not `move`
 /// is such a problem.
 pub(super) fn action(section: &Section<'_>, moves: bool) -> Option<ActionSpec> {
     let table = section.table("action")?;
@@ -289,7 +289,7 @@ pub(super) fn action(section: &Section<'_>, moves: bool) -> Option<ActionSpec> {
     }
     for (name, (low, high)) in names.iter().zip(min.iter().zip(&max)) {
         if !(low.is_finite() && high.is_finite() && low < high) {
-            let message = format!("{name} from {low} to {high} is no range");
+            let message = format!("{name} from {low} to {high} is not a range");
             return table.refuse("max", message, "write finite numbers, max above min");
         }
     }

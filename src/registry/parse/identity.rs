@@ -1,4 +1,5 @@
-//! What entries and modules may be called, and which device an entry means: the keys `vid`, `pid`, `serial` and `port`.
+//! Valid names of entries and modules, and which device an entry identifies: the keys `vid`, `pid`, `serial` and
+//! `port`.
 
 use super::device::{IDENTITY_KEYS, Kind};
 use crate::registry::section::Section;
@@ -25,7 +26,7 @@ pub fn name_problem(name: &str) -> Option<(String, String)> {
     Some((format!("{name:?} cannot be a modality's name"), fix))
 }
 
-/// The name that is nearest to any text, if one is near.
+/// The valid name nearest to a text, if there is one.
 #[must_use]
 pub fn like_a_name(text: &str) -> Option<String> {
     let better: String =
@@ -38,7 +39,7 @@ const fn in_a_name(c: char) -> bool {
 }
 
 pub(super) fn identity(kind: Option<Kind>, section: &Section<'_>) -> Option<IdentitySpec> {
-    // A device on the network has none; one behind a USB adapter of its own has that adapter's.
+    // A device on the network has none; one behind its USB adapter has that of the adapter.
     if kind == Some(Kind::Lan) && !IDENTITY_KEYS.iter().any(|key| section.has(key)) {
         return Some(IdentitySpec::Lan {});
     }
@@ -58,8 +59,9 @@ pub(super) fn identity(kind: Option<Kind>, section: &Section<'_>) -> Option<Iden
     Some(IdentitySpec::Usb(UsbSpec { vid: vid?, pid: pid?, serial, port }))
 }
 
-/// `serial = "..."`, or `serial_number = "..."`, the name beside a table of the serial line that is still called
-/// `serial`: in TOML one key cannot be both. It ends up in rules and descriptors: it must at least be one line of text.
+/// `serial = "..."`, or `serial_number = "..."`, the name for entries whose table of the serial line is still called
+/// `serial`: in TOML one key cannot be both. It is written to rules and descriptors: it must at least be one line of
+/// text.
 fn serial_number(section: &Section<'_>) -> Option<String> {
     /// A USB string descriptor holds at most 126 UTF-16 units.
     const LONGEST: usize = 126;

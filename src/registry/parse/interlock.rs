@@ -19,9 +19,9 @@ const INPUTS: [&str; 4] = ["key", "gpio", "serial", "field"];
 const KINDS: [(&str, StopKind); 2] = [("emergency", StopKind::Emergency), ("enabling", StopKind::Enabling)];
 /// Levels of a line of a GPIO chip.
 pub(super) const LEVELS: [(&str, bool); 2] = [("high", true), ("low", false)];
-/// Longest line that is looked for on a serial port, bytes.
+/// Longest line that is searched for on a serial port, bytes.
 const LONGEST_LINE: usize = 64;
-/// A stop that is silent for this long is lost, unless it says otherwise.
+/// A stop that is silent for this long is lost, unless its entry states otherwise.
 const SILENCE: Duration = Duration::from_millis(200);
 
 /// Reads the stops, in the order of the file.
@@ -55,7 +55,7 @@ pub(super) fn interlocks(root: &Section<'_>, drafts: &[Draft<'_>]) -> Vec<Interl
     stops
 }
 
-/// Are they one input, which only one can read?
+/// Whether they are the same input, which only one can read.
 fn are_one(one: &InterlockInput, other: &InterlockInput) -> bool {
     match (one, other) {
         (InterlockInput::Key(one), InterlockInput::Key(other)) => {
@@ -84,7 +84,7 @@ fn actuators(section: &Section<'_>, drafts: &[Draft<'_>]) -> Vec<String> {
     for name in &names {
         if !known.iter().any(|draft| draft.name == *name) {
             let message = if drafts.iter().any(|draft| draft.name == *name) {
-                format!("[device.{name}] is no actuator")
+                format!("[device.{name}] is not an actuator")
             } else {
                 format!("there is no [device.{name}]")
             };
@@ -114,7 +114,7 @@ fn input(section: &Section<'_>, kind: StopKind, drafts: &[Draft<'_>]) -> Option<
     let [input] = written.as_slice() else {
         if let [_, second, ..] = written.as_slice() {
             let message = format!("{} and {second}: a stop has one input", written.first().unwrap_or(&""));
-            section.report(second, message, "write a table of its own for each input: each of them stops");
+            section.report(second, message, "write a separate table for each input: each of them stops");
         } else {
             let fix = "write key = { ... }, gpio = { ... }, serial = { ... } or field = { ... }";
             section.report_at(section.at, "it has no input", fix);
@@ -162,7 +162,7 @@ fn gpio(table: &Section<'_>) -> Option<GpioInput> {
     Some(GpioInput { chip: chip?, line: line?, runs_while_high: runs? })
 }
 
-/// Reads `chip` and `line`, the level of which is a third key.
+/// Reads `chip` and `line`; the level is a third key.
 pub(super) fn gpio_line(table: &Section<'_>) -> (Option<PathBuf>, Option<u32>) {
     table.need("chip", "write chip = \"/dev/gpiochip0\"; `gpiodetect` lists them");
     table.need("line", "write line = its number on the chip; `gpioinfo` lists them");
@@ -181,7 +181,7 @@ fn line(table: &Section<'_>) -> Option<LineInput> {
         let is_line = (1..=LONGEST_LINE).contains(&text.len()) && !text.chars().any(char::is_control);
         if !is_line || text.trim() != text {
             let fix = format!("write 1 to {LONGEST_LINE} characters without a line end, and no space around them");
-            return table.refuse(key, format!("{key} = {text:?} is no line"), fix);
+            return table.refuse(key, format!("{key} = {text:?} is not a line"), fix);
         }
         Some(text.to_owned())
     });
@@ -210,14 +210,14 @@ fn field(table: &Section<'_>, drafts: &[Draft<'_>]) -> Option<FieldInput> {
             }
             Some(draft) => match (draft.numbers(), index) {
                 (Some(0), _) => {
-                    let message = format!("samples of [device.{name}] are no numbers");
+                    let message = format!("samples of [device.{name}] are not numbers");
                     table.report("device", message, "name an entry whose samples are: serial, motors, a program");
                 }
                 (Some(count), Some(index)) if index >= count => {
                     let message = format!("index = {index}, and a sample of [device.{name}] has {count} numbers");
                     table.report("index", message, format!("write index = 0 to {}", count - 1));
                 }
-                // What it sends is unknown, which has been reported.
+                // The content of its samples is unknown, which has been reported.
                 _ => {}
             },
         }
@@ -248,7 +248,7 @@ fn absolute(table: &Section<'_>, key: &str) -> Option<PathBuf> {
     if text.starts_with('/') && !text.chars().any(char::is_control) {
         return Some(PathBuf::from(text));
     }
-    table.refuse(key, format!("{key} = {text:?} is no absolute path"), "write the whole path, from /dev/")
+    table.refuse(key, format!("{key} = {text:?} is not an absolute path"), "write the whole path, from /dev/")
 }
 
 /// Reads the modules, in the order of the file.
@@ -274,7 +274,7 @@ fn module(name: &str, section: &Section<'_>, drafts: &[Draft<'_>], earlier: &[Mo
     for tag in section.texts("tags").unwrap_or_default() {
         match tag.split_once('=') {
             Some((key, value)) if !key.is_empty() => tags.push((key.to_owned(), value.to_owned())),
-            _ => section.report("tags", format!("{tag:?} is no tag"), "write KEY=VALUE, as \"finger=soft\""),
+            _ => section.report("tags", format!("{tag:?} is not a tag"), "write KEY=VALUE, as \"finger=soft\""),
         }
     }
     let devices = section.texts("devices").unwrap_or_default();

@@ -18,7 +18,7 @@ const OWN: [(Word, &[&str]); 4] = [
 const OPTIONAL: [&str; 6] = ["path", "width", "height", "fps", "download", "stream"];
 
 const DEFAULT_LEASE: Duration = Duration::from_secs(3);
-/// Ports of the neighbouring software: a GoPro's HTTP server, and the one a phone's app connects to.
+/// Default ports: that of a GoPro's HTTP server, and the one a phone's app connects to.
 const GOPRO_PORT: u16 = 8080;
 const PHONE_PORT: u16 = 5555;
 
@@ -85,7 +85,7 @@ fn protocol(table: &Section<'_>, word: Word, port: Option<u16>) -> Option<LanPro
         Word::Gopro => LanProtocol::Gopro {
             port: port.unwrap_or(GOPRO_PORT),
             download: table.flag("download").unwrap_or(false),
-            // Known when the whole registry is read.
+            // Set once the whole registry is read.
             reserve: None,
         },
         Word::Iphone => {
@@ -98,15 +98,15 @@ fn protocol(table: &Section<'_>, word: Word, port: Option<u16>) -> Option<LanPro
 }
 
 fn path(table: &Section<'_>) -> String {
-    /// Servers take 8000 characters at the least they should (RFC 9110, 4.1); none of a camera's has as many.
+    /// Servers should accept at least 8000 characters (RFC 9110, 4.1); no camera's path is nearly as long.
     const LONGEST: usize = 1000;
     let Some(path) = table.text("path") else { return "/".to_owned() };
-    // What may stand in a request line: no spaces, no control characters, nothing beyond ASCII.
+    // Characters permitted in a request line: no spaces, no control characters, only ASCII.
     if path.starts_with('/') && path.len() <= LONGEST && path.bytes().all(|b| b.is_ascii_graphic()) {
         return path.to_owned();
     }
     let fix = "begin with `/` and write what is not plain as %XX, for example path = \"/video?size=1\"";
-    table.report("path", format!("{path:?} cannot be asked for"), fix);
+    table.report("path", format!("{path:?} cannot be requested"), fix);
     "/".to_owned()
 }
 
@@ -119,7 +119,7 @@ fn picture(table: &Section<'_>, default: LanPicture) -> LanPicture {
     }
 }
 
-/// Two entries cannot have one port of this computer, unless each has it on an adapter of its own.
+/// Two entries cannot use the same port of this computer, unless each does on a separate adapter.
 pub(super) fn check_ports(drafts: &[Draft<'_>]) {
     for (index, draft) in drafts.iter().enumerate() {
         let Some((port, own)) = draft.lan().and_then(|lan| Some((lan.own_port()?, lan))) else { continue };
@@ -155,7 +155,7 @@ fn find(section: &Section<'_>, table: &Section<'_>, word: Word, port: Option<u16
     }
     match (is_usb, is_mdns, table.has("host")) {
         (true, true, _) => {
-            let message = "the entry says two ways to find the device: by USB and by mdns".to_owned();
+            let message = "the entry gives two ways to find the device: by USB and by mdns".to_owned();
             table.refuse("mdns", message, "keep vid and pid for a USB network adapter, or mdns, not both")
         }
         (true, false, has_host) => {
@@ -165,7 +165,7 @@ fn find(section: &Section<'_>, table: &Section<'_>, word: Word, port: Option<u16
             if has_host { Some(LanFind::Adapter { host: Some(host?) }) } else { Some(LanFind::Adapter { host: None }) }
         }
         (false, true, true) => {
-            let message = "the entry says two ways to find the device: by mdns and by host".to_owned();
+            let message = "the entry gives two ways to find the device: by mdns and by host".to_owned();
             table.refuse("host", message, "keep mdns for a device that announces itself, or host, not both")
         }
         (false, true, false) => {
@@ -192,7 +192,7 @@ fn fixed(table: &Section<'_>, host: Option<IpAddr>, word: Word, port: Option<u16
     };
     let probe = if table.has("probe") { table.choice("probe", &PROBES) } else { Some(default) }?;
     if probe == Probe::Udp && word != Word::Udp {
-        let message = format!("probe \"udp\" hears packets, and protocol {:?} sends none", word.name());
+        let message = format!("probe \"udp\" listens for packets, and protocol {:?} sends none", word.name());
         return table.refuse("probe", message, "write probe = \"tcp\" or \"http\"");
     }
     let own = match word {
@@ -200,11 +200,11 @@ fn fixed(table: &Section<'_>, host: Option<IpAddr>, word: Word, port: Option<u16
         Word::Mjpeg => Some(port.unwrap_or(80)),
         Word::Gopro => Some(port.unwrap_or(GOPRO_PORT)),
         Word::Udp if probe == Probe::Udp => port,
-        // There `port` is one of ours.
+        // There `port` is one of this computer.
         Word::Udp | Word::Iphone => None,
     };
     if probe == Probe::Udp && table.has("probe_port") {
-        let message = "probe \"udp\" hears what comes to port".to_owned();
+        let message = "probe \"udp\" listens on port".to_owned();
         return table.refuse("probe_port", message, "remove probe_port, or write probe = \"tcp\" or \"http\"");
     }
     let asked = if table.has("probe_port") { self::port(table, "probe_port") } else { own };

@@ -1,4 +1,4 @@
-//! The motors of `[device.NAME.can]`, and the axes of actions that follow from them.
+//! The motors of `[device.NAME.can]`, and the axes of actions derived from them.
 
 use std::time::Duration;
 
@@ -15,34 +15,34 @@ const KEYS: [&str; 11] =
     ["name", "slave", "master", "type", "mode", "kp", "kd", "position", "velocity", "torque", "slew"];
 /// How the command of a position starts and changes.
 const MOTION_KEYS: [&str; 3] = ["acceleration", "soft_start", "first_target"];
-/// When what a motor does is a fault, and how it stops then.
+/// Which behaviour of a motor is a fault, and how it stops then.
 const FAULT_KEYS: [&str; 8] =
     ["margin", "lag", "blocked_after", "own_fault", "other_fault", "emergency", "hold_for", "brake"];
 const TEMPERATURE_KEYS: [&str; 2] = ["max_mos", "max_rotor"];
-/// Six numbers a motor, and 64 in an action or a sample.
+/// Limits: six numbers per motor, and 64 in an action or a sample.
 const MOST: usize = 10;
-/// Motors that hold for want of an action must not do so between two commands.
+/// Motors that hold when no action arrives must not do so between two commands.
 const DEADMAN_PERIODS: u32 = 2;
-/// A motor that stops by itself when it receives nothing must not do so between two commands.
+/// A motor that stops when it receives nothing must not do so between two commands.
 const TIMEOUT_PERIODS: u32 = 4;
-/// A motor that continues for longer than this when this program is killed has gone far.
+/// A motor that continues for longer than this after this program is killed moves too far.
 const LONG_TIMEOUT: Duration = Duration::from_millis(500);
-/// Limits of a motor for which none are set: slow enough to step aside.
+/// Default limits of a motor: slow enough to step aside.
 const SPEED: f64 = 2.0;
-/// Of the highest torque of its type, likewise.
+/// Share of the highest torque of its type, likewise.
 const TORQUE_SHARE: f64 = 0.1;
-/// The winding's insulation and the transistors stand more; a finger does not.
+/// The winding's insulation and the transistors tolerate more; a finger does not.
 const TEMPERATURE: f64 = 80.0;
-/// By convention a motor answers with its own id and this.
+/// By convention a motor answers with its own id plus this.
 const MASTER_OFFSET: u16 = 0x10;
-/// Ids of commands, from a motor's own: MIT, position and velocity, velocity, position and force.
+/// Ids of commands, relative to a motor's own: MIT, position and velocity, velocity, position and force.
 const COMMANDS: [u16; 4] = [0, 0x100, 0x200, 0x300];
 /// The least damping above 0 in a MIT frame, Nm s/rad: 12 bits from 0 to 5.
 const KD_STEP: f64 = 5.0 / 4095.0;
 /// The id by which parameters of all motors are read and written.
 const PARAMETERS: u16 = 0x7ff;
 
-/// What a brake looks like.
+/// Example of a brake.
 const BRAKE: &str = "brake = { chip = \"/dev/gpiochip0\", line = 4, released = \"high\" }";
 /// A small spring-applied brake takes this long to engage or to release, unless its data sheet says otherwise.
 const BRAKE_TIME: Duration = Duration::from_millis(100);
@@ -78,7 +78,7 @@ pub(super) fn damiao(table: &Section<'_>) -> Option<DamiaoSpec> {
     })
 }
 
-/// Warns of motors that continue for long once nothing commands them.
+/// Warns of motors that continue for long without commands.
 pub(super) fn warn_of_slow_stop(devices: &[(Section<'_>, DeviceSpec)]) {
     for (section, device) in devices {
         let NodeSpec::Can(CanSpec { protocol: CanProtocol::Damiao(motors), .. }) = &device.node else { continue };
@@ -87,7 +87,7 @@ pub(super) fn warn_of_slow_stop(devices: &[(Section<'_>, DeviceSpec)]) {
         }
         let timeout = show_duration(motors.timeout);
         let message = format!(
-            "timeout = {timeout}: for so long the motors follow their last command when rapid and its guard are gone"
+            "timeout = {timeout}: the motors follow their last command for this long when rapid and its guard are gone"
         );
         let fix = format!("write timeout = \"500ms\" or less in [{}.can]", section.entry);
         section.warn_at(section.at, message, fix);
@@ -187,13 +187,13 @@ fn kind(entry: &Section<'_>) -> Option<MotorKind> {
 }
 
 fn position(entry: &Section<'_>, mode: Option<MotorMode>) -> Option<[f64; 2]> {
-    // Eight times what motors count to as they are shipped; a wheel turns on.
+    // Eight times the range of the factory settings; a wheel turns continuously.
     let farthest = if mode == Some(MotorMode::Velocity) { 1000.0 } else { 100.0 };
     let limits = entry.numbers("position")?;
     match limits.as_slice() {
         [low, high] if low.abs() <= farthest && high.abs() <= farthest && low < high => Some([*low, *high]),
         _ => {
-            let message = format!("position = {limits:?} is no range");
+            let message = format!("position = {limits:?} is not a range");
             let fix = format!("write [lowest, highest] in rad, the highest above the lowest, within {farthest}");
             entry.refuse("position", message, fix)
         }
@@ -211,7 +211,7 @@ fn mode(entry: &Section<'_>) -> Option<MotorMode> {
     let mode = if entry.has("mode") { entry.choice("mode", &words)? } else { zero };
     let gains = [("kp", 500.0), ("kd", 5.0)];
     if mode != zero {
-        // Frames of these modes have room for none of them.
+        // Frames of these modes have no room for any of them.
         for key in ["kp", "kd", "torque"].into_iter().filter(|key| entry.has(key)) {
             let message = format!("a motor that runs its own loop takes no {key}");
             entry.report(key, message, format!("remove {key}, or write mode = \"mit\""));
@@ -224,7 +224,7 @@ fn mode(entry: &Section<'_>) -> Option<MotorMode> {
         entry.number(key, 0.0..=most)
     });
     let (kp, kd) = (kp?, kd?);
-    // Position held without damping rings: the maker's manual forbids it. A frame has 12 bits for it.
+    // Position control without damping oscillates: the maker's manual forbids it. A frame has 12 bits for it.
     if kp > 0.0 && kd < KD_STEP {
         let message = if kd == 0.0 {
             "kp without kd: the motor would swing".to_owned()
@@ -254,7 +254,7 @@ fn motion(entry: &Section<'_>, slew: f64, mode: Option<MotorMode>) -> MotionSpec
     }
 }
 
-/// When what the motor does is a fault.
+/// Which behaviour of the motor is a fault.
 fn watch(entry: &Section<'_>) -> WatchSpec {
     let default = WatchSpec::default();
     let half_a_second = Duration::from_millis(500);
@@ -317,7 +317,7 @@ fn or_never(table: &Section<'_>, key: &str, least: Duration, default: Option<Dur
     }
 }
 
-/// Names and ids that two motors cannot both have. An answer with the id of a command would be taken for
+/// Names and ids that two motors cannot both have. An answer with the id of a command would be interpreted as
 /// one by another motor.
 fn check_pairs(motors: &[(Section<'_>, Option<MotorSpec>)]) {
     let known = || motors.iter().filter_map(|(entry, motor)| Some((entry, motor.as_ref()?)));
@@ -362,8 +362,8 @@ fn check_pairs(motors: &[(Section<'_>, Option<MotorSpec>)]) {
     }
 }
 
-/// The axes of the entry's actions. They follow from its motors, whose limits are those that are kept: a
-/// table beside them would have no effect.
+/// The axes of the entry's actions. They are derived from its motors, whose limits are applied: an additional
+/// table would have no effect.
 pub(super) fn axes(damiao: &DamiaoSpec, section: &Section<'_>) -> ActionSpec {
     if section.has("action") {
         let message = format!("motors take no table [{}]: their axes follow from them", section.child("action"));

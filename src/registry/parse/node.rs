@@ -1,5 +1,5 @@
-//! The settings of a node: `[device.NAME.camera]`, `[device.NAME.tty]`, `[device.NAME.can]` and `[device.NAME.process]`,
-//! and the sizes that follow from them.
+//! The settings of a node: `[device.NAME.camera]`, `[device.NAME.tty]`, `[device.NAME.can]` and
+//! `[device.NAME.process]`, and the sizes derived from them.
 
 use std::time::Duration;
 
@@ -70,7 +70,7 @@ pub(super) fn serial(section: &Section<'_>) -> Option<SerialSpec> {
     if parse == Parse::Raw {
         if table.has("channels") {
             let fix = "remove channels, or write parse = \"csv\", \"json\" or \"f32le\"";
-            table.report("channels", "raw messages are not looked into and have no channels".to_owned(), fix);
+            table.report("channels", "raw messages are not parsed and have no channels".to_owned(), fix);
         }
         return Some(SerialSpec { baud, framing, parse, channels: 0 });
     }
@@ -101,7 +101,7 @@ pub(super) fn warn_of_old_names(drafts: &[Draft<'_>]) {
 }
 
 fn framing(table: &Section<'_>) -> Option<Framing> {
-    /// More than any message of the devices this is for; bounds the buffer.
+    /// More than any message of the supported devices; bounds the buffer.
     const LONGEST: usize = 65_536;
     let text = table.text("framing")?;
     match text.split_once(' ') {
@@ -125,11 +125,11 @@ fn framing(table: &Section<'_>) -> Option<Framing> {
     table.refuse("framing", format!("unknown framing {text:?}"), fix)
 }
 
-/// Half a second, or ten periods of a slow camera; a serial line's rate is not known.
+/// Half a second, or ten periods of a slow camera; a serial line's rate is unknown.
 pub(super) fn default_stall(node: Option<&NodeSpec>) -> Duration {
     const LEAST: Duration = Duration::from_millis(500);
     match node.and_then(NodeSpec::picture) {
-        // It is looked at every 3 s.
+        // Its state is read every 3 s.
         _ if node.is_some_and(is_gopro) => Duration::from_secs(10),
         Some(picture) => (Duration::from_secs(10) / picture.fps.max(1)).max(LEAST),
         None => LEAST,
@@ -171,11 +171,11 @@ pub(super) fn max_bytes(section: &Section<'_>, node: Option<&NodeSpec>) -> u64 {
     section.size("max_bytes", least..=256 << 20).unwrap_or(default)
 }
 
-/// About two seconds of pictures, and a second of a LiDAR's packets; a serial line may send a thousand samples a second.
+/// About two seconds of pictures, and a second of a LiDAR's packets; a serial line may send 1000 samples a second.
 pub(super) fn default_depth(node: Option<&NodeSpec>) -> u64 {
     match node {
         Some(node) if is_gopro(node) => 16,
-        // Of a camera with 30 pictures a second, and of what may be as large.
+        // For a camera with 30 pictures a second, and for anything that may be as large.
         Some(NodeSpec::Process(process)) if process.kind != ModalityKind::Scalars => 60,
         node => node.and_then(NodeSpec::picture).map_or(2048, |picture| (2 * u64::from(picture.fps)).clamp(16, 1024)),
     }
@@ -186,7 +186,7 @@ pub(super) fn is_gopro(node: &NodeSpec) -> bool {
 }
 
 const PROCESS_KEYS: [&str; 7] = ["args", "opens", "kind", "channels", "width", "height", "heartbeat"];
-/// As good as any program that only looks whether its device still answers once a second.
+/// Sufficient for a program that only checks once a second whether its device still answers.
 const DEFAULT_HEARTBEAT: Duration = Duration::from_secs(2);
 
 /// How an entry's `program` is run and how long it may be silent; `None` if a problem with it was reported.
@@ -241,7 +241,7 @@ fn args(table: &Section<'_>) -> Vec<String> {
     args
 }
 
-/// What a sample's shape is, from the keys that belong to its kind.
+/// The shape of a sample, from the keys for its kind.
 fn shape(table: &Section<'_>, kind: ModalityKind) -> Vec<u32> {
     let (word, keys): (&str, &[(&str, i64)]) = match kind {
         ModalityKind::Scalars => ("scalars", &[("channels", 1024)]),
@@ -268,7 +268,7 @@ const CAN_KEYS: [&str; 9] =
 /// Keys that only a bus of motors has.
 const OF_MOTORS: [&str; 6] = ["motors", "hz", "deadman", "disable_after", "timeout", "silent_after"];
 
-/// What can be on a bus, by the word for it: motors, or not.
+/// What can be on a bus, by its keyword: motors, or not.
 const PROTOCOLS: [(&str, bool); 2] = [("raw", false), ("damiao", true)];
 
 /// Reads the table; `None` if a problem with it was reported.
@@ -287,7 +287,7 @@ pub(super) fn can(section: &Section<'_>) -> Option<CanSpec> {
     if has_motors == Some(true) {
         return Some(CanSpec { adapter, bitrate, protocol: CanProtocol::Damiao(motors::damiao(&table)?) });
     }
-    // A word that is none has been reported; what it was to be is not known.
+    // An unknown word has been reported; the intended protocol is unknown.
     if has_motors.is_some() || !table.has("protocol") {
         no_motors(&table);
     }

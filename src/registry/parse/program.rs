@@ -1,10 +1,10 @@
 //! The programs that an entry names, and its hooks `on_attach`, `on_detach`, `on_record_start` and `on_record_stop`:
 //! programs with their arguments.
 //!
-//! 1. An absolute path is taken as it is.
-//! 2. A name is looked for beside the registry's file, then in the absolute directories of `PATH`.
+//! 1. An absolute path is used as it is.
+//! 2. A name is searched for beside the registry's file, then in the absolute directories of `PATH`.
 //!
-//! Invariant: a program that others could change is refused as root, and warned of otherwise.
+//! Invariant: a program that others could change is rejected as root, and causes a warning otherwise.
 
 use std::ffi::OsString;
 use std::os::unix::fs::PermissionsExt;
@@ -16,22 +16,22 @@ use crate::registry::section::{Section, printable};
 use crate::registry::spec::{Hook, Hooks};
 use crate::registry::trust::distrust;
 
-/// Files beside the registry that are compared with a name that is not found.
+/// Number of files beside the registry that are compared with a name that is not found.
 const MOST_COMPARED: usize = 1000;
 
-/// Where programs are looked for.
+/// Where programs are searched for.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Programs<'a> {
     /// Beside this file and on `PATH`.
     Beside(&'a Path),
-    /// Nowhere: nothing will be run, any name is right.
+    /// Nowhere: no program will be run, any name is valid.
     Nowhere,
 }
 
-/// Which key names the program, for messages.
+/// The key that names the program, for messages.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum For {
-    /// `node`, which may also be a word for what is built in.
+    /// `node`, which may also be the word for a built-in node.
     Node,
     /// The first text of this key.
     Hook(&'static str),
@@ -50,7 +50,7 @@ impl For {
 type Wrong = (String, String);
 
 impl Programs<'_> {
-    /// Is this a registry of which nothing will be run, such as that of an episode?
+    /// Whether this is a registry whose programs will not be run, such as that of an episode.
     pub(super) const fn are_nowhere(self) -> bool {
         matches!(self, Self::Nowhere)
     }
@@ -100,13 +100,13 @@ impl Programs<'_> {
     }
 }
 
-/// The folder of the registry's file, as an absolute path: it must hold wherever a child runs.
+/// The folder of the registry's file, as an absolute path: it must be valid wherever a child runs.
 fn folder_of(file: &Path) -> PathBuf {
     let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned())
 }
 
-/// A relative directory on `PATH` would mean another program in each directory `rapid` is started in.
+/// A relative directory on `PATH` would name another program in each directory `rapid` is started in.
 fn directories(path: &OsString) -> Vec<PathBuf> {
     std::env::split_paths(path).filter(|folder| folder.is_absolute()).collect()
 }
@@ -120,13 +120,13 @@ fn executables(folder: &Path) -> Vec<String> {
     names.filter_map(|entry| entry.file_name().into_string().ok()).collect()
 }
 
-/// Can it be run, and may it be?
+/// Whether it can and may be run.
 fn check(path: &Path) -> Result<(), Wrong> {
     let label = printable(&path.display().to_string());
     let wrong = |message: &str, fix: String| Err((format!("the program {label} {message}"), fix));
     let meta = match path.metadata() {
         Ok(meta) => meta,
-        Err(error) => return wrong(&format!("cannot be looked at: {error}"), "name another program".to_owned()),
+        Err(error) => return wrong(&format!("cannot be inspected: {error}"), "name another program".to_owned()),
     };
     if !meta.is_file() {
         return wrong("is not a file", "name the program itself".to_owned());
@@ -137,7 +137,7 @@ fn check(path: &Path) -> Result<(), Wrong> {
     trusted(path, &label)
 }
 
-/// Whoever may write the program, or exchange it in its folder, decides what root runs.
+/// Any user who may write the program, or exchange it in its folder, decides what root runs.
 fn trusted(path: &Path, label: &str) -> Result<(), Wrong> {
     if !rustix::process::geteuid().is_root() {
         return Ok(());
@@ -146,15 +146,15 @@ fn trusted(path: &Path, label: &str) -> Result<(), Wrong> {
         Ok(None) => Ok(()),
         Ok(Some(reason)) => Err((format!("the program {label}: {reason}"), reason.fix())),
         Err(error) => {
-            Err((format!("the program {label}: cannot be looked at: {error}"), "name another program".to_owned()))
+            Err((format!("the program {label}: cannot be inspected: {error}"), "name another program".to_owned()))
         }
     }
 }
 
-/// Warns of the programs of entries that others could change. As root they have been refused.
+/// Warns of the programs of entries that others could change. As root they have been rejected.
 pub(super) fn warn_of_distrusted(drafts: &[Draft<'_>]) {
     for (draft, (key, path)) in drafts.iter().flat_map(|draft| draft.programs().map(move |program| (draft, program))) {
-        // What is not looked for, as nothing will be run, is not there either.
+        // A program that is not searched for, because it will not be run, does not exist there either.
         if let Ok(Some(reason)) = distrust(path) {
             let message = format!("the program {}: {reason}", printable(&path.display().to_string()));
             draft.section.warn_at(draft.section.at_of(key), message, reason.fix());
@@ -223,14 +223,14 @@ mod tests {
     }
 
     #[test]
-    fn a_program_that_others_could_change_is_refused_as_root_and_warned_of_otherwise() {
+    fn a_program_that_others_could_change_is_rejected_as_root_and_causes_a_warning_otherwise() {
         use crate::registry::Registry;
         let dir = tempfile::tempdir().unwrap();
         allow(dir.path(), 0o755);
         let (file, program) = (dir.path().join("devices.toml"), dir.path().join("p"));
         write(&program, "").unwrap();
         let entry = "[device.a]\nvid = \"1\"\npid = \"2\"\nbit = 0\n";
-        let told = |mode, keys: &str| {
+        let diagnose = |mode, keys: &str| {
             let text = format!("{entry}{keys}\n");
             allow(&program, mode);
             match Registry::parse(&text, Some(&file)) {
@@ -243,8 +243,8 @@ mod tests {
             "on_record_stop = [\"p\", \"x\"]\nnode = \"camera\"",
             "on_attach = [\"p\"]\nnode = \"process\"",
         ] {
-            assert_eq!(told(0o755, keys), (Vec::new(), false));
-            let (diagnostics, refused) = told(0o777, keys);
+            assert_eq!(diagnose(0o755, keys), (Vec::new(), false));
+            let (diagnostics, refused) = diagnose(0o777, keys);
             assert_eq!(refused, rustix::process::geteuid().is_root());
             assert_eq!(diagnostics.len(), 1, "{diagnostics:?}");
             assert!(diagnostics[0].message.ends_with("p: other users may write to it (mode 0777)"), "{diagnostics:?}");
@@ -259,7 +259,7 @@ mod tests {
         let program = dir.path().join("p");
         write(&program, "").unwrap();
         allow(&program, 0o755);
-        // Anybody else runs what that user may run anyway.
+        // Any other user runs what that user may run anyway.
         let refused = || trusted(&program, "p").is_err();
         let is_root = rustix::process::geteuid().is_root();
         assert!(!refused());

@@ -40,9 +40,9 @@ fn a_device_too_slow_for_the_window_gets_a_warning_with_a_fix() {
         let warnings = parse(window, fps, verdict);
         assert_eq!(warnings.len(), usize::from(warned), "{window} {fps} {verdict}: {warnings:?}");
     }
-    let said = parse("", 15, "").concat();
+    let warning = parse("", 15, "").concat();
     for part in ["15 samples a second", "75 %", "sync_window = 25ms", "sync_window = \"34ms\"", "[device.cam.verdict]"]
     {
-        assert!(said.contains(part), "{part}: {said}");
+        assert!(warning.contains(part), "{part}: {warning}");
     }
 }

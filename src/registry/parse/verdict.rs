@@ -1,10 +1,10 @@
 //! The limits of the verdict: `[verdict]`, `[verdict.bad]`, `[device.NAME.verdict]` and
 //! `[device.NAME.verdict.bad]`.
 //!
-//! 1. A limit that is written nowhere is that of [`VerdictSpec::of`].
+//! 1. A limit that is not written is that of [`VerdictSpec::of`].
 //! 2. `[verdict]` changes what is on by default; a check that is off for a kind of modality (two
-//!    equal vectors of numbers are no fault) is only turned on by the device's own table.
-//! 3. A limit for SUSPECT beyond the one for BAD moves that one along, unless both are written: then
+//!    equal vectors of numbers are not a fault) is only turned on by the device's own table.
+//! 3. A limit for SUSPECT beyond the one for BAD moves that one too, unless both are written: then
 //!    the file contradicts itself. "off" turns both off, unless BAD is written.
 
 use std::iter::zip;
@@ -41,17 +41,17 @@ enum Worse {
     Less,
 }
 
-/// A limit as it was written; `None` is "off".
+/// A limit as written; `None` is "off".
 type Given<T> = Option<T>;
 
-/// The limits of one grade as they were written, as far as they were.
+/// The written limits of one grade.
 #[derive(Debug, Default, Clone, Copy)]
 struct Written {
     shares: [Option<Given<f64>>; SHARES.len()],
     times: [Option<Given<Duration>>; TIMES.len()],
 }
 
-/// A verdict table as it was written.
+/// A verdict table as written.
 #[derive(Debug, Default, Clone, Copy)]
 pub(super) struct VerdictTable {
     suspect: Written,
@@ -59,12 +59,12 @@ pub(super) struct VerdictTable {
     hz: Option<f64>,
 }
 
-/// Whose table it is.
+/// The owner of the table.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Whose {
-    /// All devices'.
+    /// All devices.
     Rig,
-    /// One device's.
+    /// One device.
     Device,
 }
 
@@ -135,7 +135,7 @@ fn contradictions(table: &VerdictTable, section: &Section<'_>, bad: &Section<'_>
     let report = |key: &str| {
         let line = section.line_of(key);
         let message = format!("{key} is BAD before it is SUSPECT by [{}] on line {line}", section.entry);
-        bad.report(key, message, "make the limit for BAD the graver of the two");
+        bad.report(key, message, "make the limit for BAD the more severe of the two");
     };
     for ((key, _, worse), written) in SHARES.iter().zip(zip(table.suspect.shares, table.bad.shares)) {
         if matches!(written, (Some(Some(suspect)), Some(Some(bad))) if worse.is_beyond(&suspect, &bad)) {
@@ -150,7 +150,7 @@ fn contradictions(table: &VerdictTable, section: &Section<'_>, bad: &Section<'_>
 }
 
 impl Worse {
-    /// Is `a` a graver value than `b`?
+    /// Whether `a` is more severe than `b`.
     fn is_beyond<T: PartialOrd>(self, a: &T, b: &T) -> bool {
         match self {
             Self::More => a > b,

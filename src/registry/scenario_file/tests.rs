@@ -31,7 +31,7 @@ fn without_devices_every_entry_is_plugged() {
 }
 
 #[test]
-fn the_demo_pulls_the_second_camera_again_and_again() {
+fn the_demo_unplugs_the_second_camera_repeatedly() {
     let demo = Scenario::demo(&Registry::builtin());
     let plug = ScenarioAction::Plug { port: None };
     assert_eq!(demo.events, [event(3000, "tactile_tip", ScenarioAction::Unplug), event(6000, "tactile_tip", plug)]);
@@ -166,7 +166,7 @@ fn all_errors_are_reported_with_their_position() {
         (
             "[[device]]\nname = \"cam_wrist\"\nport = \"1-1\"\n[[device]]\nname = \"tactile_tip\"\nport = \"1-1\"\n",
             "scenario:6:8: [device 2] port 1-1 is already that of the device on line 1\n    \
-             fix: give each device a port of its own: port = \"1-4\"",
+             fix: give each device a separate port: port = \"1-4\"",
         ),
         (
             "[device]\nname = \"cam_wrist\"\nspeed = 1\n",

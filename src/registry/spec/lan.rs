@@ -8,52 +8,52 @@ use crate::modality::ModalityKind;
 /// See the module's comment.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LanSpec {
-    /// What it speaks.
+    /// Its protocol.
     pub protocol: LanProtocol,
     /// How it is found.
     pub find: LanFind,
-    /// For how long it counts as there after it was last heard of, 500 ms to 60 s, default 3 s.
+    /// How long it counts as present after data was last received from it, 500 ms to 60 s, default 3 s.
     pub lease: Duration,
 }
 
-/// What a device on the network speaks.
+/// The protocol of a device on the network.
 #[derive(Debug, Clone, PartialEq)]
 pub enum LanProtocol {
-    /// Pictures over HTTP, `multipart/x-mixed-replace`; one sample a picture.
+    /// Pictures over HTTP, `multipart/x-mixed-replace`; one sample per picture.
     Mjpeg {
         /// Port of its HTTP server; `None` is what mDNS reported, or 80.
         port: Option<u16>,
-        /// What is asked for, beginning with `/`, default `/`.
+        /// The requested path, beginning with `/`, default `/`.
         path: String,
-        /// What the pictures are.
+        /// The format of the pictures.
         picture: LanPicture,
     },
-    /// Packets sent to a port of ours, one sample each.
+    /// Packets sent to a port of this computer, one sample each.
     Udp {
         /// The port.
         port: u16,
     },
-    /// A GoPro, which records by itself; one sample a look at its state.
+    /// A GoPro, which records by itself; one sample per query of its state.
     Gopro {
         /// Port of its HTTP server, default 8080.
         port: u16,
-        /// Are its clips fetched after the episode? Default no.
+        /// Whether its clips are downloaded after the episode. Default no.
         download: bool,
-        /// `disk_reserve` of the rig, bytes: clips leave as much free, and room for an episode beside it.
+        /// `disk_reserve` of the rig, bytes: downloads leave this space free, plus room for an episode.
         reserve: Option<u64>,
     },
-    /// A phone that connects to us and sends pictures with the camera's pose.
+    /// A phone that connects to this computer and sends pictures with the camera's pose.
     Iphone {
-        /// The port of ours that it connects to, default 5555.
+        /// The port of this computer that it connects to, default 5555.
         port: u16,
         /// Which part is the sample.
         stream: PhoneStream,
-        /// What the pictures are, default 1920x1440 at 30.
+        /// The format of the pictures, default 1920x1440 at 30.
         picture: LanPicture,
     },
 }
 
-/// What the pictures of a network camera are.
+/// The format of the pictures of a network camera.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct LanPicture {
     /// Pixels, `1..=8192`, default 640.
@@ -64,10 +64,10 @@ pub struct LanPicture {
     pub fps: u32,
 }
 
-/// Which part of what a phone sends is the sample.
+/// Which part of a phone's data is the sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PhoneStream {
-    /// The picture, in which a comment holds the pose.
+    /// The picture, with the pose in a comment.
     Image,
     /// The pose: 16 numbers, 4 by 4, column by column.
     Pose,
@@ -78,33 +78,33 @@ pub enum PhoneStream {
 pub enum LanFind {
     /// It is a network adapter with the USB identity of the entry, or is behind one.
     Adapter {
-        /// Its address, where the protocol does not tell it.
+        /// Its address, if the protocol does not report it.
         host: Option<IpAddr>,
     },
     /// It announces a service.
     Mdns {
         /// The service, for example `_iphonevio._tcp`.
         service: String,
-        /// The instance of it, if only one is meant.
+        /// The instance of it, if only one is to match.
         instance: Option<String>,
     },
-    /// It has a fixed address, which is asked.
+    /// It has a fixed address, which is probed.
     Host {
         /// The address.
         host: IpAddr,
-        /// How it is asked.
+        /// How it is probed.
         probe: Probe,
-        /// Which port is asked; for [`Probe::Udp`] the one of ours that hears it.
+        /// Which port is probed; for [`Probe::Udp`] the one of this computer that receives its packets.
         port: u16,
     },
 }
 
-/// How a fixed address is asked whether its device is there.
+/// How the presence of a device at a fixed address is checked.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Probe {
-    /// It takes a TCP connection.
+    /// It accepts a TCP connection.
     Tcp,
-    /// It answers an HTTP request, whatever the answer is.
+    /// It answers an HTTP request with any answer.
     Http,
     /// Its packets arrive.
     Udp,
@@ -116,14 +116,14 @@ const HTTP_PORT: u16 = 80;
 const POSE: u32 = 16;
 
 impl LanFind {
-    /// Is the device a network adapter, or behind one?
+    /// Whether the device is a network adapter, or behind one.
     #[must_use]
     pub const fn is_adapter(&self) -> bool {
         matches!(self, Self::Adapter { .. })
     }
 
     /// Whether sockets of IPv4, and whether those of IPv6, are opened for such a device. Behind an adapter without a
-    /// `host` the addresses are IPv4; mDNS is spoken in both.
+    /// `host` the addresses are IPv4; mDNS uses both.
     #[must_use]
     pub const fn families(&self) -> [bool; 2] {
         match self {
@@ -134,9 +134,9 @@ impl LanFind {
     }
 }
 
-/// The address of ours at which a device at `peer` reaches us. One on this machine has a loopback address, and so has
-/// our side of it: nothing from outside gets there. Of any other it is every address: what a device broadcasts, as
-/// LiDARs do, is not heard at a single one.
+/// The local address at which a device at `peer` reaches this computer. A device on this machine has a loopback
+/// address, and so does the local side: nothing from outside gets there. For any other device it is the wildcard
+/// address: a broadcast, as LiDARs send, is not received at a specific one.
 #[must_use]
 pub fn own_side(peer: Option<IpAddr>) -> IpAddr {
     match peer {
@@ -147,21 +147,21 @@ pub fn own_side(peer: Option<IpAddr>) -> IpAddr {
 }
 
 impl LanPicture {
-    /// What a phone sends unless the entry says otherwise.
+    /// Pictures of a phone unless the entry states otherwise.
     pub(in crate::registry) const OF_A_PHONE: Self = Self { width: 1920, height: 1440, fps: 30 };
-    /// What a camera sends unless the entry says otherwise.
+    /// Pictures of a camera unless the entry states otherwise.
     pub(in crate::registry) const OF_A_CAMERA: Self = Self { width: 640, height: 480, fps: 30 };
 }
 
 impl LanSpec {
-    /// Takes over the rig's settings for the disk.
+    /// Applies the rig's settings for the disk.
     pub(in crate::registry) fn keep_free(&mut self, disk_reserve: Option<u64>) {
         if let LanProtocol::Gopro { reserve, .. } = &mut self.protocol {
             *reserve = disk_reserve;
         }
     }
 
-    /// What its samples hold.
+    /// Content of its samples.
     #[must_use]
     pub const fn modality_kind(&self) -> ModalityKind {
         match &self.protocol {
@@ -181,7 +181,7 @@ impl LanSpec {
         }
     }
 
-    /// What its pictures are, if it sends any.
+    /// The format of its pictures, if it sends any.
     #[must_use]
     pub const fn picture(&self) -> Option<LanPicture> {
         match &self.protocol {
@@ -214,19 +214,19 @@ impl LanSpec {
             (ModalityKind::Image, Some(picture)) => {
                 let pixels = u64::from(picture.width) * u64::from(picture.height);
                 let most = match &self.protocol {
-                    // It compresses to some fifth of a byte a pixel (quality 0.7), and its pictures are large.
+                    // It compresses to about a fifth of a byte per pixel (quality 0.7), and its pictures are large.
                     LanProtocol::Iphone { .. } => pixels / 2,
                     _ => 2 * pixels,
                 };
                 (most.max(SMALLEST_JPEG), 4096)
             }
             (ModalityKind::Scalars, _) => (8 * u64::from(POSE), 8 * u64::from(POSE)),
-            // What an Ethernet frame carries is under 1500.
+            // The payload of an Ethernet frame is under 1500.
             _ => (2048, 64),
         }
     }
 
-    /// The port at which the device is reached, or at which it reaches us, if the entry says.
+    /// The port at which the device is reached, or at which it reaches this computer, if the entry states it.
     #[must_use]
     pub const fn port(&self) -> Option<u16> {
         match &self.protocol {
@@ -237,13 +237,13 @@ impl LanSpec {
         }
     }
 
-    /// Where a device at this address is reached.
+    /// The socket address of a device at this address.
     #[must_use]
     pub fn server(&self, host: IpAddr) -> SocketAddr {
         SocketAddr::new(host, self.port().unwrap_or(HTTP_PORT))
     }
 
-    /// The port of this computer that it needs: of UDP or not, and its number.
+    /// The port of this computer that it needs: whether it is UDP, and its number.
     #[must_use]
     pub const fn own_port(&self) -> Option<(bool, u16)> {
         match &self.protocol {

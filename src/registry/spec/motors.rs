@@ -1,42 +1,44 @@
-//! Motors of a CAN bus that speak Damiao's protocol, as `[device.NAME.can]` declares them.
+//! Motors of a CAN bus with Damiao's protocol, as `[device.NAME.can]` declares them.
 //!
-//! Invariant: which ranges a motor counts in is read from the motor. [`MotorKind`] says what the maker
-//! ships, to compare it with.
+//! Invariant: the ranges of a motor's numbers are read from the motor. [`MotorKind`] holds the factory
+//! settings, for comparison.
 
 use std::path::PathBuf;
 use std::time::Duration;
 
-/// Motors of one bus, at the most: an action has an axis each, a sample 6 numbers each.
+/// Most motors of one bus: an action has an axis each, a sample 6 numbers each.
 pub const MAX_MOTORS: usize = 10;
 
 /// `protocol = "damiao"`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DamiaoSpec {
-    /// One motor an axis, in the order of samples and actions, `1..=`[`MAX_MOTORS`] of them. No two are [`Self::indistinct`].
+    /// One motor per axis, in the order of samples and actions, `1..=`[`MAX_MOTORS`] of them. No two are
+    /// [`Self::indistinct`].
     pub motors: Vec<MotorSpec>,
     /// Commands a second to each motor, `10..=1000`, default 200.
     pub hz: u32,
-    /// Without an action for this long the motors hold, two commands at least; `None` is twice the time
+    /// Without an action for this long the motors hold; at least two commands; `None` is twice the time
     /// between actions.
     pub deadman: Option<Duration>,
-    /// Holding for this long they are disabled; `None` is never.
+    /// After holding for this long they are disabled; `None` is never.
     pub disable_after: Option<Duration>,
-    /// The motors' own limit: without a frame for this long they stop by themselves. Above 0.
+    /// The motors' internal limit: without a frame for this long they stop. Above 0.
     pub timeout: Duration,
-    /// A motor that leaves frames unanswered for this long is silent, default 40 ms: with two cycles at 200 Hz it is named within 50 ms.
+    /// A motor that leaves frames unanswered for this long is silent, default 40 ms: with two cycles at 200 Hz it is
+    /// reported within 50 ms.
     pub silent_after: Duration,
 }
 
 /// One motor.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MotorSpec {
-    /// What it is called, in messages and as the name of its axis.
+    /// Its name, in messages and as the name of its axis.
     pub name: String,
     /// CAN id it listens to (Damiao: `CAN_ID` or `ESC_ID`), `1..=0xff`.
     pub slave: u16,
     /// CAN id it answers with (Damiao: `MST_ID` or Master ID), `0..=0x7ff`.
     pub master: u16,
-    /// Which motor it is.
+    /// The type of the motor.
     pub kind: MotorKind,
     /// How it is driven.
     pub mode: MotorMode,
@@ -44,19 +46,19 @@ pub struct MotorSpec {
     pub position: [f64; 2],
     /// Highest speed, rad/s; above 0.
     pub velocity: f64,
-    /// Highest torque, Nm; above 0. Bounds what the position error asks for in [`MotorMode::Mit`], and means
-    /// nothing in the other modes, whose frames have no torque.
+    /// Highest torque, Nm; above 0. Bounds the torque that results from the position error in [`MotorMode::Mit`], and
+    /// has no effect in the other modes, whose frames have no torque.
     pub torque: f64,
     /// Highest change of the command: rad/s of a commanded position, rad/s² of a commanded velocity;
     /// above 0.
     pub slew: f64,
     /// How it starts.
     pub motion: MotionSpec,
-    /// When what it does is a fault.
+    /// Which behaviour is a fault.
     pub watch: WatchSpec,
     /// How it stops at a fault.
     pub stop: StopSpec,
-    /// Its holding brake, if it has one that is driven from here.
+    /// Its holding brake, if it has one that is controlled here.
     pub brake: Option<BrakeSpec>,
     /// Highest temperature of its transistors, °C.
     pub max_mos: f64,
@@ -64,43 +66,44 @@ pub struct MotorSpec {
     pub max_rotor: f64,
 }
 
-/// How a joint stops at a fault or an emergency stop. A disarm, and the end of the program, disable it whatever this is.
+/// How a joint stops at a fault or an emergency stop. A disarm, and the end of the program, disable it regardless.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Stop {
     /// Disabled: a joint under load falls.
     Limp,
-    /// Without stiffness, with its damping alone: a joint under load sinks slowly. Motors in the modes
-    /// [`MotorMode::PositionVelocity`] and [`MotorMode::Velocity`] have no frame for it: they are not configured so, and
-    /// stop as with [`Stop::Hold`].
+    /// Without stiffness, with only its damping: a joint under load sinks slowly. Motors in the modes
+    /// [`MotorMode::PositionVelocity`] and [`MotorMode::Velocity`] have no frame for it: they are not configured so,
+    /// and stop as with [`Stop::Hold`].
     Damp,
-    /// Where it was commanded last; within its torque in [`MotorMode::Mit`], with all that the motor has in the others.
+    /// At its last commanded position; within its torque in [`MotorMode::Mit`], with all torque of the motor in the
+    /// others.
     Hold,
     /// As [`Stop::Hold`] until its brake is engaged, then disabled.
     Brake,
 }
 
-/// A brake that holds a joint while its motor is off: a line of a GPIO chip releases it. It is released while the motor is
-/// on, unless that stops as [`Stop::Brake`], and engaged at all other times.
+/// A brake that holds a joint while its motor is off: a line of a GPIO chip releases it. It is released while the motor
+/// is on, unless that stops as [`Stop::Brake`], and engaged at all other times.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct BrakeSpec {
     /// The chip, for example `/dev/gpiochip0`.
     pub chip: PathBuf,
-    /// Its line; joints of one line share a brake, which is released while it may be for all of them.
+    /// Its line; joints with the same line share a brake, which is released while all of them permit it.
     pub line: u32,
     /// The level that releases it.
     pub released_high: bool,
-    /// Until it holds, from the level on.
+    /// Time from the change of the level until it holds.
     pub engages_in: Duration,
-    /// Until it holds no more, from the level on; up to [`BrakeSpec::SLOWEST`], as the other one.
+    /// Time from the change of the level until it no longer holds; both are at most [`BrakeSpec::SLOWEST`].
     pub releases_in: Duration,
 }
 
 impl BrakeSpec {
-    /// A brake that takes longer is none.
+    /// Longest accepted time of a brake.
     pub const SLOWEST: Duration = Duration::from_secs(2);
 }
 
-/// How a motor stops at which fault.
+/// How a motor stops, by fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct StopSpec {
     /// At a fault of its own.
@@ -114,17 +117,17 @@ pub struct StopSpec {
 }
 
 impl Default for StopSpec {
-    /// What is wrong with a joint is not driven on; the others sink slowly with it. An emergency stop disables all.
+    /// A faulty joint is not driven further; the others sink slowly with it. An emergency stop disables all.
     fn default() -> Self {
         Self { own_fault: Stop::Limp, other_fault: Stop::Damp, emergency: Stop::Limp, hold_for: None }
     }
 }
 
-/// How the command of a position starts and changes. Means nothing in [`MotorMode::Velocity`], whose slew limit is one of
+/// How the command of a position starts and changes. Has no effect in [`MotorMode::Velocity`], whose slew limit is an
 /// acceleration.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MotionSpec {
-    /// Highest acceleration of the command, rad/s²; above 0, infinite is none.
+    /// Highest acceleration of the command, rad/s²; above 0, infinite is no limit.
     pub acceleration: f64,
     /// After an arm the command reaches its highest speed in this time.
     pub soft_start: Duration,
@@ -133,7 +136,7 @@ pub struct MotionSpec {
 }
 
 impl MotionSpec {
-    /// To its highest speed within so many seconds.
+    /// Default time to the highest speed, seconds.
     const SPEEDS_UP_IN: f64 = 0.05;
 
     /// For a command that changes by `slew` (rad/s) at most.
@@ -143,26 +146,26 @@ impl MotionSpec {
     }
 }
 
-/// When what a motor does is a fault.
+/// Which behaviour of a motor is a fault.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct WatchSpec {
-    /// How far outside its limits it may be, rad; an arm farther out is refused. At least 0.
+    /// How far outside its limits it may be, rad; an arm farther out is rejected. At least 0.
     pub margin: f64,
-    /// How far it may be from what its own loop is commanded, rad, in [`MotorMode::PositionVelocity`]. Above 0.
+    /// How far it may be from the command of its own loop, rad, in [`MotorMode::PositionVelocity`]. Above 0.
     pub lag: f64,
-    /// How long it may stand still while pushed with its highest torque; `None` for ever, as a gripper that holds
-    /// something does.
+    /// How long it may be blocked at its highest torque; `None` is without a limit, as for a gripper that holds
+    /// something.
     pub blocked_after: Option<Duration>,
 }
 
 impl Default for WatchSpec {
-    /// What fits a joint of an arm.
+    /// Suitable for a joint of an arm.
     fn default() -> Self {
         Self { margin: 0.1, lag: 0.3, blocked_after: Some(Duration::from_secs(2)) }
     }
 }
 
-/// How a motor is driven, and what its axis of an action means.
+/// How a motor is driven, and the meaning of its axis of an action.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum MotorMode {
     /// Impedance: torque = `kp` (position error) - `kd` velocity. The action is a position, rad.
@@ -179,7 +182,7 @@ pub enum MotorMode {
     Velocity,
 }
 
-/// Makes [`MotorKind`] of its values and how they are written in `devices.toml`.
+/// Defines [`MotorKind`] with its values and their names in `devices.toml`.
 macro_rules! motor_kinds {
     ($($kind:ident = $name:literal),+ $(,)?) => {
         /// Damiao's motors, by name: programs number them differently.
@@ -221,7 +224,7 @@ motor_kinds! {
 }
 
 impl MotorKind {
-    /// PMAX in rad, VMAX in rad/s and TMAX in Nm as the motor leaves the factory. Source: the tables of the
+    /// PMAX in rad, VMAX in rad/s and TMAX in Nm of the factory settings. Source: the tables of the
     /// public drivers `DM_CAN.py` and of `LeRobot`.
     #[must_use]
     pub const fn shipped(self) -> [f64; 3] {
@@ -248,8 +251,8 @@ impl MotorKind {
 }
 
 impl DamiaoSpec {
-    /// The first two motors, by position, that cannot be distinguished on the bus: one listens to what the
-    /// other does, or they answer with one id and the same low four bits of their own.
+    /// The first two motors, by position, that cannot be distinguished on the bus: one receives the frames of the
+    /// other, or they answer with one id and the same low four bits of their own.
     #[must_use]
     pub fn indistinct(&self) -> Option<(usize, usize)> {
         let alike = |a: &MotorSpec, b: &MotorSpec| {
@@ -296,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn motors_that_answer_alike_are_found() {
+    fn motors_with_indistinguishable_answers_are_found() {
         for (ids, pair) in [
             (&[(1, 0x11), (2, 0x12), (3, 0x13)][..], None),
             (&[(1, 0), (2, 0), (3, 0)], None),

@@ -1,4 +1,4 @@
-//! Which units could be registered, and what their entries would say.
+//! Which units could be registered, and what their entries would contain.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -28,7 +28,7 @@ fn video(usb: &UsbIdentity, path: &str) -> Attachment {
 }
 
 #[test]
-fn what_an_entry_reads_is_no_news_and_the_rest_of_its_device_may_be() {
+fn a_node_that_an_entry_reads_is_not_listed_but_other_nodes_of_its_device_may_be() {
     let registry = Registry::parse(BUILTIN, None).unwrap().registry;
     let known = usb((0x046d, 0x0825), Some("CAM00A1"), "1-1");
     let new = usb((0x046d, 0x0825), Some("OTHER"), "1-2");
@@ -43,7 +43,7 @@ fn what_an_entry_reads_is_no_news_and_the_rest_of_its_device_may_be() {
         node(&new, DeviceNode::Usb("/dev/bus/usb/001/003".into())),
     ];
     let found = unregistered(Some(&registry), &attached);
-    let said: Vec<String> = found
+    let listed: Vec<String> = found
         .iter()
         .map(|unit| {
             let nodes: Vec<String> = unit.nodes.iter().map(|node| node.node.label()).collect();
@@ -51,7 +51,7 @@ fn what_an_entry_reads_is_no_news_and_the_rest_of_its_device_may_be() {
         })
         .collect();
     assert_eq!(
-        said,
+        listed,
         [
             "1-1 Some(\"serial\") /dev/ttyACM0",
             "1-2 Some(\"camera\") /dev/video2 /dev/bus/usb/001/003",
@@ -71,7 +71,7 @@ fn units_with_equal_serial_numbers_are_distinguished_by_port() {
         ([Some("A"), Some("A")], [("port", "1-1"), ("port", "1-2")]),
         ([None, None], [("port", "1-1"), ("port", "1-2")]),
         ([None, Some("B")], [("port", "1-1"), ("serial", "B")]),
-        // What would not be one line is nothing to identify a device by.
+        // A serial number with a line break cannot identify a device.
         ([Some("evil\nline"), Some("B")], [("port", "1-1"), ("serial", "B")]),
     ] {
         let units = [usb((1, 2), serials[0], "1-1"), usb((1, 2), serials[1], "1-2")];
@@ -82,7 +82,7 @@ fn units_with_equal_serial_numbers_are_distinguished_by_port() {
 }
 
 #[test]
-fn a_camera_is_asked_for_what_it_offers() {
+fn a_camera_is_configured_with_a_format_it_offers() {
     let mode = |fourcc: &str, width, height, rates: &[u32]| Mode {
         fourcc: fourcc.into(),
         size: Size::One { width, height },
