@@ -356,8 +356,8 @@ fn misplaced(matches: &ArgMatches, command: &clap::Command) -> Option<String> {
         let long = option.get_long()?;
         return Some(match name {
             _ if option.is_global_set() => format!("--{long} has no effect on `rapid {name}`: leave it out"),
-            "replay" => format!("--{long} stands before the command; write it after: rapid replay FILE --{long}"),
-            _ => format!("--{long} is an option of a run, and `rapid {name}` runs nothing: leave it out"),
+            "replay" => format!("--{long} precedes the command; write it after: rapid replay FILE --{long}"),
+            _ => format!("--{long} is an option of a run, and `rapid {name}` starts no run: leave it out"),
         });
     }
     if name != "replay" || !given(of_command, "infer") {
@@ -377,10 +377,10 @@ fn explained(error: clap::Error, command: &mut clap::Command) -> clap::Error {
     let text = if let Some(word) = context(ContextKind::InvalidSubcommand) {
         match word.rsplit_once('.') {
             Some((_, "toml")) => format!(
-                "{word:?} is not a command; a scenario stands right after --sim (rapid --sim {word}), a registry after --config"
+                "{word:?} is not a command; a scenario is given right after --sim (rapid --sim {word}), a registry after --config"
             ),
             Some((_, "mcap" | "partial")) => {
-                format!("{word:?} is not a command; an episode stands after a command: rapid inspect {word}")
+                format!("{word:?} is not a command; an episode is given after a command: rapid inspect {word}")
             }
             _ => return error,
         }

@@ -81,7 +81,7 @@ pub struct Blocked {
     pub index: usize,
     /// Its name.
     pub stop: Arc<str>,
-    /// What it is.
+    /// Its kind.
     pub kind: StopKind,
     /// Its state.
     pub state: InputState,

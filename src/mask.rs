@@ -194,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn text_forms_are_the_papers() {
+    fn text_forms_match_the_paper() {
         assert_eq!(PhysicalMask(5).hex(3), "0x05");
         assert_eq!(PhysicalMask(5).binary(3), "00000101");
         assert_eq!(PhysicalMask(1 << 9).hex(3), "0x0200");

@@ -50,7 +50,7 @@ pub enum Void {
     #[error("a disarm came after this order was given: give it again if the actuator is to move")]
     Overtaken,
     /// Its time is in the future: it was given on another machine, or is forged.
-    #[error("the order is of a later time than now")]
+    #[error("the order is from a later time than now")]
     Early,
     /// An emergency stop or an enabling switch prevents it.
     #[error(transparent)]

@@ -49,7 +49,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn streams_are_the_same_again_and_differ_from_each_other() {
+    fn streams_are_reproducible_and_differ_from_each_other() {
         let draw = |seed, stream| {
             let mut random = Random::new(seed, stream);
             (0..4).map(|_| random.below(1000)).collect::<Vec<_>>()

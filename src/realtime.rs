@@ -31,7 +31,7 @@ pub fn use_fifo(priority: u8) -> Result<(), String> {
 /// Without an unlimited `RLIMIT_MEMLOCK`, as less of it would make later allocations fail: why, as text for the user.
 pub fn lock_memory() -> Result<(), String> {
     if let Some(limit) = getrlimit(Resource::Memlock).current {
-        return Err(format!("it may lock {} KiB of memory alone (`ulimit -l`)", limit >> 10));
+        return Err(format!("it may lock {} KiB of memory only (`ulimit -l`)", limit >> 10));
     }
     // Not before the first use: most of the space of stacks and buffers is never used.
     mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE | MlockAllFlags::ONFAULT).map_err(|error| error.to_string())

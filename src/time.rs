@@ -215,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn days_are_those_of_the_calendar() {
+    fn dates_match_the_calendar() {
         // Against `date -u -d @SECONDS`.
         for (seconds, text) in [
             (0, "1970-01-01T00:00:00.000Z"),

@@ -1,6 +1,6 @@
 //! The conductor: carries out what the user, the command line and the clock request, until one of them ends the run.
 //!
-//! Invariant: the recorder alone knows whether an episode is in progress; the conductor asks it.
+//! Invariant: the recorder alone knows whether an episode is in progress; the conductor queries it.
 
 use std::ops::ControlFlow;
 use std::path::PathBuf;

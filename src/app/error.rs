@@ -47,7 +47,7 @@ pub enum AppError {
     #[error(transparent)]
     Policy(#[from] LoadError),
     /// What the policy requires is not present.
-    #[error("the policy needs {0}: plug it in, or write --wait to start when it is there")]
+    #[error("the policy needs {0}: plug it in, or use --wait to start when it is there")]
     Required(String),
     /// The policy does not end.
     #[error("the policy did not end within {} s", LAST_CHUNK.as_secs())]
@@ -74,7 +74,7 @@ pub enum AppError {
         /// The last of them.
         file: PathBuf,
     },
-    /// A task or thread of ours panicked.
+    /// A task or thread of this program panicked.
     #[error("{0} panicked; please report this")]
     Panicked(&'static str),
     /// A second signal came while the run was ending.

@@ -1,4 +1,4 @@
-//! What shows a run: the monitor, or lines on standard output.
+//! The screen of a run: the monitor, or lines on standard output.
 
 use std::sync::Arc;
 use std::time::Duration;

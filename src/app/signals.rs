@@ -1,4 +1,4 @@
-//! What ends a run from outside.
+//! Signals that end a run.
 
 use tokio::signal::unix::{Signal, SignalKind, signal};
 

@@ -1,7 +1,7 @@
-//! The latency of a camera that looked at a light.
+//! The latency of a camera that recorded a light.
 //!
 //! A picture stamped `t` is taken to show the mean of the light over its exposure `e`, whose middle
-//! lies at `t - latency`. The fit uses differences from picture to picture, so that a camera that
+//! is at `t - latency`. The fit uses differences from picture to picture, so that a camera that
 //! adapts slowly to the light does not shift the result:
 //!
 //! `y(i) - y(i-1) = contrast * (light(i) - light(i-1)) + noise`
@@ -42,7 +42,7 @@ pub struct Flip {
     pub lit: bool,
 }
 
-/// What one picture showed.
+/// The measurement of one picture.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Seen {
     /// Its capture time.
@@ -93,7 +93,7 @@ pub enum Refusal {
     },
     /// The pictures change, but not with the light.
     #[error(
-        "the pictures change, and not with the light (correlation {correlation:.2}): point the camera at it, hold it \
+        "the pictures change, but not with the light (correlation {correlation:.2}): point the camera at it, hold it \
          still, and switch automatic exposure off"
     )]
     Unlike {

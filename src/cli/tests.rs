@@ -26,7 +26,7 @@ fn commands(words: &str, command: clap::Command) -> Vec<(String, clap::Command)>
 }
 
 #[test]
-fn help_is_short_by_h_and_has_examples_by_help() {
+fn short_help_is_short_and_long_help_has_examples() {
     let mut grammar = Cli::grammar();
     grammar.build();
     for (words, command) in commands("", grammar) {
@@ -95,7 +95,7 @@ fn options_before_or_after_a_command_parse_or_the_error_names_the_position() {
         ("--headless replay a.mcap", "write it after: rapid replay FILE --headless"),
         ("replay a.mcap --infer --record", "--record is an option of a run, and --infer compares"),
         ("replay a.mcap --tolerance 1", "--infer"),
-        ("--record inspect a.mcap", "`rapid inspect` runs nothing"),
+        ("--record inspect a.mcap", "`rapid inspect` starts no run"),
         ("inspect a.mcap --record", "--record is an option of a run"),
         ("--sim task --expert --record --duration 3s", "--duration"),
         ("--sim devices", "write `rapid devices --sim`"),

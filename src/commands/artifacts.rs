@@ -64,7 +64,7 @@ pub fn install(registry: &Registry, out: &mut dyn Write) -> Result<(), Artifacts
     for arguments in [
         ["control", "--reload"].as_slice(),
         &["trigger", "--action=change", "--subsystem-match=video4linux", "--subsystem-match=tty"],
-        // Only CAN interfaces: no others are ours.
+        // Only CAN interfaces: the rules match no others.
         &["trigger", "--action=add", "--subsystem-match=net", "--attr-match=type=280"],
     ] {
         run("udevadm", arguments)?;

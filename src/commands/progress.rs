@@ -1,6 +1,6 @@
-//! Work that takes long: a progress line on standard error, and many episodes judged in parallel, on all processors.
+//! Long-running work: a progress line on standard error, and many episodes judged in parallel, on all processors.
 //!
-//! Every file is read completely, whatever its recorder wrote about it, so later changes are found.
+//! Every file is read completely, regardless of its recorded summary, so later changes are found.
 
 use std::collections::BTreeMap;
 use std::io::{IsTerminal, Write, stderr};

@@ -70,7 +70,7 @@ impl Again {
 /// A sample: position of its device in the registry, and the number that the message holds.
 type Key = (usize, u64);
 
-/// What is being computed.
+/// The state of the computation.
 struct Work<'a> {
     bundle: &'a Bundle,
     model: &'a mut Model,

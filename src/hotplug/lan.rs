@@ -44,7 +44,7 @@ pub struct LanMonitor {
 }
 
 impl LanMonitor {
-    /// Begins to search for the entries that are to be found on the network; `None` if there are none.
+    /// Begins to search for the entries of devices on the network; `None` if there are none.
     #[must_use]
     pub fn open(registry: &Registry) -> Option<Self> {
         let (report, events) = mpsc::channel(DEPTH);

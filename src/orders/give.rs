@@ -37,7 +37,7 @@ pub enum GiveError {
         others: Vec<Other>,
     },
     /// Several runs.
-    #[error("several runs are here (processes {0:?}): arm as the user of one of them, or name it with --instance")]
+    #[error("several runs are active (processes {0:?}): arm as the user of one of them, or name it with --instance")]
     Several(Vec<u32>),
     /// The run refused it.
     #[error("process {process}: {why}")]

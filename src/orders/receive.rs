@@ -1,4 +1,4 @@
-//! The run's side: thread `orders`, which takes what comes over the socket.
+//! The run's side: thread `orders`, which receives orders over the socket.
 //!
 //! Invariant: it writes to no file and no terminal, and does not wait for a peer: a connection that sends nothing, or
 //! does not read its answer, delays no other.

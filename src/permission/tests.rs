@@ -57,7 +57,7 @@ proptest! {
     /// Whatever is given when, and however long it takes to arrive: the result is a disarm, or an arm that was given
     /// after the last disarm had arrived.
     #[test]
-    fn of_crossing_orders_the_safer_one_counts(
+    fn the_safer_of_crossing_orders_counts(
         orders in prop::collection::vec((any::<bool>(), 0..2_000_u64, 0..1_500_u64), 1..12),
         looks in prop::collection::vec(any::<bool>(), 12),
     ) {
@@ -89,7 +89,7 @@ proptest! {
 }
 
 #[test]
-fn of_two_threads_at_once_the_disarm_counts() {
+fn a_disarm_wins_against_a_concurrent_arm() {
     for _ in 0..2_000 {
         let permission = Arc::new(Permission::new(false));
         let attended = permission.attend();
@@ -218,7 +218,7 @@ proptest! {
 }
 
 #[test]
-fn of_an_arm_and_a_trip_at_once_the_trip_counts() {
+fn a_trip_wins_against_a_concurrent_arm() {
     for _ in 0..2_000 {
         let permission = with_stops(false);
         let attended = permission.attend();

@@ -240,7 +240,7 @@ impl Assigner {
     }
 
     fn near_misses(&self, attachment: &Attachment) -> Vec<String> {
-        let Unit::Usb(usb) = &attachment.unit else { return vec!["no entry looks for it".to_owned()] };
+        let Unit::Usb(usb) = &attachment.unit else { return vec!["no entry matches it".to_owned()] };
         let mut reasons: Vec<String> = self
             .entries
             .iter()

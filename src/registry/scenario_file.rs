@@ -146,7 +146,7 @@ fn devices(root: &Section<'_>, registry: &Registry) -> Vec<ScenarioDevice> {
         }
         if !device.usb.port.is_empty() {
             if let Some(line) = ports.get(&device.usb.port) {
-                let message = format!("port {} is already that of the device on line {line}", device.usb.port);
+                let message = format!("port {} is already used by the device on line {line}", device.usb.port);
                 section.report("port", message, "give each device a separate port: port = \"1-4\"");
             }
             ports.insert(device.usb.port.clone(), section.line());
@@ -313,7 +313,7 @@ fn check_order(events: &[Placed<'_>], devices: &[ScenarioDevice], repeat: Option
     }
     let Some(repeat) = repeat else { return };
     for placed in events.iter().filter(|placed| placed.event.at >= repeat) {
-        let message = "it never happens: the events begin again before".to_owned();
+        let message = "it never happens: the events repeat before it".to_owned();
         placed.section.report("at", message, "make repeat longer than the time of every event");
     }
     for (name, state) in begin {

@@ -89,7 +89,7 @@ pub struct DeviceSpec {
     pub node: NodeSpec,
     /// Topic on the bus and in the recording: `/` then `[a-zA-Z0-9_/-]*`.
     pub topic: String,
-    /// Where on the gripper the module sits.
+    /// Position of the module on the gripper.
     pub mount: Option<Mount>,
     /// Without a sample for this long while attached, the slot is Stalled. At least 10 ms; default the
     /// larger of 500 ms and 10 sample periods. For a program, its `heartbeat`, default 2 s.
@@ -98,7 +98,7 @@ pub struct DeviceSpec {
     pub max_bytes: usize,
     /// Samples a subscriber may fall behind before the oldest is lost, `2..=4096`.
     pub depth: usize,
-    /// What an observation holds when the device is attached but no sample lies in the window.
+    /// What an observation holds when the device is attached but no sample is in the window.
     pub when_stale: WhenStale,
     /// A sample captured at `t` shows events of `t - latency`; up to 1 s, default 0. Only subtracted
     /// when samples are aligned.
@@ -426,10 +426,10 @@ impl Hooks {
 pub struct ModuleSpec {
     /// Its name, as a modality's.
     pub name: String,
-    /// Where it sits.
+    /// Its position.
     #[serde(rename = "slot")]
     pub mount: Mount,
-    /// What an episode with it is tagged with: keys and values.
+    /// Tags of episodes with it: keys and values.
     pub tags: Vec<(String, String)>,
     /// The entries of its sensors; a module without any is mounted only if `--module` names it.
     pub devices: Vec<String>,
@@ -703,7 +703,7 @@ pub struct LineInput {
     /// The line that means that the actuator may move.
     pub run: String,
     /// The line that means that it may not; then lines other than the two are ignored. Without it every other line
-    /// means so.
+    /// means that it may not.
     pub stop: Option<String>,
     /// Without one of the two for this long the input is lost.
     pub silence: Duration,

@@ -138,7 +138,7 @@ async fn idle() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn keys_pressed_while_an_episode_ends_are_obeyed_one_after_the_other() {
+async fn keys_pressed_while_an_episode_ends_are_handled_in_order() {
     let mut bench = Bench::new(false, None, |file| Box::new(file));
     let keys = async {
         let press = async |count: usize| {
@@ -210,7 +210,7 @@ fn flood(board: &Board) {
 }
 
 #[tokio::test(start_paused = true)]
-async fn an_end_among_missed_events_ends_the_run_all_the_same() {
+async fn an_end_among_missed_events_still_ends_the_run() {
     for error in [None, Some("torn")] {
         let mut bench = Bench::new(true, Some(Duration::from_secs(1)), |file| Box::new(file));
         bench.conductor.begin_episode = false;

@@ -9,7 +9,7 @@ use crate::flash;
 
 const BEGIN: Stamp = Stamp(1_000_000_000_000);
 
-/// A camera that looks at the pattern.
+/// A camera that records the pattern.
 #[derive(Debug, Clone, Copy)]
 struct Camera {
     latency_ms: f64,

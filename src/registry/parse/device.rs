@@ -107,7 +107,7 @@ impl<'d> Draft<'d> {
         usize::try_from(count).ok()
     }
 
-    /// Which node of the unit the entry takes.
+    /// Which node of the unit the entry opens.
     pub(super) fn opens(&self) -> Option<Opens> {
         Some(self.node.as_ref()?.opens())
     }

@@ -130,7 +130,7 @@ pub(super) fn check_ports(drafts: &[Draft<'_>]) {
         };
         let Some(earlier) = drafts.iter().take(index).find(same) else { continue };
         let (_, number) = port;
-        let message = format!("port {number} of this computer is already that of [{}]", earlier.section.entry);
+        let message = format!("port {number} of this computer is already used by [{}]", earlier.section.entry);
         let fix = "write another port here, and set the device to send to it";
         draft.section.report("lan", message, fix);
     }

@@ -44,7 +44,7 @@ const PARAMETERS: u16 = 0x7ff;
 
 /// Example of a brake.
 const BRAKE: &str = "brake = { chip = \"/dev/gpiochip0\", line = 4, released = \"high\" }";
-/// A small spring-applied brake takes this long to engage or to release, unless its data sheet says otherwise.
+/// A small spring-applied brake takes this long to engage or to release, unless its data sheet states otherwise.
 const BRAKE_TIME: Duration = Duration::from_millis(100);
 
 /// Reads the keys of `protocol = "damiao"`; `None` if a problem with them was reported.
@@ -227,9 +227,9 @@ fn mode(entry: &Section<'_>) -> Option<MotorMode> {
     // Position control without damping oscillates: the maker's manual forbids it. A frame has 12 bits for it.
     if kp > 0.0 && kd < KD_STEP {
         let message = if kd == 0.0 {
-            "kp without kd: the motor would swing".to_owned()
+            "kp without kd: the motor would oscillate".to_owned()
         } else {
-            format!("kd = {kd} is less than a frame can express, {KD_STEP:.5}: the motor would swing")
+            format!("kd = {kd} is less than a frame can express, {KD_STEP:.5}: the motor would oscillate")
         };
         return entry.refuse("kd", message, "write a higher kd, for example kd = 0.05");
     }
@@ -328,7 +328,7 @@ fn check_pairs(motors: &[(Section<'_>, Option<MotorSpec>)]) {
                 refuse("name", format!("two motors are called {:?}", motor.name), "give each its own name");
             }
             if earlier.slave == motor.slave {
-                let message = format!("slave = {:#x} is that of {} already", motor.slave, earlier.name);
+                let message = format!("slave = {:#x} is already used by {}", motor.slave, earlier.name);
                 refuse("slave", message, "give each motor its own id, with its maker's program");
             } else if earlier.master == motor.master && earlier.slave & 0xf == motor.slave & 0xf {
                 let message = format!(

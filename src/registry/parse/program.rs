@@ -253,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn root_runs_only_what_no_other_could_have_changed() {
+    fn root_runs_only_programs_that_no_other_user_could_have_changed() {
         let dir = tempfile::tempdir().unwrap();
         allow(dir.path(), 0o755);
         let program = dir.path().join("p");

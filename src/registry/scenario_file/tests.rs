@@ -165,7 +165,7 @@ fn all_errors_are_reported_with_their_position() {
         ),
         (
             "[[device]]\nname = \"cam_wrist\"\nport = \"1-1\"\n[[device]]\nname = \"tactile_tip\"\nport = \"1-1\"\n",
-            "scenario:6:8: [device 2] port 1-1 is already that of the device on line 1\n    \
+            "scenario:6:8: [device 2] port 1-1 is already used by the device on line 1\n    \
              fix: give each device a separate port: port = \"1-4\"",
         ),
         (
