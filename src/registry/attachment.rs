@@ -117,9 +117,9 @@ impl From<UsbIdentity> for Unit {
 
 /// When the driver of a device on the network last received data from it, for the code that tracks its lease.
 #[derive(Debug, Clone, Default)]
-pub struct Heard(Arc<AtomicU64>);
+pub struct LastReceived(Arc<AtomicU64>);
 
-impl Heard {
+impl LastReceived {
     /// Data was received now.
     pub fn now(&self) {
         self.0.store(Stamp::now().0, Ordering::Relaxed);
@@ -132,7 +132,7 @@ impl Heard {
     }
 }
 
-impl PartialEq for Heard {
+impl PartialEq for LastReceived {
     /// Two nodes are equal regardless of when data was last received from them.
     fn eq(&self, _: &Self) -> bool {
         true
@@ -156,7 +156,7 @@ pub enum DeviceNode {
         /// Its address.
         address: SocketAddr,
         /// When its driver last received data from it.
-        heard: Heard,
+        last_received: LastReceived,
     },
     /// A simulated device.
     Sim(Arc<SimDevice>),

@@ -20,7 +20,7 @@ pub mod task;
 pub mod trust;
 pub mod units;
 
-pub use attachment::{Attachment, DeviceNode, Heard, LanIdentity, Unit, UsbIdentity};
+pub use attachment::{Attachment, DeviceNode, LanIdentity, LastReceived, Unit, UsbIdentity};
 pub(crate) use diagnostic::did_you_mean;
 pub use diagnostic::{Diagnostic, RegistryErrors};
 pub use identity::{Assigner, Assignment, Detached, Explanation};

@@ -15,8 +15,8 @@ use rapid::driver::{Driver, DriverError, sim};
 use rapid::modality::ModalityId;
 use rapid::registry::scenario::{SimDevice, SimSource};
 use rapid::registry::{
-    CameraSpec, DeviceNode, DeviceSpec, Framing, Heard, IdentitySpec, LanFind, LanProtocol, LanSpec, NodeSpec, Parse,
-    PixelFormat, Probe, SerialSpec, UsbSpec, WhenStale,
+    CameraSpec, DeviceNode, DeviceSpec, Framing, IdentitySpec, LanFind, LanProtocol, LanSpec, LastReceived, NodeSpec,
+    Parse, PixelFormat, Probe, SerialSpec, UsbSpec, WhenStale,
 };
 use rapid::sample::Encoding;
 use rapid::time::Stamp;
@@ -253,7 +253,8 @@ async fn open_udp() -> (Driver, std::net::UdpSocket) {
     let find = LanFind::Host { host: free.ip(), probe: Probe::Udp, port: free.port() };
     let protocol = LanProtocol::Udp { port: free.port() };
     let lan = spec(NodeSpec::Lan(LanSpec { protocol, find, lease: Duration::from_secs(3) }));
-    let driver = Driver::open(&lan, &DeviceNode::Lan { address: free, heard: Heard::default() }).await.unwrap();
+    let driver =
+        Driver::open(&lan, &DeviceNode::Lan { address: free, last_received: LastReceived::default() }).await.unwrap();
     let sender = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
     sender.connect(free).unwrap();
     (driver, sender)

@@ -9,7 +9,7 @@ use tokio::net::{TcpListener, TcpSocket, TcpStream};
 use tokio::time::{Interval, MissedTickBehavior, interval, timeout};
 
 use crate::driver::DriverError;
-use crate::registry::{DeviceNode, Heard, own_side};
+use crate::registry::{DeviceNode, LastReceived, own_side};
 
 /// A device on the same network answers within milliseconds.
 const CONNECT_LIMIT: Duration = Duration::from_secs(2);
@@ -22,7 +22,7 @@ pub(super) struct Place {
     interface: Option<String>,
     /// With the scope of a link-local address.
     address: Option<SocketAddr>,
-    heard: Heard,
+    last_received: LastReceived,
 }
 
 /// A server of a device.
@@ -38,10 +38,10 @@ impl Place {
         match node {
             DeviceNode::Net(interface) => {
                 let address = host.map(|host| SocketAddr::new(host, 0));
-                Ok(Self { interface: Some(interface.clone()), address, heard: Heard::default() })
+                Ok(Self { interface: Some(interface.clone()), address, last_received: LastReceived::default() })
             }
-            DeviceNode::Lan { address, heard } => {
-                Ok(Self { interface: None, address: Some(*address), heard: heard.clone() })
+            DeviceNode::Lan { address, last_received } => {
+                Ok(Self { interface: None, address: Some(*address), last_received: last_received.clone() })
             }
             _ => Err(DriverError::Fatal(format!("{} is not on the network", node.label()))),
         }
@@ -62,7 +62,7 @@ impl Place {
 
     /// The device was heard of, now.
     pub(super) fn heard(&self) {
-        self.heard.now();
+        self.last_received.now();
     }
 
     /// Is what comes from this address of the device?

@@ -246,7 +246,7 @@ mod tests {
     use std::net::UdpSocket;
 
     use super::*;
-    use crate::registry::{DeviceNode, Heard};
+    use crate::registry::{DeviceNode, LastReceived};
 
     /// Of UDP and of TCP.
     #[tokio::test]
@@ -261,7 +261,7 @@ mod tests {
             ("fd00::7", Some(any_v6)),
         ] {
             let host: IpAddr = host.parse().expect("an address");
-            let node = DeviceNode::Lan { address: SocketAddr::new(host, 2368), heard: Heard::default() };
+            let node = DeviceNode::Lan { address: SocketAddr::new(host, 2368), last_received: LastReceived::default() };
             let place = Place::new(&node, None).expect("a place");
             let expected = expected.unwrap_or(host);
             match bind(&place, 0) {

@@ -14,7 +14,7 @@ use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
 
 use super::super::UnplugSource;
 use super::watch::{LOOK_EVERY, Watch};
-use crate::registry::{Heard, Probe, own_side};
+use crate::registry::{LastReceived, Probe, own_side};
 use crate::time::Stamp;
 
 /// From one question to the next; also how long an answer may take.
@@ -48,7 +48,7 @@ pub(super) async fn watch(mut watch: Watch, server: SocketAddr, asked: SocketAdd
                     Answer::Silence => {}
                 }
                 let driver_has_port = probe == Probe::Udp && watch.is_there();
-                answer = Box::pin(next(watch.heard.clone(), driver_has_port, probe, asked));
+                answer = Box::pin(next(watch.last_received.clone(), driver_has_port, probe, asked));
             }
             _ = look.tick() => watch.look(Stamp::now()).await,
         }
@@ -56,9 +56,9 @@ pub(super) async fn watch(mut watch: Watch, server: SocketAddr, asked: SocketAdd
 }
 
 /// The next question, or none if the device's driver hears it, or has the port it would be heard at.
-async fn next(heard: Heard, driver_has_port: bool, probe: Probe, asked: SocketAddr) -> Answer {
+async fn next(last_received: LastReceived, driver_has_port: bool, probe: Probe, asked: SocketAddr) -> Answer {
     sleep(EVERY).await;
-    let is_heard = Stamp::now().since(heard.at()) < EVERY;
+    let is_heard = Stamp::now().since(last_received.at()) < EVERY;
     if is_heard || driver_has_port { Answer::Silence } else { ask(probe, asked).await }
 }
 

@@ -17,7 +17,7 @@ use std::time::Duration;
 use tokio::sync::mpsc;
 
 use super::super::{HotplugEvent, UnplugSource};
-use crate::registry::{Attachment, DeviceNode, Heard, LanIdentity, Unit};
+use crate::registry::{Attachment, DeviceNode, LanIdentity, LastReceived, Unit};
 use crate::time::Stamp;
 
 /// How often leases and links are looked at: a link that is down is seen this late.
@@ -32,7 +32,7 @@ pub(super) struct Watch {
     grace: Duration,
     lease: Lease,
     /// What the driver hears.
-    pub(super) heard: Heard,
+    pub(super) last_received: LastReceived,
     pub(super) link: Link,
     /// Where the device is, while it is there.
     pub(super) address: Option<SocketAddr>,
@@ -46,7 +46,7 @@ impl Watch {
             length,
             grace: Duration::ZERO,
             lease: Lease::new(length),
-            heard: Heard::default(),
+            last_received: LastReceived::default(),
             link: Link::default(),
             address: None,
             events,
@@ -65,7 +65,7 @@ impl Watch {
 
     /// Has the driver heard of it within this time?
     pub(super) fn is_sending(&self, within: Duration, now: Stamp) -> bool {
-        self.is_there() && now.since(self.heard.at()) < within
+        self.is_there() && now.since(self.last_received.at()) < within
     }
 
     /// It was heard of at this address.
@@ -76,14 +76,14 @@ impl Watch {
         }
         // Found at another address, it is told anew: the rig sees that the unit at its path is another.
         self.address = Some(address);
-        self.heard = Heard::default();
+        self.last_received = LastReceived::default();
         self.link = Link::to(address);
         let unit = LanIdentity {
             entry: self.entry.clone(),
             address: address.to_string(),
             instance: instance.map(str::to_owned),
         };
-        let node = DeviceNode::Lan { address, heard: self.heard.clone() };
+        let node = DeviceNode::Lan { address, last_received: self.last_received.clone() };
         let attachment = Attachment { syspath: self.syspath(), node, unit: Unit::Lan(unit), driver: None };
         self.tell(HotplugEvent::Added(attachment)).await;
     }
@@ -106,7 +106,7 @@ impl Watch {
         if !self.is_there() {
             return;
         }
-        let heard = self.heard.at();
+        let heard = self.last_received.at();
         self.lease.heard(heard);
         if self.link.is_down() {
             return self.gone(UnplugSource::Link, now).await;

@@ -10,7 +10,7 @@ use tokio::net::TcpListener;
 use super::answer::Name;
 use super::clip::Failure;
 use super::*;
-use crate::registry::{DeviceNode, Heard};
+use crate::registry::{DeviceNode, LastReceived};
 
 /// A camera that has a clip, and breaks off in its middle so many times; who is asked how often.
 async fn camera(clip: Vec<u8>, breaks: usize) -> (Server, Arc<AtomicUsize>) {
@@ -39,7 +39,8 @@ async fn camera(clip: Vec<u8>, breaks: usize) -> (Server, Arc<AtomicUsize>) {
             let _ = stream.write_all(sent).await;
         }
     });
-    let place = Place::new(&DeviceNode::Lan { address, heard: Heard::default() }, None).expect("a place");
+    let place =
+        Place::new(&DeviceNode::Lan { address, last_received: LastReceived::default() }, None).expect("a place");
     (place.server(address.port()).expect("a server"), asked)
 }
 
@@ -206,7 +207,8 @@ impl Fake {
                 let _ = stream.write_all(&[head.as_bytes(), &body].concat()).await;
             }
         });
-        let place = Place::new(&DeviceNode::Lan { address, heard: Heard::default() }, None).expect("a place");
+        let place =
+            Place::new(&DeviceNode::Lan { address, last_received: LastReceived::default() }, None).expect("a place");
         (fake, place.server(address.port()).expect("a server"))
     }
 
@@ -481,7 +483,8 @@ async fn fetched(head: &'static str, size: Option<u64>, there: &[u8]) -> (Result
             let _ = stream.write_all(&answer).await;
         }
     });
-    let place = Place::new(&DeviceNode::Lan { address, heard: Heard::default() }, None).expect("a place");
+    let place =
+        Place::new(&DeviceNode::Lan { address, last_received: LastReceived::default() }, None).expect("a place");
     let server = place.server(address.port()).expect("a server");
     let folder = tempfile::tempdir().expect("a folder");
     let clip = Clip::new(named(1), size, folder.path().join("ep_001.mcap"), "gopro");

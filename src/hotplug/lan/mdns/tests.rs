@@ -108,10 +108,10 @@ async fn what_its_driver_hears_outlasts_a_lost_announcement_and_not_a_goodbye() 
         let found = Found { name: "a".into(), addresses: vec![([127, 0, 0, 1], 5).into()] };
         bench.service.announced("a._s._tcp.local.".into(), found, bench.now).await;
         let Ok(HotplugEvent::Added(attachment)) = bench.told.try_recv() else { panic!("not told") };
-        let DeviceNode::Lan { heard, .. } = attachment.node else { panic!("not on the network") };
+        let DeviceNode::Lan { last_received, .. } = attachment.node else { panic!("not on the network") };
         bench.service.wanted[0].asked = Some(bench.now);
         bench.now = bench.now.after(if goodbye { LEASE / 2 } else { LEASE });
-        heard.now();
+        last_received.now();
         if goodbye {
             assert_eq!(bench.removed("a").await, ["-/lan/phone goodbye"]);
             continue;

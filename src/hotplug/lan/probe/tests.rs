@@ -111,11 +111,11 @@ async fn a_refused_probe_proves_nothing_while_the_driver_holds_the_connection() 
     let lease = EVERY * 4;
     tokio::spawn(watch(Watch::new("cam", lease, tell), address, address, Probe::Tcp));
     let Some(HotplugEvent::Added(attachment)) = told.recv().await else { panic!("not found") };
-    let DeviceNode::Lan { heard, .. } = attachment.node else { panic!("not on the network") };
+    let DeviceNode::Lan { last_received, .. } = attachment.node else { panic!("not on the network") };
     // It has a connection, and sends more seldom than it would be asked.
     drop(listener);
-    heard.now();
-    let since = heard.at();
+    last_received.now();
+    let since = last_received.at();
     let Some(HotplugEvent::Removed { noticed, .. }) = told.recv().await else { panic!("not gone") };
     assert!(noticed.since(since) >= lease, "gone after {:?}", noticed.since(since));
 }
@@ -127,13 +127,13 @@ async fn a_lease_waits_for_a_driver_that_is_started_later() {
     let begin = Stamp::now();
     watch.found(nobody(), None, begin).await;
     let Some(HotplugEvent::Added(attachment)) = told.recv().await else { panic!("not found") };
-    let DeviceNode::Lan { heard, .. } = attachment.node else { panic!("not on the network") };
+    let DeviceNode::Lan { last_received, .. } = attachment.node else { panic!("not on the network") };
     watch.look(begin.after(EVERY * 2)).await;
     assert!(watch.is_there(), "its driver has not begun");
     // From the first packet on, the lease is what it is.
-    heard.now();
+    last_received.now();
     watch.look(begin).await;
-    watch.look(heard.at().after(EVERY)).await;
+    watch.look(last_received.at().after(EVERY)).await;
     assert!(!watch.is_there());
     // One that was never heard is gone at last.
     watch.found(nobody(), None, begin.after(EVERY * 20)).await;
@@ -148,11 +148,11 @@ async fn a_device_appears_and_disappears_and_a_sending_one_is_not_probed() {
     let (tell, mut told) = mpsc::channel(8);
     tokio::spawn(watch(Watch::new("cam", EVERY * 3, tell), address, address, Probe::Tcp));
     let Some(HotplugEvent::Added(attachment)) = told.recv().await else { panic!("not found") };
-    let DeviceNode::Lan { heard, .. } = attachment.node else { panic!("not on the network") };
+    let DeviceNode::Lan { last_received, .. } = attachment.node else { panic!("not on the network") };
     drop(listener.accept().await);
     // While its driver hears it, nobody connects.
     for _ in 0..30 {
-        heard.now();
+        last_received.now();
         let asked = timeout(Duration::from_millis(100), listener.accept()).await;
         assert!(asked.is_err(), "asked although it sends");
     }
