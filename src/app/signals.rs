@@ -10,7 +10,7 @@ pub(crate) struct Signals {
     ends: [Signal; 4],
     _too_large: Signal,
     /// How many arrived.
-    asked: u32,
+    received: u32,
 }
 
 impl Signals {
@@ -23,7 +23,7 @@ impl Signals {
                 signal(SignalKind::hangup())?,
             ],
             _too_large: signal(SignalKind::from_raw(libc::SIGXFSZ))?,
-            asked: 0,
+            received: 0,
         })
     }
 
@@ -36,12 +36,12 @@ impl Signals {
             _ = quit.recv() => {}
             _ = hangup.recv() => {}
         }
-        self.asked += 1;
+        self.received += 1;
     }
 
     /// Waits for the second of the run: the first only requests the end, which may be in progress anyway.
     pub(super) async fn second(&mut self) {
-        while self.asked < 2 {
+        while self.received < 2 {
             self.next().await;
         }
     }

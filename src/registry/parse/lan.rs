@@ -207,12 +207,12 @@ fn fixed(table: &Section<'_>, host: Option<IpAddr>, word: Word, port: Option<u16
         let message = "probe \"udp\" listens on port".to_owned();
         return table.refuse("probe_port", message, "remove probe_port, or write probe = \"tcp\" or \"http\"");
     }
-    let asked = if table.has("probe_port") { self::port(table, "probe_port") } else { own };
-    if asked.is_none() && !table.has("probe_port") && (table.has("port") || word == Word::Iphone) {
+    let probed = if table.has("probe_port") { self::port(table, "probe_port") } else { own };
+    if probed.is_none() && !table.has("probe_port") && (table.has("port") || word == Word::Iphone) {
         let fix = "write probe_port = a port of the device that takes connections; `port` is one of this computer";
         table.missing("probe_port", fix);
     }
-    Some(LanFind::Host { host: host?, probe, port: asked? })
+    Some(LanFind::Host { host: host?, probe, port: probed? })
 }
 
 fn host(table: &Section<'_>) -> Option<IpAddr> {
