@@ -22,7 +22,7 @@ use super::index::Index;
 use super::integrity::{LARGEST_HEADER, Writer, writer};
 use super::names::Names;
 use super::own::Owner;
-use super::source::{Fit, ReadAt, Source, is_known};
+use super::source::{Fit, ReadAt, Source, is_known, is_opaque};
 use super::wire::Fields;
 
 pub use super::integrity::{FileEnd, LeftOut};
@@ -326,7 +326,15 @@ impl<R: ReadAt> RecordIter<R> {
         let fit = self.source.fit(opcode, at + HEAD, length)?;
         if length > left {
             self.sure = if fit == Fit::Exact { at } else { self.sure };
-            return if fit == Fit::Not { self.lost(at, opcode) } else { self.torn(at, opcode) };
+            // What follows the last record, such as another file, may look like a record of any length, above all like a
+            // private one.
+            let is_cut = length <= MAX_RECORD
+                && match fit {
+                    Fit::Exact | Fit::Cut => true,
+                    Fit::Loose => opcode == op::MESSAGE,
+                    Fit::Not => false,
+                };
+            return if is_cut { self.torn(at, opcode) } else { self.lost(at, opcode) };
         }
         let is_right = match fit {
             Fit::Exact | Fit::Cut => true,
@@ -336,8 +344,7 @@ impl<R: ReadAt> RecordIter<R> {
         if !is_right {
             return self.lost(at, opcode);
         }
-        // A message, and what is not defined here, may hold anything.
-        let is_longer = fit == Fit::Loose && opcode != op::MESSAGE && opcode < op::PRIVATE;
+        let is_longer = fit == Fit::Loose && !is_opaque(opcode);
         if (opcode == op::MESSAGE_INDEX || is_longer) && self.takes_along(at, at + HEAD + length)? {
             return Ok(Step::Again);
         }

@@ -166,7 +166,7 @@ impl<R: ReadAt> Source<R> {
         Ok(match self.fit(opcode, at + 9, length)? {
             Fit::Exact => true,
             // Of a private record or a message its length is all there is: one that fits by chance is rare.
-            Fit::Loose => is_there && (opcode >= op::PRIVATE || opcode == op::MESSAGE),
+            Fit::Loose => is_there && is_opaque(opcode),
             Fit::Cut => !is_there,
             Fit::Not => false,
         })
@@ -224,4 +224,9 @@ fn parts(opcode: u8) -> &'static [Part] {
 /// Is this the opcode of a record that has been defined?
 pub(super) fn is_known(opcode: u8) -> bool {
     (1..=op::DATA_END).contains(&opcode) || opcode >= op::PRIVATE
+}
+
+/// May a record of this opcode hold anything? A message does, and a private record.
+pub(super) fn is_opaque(opcode: u8) -> bool {
+    opcode == op::MESSAGE || opcode >= op::PRIVATE
 }

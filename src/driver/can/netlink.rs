@@ -74,9 +74,16 @@ pub fn look(name: &str) -> Result<Interface, LinkError> {
     interface.details().map(|details| read(&details)).map_err(|error| refusal(name, &error))
 }
 
-/// The index of the interface `name`, which distinguishes it from a later one of that name.
-pub(super) fn index(name: &str) -> Option<u32> {
-    Some(CanInterface::open(name).ok()?.details().ok()?.index)
+/// Was the interface `name` of this index removed, or replaced by a later one of that name?
+pub(super) fn is_gone(name: &str, index: u32) -> bool {
+    let details = CanInterface::open(name).and_then(|interface| interface.details());
+    is_another(details.map(|details| details.index).map_err(|error| refusal(name, &error)), index)
+}
+
+/// Where the kernel did not answer, the interface is taken for the same: as a removed one it would be brought up again,
+/// against the will of an operator who set it down.
+fn is_another(found: Result<u32, LinkError>, index: u32) -> bool {
+    found.map_or_else(|error| error == LinkError::Gone, |found| found != index)
 }
 
 /// An interface that is up.
@@ -252,7 +259,15 @@ mod tests {
     fn an_interface_that_is_not_there_is_gone() {
         assert_eq!(look("no-such-can0"), Err(LinkError::Gone));
         assert_eq!(bring_up("no-such-can0", 1_000_000), Err(LinkError::Gone));
-        assert_eq!(index("no-such-can0"), None);
+        assert!(is_gone("no-such-can0", 1));
+    }
+
+    #[test]
+    fn an_interface_that_the_kernel_does_not_describe_is_not_taken_for_removed() {
+        let refused = refusal("can0", &socketcan::Error::from(std::io::Error::from_raw_os_error(libc::ENOBUFS)));
+        for (found, expected) in [(Ok(7), false), (Ok(8), true), (Err(LinkError::Gone), true), (Err(refused), false)] {
+            assert_eq!(is_another(found.clone(), 7), expected, "{found:?}");
+        }
     }
 
     #[test]

@@ -98,7 +98,7 @@ impl Socket {
             Some(libc::EAGAIN | libc::EINTR | libc::ENOBUFS) => None,
             Some(libc::ENODEV | libc::ENXIO) => Some(LinkError::Gone),
             // The interface went down: with its adapter, or by an operator's command.
-            Some(libc::ENETDOWN) if netlink::index(&self.name) != Some(self.index) => Some(LinkError::Gone),
+            Some(libc::ENETDOWN) if netlink::is_gone(&self.name, self.index) => Some(LinkError::Gone),
             Some(libc::ENETDOWN) => {
                 netlink::was_set_down(self.index);
                 Some(LinkError::Retry(format!("{} was set down", self.name)))

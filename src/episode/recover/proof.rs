@@ -7,7 +7,7 @@ use std::path::Path;
 use super::super::chunk_writer::{Channel, ChunkWriter};
 use super::damage::{Chunk, chunks, largest, unfinished};
 use super::tests::{go_on, names, put, recorded, repaired};
-use super::{FileEnd, Outcome, recover};
+use super::{FileEnd, Outcome, RecoverError, recover};
 use crate::episode::own::EpisodeId;
 use crate::episode::record_iter::MAGIC;
 use crate::episode::testing::{Message, metadata, strictly};
@@ -297,21 +297,66 @@ async fn the_repair_of_a_file_without_one_of_its_chunks_reports_it() {
     assert!(!said.sentence().1.contains("missing"), "{said:?}");
 }
 
-/// Half of an episode and a whole one behind it: the second is no part of the first.
+/// Where the records of a file begin that stand outside its chunks.
+fn boundaries(bytes: &[u8]) -> Vec<usize> {
+    let (mut at, mut all) = (MAGIC.len(), Vec::new());
+    while at < bytes.len() - MAGIC.len() {
+        all.push(at);
+        at += 9 + usize::try_from(u64::from_le_bytes(bytes[at + 1..at + 9].try_into().unwrap())).unwrap();
+    }
+    all
+}
+
+/// An episode that is cut anywhere, and another one behind it: the second is no part of the first, whichever record the cut
+/// goes through or stands before, and whichever of them is longer.
 #[tokio::test]
 async fn unread_bytes_are_reported_and_the_original_is_kept() {
     let (folder, first) = recorded().await;
     let (_other, second) = recorded().await;
-    let bytes = [&first[..first.len() / 2], &second].concat();
-    for name in ["a_001.mcap.partial", "b_001.mcap"] {
-        let file = put(&folder, name, &bytes);
-        let reasons = inspect(&file).unwrap().verdict.reasons().join("; ");
-        assert!(reasons.contains("not readable") || reasons.contains("left out"), "{name}: {reasons}");
-        let said = recover(&file, &mut go_on).unwrap();
-        let Outcome::Repaired(made) = &said.outcome else { panic!("{said:?}") };
-        assert!(made.unread_bytes >= second.len() as u64 / 2, "{name}: {said:?}");
-        let size = crate::text::counted(made.unread_bytes, "byte");
-        assert!(said.sentence().1.contains(&size), "{name}: {}", said.sentence().1);
-        assert_eq!(fs::read(made.original.as_ref().unwrap()).unwrap(), bytes, "{name}");
+    let (all, other) = (strictly(&first), strictly(&second));
+    let is_known = chunks(&first)[0].content.end;
+    let ends = boundaries(&first);
+    let begin = ends[1];
+    let cuts = ends.into_iter().skip(1).chain((begin..first.len()).step_by(first.len() / 100));
+    let shorter = &second[..second.len() / 5];
+    for (cut, behind) in cuts.flat_map(|cut| [(cut, &second[..]), (cut, shorter)]) {
+        let bytes = [&first[..cut], behind].concat();
+        for name in ["a_001.mcap.partial", "b_001.mcap"] {
+            let what = format!("{name}, cut at {cut} of {}, {} bytes behind", first.len(), behind.len());
+            let file = put(&folder, name, &bytes);
+            let seen = inspect(&file).unwrap();
+            assert_ne!(seen.verdict.grade(), Some(crate::status::Grade::Good), "{what}");
+            let reasons = seen.verdict.reasons().join("; ");
+            assert!(reasons.contains("not readable") || reasons.contains("left out"), "{what}: {reasons}");
+            let original = match recover(&file, &mut go_on) {
+                Ok(said) => match &said.outcome {
+                    Outcome::Repaired(made) => {
+                        let kept = strictly(&fs::read(&made.to).unwrap());
+                        let is_second = cut < is_known && !kept.is_empty() && other.starts_with(&kept);
+                        assert!(is_second || all.starts_with(&kept), "{what}: {said:?}");
+                        // Chunks that can be read, damaged ones and those of the second, are counted as chunks.
+                        let is_counted = made.damaged_chunks + made.left_out.other_chunks > 0
+                            || made.unread_bytes >= behind.len() as u64 / 2;
+                        assert!(is_second || is_counted, "{what}: {said:?}");
+                        let counts = [
+                            crate::text::counted(made.unread_bytes, "byte"),
+                            crate::text::counted(made.damaged_chunks, "damaged chunk"),
+                            "another episode's".to_owned(),
+                        ];
+                        let sentence = said.sentence().1;
+                        assert!(is_second || counts.iter().any(|count| sentence.contains(count)), "{what}: {sentence}");
+                        made.original.clone().unwrap_or_else(|| panic!("{what}: not kept: {said:?}"))
+                    }
+                    Outcome::Unreadable { kept, .. } => kept.clone(),
+                    other => panic!("{what}: {other:?}"),
+                },
+                Err(RecoverError::Nothing(_)) => file,
+                Err(error) => panic!("{what}: {error}"),
+            };
+            assert_eq!(fs::read(original).unwrap(), bytes, "{what}");
+            for name in names(folder.path()) {
+                fs::remove_file(folder.path().join(name)).unwrap();
+            }
+        }
     }
 }

@@ -21,6 +21,7 @@ use crate::time::Stamp;
 /// Ticks are at whole nanoseconds of another clock.
 const ROUNDING: u64 = 1_000;
 
+const UNFINISHED: &str = "the recorder has not finished it";
 const UNPROVEN: &str = "check values are missing in it, so that damage would not show";
 
 pub(super) fn file_state<'a>(ending: &Ending<'a>) -> FileState<'a> {
@@ -35,21 +36,24 @@ pub(super) fn file_state<'a>(ending: &Ending<'a>) -> FileState<'a> {
         (FileEnd::Finished, None) if integrity.damaged_chunks == 0 && integrity.sound => match cut_short {
             Some(why) => FileState::NotWhole(why),
             // Whoever wrote the footer: what the recorder ends, it sums up.
-            None if summary.is_empty() => FileState::NotWhole("the recorder has not finished it"),
+            None if summary.is_empty() => FileState::NotWhole(UNFINISHED),
             None if !integrity.proven => FileState::NotWhole(UNPROVEN),
             None => FileState::Whole,
         },
-        (FileEnd::Finished, None) => FileState::NotWhole(damage),
-        (FileEnd::Unfinished, _) => FileState::NotWhole("the recorder has not finished it"),
-        (FileEnd::Torn, _) => FileState::NotWhole("its last record is cut"),
-        (FileEnd::Damaged, _) => FileState::NotWhole("from some place on it cannot be read"),
+        _ => FileState::NotWhole(damage),
     }
 }
 
-/// What of a damaged file is left out, for people.
+/// What a file that is not whole lacks: how it ends, and what is left out.
 pub(super) fn damage(integrity: &Integrity) -> String {
+    let end = match integrity.end {
+        FileEnd::Finished => "parts of it are damaged",
+        FileEnd::Unfinished => UNFINISHED,
+        FileEnd::Torn => "its last record is cut",
+        FileEnd::Damaged => "from some place on it cannot be read",
+    };
     let left_out = integrity.left_out.sentences(integrity.damaged_chunks);
-    std::iter::once("parts of it are damaged".to_owned()).chain(left_out).collect::<Vec<_>>().join("; ")
+    std::iter::once(end.to_owned()).chain(left_out).collect::<Vec<_>>().join("; ")
 }
 
 /// What a repaired file lacks, by its record `rapid/recovered`; `None`: it has none.

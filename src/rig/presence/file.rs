@@ -57,9 +57,15 @@ pub enum PresenceError {
         /// What the system says.
         error: std::io::Error,
     },
-    /// Nobody publishes there.
+    /// No process publishes there.
     #[error("{path}: there is no physical mask: no rapid runs on this machine")]
     NotPublished {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The file was made, and its process has not published a mask yet.
+    #[error("{path}: no mask yet: rapid is starting; try again")]
+    Starting {
         /// The file.
         path: PathBuf,
     },
@@ -267,8 +273,14 @@ pub fn read_mask(path: &Path) -> Result<MaskRecord, PresenceError> {
         let mut generation = [0; 2];
         file.read_exact_at(&mut generation, 6).map_err(cut)?;
         if bytes[6] % 2 == 0 && bytes[6..8] == generation {
-            return MaskRecord::from_bytes(&bytes)
-                .map_err(|error| PresenceError::Record { path: path.to_owned(), error });
+            let record = MaskRecord::from_bytes(&bytes)
+                .map_err(|error| PresenceError::Record { path: path.to_owned(), error })?;
+            // The first publication has number 1.
+            return if record.sequence > 0 {
+                Ok(record)
+            } else {
+                Err(PresenceError::Starting { path: path.to_owned() })
+            };
         }
         if Stamp::now().since(begun) > READ_PATIENCE {
             break;

@@ -119,10 +119,11 @@ impl Presence {
         if self.ended.is_cancelled() {
             return true;
         }
-        let Ok(published) = read_mask(&self.path) else { return true };
-        if published.mask != mask {
-            return false;
-        }
+        let published = match read_mask(&self.path) {
+            Ok(published) if published.mask == mask => published,
+            Ok(_) | Err(PresenceError::Starting { .. }) => return false,
+            Err(_) => return true,
+        };
         let written = json::write(&self.json, mask, published.sequence, devices);
         let failed_before = self.json_failed.swap(written.is_err(), Ordering::Relaxed);
         if let (Err(error), false) = (written, failed_before) {

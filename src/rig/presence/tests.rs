@@ -9,9 +9,10 @@ fn path() -> PathBuf {
 }
 
 #[test]
-fn what_is_published_is_read_back_and_goes_with_the_publisher() {
+fn a_published_mask_is_read_back_until_its_publisher_ends() {
     let path = path();
     let mut file = MaskFile::create(&path, 3).expect("create");
+    assert!(matches!(read_mask(&path), Err(PresenceError::Starting { .. })), "no mask was published yet");
     for round in 1..=5 {
         file.publish(PhysicalMask(round), 1_000 + round).expect("publish");
         let record = read_mask(&path).expect("read");
