@@ -12,9 +12,6 @@ const PATIENCE: Duration = Duration::from_secs(30);
 /// Bytes that are in the kernel's hands before the file is touched.
 const ENOUGH: u64 = 200_000;
 
-/// Bytes of a file in which nothing is but the reason why it is BAD.
-const LITTLE: u64 = 300;
-
 /// What another program does to a file; what it keeps open stays so until the episode has ended.
 type Deed = fn(&Path) -> Option<File>;
 
@@ -143,6 +140,20 @@ async fn a_file_that_is_changed_within_while_it_is_recorded_is_not_called_good()
     }
 }
 
+/// Is there a whole chunk in the file? Read without any of the code under test.
+fn has_chunk(bytes: &[u8]) -> bool {
+    let mut at = 8;
+    while let Some(length) = bytes.get(at + 1..at + 9) {
+        let end = u64::from_le_bytes(length.try_into().unwrap()).saturating_add(at as u64 + 9);
+        match usize::try_from(end) {
+            Ok(end) if end <= bytes.len() && bytes[at] == crate::episode::op::CHUNK => return true,
+            Ok(end) if end <= bytes.len() => at = end,
+            _ => return false,
+        }
+    }
+    false
+}
+
 /// The recorder's judgement is found again by whoever reads the file, and in what a repair makes of it.
 fn found_again(what: &str, why: &str, file: &Path) {
     let is_found = |file: &Path| {
@@ -159,8 +170,8 @@ fn found_again(what: &str, why: &str, file: &Path) {
     assert!(said.sentence().1.contains(why), "{what}: {}", said.sentence().1);
     let repaired = match &said.outcome {
         recover::Outcome::Repaired(repaired) => repaired,
-        // It was found out before anything more was written.
-        recover::Outcome::Unreadable { kept, .. } if file.metadata().unwrap().len() < LITTLE => return is_found(kept),
+        // What the other program left of it ends within the first chunk.
+        recover::Outcome::Unreadable { kept, .. } if !has_chunk(&std::fs::read(file).unwrap()) => return is_found(kept),
         _ => panic!("{what}: {said:?}"),
     };
     is_found(&repaired.to);
