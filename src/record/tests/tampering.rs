@@ -171,7 +171,9 @@ fn found_again(what: &str, why: &str, file: &Path) {
     let repaired = match &said.outcome {
         recover::Outcome::Repaired(repaired) => repaired,
         // What the other program left of it ends within the first chunk.
-        recover::Outcome::Unreadable { kept, .. } if !has_chunk(&std::fs::read(file).unwrap()) => return is_found(kept),
+        recover::Outcome::Unreadable { kept, .. } if !has_chunk(&std::fs::read(file).unwrap()) => {
+            return is_found(kept);
+        }
         _ => panic!("{what}: {said:?}"),
     };
     is_found(&repaired.to);
