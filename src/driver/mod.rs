@@ -13,6 +13,8 @@ mod arrival;
 pub mod camera;
 #[cfg(feature = "motors")]
 pub mod can;
+#[cfg(any(feature = "lan", feature = "motors"))]
+mod datagram;
 #[cfg(feature = "lan")]
 pub mod lan;
 pub mod process;

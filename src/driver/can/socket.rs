@@ -13,11 +13,9 @@ use socketcan::{CanSocket, Socket as _, SocketOptions as _};
 use super::link::{Arrival, LinkError, is_overflow};
 use super::netlink::{self, Ready};
 use crate::control::can::CanFrame;
+use crate::driver::datagram::{self, Datagram};
 use crate::time::{Stamp, WallClock};
 
-/// Bytes of the receive queue that are asked for; the kernel grants `net.core.rmem_max` of them at most
-/// to who is not root. A frame takes about 1 KiB there.
-const QUEUE: usize = 8 << 20;
 /// A frame that waited longer than this did not: the wall clock was set.
 const OLDEST: Duration = Duration::from_secs(10);
 
@@ -75,21 +73,17 @@ impl Socket {
     }
 
     pub(super) fn try_recv(&mut self, frame: &mut CanFrame) -> Result<Option<Arrival>, LinkError> {
-        let message = loop {
+        let (raw, datagram) = loop {
             match receive(&self.bound) {
-                Ok(Some(message)) => break message,
+                Ok(Some(received)) => break received,
                 // Something else than a classical frame.
                 Ok(None) => {}
                 Err(error) => return self.result_of(&error, "reading from").map_or(Ok(None), Err),
             }
         };
-        if let Some(dropped) = message.dropped {
-            self.lost += u64::from(dropped.wrapping_sub(self.dropped));
-            self.dropped = dropped;
-        }
-        *frame = from_raw(&message.frame);
-        self.lost += u64::from(is_overflow(frame));
-        Ok(Some(arrival(message.stamp_ns)))
+        *frame = from_raw(&raw);
+        self.lost += datagram.newly_dropped(&mut self.dropped) + u64::from(is_overflow(frame));
+        Ok(Some(arrival(datagram.stamp_ns)))
     }
 
     /// Why the link has ended; `None` if it has not, and trying again is all there is to do.
@@ -153,13 +147,9 @@ fn listen(index: u32) -> io::Result<CanSocket> {
 
 fn set_up(socket: &CanSocket) -> io::Result<()> {
     socket.set_nonblocking(true)?;
-    socket.set_recv_timestamp(true)?;
-    socket.set_socket_option_int(libc::SOL_SOCKET, libc::SO_RXQ_OVFL, 1)?;
-    let queue = libc::c_int::try_from(QUEUE).unwrap_or(libc::c_int::MAX);
-    // The first only as root; the second takes what is granted.
-    if socket.set_socket_option_int(libc::SOL_SOCKET, libc::SO_RCVBUFFORCE, queue).is_err() {
-        socket.set_socket_option_int(libc::SOL_SOCKET, libc::SO_RCVBUF, queue)?;
-    }
+    datagram::prepare(socket.as_fd())?;
+    // Past the limit of the machine, which root alone may do.
+    let _ = datagram::set(socket.as_fd(), libc::SO_RCVBUFFORCE, &datagram::QUEUE.to_ne_bytes());
     Ok(())
 }
 
@@ -174,58 +164,15 @@ fn open_error(name: &str, error: &io::Error) -> LinkError {
     }
 }
 
-/// What one call received.
-struct Message {
-    frame: libc::can_frame,
-    /// `CLOCK_REALTIME`.
-    stamp_ns: Option<u64>,
-    dropped: Option<u32>,
-}
-
-/// Room for a stamp and a counter with their headers; aligned as a header wants it.
-#[repr(C, align(8))]
-struct Extras([u8; 128]);
-
 /// The next frame that waits; `None` if it is no classical frame.
-fn receive(socket: &CanSocket) -> io::Result<Option<Message>> {
+fn receive(socket: &CanSocket) -> io::Result<Option<(libc::can_frame, Datagram)>> {
     // SAFETY: integers alone, for which zero is a value.
-    let (mut frame, mut header): (libc::can_frame, libc::msghdr) = unsafe { (zeroed(), zeroed()) };
-    let mut extras = Extras([0; 128]);
-    let mut place = libc::iovec { iov_base: (&raw mut frame).cast(), iov_len: size_of::<libc::can_frame>() };
-    header.msg_iov = &raw mut place;
-    header.msg_iovlen = 1;
-    header.msg_control = extras.0.as_mut_ptr().cast();
-    header.msg_controllen = extras.0.len();
-    // SAFETY: the header points to `place`, which points to all of `frame`, and to all of `extras`.
-    let count = unsafe { libc::recvmsg(socket.as_raw_fd(), &raw mut header, libc::MSG_DONTWAIT | libc::MSG_TRUNC) };
-    let count = usize::try_from(count).map_err(|_| io::Error::last_os_error())?;
-    if count != size_of::<libc::can_frame>() {
-        return Ok(None);
-    }
-    let mut message = Message { frame, stamp_ns: None, dropped: None };
-    // SAFETY: the kernel wrote whole headers into `extras`, as many as `msg_controllen` says by now, and
-    // the macros stay within them; payloads are as long as their type, and read unaligned.
-    unsafe {
-        let mut next = libc::CMSG_FIRSTHDR(&raw const header);
-        while let Some(extra) = next.as_ref() {
-            let data = libc::CMSG_DATA(next);
-            match (extra.cmsg_level, extra.cmsg_type) {
-                (libc::SOL_SOCKET, libc::SCM_TIMESTAMPNS) => {
-                    let stamp = data.cast::<libc::timespec>().read_unaligned();
-                    message.stamp_ns = nanoseconds(&stamp);
-                }
-                (libc::SOL_SOCKET, libc::SO_RXQ_OVFL) => message.dropped = Some(data.cast::<u32>().read_unaligned()),
-                _ => {}
-            }
-            next = libc::CMSG_NXTHDR(&raw const header, next);
-        }
-    }
-    Ok(Some(message))
-}
-
-fn nanoseconds(time: &libc::timespec) -> Option<u64> {
-    let seconds = u64::try_from(time.tv_sec).ok()?;
-    seconds.checked_mul(1_000_000_000)?.checked_add(u64::try_from(time.tv_nsec).ok()?)
+    let mut frame: libc::can_frame = unsafe { zeroed() };
+    let size = size_of::<libc::can_frame>();
+    // SAFETY: `frame` is of integers, without gaps, so that all of it is bytes, and outlives the slice.
+    let place = unsafe { std::slice::from_raw_parts_mut((&raw mut frame).cast::<u8>(), size) };
+    let datagram = datagram::receive(socket.as_fd(), place, None)?;
+    Ok((datagram.length == size && !datagram.is_cut).then_some((frame, datagram)))
 }
 
 /// Puts a stamp of the wall clock on the monotonic one.

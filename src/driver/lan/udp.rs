@@ -8,9 +8,9 @@
 //! Invariant: nothing is allocated for a packet.
 
 use std::io;
-use std::mem::{size_of, zeroed};
+use std::mem::zeroed;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
-use std::os::fd::{AsRawFd, OwnedFd};
+use std::os::fd::{AsFd as _, OwnedFd};
 use std::time::Duration;
 
 use rustix::net::{AddressFamily, SocketFlags, SocketType};
@@ -20,19 +20,16 @@ use tokio::task::coop::consume_budget;
 use tokio::time::timeout;
 
 use super::place::{Place, port_error};
+use crate::driver::datagram::{self, Datagram};
 use crate::driver::{DriverError, Reading};
 use crate::registry::own_side;
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
 use crate::time::{Stamp, realtime_ns};
 
-/// What the kernel keeps for a reader that is late, bytes; it gives as much as `net.core.rmem_max` permits.
-const BACKLOG: libc::c_int = 8 << 20;
 /// The interface is looked for after so long without a packet.
 const ASK_AFTER: Duration = Duration::from_millis(500);
 /// A packet that waited longer than this has a time that the wall clock was set in between.
 const LONGEST_WAIT: Duration = Duration::from_secs(1);
-/// Room for the two control messages that are asked for.
-const CONTROL: usize = 128;
 
 /// See the module's comment.
 #[derive(Debug)]
@@ -42,22 +39,10 @@ pub(super) struct Packets {
     packet: Vec<u8>,
     filled: usize,
     /// What the kernel dropped so far.
-    dropped: Option<u32>,
+    dropped: u32,
     lost: u64,
     /// Time of the newest packet.
     last: Stamp,
-}
-
-/// A packet as the kernel gives it.
-#[derive(Debug, Clone, Copy)]
-struct Received {
-    length: usize,
-    is_cut: bool,
-    from: Option<IpAddr>,
-    /// Wall clock, ns since 1970.
-    stamp: Option<u64>,
-    /// Packets of this socket that were dropped before it, since it was opened.
-    dropped: Option<u32>,
 }
 
 impl Packets {
@@ -67,15 +52,7 @@ impl Packets {
         // SAFETY: the descriptor is owned by what is registered.
         let socket = unsafe { AsyncFd::register_with_interest(socket, Interest::READABLE) }
             .map_err(|error| DriverError::Retry(format!("port {port}: {}", io::Error::from(error))))?;
-        Ok(Self {
-            socket,
-            place,
-            packet: vec![0; max_bytes],
-            filled: 0,
-            dropped: None,
-            lost: 0,
-            last: Stamp::default(),
-        })
+        Ok(Self { socket, place, packet: vec![0; max_bytes], filled: 0, dropped: 0, lost: 0, last: Stamp::default() })
     }
 
     pub(super) async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
@@ -91,7 +68,9 @@ impl Packets {
                 continue;
             };
             let mut guard = ready.map_err(|error| self.place.lost(error))?;
-            let received = match receive(guard.get_inner(), &mut self.packet) {
+            // SAFETY: all zeroes are valid for it.
+            let mut from: libc::sockaddr_storage = unsafe { zeroed() };
+            let received = match datagram::receive(guard.get_inner().as_fd(), &mut self.packet, Some(&mut from)) {
                 Ok(received) => received,
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
                     guard.clear_ready();
@@ -101,7 +80,7 @@ impl Packets {
                 Err(error) => return Err(self.place.lost(error)),
             };
             drop(guard);
-            if let Some(captured) = self.take(received) {
+            if let Some(captured) = self.take(received, address(&from)) {
                 break captured;
             }
         };
@@ -118,12 +97,9 @@ impl Packets {
     }
 
     /// The packet's time and flags, if it is a sample.
-    fn take(&mut self, received: Received) -> Option<(Stamp, u32)> {
-        if let Some(dropped) = received.dropped {
-            let before = self.dropped.replace(dropped).unwrap_or(0);
-            self.lost += u64::from(dropped.wrapping_sub(before));
-        }
-        if !received.from.is_some_and(|from| self.place.means(from)) {
+    fn take(&mut self, received: Datagram, from: Option<IpAddr>) -> Option<(Stamp, u32)> {
+        self.lost += received.newly_dropped(&mut self.dropped);
+        if !from.is_some_and(|from| self.place.means(from)) {
             return None;
         }
         self.place.heard();
@@ -135,7 +111,7 @@ impl Packets {
             return None;
         }
         self.filled = received.length;
-        let (stamp, flags) = stamp(received.stamp, Stamp::now(), realtime_ns());
+        let (stamp, flags) = stamp(received.stamp_ns, Stamp::now(), realtime_ns());
         // The two clocks are read one after the other, which is not always equally quick.
         self.last = self.last.max(stamp);
         Some((self.last, flags))
@@ -157,74 +133,12 @@ fn bind(place: &Place, port: u16) -> io::Result<OwnedFd> {
     let family = if own.is_ipv6() { AddressFamily::INET6 } else { AddressFamily::INET };
     let flags = SocketFlags::NONBLOCK | SocketFlags::CLOEXEC;
     let socket = rustix::net::socket_with(family, SocketType::DGRAM, flags, None)?;
-    set(&socket, libc::SO_TIMESTAMPNS, 1)?;
-    set(&socket, libc::SO_RXQ_OVFL, 1)?;
-    set(&socket, libc::SO_RCVBUF, BACKLOG)?;
+    datagram::prepare(socket.as_fd())?;
     if let Some(interface) = place.interface() {
-        set_bytes(&socket, libc::SO_BINDTODEVICE, interface.as_bytes())?;
+        datagram::set(socket.as_fd(), libc::SO_BINDTODEVICE, interface.as_bytes())?;
     }
     rustix::net::bind(&socket, &own)?;
     Ok(socket)
-}
-
-fn length_of<T>() -> libc::socklen_t {
-    libc::socklen_t::try_from(size_of::<T>()).unwrap_or(0)
-}
-
-fn set(socket: &OwnedFd, option: libc::c_int, value: libc::c_int) -> io::Result<()> {
-    set_bytes(socket, option, &value.to_ne_bytes())
-}
-
-fn set_bytes(socket: &OwnedFd, option: libc::c_int, value: &[u8]) -> io::Result<()> {
-    let length = libc::socklen_t::try_from(value.len()).map_err(|_| io::ErrorKind::InvalidInput)?;
-    // SAFETY: the value is read for the call, with its length.
-    let result =
-        unsafe { libc::setsockopt(socket.as_raw_fd(), libc::SOL_SOCKET, option, value.as_ptr().cast(), length) };
-    if result == 0 { Ok(()) } else { Err(io::Error::last_os_error()) }
-}
-
-/// The control messages lie as the kernel aligns them.
-#[repr(C, align(8))]
-struct Control([u8; CONTROL]);
-
-fn receive(socket: &OwnedFd, packet: &mut [u8]) -> io::Result<Received> {
-    let mut control = Control([0; CONTROL]);
-    // SAFETY: all zeroes are valid for these.
-    let (mut from, mut message): (libc::sockaddr_storage, libc::msghdr) = unsafe { (zeroed(), zeroed()) };
-    let mut into = libc::iovec { iov_base: packet.as_mut_ptr().cast(), iov_len: packet.len() };
-    message.msg_name = (&raw mut from).cast();
-    message.msg_namelen = length_of::<libc::sockaddr_storage>();
-    message.msg_iov = &raw mut into;
-    message.msg_iovlen = 1;
-    message.msg_control = control.0.as_mut_ptr().cast();
-    message.msg_controllen = CONTROL;
-    // SAFETY: every pointer of the message is to a local or the lent packet, with its length.
-    let length = unsafe { libc::recvmsg(socket.as_raw_fd(), &raw mut message, 0) };
-    let length = usize::try_from(length).map_err(|_| io::Error::last_os_error())?;
-    let (mut stamp, mut dropped) = (None, None);
-    // SAFETY: the kernel wrote whole control messages of the length it says; `control` is still there.
-    let mut header = unsafe { libc::CMSG_FIRSTHDR(&raw const message) };
-    // SAFETY: not null, so it points to a header within `control`.
-    while let Some(found) = unsafe { header.as_ref() } {
-        // SAFETY: the data of each type is what socket(7) says, perhaps unaligned.
-        unsafe {
-            let data = libc::CMSG_DATA(header);
-            match (found.cmsg_level, found.cmsg_type) {
-                (libc::SOL_SOCKET, libc::SCM_TIMESTAMPNS) => {
-                    stamp = nanoseconds(data.cast::<libc::timespec>().read_unaligned());
-                }
-                (libc::SOL_SOCKET, libc::SO_RXQ_OVFL) => dropped = Some(data.cast::<u32>().read_unaligned()),
-                _ => {}
-            }
-            header = libc::CMSG_NXTHDR(&raw const message, header);
-        }
-    }
-    let is_cut = message.msg_flags & libc::MSG_TRUNC != 0;
-    Ok(Received { length, is_cut, from: address(&from), stamp, dropped })
-}
-
-fn nanoseconds(time: libc::timespec) -> Option<u64> {
-    u64::try_from(time.tv_sec).ok()?.checked_mul(1_000_000_000)?.checked_add(u64::try_from(time.tv_nsec).ok()?)
 }
 
 fn address(from: &libc::sockaddr_storage) -> Option<IpAddr> {
