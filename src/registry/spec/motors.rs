@@ -12,8 +12,8 @@ pub const MAX_MOTORS: usize = 10;
 /// `protocol = "damiao"`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DamiaoSpec {
-    /// One motor per axis, in the order of samples and actions, `1..=`[`MAX_MOTORS`] of them. No two are
-    /// [`Self::indistinct`].
+    /// One motor per axis, in the order of samples and actions, `1..=`[`MAX_MOTORS`] of them. Their answers are distinct on
+    /// the bus.
     pub motors: Vec<MotorSpec>,
     /// Commands a second to each motor, `10..=1000`, default 200.
     pub hz: u32,
@@ -250,66 +250,9 @@ impl MotorKind {
     }
 }
 
-impl DamiaoSpec {
-    /// The first two motors, by position, that cannot be distinguished on the bus: one receives the frames of the
-    /// other, or they answer with one id and the same low four bits of their own.
-    #[must_use]
-    pub fn indistinct(&self) -> Option<(usize, usize)> {
-        let alike = |a: &MotorSpec, b: &MotorSpec| {
-            a.slave == b.slave || (a.master == b.master && a.slave & 0xf == b.slave & 0xf)
-        };
-        self.motors.iter().enumerate().find_map(|(at, motor)| {
-            let earlier = self.motors.iter().take(at).position(|other| alike(other, motor))?;
-            Some((earlier, at))
-        })
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn motors(ids: &[(u16, u16)]) -> DamiaoSpec {
-        let motor = |(slave, master)| MotorSpec {
-            name: format!("m{slave}"),
-            slave,
-            master,
-            kind: MotorKind::Dm4310,
-            mode: MotorMode::Velocity,
-            position: [-1.0, 1.0],
-            velocity: 1.0,
-            torque: 1.0,
-            slew: 1.0,
-            motion: MotionSpec::of_slew(1.0),
-            watch: WatchSpec::default(),
-            stop: StopSpec::default(),
-            brake: None,
-            max_mos: 80.0,
-            max_rotor: 80.0,
-        };
-        let second = Duration::from_secs(1);
-        DamiaoSpec {
-            motors: ids.iter().copied().map(motor).collect(),
-            hz: 200,
-            deadman: None,
-            disable_after: Some(second),
-            timeout: second,
-            silent_after: second,
-        }
-    }
-
-    #[test]
-    fn motors_with_indistinguishable_answers_are_found() {
-        for (ids, pair) in [
-            (&[(1, 0x11), (2, 0x12), (3, 0x13)][..], None),
-            (&[(1, 0), (2, 0), (3, 0)], None),
-            (&[(1, 0x11), (0x11, 0x21)], None),
-            (&[(1, 0x11), (2, 0x12), (1, 0x13)], Some((0, 2))),
-            (&[(1, 0), (2, 0), (0x12, 0)], Some((1, 2))),
-        ] {
-            assert_eq!(motors(ids).indistinct(), pair, "{ids:x?}");
-        }
-    }
 
     #[test]
     fn names_are_unique_and_found() {
