@@ -4,10 +4,11 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use super::LAST_CHUNK;
-use super::inference::LoadError;
 use crate::bus::BusError;
 use crate::hotplug::HotplugError;
 use crate::logging::LoggingError;
+#[cfg(feature = "policy")]
+use crate::policy::{library::LibraryError, sampler::PolicyError};
 use crate::record::RecordError;
 use crate::rig::RigError;
 use crate::rig::presence::PresenceError;
@@ -43,9 +44,14 @@ pub enum AppError {
     /// A thread or signal handler.
     #[error("system call failed: {0}")]
     System(#[from] io::Error),
-    /// The policy.
+    /// onnxruntime.
+    #[cfg(feature = "policy")]
     #[error(transparent)]
-    Policy(#[from] LoadError),
+    Library(#[from] LibraryError),
+    /// The policy cannot be loaded.
+    #[cfg(feature = "policy")]
+    #[error(transparent)]
+    Policy(#[from] PolicyError),
     /// What the policy requires is not present.
     #[error("the policy needs {0}: plug it in, or use --wait to start when it is there")]
     Required(String),

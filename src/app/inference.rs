@@ -15,10 +15,9 @@ use super::stage::Stage;
 use crate::bus::{Bus, Inbox, TopicId, Writer};
 use crate::mask::PhysicalMask;
 use crate::modality::ModalityId;
-use crate::policy::library::{Environment, LibraryError};
+use crate::policy::library::Environment;
 use crate::policy::live::{Live, LiveOptions};
 use crate::policy::model::Model;
-use crate::policy::sampler::PolicyError;
 use crate::registry::Registry;
 use crate::status::{Board, Level, What};
 
@@ -38,17 +37,6 @@ pub struct PolicyOptions {
     pub denoising_steps: Option<usize>,
     /// Library of onnxruntime instead of the built-in one.
     pub library: Option<PathBuf>,
-}
-
-/// Why a policy cannot be loaded.
-#[derive(Debug, thiserror::Error)]
-pub enum LoadError {
-    /// onnxruntime.
-    #[error(transparent)]
-    Library(#[from] LibraryError),
-    /// The graphs.
-    #[error(transparent)]
-    Policy(#[from] PolicyError),
 }
 
 /// Starts the stage: it loads the policy and starts it when everything it requires is present; when it is to be
@@ -101,7 +89,7 @@ impl Flight {
         let loaded = tokio::task::spawn_blocking({
             let (bundle, named, steps) =
                 (Arc::clone(&self.options.live.bundle), self.options.library.clone(), self.options.denoising_steps);
-            move || -> Result<(Model, String), LoadError> {
+            move || -> Result<(Model, String), AppError> {
                 let environment = Environment::open(named.as_deref())?;
                 let model = Model::load(&bundle, &environment, steps)?;
                 Ok((model, environment.origin.to_string()))

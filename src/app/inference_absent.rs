@@ -12,10 +12,6 @@ use crate::status::Board;
 #[derive(Debug)]
 pub enum PolicyOptions {}
 
-/// No policy is loaded.
-#[derive(Debug, thiserror::Error)]
-pub enum LoadError {}
-
 /// Starts nothing.
 pub(super) fn start(
     options: PolicyOptions,
