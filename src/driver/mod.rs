@@ -98,6 +98,21 @@ pub enum Driver {
     Replay(Box<replay::Replay>),
 }
 
+/// The same expression for the driver of every kind.
+macro_rules! each {
+    ($self:ident, $driver:ident => $what:expr) => {
+        match $self {
+            Driver::Camera($driver) => $what,
+            Driver::Serial($driver) => $what,
+            Driver::Motors($driver) => $what,
+            Driver::Can($driver) => $what,
+            Driver::Lan($driver) => $what,
+            Driver::Sim($driver) => $what,
+            Driver::Replay($driver) => $what,
+        }
+    };
+}
+
 impl Driver {
     /// Is the link that leads to the device behind `node` down? If so, a future that ends when it is not: while a cable
     /// is out, opening again and again leads nowhere.
@@ -155,15 +170,7 @@ impl Driver {
     /// # Errors
     /// When the device is gone or cannot be read any more.
     pub async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
-        match self {
-            Self::Camera(driver) => driver.read().await,
-            Self::Serial(driver) => driver.read().await,
-            Self::Motors(driver) => driver.read().await,
-            Self::Can(driver) => driver.read().await,
-            Self::Lan(driver) => driver.read().await,
-            Self::Sim(driver) => driver.read().await,
-            Self::Replay(driver) => driver.read().await,
-        }
+        each!(self, driver => driver.read().await)
     }
 
     /// Commands an actuator that does not follow actions itself ([`Self::attend`]): a target for each axis, in the order
@@ -264,15 +271,7 @@ impl Driver {
     /// reports: a serial line reports nothing.
     #[must_use]
     pub fn negotiated(&self) -> Negotiated {
-        match self {
-            Self::Camera(driver) => driver.negotiated(),
-            Self::Serial(driver) => driver.negotiated(),
-            Self::Motors(driver) => driver.negotiated(),
-            Self::Can(driver) => driver.negotiated(),
-            Self::Lan(driver) => driver.negotiated(),
-            Self::Sim(driver) => driver.negotiated(),
-            Self::Replay(driver) => driver.negotiated(),
-        }
+        each!(self, driver => driver.negotiated())
     }
 }
 
