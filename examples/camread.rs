@@ -1,7 +1,7 @@
 //! Opens a camera and prints what it sends: `camread NODE [WIDTH HEIGHT FPS FORMAT [FRAMES]]`.
 //!
 //! For a bench with real or emulated cameras. Ends with the number of frames, or with what the driver
-//! says when the camera is unplugged.
+//! reports when the camera is unplugged.
 
 use std::io::Write as _;
 use std::path::{Path, PathBuf};

@@ -1,4 +1,4 @@
-//! The monitor on a board that nobody but this program writes: for looking at the screen.
+//! The monitor on a board that only this program writes: for looking at the screen.
 //!
 //! `cargo run --example monitor_preview [DEVICES]` shows up to 64 devices (default 6) that come, go,
 //! stall and fail; space starts and ends a pretended episode. With `--headless` or `--json` behind
@@ -37,7 +37,7 @@ async fn main() -> Result<(), tui::TuiError> {
             let json = form == "--json";
             let options = HeadlessOptions { json, progress: true, duration: Some(duration), ..Default::default() };
             let output = headless::run(board, shutdown.clone(), options, std::io::stdout());
-            // It stands for whoever ends the run; when the output ended before, there is nothing to end.
+            // It stands in for the end of the run; when the output ended before, there is nothing to end.
             let end = async {
                 tokio::time::sleep(duration).await;
                 shutdown.cancel();

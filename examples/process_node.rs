@@ -27,10 +27,10 @@ use iceoryx2::prelude::*;
 use rapid::sample::{Encoding, SampleHeader};
 use rapid::time::Stamp;
 
-/// Says that SIGTERM came, and goes on.
-extern "C" fn told_to_end(_: libc::c_int) {
-    const WORDS: &[u8] = b"told to end, and goes on\n";
-    // SAFETY: the words are as long as they say.
+/// Reports SIGTERM and keeps running.
+extern "C" fn on_sigterm(_: libc::c_int) {
+    const WORDS: &[u8] = b"asked to end, keeps running\n";
+    // SAFETY: pointer and length are those of one static slice.
     let _ = unsafe { libc::write(libc::STDOUT_FILENO, WORDS.as_ptr().cast(), WORDS.len()) };
 }
 
@@ -38,7 +38,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let options = Options::from_arguments()?;
     if options.ignore_sigterm {
         // SAFETY: the handler calls nothing but write(2), which signal-safety(7) lists.
-        unsafe { libc::signal(libc::SIGTERM, told_to_end as extern "C" fn(libc::c_int) as libc::sighandler_t) };
+        unsafe { libc::signal(libc::SIGTERM, on_sigterm as extern "C" fn(libc::c_int) as libc::sighandler_t) };
     }
     if options.flood_stderr {
         std::thread::spawn(|| {
@@ -72,7 +72,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let begun = Instant::now();
     for seq in 0_u32.. {
         if options.crash_after == Some(seq) {
-            return Err(format!("crashes after {seq} samples, as told").into());
+            return Err(format!("crashes after {seq} samples, as requested").into());
         }
         if options.silent_after == Some(seq) {
             std::thread::sleep(Duration::MAX);

@@ -1,4 +1,4 @@
-//! A program that tells an actuator where to go: it publishes actions on `/action`, as a policy would.
+//! A program that commands an actuator: it publishes actions on `/action`, as a policy would.
 //!
 //!     rapid --headless --config devices.toml --arm &
 //!     publish_action --axes 2 --rate 10 --amplitude 0.3
@@ -9,7 +9,7 @@
 //!
 //! Options: `--axes N`, `--rate HZ`, `--amplitude A`, `--period SECONDS`, `--seconds S` (0: for ever).
 
-#![expect(clippy::print_stdout, reason = "what a program prints is for whoever started it")]
+#![expect(clippy::print_stdout, reason = "a program's output is for its caller")]
 
 use std::error::Error;
 use std::f64::consts::TAU;
@@ -23,7 +23,7 @@ use rapid::time::Stamp;
 fn main() -> Result<(), Box<dyn Error>> {
     let options = Options::from_arguments()?;
     let mut config = Config::global_config().clone();
-    // Only a program that `rapid` started, or one for a second rig, is told of another bus.
+    // Another bus is set only for a program that `rapid` started, or for a second rig.
     if let Ok(prefix) = std::env::var("RAPID_BUS_PREFIX") {
         config.global.prefix = FileName::new(prefix.as_bytes())?;
     }

@@ -6,7 +6,7 @@
 //! (docs/policies.md describes all of it). What is printed: the first numbers of the noise, and how far the chunk
 //! computed here is from the recorded one. POLICY is the folder of the policy; by default the one inside `rapid`.
 
-#![expect(clippy::print_stdout, reason = "what a program prints is for whoever started it")]
+#![expect(clippy::print_stdout, reason = "a program's output is for its caller")]
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::error::Error;
@@ -56,7 +56,7 @@ struct Observed {
     seqs: Vec<u64>,
 }
 
-/// What the metadata record `rapid` says of a modality.
+/// A modality's entry in the metadata record `rapid`.
 #[derive(Deserialize)]
 struct Modality {
     name: String,

@@ -4,7 +4,7 @@
 //!
 //! It ends after so many samples, by default never. `RAPID_INSTANCE` is what that `rapid` was given as `--instance`.
 
-#![expect(clippy::print_stdout, reason = "what a program prints is for whoever started it")]
+#![expect(clippy::print_stdout, reason = "a program's output is for its caller")]
 
 use std::error::Error;
 use std::time::Duration;

@@ -1,4 +1,4 @@
-//! Our own share of the time from an unplug to its bit: from the moment the witness tells of it to
+//! Our own share of the time from an unplug to its bit: from the moment the witness reports it to
 //! the bytes in the mask's file, over simulated unplugs. What the kernel takes before that is measured
 //! on the virtual bench.
 //!

@@ -6,7 +6,7 @@
 # The stable compiler instruments by flags it passes to LLVM (the ones cargo-fuzz uses), so no nightly one is needed;
 # without it there is no address sanitizer, which matters little to code without `unsafe`. What was learnt is kept in
 # target/fuzz/corpus and used by the next run. An input that breaks a promise lies in target/fuzz/found: the last lines
-# say how to see it again, and where to put it so that the tests run it from then on.
+# print how to reproduce it, and where to put it so that the tests run it from then on.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -51,6 +51,6 @@ done
 [[ ${#broken[@]} -eq 0 ]] || {
     ls "$PLACE/found"
     echo "fuzz: again with: cargo run -p fuzz --bin fuzz run TARGET FILE"
-    echo "fuzz: mended, keep the file as tests/fuzz/cases/TARGET/NAME"
+    echo "fuzz: fixed, keep the file as tests/fuzz/cases/TARGET/NAME"
     exit 1
 }

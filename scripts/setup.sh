@@ -36,7 +36,7 @@ main() {
     flock 9
     rm -rf "$CACHE"/onnxruntime.partial.*
 
-    # The packages of all parts come first, in one go: whoever has to ask an administrator asks once.
+    # The packages of all parts come first, in one step: an administrator is needed only once.
     local wanted=() part
     for part in "$@"; do
         case "$part" in

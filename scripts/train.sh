@@ -3,7 +3,7 @@
 #
 #     train.sh policy [RAPID]      demonstrations, training, export to models/tactile-id
 #     train.sh ablation RAPID      what each input of the policy is worth: models/results/ablation.{json,md}
-#     train.sh texture             what a tactile picture tells about the texture: models/results/texture.{json,md}
+#     train.sh texture             what a tactile picture shows of the texture: models/results/texture.{json,md}
 #     train.sh test                tests of the Python under models/
 #     train.sh python ARGS...      that Python, run in models/
 #

@@ -53,9 +53,9 @@ fn main() -> ExitCode {
         }
         return ExitCode::SUCCESS;
     }
-    let wished = args.iter().find(|arg| !arg.starts_with('-'));
+    let filter = args.iter().find(|arg| !arg.starts_with('-'));
     for (name, case) in CASES {
-        if wished.is_none_or(|wished| name.contains(wished.as_str())) {
+        if filter.is_none_or(|filter| name.contains(filter.as_str())) {
             // One that fails panics, which ends the program with an error.
             case();
             println!("test {name} ... ok");

@@ -44,7 +44,7 @@ const LAYERS: &[&[&str]] = &[
     &["main", "dispatch", "cli", "commands"],
 ];
 
-/// Imports within a layer. All nouns of layer 0 may speak of each other besides.
+/// Imports within a layer. All nouns of layer 0 may also import each other.
 const SIDEWAYS: &[(&str, &[&str])] = &[
     ("registry", &["folder"]),
     ("status", &["registry", "text"]),

@@ -11,7 +11,7 @@
  *
  * `rapid` starts it when the device is plugged in and ends it with SIGTERM when that is pulled out. What it
  * publishes, here a counter and the time, comes out under the topic of the entry; what it prints goes into the
- * log. rapid_node.h says how it is built. */
+ * log. Build instructions: rapid_node.h. */
 #include <stdio.h>
 #include <stdlib.h>
 #include <time.h>

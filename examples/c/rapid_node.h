@@ -30,7 +30,7 @@ struct rapid_sample {
 typedef struct rapid_node rapid_node;
 
 /* Joins the bus of the `rapid` that started this program, to publish samples of at most max_bytes.
- * NULL if that cannot be; rapid_node_error() says why. */
+ * NULL on failure; rapid_node_error() returns the reason. */
 rapid_node *rapid_node_open(size_t max_bytes);
 
 /* Publishes a sample, whose bytes are copied. 0, or -1 with a rapid_node_error(). */

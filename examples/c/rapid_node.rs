@@ -96,7 +96,7 @@ pub extern "C" fn rapid_node_open(max_bytes: usize) -> *mut RapidNode {
 /// `node` comes from [`rapid_node_open`] and was not closed; `sample` and its bytes can be read.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rapid_node_publish(node: *mut RapidNode, sample: *const RapidSample) -> c_int {
-    // SAFETY: the caller keeps to the header: both are null or valid, and nobody else uses the node meanwhile.
+    // SAFETY: the caller keeps to the header: both are null or valid, and no other thread uses the node meanwhile.
     let (Some(node), Some(sample)) = (unsafe { node.as_mut() }, unsafe { sample.as_ref() }) else {
         say(&*Box::<dyn Error>::from("no node or no sample"));
         return -1;
@@ -104,7 +104,7 @@ pub unsafe extern "C" fn rapid_node_publish(node: *mut RapidNode, sample: *const
     let bytes = if sample.length == 0 || sample.bytes.is_null() {
         &[]
     } else {
-        // SAFETY: the caller says that there are so many bytes; they are only read, before this returns.
+        // SAFETY: the caller guarantees this number of bytes; they are only read, before this returns.
         unsafe { std::slice::from_raw_parts(sample.bytes, sample.length) }
     };
     match publish(node, sample, bytes) {
@@ -267,14 +267,14 @@ fn variable(name: &str) -> Result<String, Box<dyn Error>> {
     std::env::var(name).map_err(|_| format!("{name} is not set: rapid starts this program, see docs/nodes.md").into())
 }
 
-fn publish(node: &mut RapidNode, said: &RapidSample, bytes: &[u8]) -> Result<(), Box<dyn Error>> {
+fn publish(node: &mut RapidNode, description: &RapidSample, bytes: &[u8]) -> Result<(), Box<dyn Error>> {
     let mut sample = node.publisher.loan_slice_uninit(bytes.len())?;
-    let RapidSample { capture_ns, encoding, width, height, lost, .. } = *said;
+    let RapidSample { capture_ns, encoding, width, height, lost, .. } = *description;
     // What the device lost leaves a hole.
     let seq = node.header.seq + lost;
     *sample.user_header_mut() = SampleHeader { seq, capture_ns, encoding, width, height, ..node.header };
     sample.write_from_slice(bytes).send()?;
-    // Until it was sent nothing is counted: who tries again says the same again.
+    // Nothing is counted until it was sent: a retry passes the same values again.
     node.header.seq = seq + 1;
     // Without a notification a sample is found a little later.
     node.wake.notify()?;

@@ -3,7 +3,7 @@
  *     subscriber /rapid/camera/wrist 5
  *
  * ends after so many samples, by default never. RAPID_INSTANCE is what that `rapid` was given as --instance.
- * rapid_node.h says how it is built. */
+ * Build instructions: rapid_node.h. */
 #include <inttypes.h>
 #include <stdio.h>
 #include <stdlib.h>

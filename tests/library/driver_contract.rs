@@ -247,7 +247,7 @@ async fn a_serial_reading_allocates_nothing() {
     }
 }
 
-/// A driver that hears packets, and a sender.
+/// A driver that receives packets, and a sender.
 async fn open_udp() -> (Driver, std::net::UdpSocket) {
     let free = std::net::UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
     let find = LanFind::Host { host: free.ip(), probe: Probe::Udp, port: free.port() };

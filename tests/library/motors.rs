@@ -90,7 +90,7 @@ async fn motors_move_after_an_arm_and_are_turned_off_at_the_end() {
 
     driven.motors.close().await;
     adapter.wait_until_off(&[1, 2]);
-    assert_eq!(adapter.count("motor_timeout"), 0, "they were told, and did not find out by themselves");
+    assert_eq!(adapter.count("motor_timeout"), 0, "they were disabled, and did not time out by themselves");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -160,7 +160,7 @@ async fn one_motor_that_fails_stops_all() {
         let enabled = adapter.count("motor_enabled");
         let begun = Instant::now();
         until(&mut driven, Some([0.1, 0.1]), |_, _| begun.elapsed() > Duration::from_millis(300)).await;
-        assert_eq!(adapter.count("motor_enabled"), enabled, "{fault:?}: nobody armed them");
+        assert_eq!(adapter.count("motor_enabled"), enabled, "{fault:?}: nothing armed them");
         driven.motors.order(Asked::Arm).expect("it listens");
         until(&mut driven, Some([0.1, 0.1]), |_, arming| arming == Some(Arming::Armed)).await;
     }
@@ -213,7 +213,7 @@ async fn in_a_process_that_panics() {
     until(&mut driven, Some([0.1, 0.1]), |_, arming| arming == Some(Arming::Armed)).await;
     std::fs::write(order, "").expect("the order");
     adapter.wait_until_off(&[1, 2]);
-    assert_eq!(adapter.count("motor_timeout"), 0, "they were told, and did not find out by themselves");
+    assert_eq!(adapter.count("motor_timeout"), 0, "they were disabled, and did not time out by themselves");
     let ended = async {
         loop {
             if let Err(error) = driven.motors.read().await {

@@ -125,7 +125,7 @@ fn a_chunk_is_as_its_definition_gives_it() {
 }
 
 #[test]
-fn what_is_not_a_number_is_passed_on_unless_the_mask_says_it_is_not_there() {
+fn nan_is_passed_on_unless_the_mask_marks_the_modality_absent() {
     let (_folder, bundle) = bundle(&[]);
     let mut sampler = sampler(&bundle, None);
     let mut observation = observation(&bundle);

@@ -260,7 +260,7 @@ fn emergency_stops_and_enabling_switches_arrive() {
     let InterlockInput::Serial(line) = &pendant.input else { panic!("a serial port") };
     assert_eq!((line.baud, line.run.as_str(), line.stop.as_deref()), (9600, "RUN", Some("STOP")));
     assert_eq!((line.path.to_str(), line.silence.as_millis()), (Some("/dev/serial/by-id/usb-pendant"), 150));
-    // A switch is held, an emergency stop is not pressed, unless they say otherwise.
+    // A switch is held, an emergency stop is not pressed, unless configured otherwise.
     let keys = [pedal, panel].map(|stop| {
         let InterlockInput::Key(key) = &stop.input else { panic!("a key") };
         (key.device.as_str(), key.number, key.runs_while_pressed)
@@ -302,7 +302,7 @@ fn limits_of_the_verdict_are_the_defaults_then_the_rigs_then_the_devices() {
     assert_eq!((screen.suspect.gap, screen.bad.gap, screen.hz), (ms(2000), ms(5000), Some(30.0)));
     assert_eq!((cam.suspect.frozen, cam.bad.frozen, cam.compares()), (ms(1000), ms(2000), true));
     assert_eq!((screen.suspect.frozen, screen.bad.frozen, screen.compares()), (None, None, false));
-    // Equal numbers are no fault unless the device's own table says so.
+    // Equal numbers are no fault unless the device's own table makes them one.
     assert_eq!((imu.suspect.frozen, imu.bad.frozen, imu.compares()), (None, ms(5000), true));
     assert_eq!((imu.suspect.rate, imu.bad.rate, imu.hz), (Some(0.9), Some(0.8), Some(200.0)));
 }

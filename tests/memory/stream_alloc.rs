@@ -182,7 +182,7 @@ fn whole_rig(registry: &Registry, scenario: Scenario) {
     let files = elapsed.as_secs() / JSON_PERIOD.as_secs() + 1;
     let allowed = 2 * files + WORKERS as u64;
     assert!(noisy <= allowed, "{noisy} of {stretches} stretches allocated, {files} JSON files in {elapsed:?}");
-    assert!(stretches > 2 * allowed, "{stretches} stretches in {elapsed:?} are too few to tell");
+    assert!(stretches > 2 * allowed, "{stretches} stretches in {elapsed:?} are too few to judge");
     assert!(counts[2] > 0, "no mask came");
 }
 

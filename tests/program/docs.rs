@@ -1,4 +1,4 @@
-//! The documents do what they say: every fenced block of README.md, CONTRIBUTING.md and docs/ is run, parsed or found
+//! The documents are right: every fenced block of README.md, CONTRIBUTING.md and docs/ is run, parsed or found
 //! in the program that it quotes, and every `rapid ...` and `make ...` in the text is understood.
 //!
 //! | block | what is done with it |
@@ -196,7 +196,7 @@ fn quoted_code_is_in_its_example() {
     check_blocks(&["c", "python", "rust"], |block| {
         let path = block.option("file=").unwrap_or_default();
         let example = std::fs::read_to_string(root().join(path)).map_err(|error| format!("{path}: {error}"))?;
-        if example.contains(block.text.trim()) { Ok(()) } else { Err(format!("{path} says something else")) }
+        if example.contains(block.text.trim()) { Ok(()) } else { Err(format!("{path} differs")) }
     });
 }
 

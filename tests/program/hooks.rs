@@ -13,7 +13,7 @@ use serde_json::Value;
 const NOTE: &str = "#!/bin/sh\n\
     echo \"$*|$DEVICE_NAME|$DEVICE_NODE|$DEVICE_SERIAL|$DEVICE_ADDR|$RAPID_TOPIC|$RAPID_EPISODE|$SESSION_ID|$OUTPUT_DIR\" \
     >>notes.txt\n\
-    echo \"hook says $1\"\n";
+    echo \"hook prints $1\"\n";
 
 /// A line of [`NOTE`].
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -94,7 +94,7 @@ fn hooks_are_notified_of_plugs_and_of_episodes_in_their_order() {
         }
     }
     let reported = events(&String::from_utf8_lossy(&output.stdout));
-    assert_eq!(logged(&reported, "motor: on_detach: hook says detach").len(), 1, "{reported:#?}");
+    assert_eq!(logged(&reported, "motor: on_detach: hook prints detach").len(), 1, "{reported:#?}");
 }
 
 /// Another program takes the name that the episode is to get, or damages its file.

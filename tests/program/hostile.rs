@@ -90,7 +90,7 @@ fn device_names_are_recorded_exactly_and_shown_escaped() {
         attached.unwrap_or_else(|| panic!("{device} was not matched"))["serial"].clone()
     };
     assert_eq!([serial("by_port"), serial("by_serial"), serial("any_unit")], [CURSED, AWKWARD, &long]);
-    assert!(printed.iter().any(|event| event["event"] == "unregistered"), "the stranger is told");
+    assert!(printed.iter().any(|event| event["event"] == "unregistered"), "the stranger is reported");
 
     let file = place.path("out").join(&place.files("out")[0]);
     let episode = Episode::read(&file);
@@ -210,7 +210,7 @@ fn a_registry_that_others_may_change_is_refused_as_root_and_warned_of_otherwise(
         let output = place.run(&["--sim", "--headless", "--duration", "100ms", "--config", path]);
         assert_eq!(output.status.code(), Some(2), "a run as root: {path}");
         let output = shared.as_nobody(&["check", "--config", path]);
-        assert_eq!(output.status.code(), Some(0), "nobody: {path}: {}", text(&output.stderr));
+        assert_eq!(output.status.code(), Some(0), "user nobody: {path}: {}", text(&output.stderr));
         let reported = text(&output.stdout);
         assert!(reported.contains("warning: ") && reported.contains(printed) && reported.contains(fix), "{reported}");
         give(change, 0, before);
@@ -245,7 +245,7 @@ fn two_users_on_one_machine_do_not_write_through_each_other() {
     assert!(printed.contains("it belongs to user 0") && printed.contains("remove it: rm -r /dev/shm/"), "{printed}");
     fs::remove_file(&mask).expect("clean");
 
-    // The bus's folder is root's by now, as it is of whoever comes first.
+    // The bus's folder is root's by now, as the first user owns it.
     let output = place.run(&["--sim", "--headless", "--duration", "100ms"]);
     assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
     let output = shared.as_nobody(&run);

@@ -135,7 +135,7 @@ fn a_pulled_sensor_is_left_out_at_the_next_tick_and_actions_continue() {
         let ticks = u64::from(action.sequence - first.sequence);
         assert_eq!(action.log_time - first.log_time, ticks * 100_000_000);
     }
-    // While the bit was clear, actions went on; how many is the machine's affair.
+    // While the bit was clear, actions continued; how many depends on the machine.
     let edges = episode.mask_edges();
     let out = edges.iter().position(|(_, mask)| *mask == 0x05).expect("it was pulled out");
     let (from, until) = (edges[out].0, edges[out + 1].0);
@@ -198,7 +198,7 @@ fn a_policy_not_trained_without_a_sensor_holds_until_it_is_back_or_ignored() {
     assert_eq!(hold["device"], "tactile_tip");
     let acted = printed.iter().rposition(|event| event["event"] == "act");
     let stopped = printed.iter().position(|event| std::ptr::eq(event, hold));
-    assert!(acted > stopped, "it goes on when the sensor is back");
+    assert!(acted > stopped, "it continues when the sensor is back");
 
     let (code, printed, stderr) = infer(&place, &bundle, PULLED, &["--duration", "8s", "--ignore-missing"]);
     assert_eq!(code, Some(0), "{stderr}");

@@ -4,7 +4,7 @@
 //! A loaded machine may hold up the thread that writes; how long threads of the killed run were ready
 //! and got no processor, by the kernel's count, and that much more may be missing.
 
-#![allow(clippy::expect_used, clippy::print_stdout, reason = "what fails here fails a test, which may say more")]
+#![allow(clippy::expect_used, clippy::print_stdout, reason = "what fails here fails a test, which may print more")]
 #![allow(clippy::case_sensitive_file_extension_comparisons, reason = "names that rapid itself writes")]
 
 use std::fs;

@@ -64,8 +64,8 @@ fn multicast_works() -> std::io::Result<()> {
     listener.set_read_timeout(Some(Duration::from_secs(20)))?;
     let sender = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0))?;
     sender.send_to(b"anybody?", (GROUP, listener.local_addr()?.port()))?;
-    let mut heard = [0; 8];
-    listener.recv(&mut heard)?;
+    let mut datagram = [0; 8];
+    listener.recv(&mut datagram)?;
     Ok(())
 }
 

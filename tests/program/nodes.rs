@@ -129,7 +129,7 @@ fn c_library() -> PathBuf {
         .filter_map(serde_json::Value::as_str)
         .map(Path::new)
         .find(|file| file.extension().is_some_and(|end| end == "a"));
-    archive.expect("cargo says where the archive is").into()
+    archive.expect("cargo prints the archive's path").into()
 }
 
 /// Compiles a program of `examples/c` into a place, with the library or with none.

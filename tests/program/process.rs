@@ -130,7 +130,7 @@ fn a_deaf_program_is_unplugged_at_once_and_killed_later_and_its_successor_waits(
     let edges: Vec<u64> = episode.mask_edges().into_iter().map(|(_, mask)| mask).collect();
     assert_eq!(edges, [1, 0, 1]);
 
-    // The program went on publishing until it was killed: none of that counts.
+    // The program continued to publish until it was killed: none of that counts.
     let samples: Vec<_> = episode.topic(TOPIC).collect();
     assert!(!samples.is_empty());
     assert!(samples.windows(2).all(|pair| pair[1].sequence == pair[0].sequence + 1), "a hole in the samples");
@@ -181,7 +181,7 @@ fn a_program_that_crashes_again_and_again_fails() {
     let failed = find(&reported, |event| event["state"] == "failed", "failed");
     assert_eq!(failed["detail"], "its process ended with code 1");
     assert_eq!(failed["mask"], "0x00");
-    assert_eq!(logged(&reported, "crashes after 3 samples").len(), 6, "what it said is in the log");
+    assert_eq!(logged(&reported, "crashes after 3 samples").len(), 6, "its output is in the log");
     let kept = place.logbook("counter");
     for words in ["started as process", "crashes after 3 samples", "its process ended with code 1"] {
         assert_eq!(kept.matches(words).count(), 6, "{words:?} in {kept}");
@@ -242,7 +242,7 @@ fn the_end_of_a_run_waits_for_a_deaf_program_and_a_second_signal_does_not() {
         running.signal(Signal::INT);
         if second {
             // The mask is 0 only when all is over: until then there is something to interrupt.
-            running.wait_for("told to end");
+            running.wait_for("asked to end");
             running.signal(Signal::INT);
         }
         let (code, output, _) = running.end();

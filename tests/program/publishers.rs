@@ -49,7 +49,7 @@ fn a_second_publisher_gets_nothing_into_an_episode_and_is_named_in_its_verdict()
         let events = running.reported();
         events.into_iter().find(|event| event["event"] == "publisher" && event["topic"] == topic)
     };
-    until("a word of both", || {
+    until("an event of both", || {
         seq += 1;
         let forged = [FORGED_MASK, 1_000_000 + seq].map(u64::to_le_bytes).concat();
         give(&mask, 1_000_000 + seq, Encoding::Mask, &forged);
@@ -57,7 +57,7 @@ fn a_second_publisher_gets_nothing_into_an_episode_and_is_named_in_its_verdict()
         reported("/rapid/mask").is_some() && reported("/rapid/camera/wrist").is_some()
     });
     let process = u64::from(std::process::id());
-    let event = reported("/rapid/mask").expect("told");
+    let event = reported("/rapid/mask").expect("reported");
     assert_eq!(event["process"], process);
     let own = std::env::current_exe().expect("this program");
     let own = own.file_name().and_then(|name| name.to_str()).expect("its name");

@@ -87,8 +87,8 @@ fn the_text_of_a_device_adds_no_rule_and_no_line() {
     ok(&place.run(&by_port));
     let new = text(&place);
     assert!(!new.contains("MODE=\"0777"), "its serial number cannot be written, and is not");
-    let as_told = ["register", "--vid", "dead", "--pid", "000a", "--serial", "x\"\nMODE=\"0777", "--name", "other"];
-    let error = refused(&place.run(&[&as_told[..], &["--node", "camera"]].concat()));
+    let by_identity = ["register", "--vid", "dead", "--pid", "000a", "--serial", "x\"\nMODE=\"0777", "--name", "other"];
+    let error = refused(&place.run(&[&by_identity[..], &["--node", "camera"]].concat()));
     assert!(error.contains("control characters") && error.contains("nothing was written"), "{error}");
     let one_line = ["register", "--vid", "1", "--pid", "2", "--serial", "x\", MODE=\"0777", "--name", "other"];
     ok(&place.run(&[&one_line[..], &["--node", "camera"]].concat()));

@@ -236,7 +236,7 @@ fn masks(run: &Run) {
     assert_eq!(edges.first().copied(), targets.next(), "{edges:x?}");
     let mut target = targets.next();
     for pair in edges.windows(2) {
-        let wanted = target.unwrap_or_else(|| panic!("{edges:x?} goes on after {expected:x?}"));
+        let wanted = target.unwrap_or_else(|| panic!("{edges:x?} continues after {expected:x?}"));
         assert_eq!((pair[0] ^ pair[1]) & !(pair[0] ^ wanted), 0, "{edges:x?} on the way to {wanted:x}");
         if pair[1] == wanted {
             target = targets.next();
@@ -490,7 +490,7 @@ fn verdict(run: &Run) {
 
     let Inspection { verdict, recorded_verdict, modalities, .. } = &run.inspected;
     let verdict = verdict.verdict().expect("an episode");
-    assert_eq!((verdict.grade.word(), &verdict.reasons), (word, &reasons), "inspect says the same");
+    assert_eq!((verdict.grade.word(), &verdict.reasons), (word, &reasons), "inspect has the same verdict");
     assert_eq!(recorded_verdict.as_ref(), Some(verdict));
     let counted: Value = serde_json::from_str(run.episode.value("rapid/summary", "modalities")).expect("JSON");
     for modality in modalities {

@@ -177,7 +177,7 @@ fn an_arm_needs_every_input_and_a_stop_is_an_order_and_an_event_of_the_episode()
     let (_, output, stderr) = running.end();
     let reported = support::events(&output);
     let last_words = words(&reported);
-    assert!(!last_words.ends_with(&["pendant lost".to_owned()]), "no word of what closes at the end: {stderr}");
+    assert!(!last_words.ends_with(&["pendant lost".to_owned()]), "an input closed at the end is reported: {stderr}");
     let file = place.files("out").into_iter().find(|name| Path::new(name).extension().is_some_and(|e| e == "mcap"));
     let episode = Episode::read(&place.path("out").join(file.expect("an episode")));
     let recorded: Vec<Value> = episode

@@ -36,7 +36,7 @@ class SampleHeader(ctypes.Structure):
 
     @staticmethod
     def type_name() -> str:
-        """The name under which the service knows the header: both sides must say the same."""
+        """The name under which the service knows the header: both sides must use the same."""
         return "RapidSampleHeader"
 
 

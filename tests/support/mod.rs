@@ -11,7 +11,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
-/// How long a condition may take to come true before a test gives up. It is no requirement: a slow
+/// How long a condition may take to be met before a test gives up. It is no requirement: a slow
 /// machine only makes the test slow.
 pub(crate) const PATIENCE: Duration = Duration::from_mins(3);
 
@@ -19,7 +19,7 @@ pub(crate) const PATIENCE: Duration = Duration::from_mins(3);
 pub(crate) fn until(what: &str, mut holds: impl FnMut() -> bool) {
     let begun = Instant::now();
     while !holds() {
-        assert!(begun.elapsed() < PATIENCE, "{what} does not come true");
+        assert!(begun.elapsed() < PATIENCE, "{what}: not met in time");
         std::thread::sleep(Duration::from_millis(5));
     }
 }

@@ -12,7 +12,7 @@
 //! rewrite MOTOR RID VALUE           a register is written in a frame that the program does not receive
 //! damage MOTOR COUNT RAD            so many of its next frames have a position that is off by this
 //! chip 0|1                          the chip of the brakes is unplugged, and all engage, or is back
-//! stuck 0|1                         brakes stay as they are, whatever their lines say
+//! stuck 0|1                         brakes stay as they are, at any level of their lines
 //! ```
 //!
 //! MOTOR counts from 1, as its id does.
@@ -45,7 +45,7 @@ pub(crate) const CYCLE: Duration = Duration::from_millis(5);
 const ACTIONS: Duration = Duration::from_millis(100);
 /// What motors of the kind count in: PMAX, VMAX, TMAX.
 const RANGES: [f64; 3] = [12.5, 30.0, 10.0];
-/// A motor that can hear is off this long after nothing allows it to be on.
+/// A motor that can receive is off this long after nothing allows it to be on.
 const OFF_WITHIN: Duration = Duration::from_millis(50);
 /// A joint is stopped in its way this long after a fault.
 const KIND_WITHIN: Duration = Duration::from_millis(20);
@@ -121,7 +121,7 @@ pub(crate) struct Axis {
     enabling: u8,
     /// The newest frame is one that damps.
     is_damped: bool,
-    /// It neither hears nor answers.
+    /// It neither receives nor answers.
     pub(crate) is_deaf: bool,
     /// Another program commands it after the end of ours.
     is_foreign: bool,
@@ -353,7 +353,7 @@ impl World {
         self.judge.judge_brakes(&let_go.collect::<Vec<_>>(), self.are_brakes_stuck, &self.spec, now);
     }
 
-    /// The lines of the brakes say this.
+    /// The levels of the brakes' lines.
     fn drive_brakes(&mut self, released: u16) {
         if self.are_brakes_stuck {
             return;
@@ -367,7 +367,7 @@ impl World {
         }
     }
 
-    /// Brakes engage and release some time after their lines say so.
+    /// Brakes engage and release some time after their lines change.
     fn turn_brakes(&mut self) {
         for (index, ((turns, since), spec)) in self.turns.iter_mut().zip(&self.spec.motors).enumerate() {
             let Some(brake) = &spec.brake else { continue };
@@ -558,7 +558,7 @@ impl Judge {
             for (at, (axis, motor)) in self.axes.iter_mut().zip(motors).enumerate() {
                 let stop = spec.motors[at].stop;
                 let kind = if Some(at) == own { stop.own_fault } else { stop.other_fault };
-                // Who was stopped before stays so; who is off, or does not hear, cannot be kept.
+                // A motor stopped before stays so; one that is off, or does not receive, cannot be kept.
                 if place == 0 && self.was_armed && motor.is_on() && !axis.is_deaf && self.may_keep {
                     axis.kind = Some((kind, now.after(KIND_WITHIN)));
                     axis.brakes = kind == Stop::Brake;

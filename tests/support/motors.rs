@@ -1,4 +1,4 @@
-//! Motors on a serial line: the simulated motors of the virtual bench behind an adapter of Damiao's or one that speaks
+//! Motors on a serial line: the simulated motors of the virtual bench behind an adapter of Damiao's or one that uses
 //! slcan, on a pseudo-terminal.
 
 #![allow(dead_code, reason = "each who uses it needs a part of it")]
@@ -23,7 +23,7 @@ use rapid::time::Stamp;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use vbench::emu::can::bus::{self, Bus};
 use vbench::emu::can::damiao::{self, Damiao};
-use vbench::emu::can::slcan::{Heard, Slcan};
+use vbench::emu::can::slcan::{Received, Slcan};
 use vbench::emu::order::Order;
 use vbench::emu::reported::Reported;
 
@@ -74,7 +74,7 @@ struct Shared {
     reported: Vec<(Stamp, Reported)>,
 }
 
-/// How the adapter speaks on its line.
+/// The adapter's protocol on its line.
 enum Speech {
     Damiao(Damiao),
     Slcan(Slcan),
@@ -86,8 +86,8 @@ impl Speech {
         let mut frames = Vec::new();
         match self {
             Self::Damiao(damiao) => damiao.hear(bytes, answers, |frame| frames.push(frame)),
-            Self::Slcan(slcan) => slcan.hear(bytes, answers, |heard| {
-                if let Heard::Frame(frame) = heard {
+            Self::Slcan(slcan) => slcan.hear(bytes, answers, |received| {
+                if let Received::Frame(frame) = received {
                     frames.push(frame);
                 }
             }),
@@ -107,7 +107,7 @@ impl Adapter {
         Self::plug_as(CanAdapter::Damiao, count)
     }
 
-    /// One that speaks slcan, or Damiao's.
+    /// One that uses slcan, or Damiao's.
     pub(crate) fn plug_as(adapter: CanAdapter, count: u16) -> Self {
         let speech = match adapter {
             CanAdapter::Slcan => Speech::Slcan(Slcan::default()),
@@ -155,7 +155,7 @@ impl Adapter {
     }
 
     /// Waits until each of these motors was turned off after the last time that it was enabled. One motor
-    /// may tell several times that it was turned off.
+    /// may report several times that it was turned off.
     pub(crate) fn wait_until_off(&self, motors: &[u16]) {
         let begun = Instant::now();
         while !motors.iter().all(|motor| self.is_off(*motor)) {

@@ -28,7 +28,9 @@ pub(crate) fn check(registry: &Registry) {
         let text = &artifact.contents;
         match artifact.kind {
             ArtifactKind::Rules => check_rules(registry, text),
-            ArtifactKind::Unit => assert_eq!(unit_without_names(text), expected, "the unit says more than its name"),
+            ArtifactKind::Unit => {
+                assert_eq!(unit_without_names(text), expected, "the unit differs in more than its name")
+            }
             ArtifactKind::Descriptor => check_descriptor(registry, &artifact.path, text),
         }
     }

@@ -1,11 +1,11 @@
-//! CAN adapters on a serial line: what they say depends on the bytes alone, not on how they were cut into reads.
+//! CAN adapters on a serial line: their output depends on the bytes alone, not on how they were cut into reads.
 
 use rapid::control::can::CanFrame;
 use rapid::driver::can::{damiao_serial, slcan};
 
 use crate::targets::short;
 
-/// A CAN adapter that speaks slcan: a frame that is sent again comes back as it was.
+/// A CAN adapter that uses slcan: a frame that is sent again comes back as it was.
 pub fn slcan(bytes: &[u8]) {
     use slcan::{Decoder, Event, encode};
     let Some((cut, stream)) = short(bytes).and_then(<[u8]>::split_first) else { return };

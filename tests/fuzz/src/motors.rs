@@ -108,7 +108,7 @@ fn is_harmless(frame: &CanFrame) -> bool {
 struct Axis {
     spec: MotorSpec,
     /// The ends of position, velocity and torque that it reported: the smallest and the largest of each. Which of
-    /// them counts is for the bus to say, so what is judged by them is judged by the largest.
+    /// them counts is decided by the bus, so what is judged by them is judged by the largest.
     reported: [[f64; 2]; 3],
     /// The newest positions it reported, rad, the newest last. Two that are impossible may be passed over, not a third.
     measured: Vec<f64>,

@@ -44,7 +44,7 @@ pub fn units() -> Vec<Vec<u8>> {
     all.map(|text| text.as_bytes().to_vec()).to_vec()
 }
 
-/// Lines of CAN adapters that speak slcan.
+/// Lines of CAN adapters that use slcan.
 #[must_use]
 pub fn slcan() -> Vec<Vec<u8>> {
     vec![

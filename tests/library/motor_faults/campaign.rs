@@ -29,7 +29,7 @@ const AGAIN: Duration = Duration::from_secs(1);
 const READ_AGAIN: Duration = Duration::from_millis(850);
 /// Of a motor that does not answer any fault may be named, whichever comes first.
 const SILENT: &str = "";
-/// After a pause of the program its first frames say little.
+/// After a pause of the program its first frames prove little.
 const SETTLED: Duration = Duration::from_millis(100);
 
 #[test]
@@ -166,7 +166,7 @@ impl Campaign {
             self.happen();
         }
         self.pass(300);
-        // Whatever came before: nothing is on some time after a disarm, and all that can be heard.
+        // Whatever came before: nothing is on some time after a disarm, and all that can be received.
         for line in ["mute 0 0", "power 0 1", "disarm"] {
             self.order(line);
         }
@@ -290,7 +290,7 @@ impl Campaign {
         self.paused = self.paused.max(self.world.now.after(Duration::from_millis(ms)));
     }
 
-    /// What just happened is to be named, if all motors are on and heard.
+    /// What just happened is to be named, if all motors are on and answer.
     fn owe(&mut self, motor: usize, words: &'static str, within: Duration) {
         let what = self.story.lines().last().unwrap_or_default().trim().to_owned();
         if self.is_seen(motor) {
@@ -298,7 +298,7 @@ impl Campaign {
         }
     }
 
-    /// The program runs, the motors are on, and it hears this one.
+    /// The program runs, the motors are on, and it receives from this one.
     fn is_seen(&self, motor: usize) -> bool {
         self.world.now >= self.paused.after(SETTLED) && self.world.bus.is_armed() && {
             !self.world.judge.axes[motor].is_deaf && self.world.motors[motor].is_on()

@@ -17,8 +17,8 @@ wait_for() {
   done
 }
 
-# said FILE FRAGMENT...: one line of FILE holds every fragment.
-said() {
+# has_line FILE FRAGMENT...: one line of FILE holds every fragment.
+has_line() {
   local file=$1 lines fragment; shift
   lines=$(cat "$file" 2>/dev/null)
   for fragment in "$@"; do lines=$(grep -F -- "$fragment" <<<"$lines") || return 1; done
@@ -30,7 +30,7 @@ emu_start() {
   "${usbemu[@]}" "$@" 0<>/tmp/emu.ctl >"$out/emu.jsonl" 2>"$out/emu.err" &
   emu_pid=$!
   exec 7>/tmp/emu.ctl
-  wait_for 30 said "$out/emu.jsonl" '"action":"ready"' || fail "the emulator did not start: $(cat "$out/emu.err")"
+  wait_for 30 has_line "$out/emu.jsonl" '"action":"ready"' || fail "the emulator did not start: $(cat "$out/emu.err")"
 }
 
 # emu COMMAND...: one line to the emulator.
@@ -40,7 +40,7 @@ emu() { echo "$*" >&7; }
 emu_done() {
   emu_asked=$((${emu_asked:-0} + 1))
   emu "say done-$emu_asked"
-  wait_for "$1" said "$out/emu.jsonl" "\"word\":\"done-$emu_asked\"" || fail "the emulator is not done: $(tail -n 1 "$out/emu.jsonl")"
+  wait_for "$1" has_line "$out/emu.jsonl" "\"word\":\"done-$emu_asked\"" || fail "the emulator is not done: $(tail -n 1 "$out/emu.jsonl")"
 }
 
 # emu_quit: what is still plugged is pulled, and the log is complete.
@@ -63,9 +63,9 @@ rapid_start() {
 await_rapid() {
   local limit=$(($1 > watchdog ? $1 : watchdog)) end; shift
   end=$((SECONDS + limit))
-  until said "$out/rapid.jsonl" "$@"; do
-    kill -0 "$rapid_pid" 2>/dev/null || { echo "bench: rapid ended before it said: $*"; rapid_wait; return 1; }
-    [ $SECONDS -lt "$end" ] || { echo "bench: rapid did not say within $limit s: $*"; return 1; }
+  until has_line "$out/rapid.jsonl" "$@"; do
+    kill -0 "$rapid_pid" 2>/dev/null || { echo "bench: rapid ended before the line: $*"; rapid_wait; return 1; }
+    [ $SECONDS -lt "$end" ] || { echo "bench: no line of rapid within $limit s: $*"; return 1; }
     sleep 0.2
   done
 }
@@ -103,12 +103,12 @@ lan_rule() {
 # mark WORD: the emulator's log has the word; what is logged from now on comes after it.
 mark() {
   emu "say $1"
-  wait_for 20 said "$out/emu.jsonl" "\"word\":\"$1\"" || fail "the emulator does not say $1"
+  wait_for 20 has_line "$out/emu.jsonl" "\"word\":\"$1\"" || fail "the emulator did not log $1"
   marked=$(wc -l <"$out/emu.jsonl")
 }
 
-# told ACTION [FRAGMENT...]: since the last mark the emulator's log has a line of this action with all fragments.
-told() {
+# logged ACTION [FRAGMENT...]: since the last mark the emulator's log has a line of this action with all fragments.
+logged() {
   local lines fragment
   lines=$(tail -n "+$((${marked:-0} + 1))" "$out/emu.jsonl" | grep -F "\"action\":\"$1\"") || return 1; shift
   for fragment in "$@"; do lines=$(grep -F -- "$fragment" <<<"$lines") || return 1; done

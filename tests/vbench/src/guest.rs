@@ -146,7 +146,7 @@ impl Image {
     }
 }
 
-/// A running QEMU, killed with whoever started it.
+/// A running QEMU, killed with the process that started it.
 struct Machine(Child);
 
 impl Machine {

@@ -27,7 +27,7 @@ impl Delays {
     }
 
     /// The first effect of each cause, as in [`Self::between`], as time from the cause's own `moment`; negative where the
-    /// effect came first. So two listeners to one event are compared: neither always hears of it before the other.
+    /// effect came first. So two listeners to one event are compared: neither always receives it before the other.
     pub fn beside(causes: &[u64], moments: &[u64], effects: &[u64]) -> Self {
         let (mut found, mut missing) = (Vec::new(), 0);
         for (place, (cause, moment)) in causes.iter().zip(moments).enumerate() {
@@ -89,7 +89,7 @@ mod tests {
     }
 
     #[test]
-    fn an_effect_may_come_before_another_listener_hears_of_the_cause() {
+    fn an_effect_may_come_before_another_listener_receives_the_cause() {
         let ms = |all: &[u64]| all.iter().map(|value| value * 1_000_000).collect::<Vec<_>>();
         let delays = Delays::beside(&ms(&[100, 200, 300]), &ms(&[110, 210, 310]), &ms(&[108, 213]));
         assert_eq!(delays.to_string(), "n=2/3 min=-2.0 p50=-2.0 p95=3.0 max=3.0 ms");

@@ -24,7 +24,7 @@ usage: usbemu SPEC...                    emulate; commands on stdin (plug, unplu
        usbemu --can-count NAME FRAMES    read generated frames, print how many were lost
        usbemu --lidar PORT PACKETS       read a LiDAR's packets, print how many were lost
        usbemu --watch-mask [SECONDS]     print each change of the physical mask as a JSON line
-       usbemu --watch-uevents            print what the kernel and udev tell of devices, a JSON line each
+       usbemu --watch-uevents            print the device events of the kernel and udev, a JSON line each
        usbemu --keys NAME KEY...         an input device with these keys: `press KEY`, `release KEY` on stdin
        usbemu --grab NODE                keep an input device's events from everybody else
        usbemu --beat MICROSECONDS FILE   sleep to absolute deadlines, note each waking in FILE

@@ -109,7 +109,7 @@ impl Scenario {
     }
 
     /// Runs `rapid` recording; the timeline starts when these registry entries stream, and so many seconds of it later the
-    /// recording ends, or when everything given to [`Scenario::until`] has come true, if that is later.
+    /// recording ends, or when everything given to [`Scenario::until`] is met, if that is later.
     #[must_use]
     pub fn record(mut self, seconds: u32, streaming: &[&str]) -> Self {
         self.play = Play::Record { seconds, streaming: streaming.iter().map(ToString::to_string).collect() };

@@ -44,7 +44,7 @@ const IN_MS: u64 = 1_800;
 /// The plain program knows no cooldown.
 const PLAIN_OUT_MS: u64 = 600;
 const PLAIN_IN_MS: u64 = 1_800;
-const USAGE: &str = "usage: vbench-cycles [CYCLES] [--json]   (50 cycles unless told otherwise)";
+const USAGE: &str = "usage: vbench-cycles [CYCLES] [--json]   (50 cycles by default)";
 
 struct Plan {
     cycles: u64,
@@ -258,7 +258,7 @@ impl Seen {
                     .baseline(plain_from_node.quantile(share))
                     .target(60.0)
                     .note(format!(
-                        "udev has processed the node -> first recorded sample received, {}, {cooled}; baseline: told by udev, open, \
+                        "udev has processed the node -> first recorded sample received, {}, {cooled}; baseline: event of udev, open, \
                          STREAMON, first frame, nothing else",
                         from_node.count()
                     )),
@@ -283,13 +283,13 @@ impl Seen {
                 "stage_told",
                 Delays::beside(&self.firsts(&kernel_nodes), &reported, &self.attached),
                 None,
-                "-> rapid has matched it to its entry; below 0 it heard of it before the listener of the bench",
+                "-> rapid has matched it to its entry; below 0 it was notified before the listener of the bench",
             ),
             (
                 "stage_open",
                 Delays::between(&self.firsts(&self.attached), &self.stream_on),
                 plain_streaming.quantile(0.5),
-                "-> the camera is told to stream: open, format, rate, buffers, STREAMON",
+                "-> the camera is set to stream: open, format, rate, buffers, STREAMON",
             ),
             (
                 "stage_first_frame",

@@ -134,7 +134,7 @@ apart() {{
   udevadm settle
   sleep {HANDS_S}
 }}
-# next KEY: what `rapid ablation` says of the configuration that is next.
+# next KEY: a field of the next configuration of `rapid ablation`.
 next() {{ sed -n 's/.*"event":"next".*/&/p' $out/plan.jsonl | sed -n 's/.*"'"$1"'":\(\[[^]]*\]\|"[^"]*"\).*/\1/p' | tr -d '[]"' | tr ',' ' '; }}
 plan() {{
   "${{rapid[@]}}" ablation --finger {fingers} --modality {sets} --episodes 1 --count any --in $out/episodes --json >$out/plan.jsonl \
@@ -152,7 +152,7 @@ await_rapid 60 '"event":"recording"' || fail 'not recording'
 rapid_stop
 kill $watcher
 plan
-while said $out/plan.jsonl '"event":"next"'; do
+while has_line $out/plan.jsonl '"event":"next"'; do
   episode=$((${{episode:-0}} + 1))
   [ $episode -le {wanted} ] || fail 'rapid ablation wants more episodes than configurations'
   devices=()

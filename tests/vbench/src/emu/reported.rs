@@ -1,4 +1,4 @@
-//! What a device has to tell of itself, besides what it sends.
+//! The events of a device, besides what it sends.
 
 use serde_json::Value;
 

@@ -73,7 +73,7 @@ pub enum Kind {
     },
     /// A CAN adapter.
     Can {
-        /// How it speaks with the host.
+        /// Its protocol with the host.
         protocol: Protocol,
         /// What is on its bus.
         motors: Vec<MotorSpec>,

@@ -1,7 +1,7 @@
-//! Devices that are spoken with: what they have to say is sent as soon as the host asks for it, and what they do of their own
+//! Devices with a protocol: their output is sent as soon as the host requests it, and what they do of their own
 //! is done in time, plugged or not.
 //!
-//! Invariant: `attend` follows whatever changes such a device, so nothing it has to say or tell waits for the next beat.
+//! Invariant: `attend` follows whatever changes such a device, so none of its output or events waits for the next beat.
 
 use std::time::Duration;
 

@@ -38,6 +38,6 @@ pub trait Talker: std::fmt::Debug + Send {
     /// Something happens to it, or to a motor behind it; false: not to such a device.
     fn befall(&mut self, motor: Option<u16>, order: Order, now_ns: u64) -> bool;
 
-    /// Appends what it has to tell since the last call.
+    /// Appends its events since the last call.
     fn reported(&mut self, reported: &mut Vec<Reported>);
 }

@@ -1,4 +1,4 @@
-//! Speaks on a CAN interface of the guest, as `cansend` and `candump` would.
+//! Sends and receives on a CAN interface of the guest, as `cansend` and `candump` would.
 
 use std::fs;
 use std::io;

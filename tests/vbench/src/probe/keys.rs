@@ -13,7 +13,7 @@ fn code(word: &str) -> Result<KeyCode, Failure> {
     KeyCode::from_str(word).map_err(|_| format!("there is no key {word}").into())
 }
 
-/// An input device called `name` with these keys, which does what the lines say until they end: `press KEY`, `release KEY`.
+/// An input device called `name` with these keys, which follows the lines until they end: `press KEY`, `release KEY`.
 /// Prints `ready`, and `done` after each.
 pub fn serve(name: &str, keys: &[&str], lines: impl BufRead) -> Result<(), Failure> {
     let mut set = AttributeSet::<KeyCode>::new();

@@ -1,6 +1,6 @@
-//! What the kernel and udev say of devices, as a bare listener hears it.
+//! The device events of the kernel and udev, as a bare listener receives them.
 //!
-//! Both speak on one netlink protocol, in two groups. The kernel's message is `ACTION@PATH` and lines `KEY=VALUE`, each ended
+//! Both send on one netlink protocol, in two groups. The kernel's message is `ACTION@PATH` and lines `KEY=VALUE`, each ended
 //! by a zero byte; udev's has a binary head in front of such lines (`struct udev_monitor_netlink_header`, systemd,
 //! `src/libsystemd/sd-device/device-monitor.c`).
 //! Invariant: a message that is neither is passed over; it never ends the listener.
@@ -74,7 +74,7 @@ impl Uevent {
     }
 }
 
-/// A socket on which both speak.
+/// A socket that receives both.
 #[derive(Debug)]
 pub struct Listener {
     socket: OwnedFd,

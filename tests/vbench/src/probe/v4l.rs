@@ -94,10 +94,10 @@ pub fn read(path: &Path, count: u32) -> Result<Value, ReadError> {
 /// Opens each camera as soon as udev has made it ready, takes one frame, closes it and prints how long the steps took, without
 /// end. The plainest program there can be: it keeps the camera's format, and does nothing else meanwhile.
 pub fn first_frames(log: &Log) -> Result<(), ReadError> {
-    let heard = |error| ReadError::Call("recv from udev", error);
-    let mut listener = Listener::open().map_err(heard)?;
+    let receive_error = |error| ReadError::Call("recv from udev", error);
+    let mut listener = Listener::open().map_err(receive_error)?;
     loop {
-        let (event, reported) = listener.receive().map_err(heard)?;
+        let (event, reported) = listener.receive().map_err(receive_error)?;
         let Some(node) = event.camera_added() else { continue };
         match first_frame(Path::new(&node)) {
             Ok((streaming, came)) => {

@@ -37,9 +37,9 @@ udevadm settle
 
 record /tmp/clock
 date -s '1 hour' >/dev/null
-patiently is 1 steps || fail 'the step forward is not said'
+patiently is 1 steps || fail 'the step forward is not reported'
 date -s '3 hours ago' >/dev/null
-patiently is 2 steps || fail 'the step back is not said'
+patiently is 2 steps || fail 'the step back is not reported'
 sleep 1
 rapid_stop
 date -s '2 hours' >/dev/null
@@ -53,7 +53,7 @@ kept moved /tmp/elsewhere
 
 record /tmp/removed
 rm -r /tmp/removed
-await_rapid 60 removed || fail 'the removal is not said'
+await_rapid 60 removed || fail 'the removal is not reported'
 sleep 1
 rapid_stop
 kept removed /tmp/removed
@@ -63,7 +63,7 @@ mount -t tmpfs -o size=24m small /tmp/small
 record /tmp/small/rec
 head -c 18M /dev/zero >/tmp/small/fill 2>/dev/null
 ended() { ! kill -0 $rapid_pid; }
-wait_for 60 ended || fail 'a run on a full disk goes on'
+wait_for 60 ended || fail 'a run on a full disk does not end'
 rapid_wait
 kept full /tmp/small/rec
 refused next /tmp/small/rec
@@ -119,7 +119,7 @@ fn clock(outcome: &Outcome) {
 /// Another program takes the last byte: warned of beforehand, closed whole, the next refused, and so is one on a disk that takes no bytes.
 fn full(outcome: &Outcome) {
     let printed = json_lines(&outcome.file("full.jsonl"));
-    assert!(printed.iter().any(|line| line["event"] == "disk_low"), "nearly full is not said");
+    assert!(printed.iter().any(|line| line["event"] == "disk_low"), "nearly full is not reported");
     let ended = printed.iter().find(|line| line["event"] == "episode").expect("the episode's end");
     println!("{ended}");
     // A busy machine may have given reasons of its own.

@@ -33,7 +33,7 @@ watcher=$!
 rapid_start --headless --record --out $out/rec --config /tmp/bench/devices.toml --json
 await_rapid 60 '"event":"recording"' || fail 'not recording'
 emu plug 0 1 2
-# A bus is quiet until somebody sends.
+# A bus is quiet until a program sends.
 wait_for 30 test -e /sys/class/net/can0 || fail 'no interface'
 emu flood 0 50
 emu flood 1 50
@@ -41,7 +41,7 @@ for device in bus slcan damiao; do
   wait_for 60 states 1 $device streaming || fail "$device does not stream"
 done
 "${rapid[@]}" arm || fail 'rapid takes no order'
-wait_for 30 told motor_enabled '"device":2' || fail 'the motor is not enabled'
+wait_for 30 logged motor_enabled '"device":2' || fail 'the motor is not enabled'
 sleep 2
 mark full
 emu flood 0 8000
@@ -60,7 +60,7 @@ exit 0
 
 fn printed(outcome: &Outcome, word: &str) -> u64 {
     let line = outcome.emu.iter().find(|line| line["action"] == "say" && line["word"] == word);
-    line.and_then(|line| line["mono_ns"].as_u64()).unwrap_or_else(|| panic!("nobody said {word}"))
+    line.and_then(|line| line["mono_ns"].as_u64()).unwrap_or_else(|| panic!("no word {word}"))
 }
 
 #[test]
@@ -114,7 +114,7 @@ fn a_full_bus_is_recorded_and_disturbs_no_other_device() {
     let rows = episode.rows("/rapid/damiao");
     assert!(!rows.is_empty() && rows.iter().all(|row| row.len() == 6), "{} rows of the motor", rows.len());
     let off = |line: &&Value| line["action"] == "motor_disabled" && line["device"] == 2;
-    assert!(outcome.emu.iter().any(|line| off(&line)), "the motor was not told to turn off");
+    assert!(outcome.emu.iter().any(|line| off(&line)), "the motor got no command to turn off");
 }
 
 #[test]

@@ -48,18 +48,18 @@ modprobe uinput
 mkfifo /tmp/keys
 "${usbemu[@]}" --keys 'bench pedal' KEY_B 0<>/tmp/keys >$out/keys 2>&1 &
 exec 8>/tmp/keys
-wait_for 30 said $out/keys ready || fail "no keys: $(cat $out/keys)"
+wait_for 30 has_line $out/keys ready || fail "no keys: $(cat $out/keys)"
 key() { echo "$1 KEY_B" >&8; }
-stop_is() { said $out/rapid.jsonl '"event":"stop"' "\"stop\":\"$1\"" "\"state\":\"$2\""; }
+stop_is() { has_line $out/rapid.jsonl '"event":"stop"' "\"stop\":\"$1\"" "\"state\":\"$2\""; }
 # stops N STOP STATE: this state of the stop was reported N times at least.
 stops() { [ "$(grep -F '"event":"stop"' $out/rapid.jsonl | grep -F "\"stop\":\"$2\"" | grep -cF "\"state\":\"$3\"")" -ge "$1" ]; }
 # arm WORD: what follows is of this round.
 arm() {
   mark $1
   wait_for 30 "${rapid[@]}" arm || fail "$1: $("${rapid[@]}" arm 2>&1)"
-  wait_for 30 told motor_enabled || fail "$1: not enabled"
-  wait_for 30 told gpio '"line":0' '"level":1' || fail "$1: the brake is not released"
-  wait_for 30 told commands_begin || fail "$1: no commands"
+  wait_for 30 logged motor_enabled || fail "$1: not enabled"
+  wait_for 30 logged gpio '"line":0' '"level":1' || fail "$1: the brake is not released"
+  wait_for 30 logged commands_begin || fail "$1: no commands"
   mark $1.armed
 }
 # Its number is another one after a plug, while the kernel remembers who had its lines.
@@ -84,7 +84,7 @@ wait_for 30 stops 1 pedal runs || fail 'the pedal is not pressed'
 emu zero 0.5 1.3
 emu_done 10
 "${rapid[@]}" arm || fail 'rapid takes no order'
-actuator() { said $out/rapid.jsonl '"event":"actuator"' "$1"; }
+actuator() { has_line $out/rapid.jsonl '"event":"actuator"' "$1"; }
 wait_for 30 actuator 'outside its limits' || fail 'armed outside the limits'
 mark back
 "${rapid[@]}" arm --drive-back || fail 'rapid takes no order'
@@ -96,14 +96,14 @@ wait_for 30 actuator 'motors are disabled' || fail 'not disarmed'
 
 arm door
 emu level 1.2 1
-wait_for 30 told motor_disabled || fail 'the door stops nothing'
+wait_for 30 logged motor_disabled || fail 'the door stops nothing'
 emu level 1.2 0
 wait_for 30 stops 2 door runs || fail 'the door is not closed again'
 
 arm pedal
 key release
-wait_for 30 told motor_disabled || fail 'the pedal stops nothing'
-wait_for 30 told gpio '"line":0' '"level":0' || fail 'the brake is not engaged after a disarm'
+wait_for 30 logged motor_disabled || fail 'the pedal stops nothing'
+wait_for 30 logged gpio '"line":0' '"level":0' || fail 'the brake is not engaged after a disarm'
 key press
 wait_for 30 stops 2 pedal runs || fail 'the pedal is not pressed again'
 
@@ -111,9 +111,9 @@ arm grabbed
 node=$(grep -l 'bench pedal' /sys/class/input/event*/device/name)
 "${usbemu[@]}" --grab /dev/input/$(basename ${node%/device/name}) >$out/grab 2>&1 &
 grab=$!
-wait_for 30 said $out/grab grabbed || fail "not grabbed: $(cat $out/grab)"
+wait_for 30 has_line $out/grab grabbed || fail "not grabbed: $(cat $out/grab)"
 key release
-wait_for 30 told motor_disabled || fail 'a pedal that another program has grabbed stops nothing'
+wait_for 30 logged motor_disabled || fail 'a pedal that another program has grabbed stops nothing'
 key press
 wait_for 30 stops 3 pedal runs || fail 'a grabbed pedal is not seen to be pressed'
 kill $grab
@@ -121,12 +121,12 @@ kill $grab
 arm unplugged
 emu unplug 1
 wait_for 30 stops 1 door lost || fail 'the chip is not missed'
-lost() { said $out/rapid.log 'the brake cannot be driven'; }
+lost() { has_line $out/rapid.log 'the brake cannot be driven'; }
 wait_for 30 lost || fail 'the brake is not missed'
 sleep 1
-told motor_disabled && fail 'a joint whose brake is not known to hold was let go'
+logged motor_disabled && fail 'a joint whose brake is not known to hold was disabled'
 "${rapid[@]}" disarm || fail 'no disarm'
-wait_for 30 told motor_disabled || fail 'not disarmed'
+wait_for 30 logged motor_disabled || fail 'not disarmed'
 "${rapid[@]}" arm >$out/refused.lost 2>&1 && fail 'armed without the door'
 emu plug 1
 emu level 1.2 0
@@ -135,7 +135,7 @@ wait_for 30 stops 3 door runs || fail 'the chip is not found again'
 arm killed
 kill -KILL $rapid_pid
 mark dead
-wait_for 60 told motor_disabled || fail 'nothing stops a motor without rapid'
+wait_for 60 logged motor_disabled || fail 'nothing stops a motor without rapid'
 wait $rapid_pid
 gone() { ! pgrep -x motor-guard >/dev/null; }
 wait_for 30 gone || fail 'the guard is left'

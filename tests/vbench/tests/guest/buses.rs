@@ -36,7 +36,7 @@ can() { "${usbemu[@]}" --can can0 "$@"; }
 state() { ip -details link show can0 | sed -n 's/.* state \([A-Z-]*\) .*restart-ms.*/\1/p; s/.*can state \([A-Z-]*\) .*/\1/p' | head -n 1; }
 can_up can0
 udevadm info --query=property --path=/sys/class/net/can0 >$out/can0
-# A zero, a parameter, enable, go to 1 rad, there it is, disable, another motor, nobody.
+# A zero, a parameter, enable, go to 1 rad, at 1 rad, disable, another motor, an unused id.
 can 005#7fff7ff0000007ff 7ff#0500331600000000 005#fffffffffffffffc 005#8a3c7ff0520007ff >$out/answers
 sleep 1
 can 7ff#0500cc0000000000 005#fffffffffffffffd 006#7fff7ff0000007ff 007#7fff7ff0000007ff >>$out/answers
@@ -68,7 +68,7 @@ stream_pid=$!
 sleep 1
 emu unplug 0
 wait $stream_pid
-wait_for 10 said $out/emu.jsonl motor_timeout || fail 'the motor did not give up'
+wait_for 10 has_line $out/emu.jsonl motor_timeout || fail 'the motor did not give up'
 emu plug 0
 wait_for 30 test -e /sys/class/net/can0 || fail 'can0 did not come back'
 udevadm settle
@@ -110,7 +110,7 @@ exit 0
     let position = |answer: &str| u16::from_str_radix(&answer[6..10], 16).unwrap();
     assert!(position(answers[4]).abs_diff(0x8a3c) <= 2, "{answers:?}: 1 rad is 8a3c");
     assert!(answers[5].starts_with("015#05") && answers[6].starts_with("016#06"), "{answers:?}");
-    assert_eq!(answers[7], "-", "nobody has this id");
+    assert_eq!(answers[7], "-", "no motor has this id");
     let faults = outcome.file("faults");
     let faults: Vec<&str> = faults.lines().collect();
     assert!(faults[0].starts_with("015#d5"), "{faults:?}");
@@ -133,7 +133,7 @@ exit 0
     let last = ends.iter().find(|line| line["count"].as_u64().unwrap() > 20).expect("a run of commands");
     let last_ns = last["last_mono_ns"].as_u64().unwrap();
     assert!(gave_up >= last_ns + silent_ns, "it gave up after {} ms", (gave_up - last_ns) / 1_000_000);
-    assert!(last_ns <= gone, "commands went on when the adapter was gone");
+    assert!(last_ns <= gone, "commands continued when the adapter was gone");
     assert!(outcome.file("after").starts_with("015#d5"), "{}", outcome.file("after"));
 
     assert_eq!(outcome.file("slcan"), ";;;z;t0158057FFF7FF7FF1E1E;");

@@ -67,7 +67,7 @@ for device in cam_raw force; do
 done
 wait_for 60 states 1 cam_wide failed || fail 'cam_wide does not fail'
 "${rapid[@]}" --headless --duration 1s $config >$out/second.txt 2>&1; echo $? >$out/second.rc
-# Held by rapid: nobody else can stream from it.
+# Held by rapid: no other program can stream from it.
 "${usbemu[@]}" --read /dev/rapid/cam_raw 1 >$out/held.txt 2>&1
 sleep 2
 rapid_stop

@@ -54,6 +54,6 @@ fn programs_that_behave_badly_do_not_hold_up_the_mask() {
         states("crashing")
     );
     assert!(says("crashing: Error: \"crashes after 50 samples") >= 5);
-    assert_eq!(states("flooding"), ["opening", "streaming"], "it goes on");
+    assert_eq!(states("flooding"), ["opening", "streaming"], "it continues");
     assert!(says("flooding: prints too much") > 0);
 }

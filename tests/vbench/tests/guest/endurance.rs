@@ -64,7 +64,7 @@ fn ninety_cycles_leave_the_truth_and_nothing_else() {
 const SCRIPT: &str = r#"
 # The threads of the pool that opens devices end when they have been idle for some seconds.
 rest() { wait_for 60 is $threads held task || fail "$(held task) threads instead of $threads"; }
-# agreed MASK: this is what is plugged once the emulator has done what it was told, and what rapid says before long.
+# agreed MASK: this is plugged once the emulator has done its commands, and rapid reports it soon after.
 agreed() {
   emu_done 120
   wait_for 90 is $1 published mask || fail "the mask is $(published mask) instead of $1"

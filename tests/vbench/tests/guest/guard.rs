@@ -34,13 +34,13 @@ for round in 0:socketcan:KILL 1:slcan:KILL 2:damiao:KILL 0:socketcan:STOP; do
   wait_for 60 states 1 arm streaming || fail "$kind: the motor does not stream"
   mark $kind.$signal
   "${rapid[@]}" arm || fail 'rapid takes no order'
-  wait_for 30 told motor_enabled "\"device\":$device" || fail "$kind: the motor is not enabled"
-  wait_for 30 told commands_begin "\"device\":$device" || fail "$kind: no commands"
+  wait_for 30 logged motor_enabled "\"device\":$device" || fail "$kind: the motor is not enabled"
+  wait_for 30 logged commands_begin "\"device\":$device" || fail "$kind: no commands"
   sleep 1
   mark $kind.$signal.killed
   awk '{ printf "%.0f\n", $1 * 1e9 }' /proc/uptime >$out/$kind.$signal
   kill -$signal $rapid_pid
-  wait_for 60 told motor_disabled "\"device\":$device" || fail "$kind: the motor was not disabled"
+  wait_for 60 logged motor_disabled "\"device\":$device" || fail "$kind: the motor was not disabled"
   # Longer than the motor's own limit.
   sleep 4
   emu ask $device

@@ -21,7 +21,7 @@ await_rapid 60 '"event":"recording"' || fail 'not recording'
 emu plug 0 1
 wait_for 60 states 1 lidar streaming || fail 'the lidar does not stream'
 wait_for 60 states 1 gopro streaming || fail 'the camera does not stream'
-wait_for 30 told http shutter/start || fail 'the shutter was not started'
+wait_for 30 logged http shutter/start || fail 'the shutter was not started'
 sleep 4
 emu unplug 1
 wait_for 30 states 1 lidar absent || fail 'the lidar is still there'
@@ -110,7 +110,7 @@ fn packets(outcome: &Outcome, episode: &Recording) {
     let pulled = outcome.actions("unplug", 1)[0].real_ns;
     let printed = |word: &str| {
         let line = outcome.emu.iter().find(|line| line["action"] == "say" && line["word"] == word);
-        line.and_then(|line| line["real_ns"].as_u64()).unwrap_or_else(|| panic!("nobody said {word}"))
+        line.and_then(|line| line["real_ns"].as_u64()).unwrap_or_else(|| panic!("no word {word}"))
     };
     let (down, up) = (printed("down"), printed("up"));
     assert_eq!(fell.len(), 2, "the adapter was pulled, and then its cable: {edges:?}");
@@ -124,7 +124,7 @@ fn packets(outcome: &Outcome, episode: &Recording) {
     assert!(rose.len() == 2 && rose[0] < down && rose[1] >= up, "it rose with each return: {edges:?}");
     assert_eq!(falls(&edges, 0), Vec::<u64>::new(), "the camera's bit");
     let reported = outcome.file("first.jsonl");
-    assert!(reported.contains("the network link is down"), "nobody says why: {reported}");
+    assert!(reported.contains("the network link is down"), "the reason is not reported: {reported}");
     let witness = |event: &&str| event.contains("\"event\":\"detach\"") && event.contains("\"witness\":\"link\"");
     assert_eq!(reported.lines().filter(witness).count(), 1, "the pulled cable has its witness: {reported}");
     let comes = |line: &&str| line.contains("\"event\":\"attach\"") && line.contains("\"bit\":1");

@@ -24,9 +24,9 @@ motors = [
 
 const SCRIPT: &str = r#"
 arm() { "${rapid[@]}" arm || fail 'rapid takes no order'; }
-# both ACTION: since the last mark both motors have told this.
-both() { told $1 '"motor":5' && told $1 '"motor":6'; }
-actuator() { said $out/rapid.jsonl '"event":"actuator"' "\"arming\":\"$1\""; }
+# both ACTION: since the last mark both motors have logged this.
+both() { logged $1 '"motor":5' && logged $1 '"motor":6'; }
+actuator() { has_line $out/rapid.jsonl '"event":"actuator"' "\"arming\":\"$1\""; }
 # again WORD: marks, arms, and waits until both are enabled.
 again() {
   sleep 1
@@ -59,19 +59,19 @@ sleep 3
 again replugged
 mark fault
 emu fault 0.5 a
-wait_for 20 told motor_disabled '"motor":6' || fail 'the other motor was not disabled'
-wait_for 20 actuator faulted || fail 'no word of the fault'
+wait_for 20 logged motor_disabled '"motor":6' || fail 'the other motor was not disabled'
+wait_for 20 actuator faulted || fail 'the fault is not reported'
 sleep 2
 again faulted
 mark silence
 emu mute 0.6 1
-wait_for 20 told motor_disabled '"motor":5' || fail 'silence disables nobody'
+wait_for 20 logged motor_disabled '"motor":5' || fail 'silence disables no motor'
 sleep 1
 emu mute 0.6 0
-again spoke
+again answered
 mark heat
 emu hot 0.6 95
-wait_for 20 told motor_disabled '"motor":5' || fail 'heat disables nobody'
+wait_for 20 logged motor_disabled '"motor":5' || fail 'heat disables no motor'
 sleep 1
 emu hot 0.6 30
 again cooled
@@ -88,7 +88,7 @@ exit 0
 fn between<'a>(outcome: &'a Outcome, from: &str, to: &str) -> &'a [Value] {
     let place = |word: &str| {
         let place = outcome.emu.iter().position(|line| line["action"] == "say" && line["word"] == word);
-        place.unwrap_or_else(|| panic!("nobody said {word}"))
+        place.unwrap_or_else(|| panic!("no word {word}"))
     };
     let to = if to.is_empty() { outcome.emu.len() } else { place(to) };
     &outcome.emu[place(from)..to]
@@ -132,7 +132,7 @@ fn motors_move_after_an_arm_and_at_no_other_time() {
     assert!(commands > 400, "{commands} commands");
     for run in moving {
         println!("motor {}: {run}", run["motor"]);
-        // 2 rad/s over the longest time in which it heard nothing, and two cycles of 10 ms; an action that is not slewed is
+        // 2 rad/s over the longest time in which it received nothing, and two cycles of 10 ms; an action that is not slewed is
         // 0.15 from the one before.
         let silent = run["longest_gap_ns"].as_f64().unwrap() / 1e9;
         assert!(run["largest_step"].as_f64().unwrap() <= 2.0 * (silent + 0.02) + 0.001, "{run}");
@@ -140,7 +140,7 @@ fn motors_move_after_an_arm_and_at_no_other_time() {
         assert!(last <= gone.mono_ns, "commands {} ms after the adapter was gone", ms(last, gone.mono_ns));
     }
 
-    // The replug alone enables nothing, though actions went on.
+    // The replug alone enables nothing, though actions continued.
     let replugged = between(&outcome, "pulled", "replugged");
     assert_eq!(actions(replugged, "can_up").len(), 1, "the adapter came up again");
     for action in ["motor_enabled", "commands_begin"] {
@@ -154,11 +154,11 @@ fn motors_move_after_an_arm_and_at_no_other_time() {
     assert!(rose.last().is_some_and(|rose| *rose >= outcome.actions("plug", 0)[1].real_ns), "{edges:?}");
 
     // Each trouble disables both, and nothing enables them before the next arm.
-    for (trouble, arm) in [("fault", "faulted"), ("silence", "spoke"), ("heat", "cooled")] {
+    for (trouble, arm) in [("fault", "faulted"), ("silence", "answered"), ("heat", "cooled")] {
         let lines = between(&outcome, trouble, arm);
         assert_eq!(actions(lines, "motor_enabled"), Vec::<&Value>::new(), "{trouble}");
         for motor in [5, 6] {
-            // One that is silent hears nothing either, and gives up by itself.
+            // A silent one receives nothing either, and times out by itself.
             let is_off = |line: &Value| line["action"] == "motor_disabled" || line["action"] == "motor_timeout";
             assert!(
                 lines.iter().any(|line| line["motor"] == motor && is_off(line)),
@@ -173,7 +173,7 @@ fn motors_move_after_an_arm_and_at_no_other_time() {
         ["shoulder reports over-current:", "gripper does not answer:", "gripper have 95 °C, more than 80 °C:"]
     {
         let reported = faulted.iter().any(|text| text.contains(trouble) && text.ends_with("all motors are stopped"));
-        assert!(reported, "{trouble} is not told in {faulted:#?}");
+        assert!(reported, "{trouble} is not reported in {faulted:#?}");
     }
 
     // SIGTERM: both were turned off before the program ended, and no command came after.
@@ -183,7 +183,7 @@ fn motors_move_after_an_arm_and_at_no_other_time() {
             actions(end, action).into_iter().filter(|line| line["motor"] == motor).collect()
         };
         let off = reported("motor_disabled").first().and_then(|line| line["mono_ns"].as_u64());
-        let off = off.unwrap_or_else(|| panic!("motor {motor} was not told to turn off"));
+        let off = off.unwrap_or_else(|| panic!("motor {motor} got no command to turn off"));
         assert!(reported("motor_timeout").is_empty(), "motor {motor} had to give up by itself");
         let runs = reported("commands_end");
         assert!(!runs.is_empty(), "motor {motor} had commands until the end");

@@ -238,7 +238,7 @@ fn equal_units_keep_their_entries() {
     assert_whole(&episode, moved.1, replugged..);
 }
 
-/// A camera that stops sending without leaving is stalled, not absent: the mask speaks of plugs, not of data.
+/// A camera that stops sending without leaving is stalled, not absent: the mask shows plugs, not data.
 #[test]
 fn silence_is_not_absence() {
     let outcome = recorded(

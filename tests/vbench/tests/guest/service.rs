@@ -25,7 +25,7 @@ useradd --no-create-home keeper || fail 'no user'
 useradd --no-create-home stranger || fail 'no user'
 as() { setpriv --reuid="$1" --regid="$1" --init-groups "${@:2}"; }
 
-# As the README and the unit's first lines say.
+# As in the README and the unit's first lines.
 if [ ${#rapid[@]} = 1 ]; then
   install -m 755 "${rapid[0]}" /usr/local/bin/rapid
 else

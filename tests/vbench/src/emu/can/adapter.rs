@@ -1,4 +1,4 @@
-//! A USB adapter for a CAN bus: gs_usb, or a serial line that speaks slcan or Damiao's framing.
+//! A USB adapter for a CAN bus: gs_usb, or a serial line that uses slcan or Damiao's framing.
 //!
 //! Invariant: a frame of the host's reaches the bus only while the adapter is on it, at the bus's own rate, and not bus-off.
 
@@ -10,7 +10,7 @@ use super::Frame;
 use super::bus::{Bus, MotorSpec};
 use super::damiao::{self, Damiao};
 use super::gsusb::{self, FROM_THE_BUS, HOST_FRAME, Request};
-use super::slcan::{Heard, Slcan};
+use super::slcan::{Received, Slcan};
 use crate::emu::descriptor::{Answer, BULK_PACKET, Configuration, DeviceClass, Setup};
 use crate::emu::function::DATA_IN;
 use crate::emu::order::Order;
@@ -24,7 +24,7 @@ const DATA_OUT: u8 = 0x02;
 /// What an adapter can hold for a host that does not fetch it; more is lost, and reported.
 const OUTBOX: usize = 64 * 1024;
 
-/// How the adapter speaks with the host.
+/// The adapter's protocol with the host.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Protocol {
     /// gs_usb: a network interface `can0`.
@@ -125,11 +125,11 @@ impl Adapter {
         for byte in text {
             let Speech::Slcan(_, slcan) = &mut self.speech else { return };
             let (mut answer, mut what) = (Vec::new(), None);
-            slcan.hear(&[*byte], &mut answer, |heard| what = Some(heard));
+            slcan.hear(&[*byte], &mut answer, |received| what = Some(received));
             self.outbox.extend(answer);
             match what {
-                Some(Heard::Open(rate)) => self.join(rate),
-                Some(Heard::Frame(frame)) => self.send(FROM_THE_BUS, frame, now_ns),
+                Some(Received::Open(rate)) => self.join(rate),
+                Some(Received::Frame(frame)) => self.send(FROM_THE_BUS, frame, now_ns),
                 None => {}
             }
         }

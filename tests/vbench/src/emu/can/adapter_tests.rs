@@ -112,7 +112,7 @@ fn a_motor_keeps_moving_when_the_adapter_is_pulled() {
 fn generated_frames_fill_transfers() {
     let mut adapter = adapter(Protocol::Slcan);
     adapter.befall(None, Order::Flood(8_000.0), 0);
-    assert_eq!(taken(&mut adapter, 10 * MS).len(), 0, "nobody listens");
+    assert_eq!(taken(&mut adapter, 10 * MS).len(), 0, "no host listens");
     adapter.hear(b"S8\rO\r", 10 * MS);
     let bytes: Vec<u8> = taken(&mut adapter, 20 * MS).concat();
     let lines: Vec<&[u8]> = bytes.split(|byte| *byte == b'\r').filter(|line| line.len() > 5).collect();

@@ -96,7 +96,7 @@ impl Bus {
         found
     }
 
-    /// What the bus has to tell since the last call.
+    /// What happened on the bus since the last call.
     pub fn reported(&mut self) -> impl Iterator<Item = Reported> + '_ {
         self.reported.drain(..).chain(self.motors.iter_mut().flat_map(Motor::reported))
     }

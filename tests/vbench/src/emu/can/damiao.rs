@@ -9,7 +9,7 @@ const FROM_HOST: usize = 30;
 /// Bytes of a frame to the host.
 pub const TO_HOST: usize = 16;
 const HEAD: [u8; 3] = [0x55, 0xaa, 0x1e];
-/// Send, and tell the host that it was sent.
+/// Send, and confirm it to the host.
 const FORWARD_ACKNOWLEDGED: u8 = 1;
 /// Send.
 const FORWARD: u8 = 3;
@@ -77,7 +77,7 @@ mod tests {
         0xff, 0xff, 0xff, 0xfc, 0,
     ];
 
-    fn heard(damiao: &mut Damiao, bytes: &[u8]) -> (Vec<u8>, Vec<Frame>) {
+    fn decoded(damiao: &mut Damiao, bytes: &[u8]) -> (Vec<u8>, Vec<Frame>) {
         let (mut out, mut frames) = (Vec::new(), Vec::new());
         damiao.hear(bytes, &mut out, |frame| frames.push(frame));
         (out, frames)
@@ -86,17 +86,17 @@ mod tests {
     #[test]
     fn the_vendors_frames_are_read() {
         let frame = Frame::data(5, [0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xfc]);
-        assert_eq!(heard(&mut Damiao::default(), &ENABLE), (vec![], vec![frame]));
+        assert_eq!(decoded(&mut Damiao::default(), &ENABLE), (vec![], vec![frame]));
         let mut acknowledged = ENABLE;
         acknowledged[3] = 1;
-        let (out, frames) = heard(&mut Damiao::default(), &acknowledged);
+        let (out, frames) = decoded(&mut Damiao::default(), &acknowledged);
         assert_eq!((out.len(), out[1], frames), (TO_HOST, 0x12, vec![frame]));
         let mut handshake = ENABLE;
         handshake[3] = 2;
-        assert_eq!(heard(&mut Damiao::default(), &handshake), (vec![], vec![]));
+        assert_eq!(decoded(&mut Damiao::default(), &handshake), (vec![], vec![]));
         let mut long = ENABLE;
         long[18] = 9;
-        assert_eq!(heard(&mut Damiao::default(), &long), (vec![], vec![]));
+        assert_eq!(decoded(&mut Damiao::default(), &long), (vec![], vec![]));
     }
 
     #[test]
@@ -115,7 +115,7 @@ mod tests {
         ) {
             let mut damiao = Damiao::default();
             let bytes = [&noise[..], &ENABLE, &ENABLE].concat();
-            let frames: usize = bytes.chunks(cut).map(|part| heard(&mut damiao, part).1.len()).sum();
+            let frames: usize = bytes.chunks(cut).map(|part| decoded(&mut damiao, part).1.len()).sum();
             prop_assert_eq!(frames, 2);
         }
     }

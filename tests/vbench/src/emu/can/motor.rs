@@ -5,7 +5,7 @@
 //! its commands with a lag of the first order, never faster than VMAX, and carries no load; once an order gives it a body
 //! (`plant`), it moves as that does under the torque of its loops, TMAX at the most, and without any while it is disabled.
 //!
-//! Invariant: every frame for a motor that can hear gets one answer, but for a register it does not have and a save while enabled.
+//! Invariant: every frame for a motor that can receive gets one answer, except for a missing register and a save while enabled.
 //! Invariant: it moves by itself only while it is enabled; a fault and the time-out of its own disable it until it is enabled again.
 
 use serde_json::{Value, json};
@@ -41,7 +41,7 @@ pub struct Motor {
     body: Option<Body>,
     trouble: Trouble,
     moved_ns: u64,
-    heard_ns: u64,
+    received_ns: u64,
     run: Option<Run>,
     reported: Vec<Reported>,
 }
@@ -63,7 +63,7 @@ impl Motor {
             body: None,
             trouble: Trouble::default(),
             moved_ns: 0,
-            heard_ns: 0,
+            received_ns: 0,
             run: None,
             reported: Vec::new(),
         }
@@ -84,12 +84,12 @@ impl Motor {
         self.enabled && self.powered
     }
 
-    /// What it has to tell since the last call.
+    /// Its events since the last call.
     pub fn reported(&mut self) -> impl Iterator<Item = Reported> + '_ {
         self.reported.drain(..)
     }
 
-    /// Hears a frame; its answer, if the frame is for it.
+    /// Receives a frame; its answer, if the frame is for it.
     pub fn hear(&mut self, frame: &Frame, now_ns: u64) -> Option<Frame> {
         if frame.extended || frame.remote || frame.len() != 8 || self.muted || !self.powered {
             return None;
@@ -101,11 +101,11 @@ impl Motor {
         match (frame.id, mode) {
             (PARAMETERS, _) => {
                 (u32::from(u16::from_le_bytes([bytes[0], bytes[1]])) == slave).then_some(())?;
-                self.heard_ns = now_ns;
+                self.received_ns = now_ns;
                 self.parameter(bytes)
             }
             (_, Some(mode @ 1..=4)) => {
-                self.heard_ns = now_ns;
+                self.received_ns = now_ns;
                 match bytes {
                     [0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, word @ 0xfb..=0xfe] => self.switch(word),
                     _ if mode == self.registers.mode => self.command(bytes, now_ns),
@@ -124,9 +124,9 @@ impl Motor {
         let mut due_ns = None;
         if let Some(patience) = silence {
             let patience_ns = u64::try_from(patience.as_nanos()).unwrap_or(u64::MAX);
-            let give_up_ns = self.heard_ns.saturating_add(patience_ns);
+            let give_up_ns = self.received_ns.saturating_add(patience_ns);
             if now_ns >= give_up_ns {
-                self.tell("motor_timeout", json!({"after_ns": patience_ns, "last_heard_ns": self.heard_ns}));
+                self.tell("motor_timeout", json!({"after_ns": patience_ns, "last_received_ns": self.received_ns}));
                 self.latch(COMMUNICATION_LOST);
             } else {
                 due_ns = Some(give_up_ns);

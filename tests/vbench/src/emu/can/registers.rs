@@ -1,7 +1,7 @@
 //! The parameters of a Damiao motor: read, written and saved over the bus by register number (RID).
 //!
 //! Numbers, types and the table of limits as in the vendor's `DM_CAN.py` and LeRobot's `motors/damiao/tables.py`. The unit of
-//! TIMEOUT, 50 us, is what public drivers take it for; neither of the two says.
+//! TIMEOUT, 50 us, is what public drivers take it for; neither of the two states it.
 
 use std::time::Duration;
 

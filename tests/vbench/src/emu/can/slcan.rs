@@ -1,4 +1,4 @@
-//! slcan, the ASCII protocol of serial CAN adapters (LAWICEL CAN232; what the kernel's `slcan` and `slcand` speak).
+//! slcan, the ASCII protocol of serial CAN adapters (LAWICEL CAN232; what the kernel's `slcan` and `slcand` use).
 //!
 //! Invariant: a command is answered by a carriage return, or by a bell when it is none or comes at the wrong time.
 
@@ -21,7 +21,7 @@ pub struct Slcan {
 
 /// What a byte of the host's led to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Heard {
+pub enum Received {
     /// The channel was opened at this many bits a second, or closed.
     Open(Option<u32>),
     /// A frame for the bus.
@@ -29,13 +29,13 @@ pub enum Heard {
 }
 
 impl Slcan {
-    /// Takes what the host sent; answers go to `out`, the rest to `heard`.
-    pub fn hear(&mut self, bytes: &[u8], out: &mut Vec<u8>, mut heard: impl FnMut(Heard)) {
+    /// Takes what the host sent; answers go to `out`, the rest to `received`.
+    pub fn hear(&mut self, bytes: &[u8], out: &mut Vec<u8>, mut received: impl FnMut(Received)) {
         for byte in bytes {
             match byte {
                 b'\r' => {
                     let line = std::mem::take(&mut self.line);
-                    heard_of(self.command(&line, out), &mut heard);
+                    pass_on(self.command(&line, out), &mut received);
                 }
                 // Hosts send line ends of all kinds in front of a command, to end what was there before.
                 b'\n' if self.line.is_empty() => {}
@@ -52,26 +52,26 @@ impl Slcan {
         }
     }
 
-    fn command(&mut self, line: &[u8], out: &mut Vec<u8>) -> Option<Heard> {
+    fn command(&mut self, line: &[u8], out: &mut Vec<u8>) -> Option<Received> {
         let Some((word, rest)) = line.split_first() else {
             out.push(OK);
             return None;
         };
-        let (answer, heard): (&[u8], _) = match (word, rest, self.open) {
+        let (answer, received): (&[u8], _) = match (word, rest, self.open) {
             (b'S', [digit @ b'0'..=b'8'], false) => {
                 self.rate = Some(RATES[usize::from(digit - b'0')]);
                 (&[OK], None)
             }
             (b'O', [], false) if self.rate.is_some() => {
                 self.open = true;
-                (&[OK], Some(Heard::Open(self.rate)))
+                (&[OK], Some(Received::Open(self.rate)))
             }
             (b'C', [], _) => {
                 let was_open = std::mem::take(&mut self.open);
-                (&[OK], was_open.then_some(Heard::Open(None)))
+                (&[OK], was_open.then_some(Received::Open(None)))
             }
             (b't' | b'T' | b'r' | b'R', _, true) => match decode(line) {
-                Some(frame) => (if frame.extended { b"Z\r" } else { b"z\r" }, Some(Heard::Frame(frame))),
+                Some(frame) => (if frame.extended { b"Z\r" } else { b"z\r" }, Some(Received::Frame(frame))),
                 None => (&[BELL], None),
             },
             (b'V', [], _) => (b"V1013\r", None),
@@ -82,13 +82,13 @@ impl Slcan {
             _ => (&[BELL], None),
         };
         out.extend_from_slice(answer);
-        heard
+        received
     }
 }
 
-fn heard_of(what: Option<Heard>, heard: &mut impl FnMut(Heard)) {
+fn pass_on(what: Option<Received>, received: &mut impl FnMut(Received)) {
     if let Some(what) = what {
-        heard(what);
+        received(what);
     }
 }
 
@@ -139,10 +139,10 @@ mod tests {
     use super::*;
     use crate::emu::can::strategies;
 
-    fn talk(slcan: &mut Slcan, bytes: &[u8]) -> (Vec<u8>, Vec<Heard>) {
-        let (mut out, mut heard) = (Vec::new(), Vec::new());
-        slcan.hear(bytes, &mut out, |what| heard.push(what));
-        (out, heard)
+    fn talk(slcan: &mut Slcan, bytes: &[u8]) -> (Vec<u8>, Vec<Received>) {
+        let (mut out, mut received) = (Vec::new(), Vec::new());
+        slcan.hear(bytes, &mut out, |what| received.push(what));
+        (out, received)
     }
 
     #[test]
@@ -152,23 +152,23 @@ mod tests {
         let mut nothing = Vec::new();
         slcan.tell(&frame, &mut nothing);
         assert_eq!(nothing, b"", "a closed channel is silent");
-        let cases: [(&[u8], &[u8], &[Heard]); 12] = [
+        let cases: [(&[u8], &[u8], &[Received]); 12] = [
             (b"\r\r", b"\r\r", &[]),
             (b"O\r", b"\x07", &[]),
             (b"C\r", b"\r", &[]),
             (b"S6", b"", &[]),
             (b"\r", b"\r", &[]),
             (b"t0052ABCD\r", b"\x07", &[]),
-            (b"O\r", b"\r", &[Heard::Open(Some(500_000))]),
-            (b"t0052ABcd\r", b"z\r", &[Heard::Frame(frame)]),
+            (b"O\r", b"\r", &[Received::Open(Some(500_000))]),
+            (b"t0052ABcd\r", b"z\r", &[Received::Frame(frame)]),
             (b"S8\r", b"\x07", &[]),
             (b"t0052AB\rx\rt8000\r", b"\x07\x07\x07", &[]),
             (b"R1234567Q4\r", b"\x07", &[]),
-            (b"C\rC\r", b"\r\r", &[Heard::Open(None)]),
+            (b"C\rC\r", b"\r\r", &[Received::Open(None)]),
         ];
-        for (bytes, out, heard) in cases {
+        for (bytes, out, received) in cases {
             let found = talk(&mut slcan, bytes);
-            assert_eq!(found, (out.to_vec(), heard.to_vec()), "{:?}", String::from_utf8_lossy(bytes));
+            assert_eq!(found, (out.to_vec(), received.to_vec()), "{:?}", String::from_utf8_lossy(bytes));
         }
     }
 

@@ -17,7 +17,7 @@ pub const PORT: u16 = 8080;
 const FOLDER: &str = "100GOPRO";
 /// From the stop of the shutter to the clip's being there.
 const FINISHING_NS: u64 = 700_000_000;
-/// The smallest box that makes a file an MP4 to whoever looks.
+/// The smallest box by which a file is recognized as MP4.
 const HEAD: [u8; 24] = *b"\0\0\0\x18ftypmp41\0\0\0\0mp41isom";
 
 /// The camera.
@@ -53,7 +53,7 @@ impl Gopro {
         reply
     }
 
-    /// What it has to tell since the last call.
+    /// Its events since the last call.
     pub fn reported(&mut self) -> impl Iterator<Item = Reported> + '_ {
         self.reported.drain(..)
     }

@@ -1,4 +1,4 @@
-//! As much HTTP/1.1 as a camera's server speaks: GET, one answer a connection, ranges from a byte on.
+//! The part of HTTP/1.1 that a camera's server uses: GET, one answer a connection, ranges from a byte on.
 //!
 //! Invariant: no request panics; one that is not understood is answered 400.
 

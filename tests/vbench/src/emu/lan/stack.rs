@@ -220,12 +220,12 @@ struct Wire {
 }
 
 impl Device for Wire {
-    type RxToken<'a> = Heard;
+    type RxToken<'a> = Received;
     type TxToken<'a> = Room<'a>;
 
-    fn receive(&mut self, _now: Instant) -> Option<(Heard, Room<'_>)> {
+    fn receive(&mut self, _now: Instant) -> Option<(Received, Room<'_>)> {
         let frame = self.inbound.pop_front()?;
-        Some((Heard(frame), Room(&mut self.outbound)))
+        Some((Received(frame), Room(&mut self.outbound)))
     }
 
     fn transmit(&mut self, _now: Instant) -> Option<Room<'_>> {
@@ -240,9 +240,9 @@ impl Device for Wire {
     }
 }
 
-struct Heard(Vec<u8>);
+struct Received(Vec<u8>);
 
-impl phy::RxToken for Heard {
+impl phy::RxToken for Received {
     fn consume<R, F: FnOnce(&[u8]) -> R>(self, f: F) -> R {
         f(&self.0)
     }
