@@ -3,7 +3,7 @@
 //! An event service of the topic's name wakes it; an action of a program that does not notify is found by the clock.
 //!
 //! Invariant: once this process, which runs a policy, has published an action, those of other programs move nothing.
-//! Invariant: what is no list of at most [`MAX_ACTION`] finite numbers is no action, whoever published it.
+//! Invariant: what is no list of at most [`MAX_ACTION`] finite numbers is no action, whatever its publisher.
 
 use std::os::fd::{BorrowedFd, OwnedFd};
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -14,7 +14,7 @@ use super::leftovers::Files;
 use super::service::Service;
 use super::{BusError, place, room, sigbus};
 
-/// Whoever looks through the files takes milliseconds.
+/// A process that looks through the files takes milliseconds.
 const TURN_LIMIT: Duration = Duration::from_millis(500);
 const TURN_LOOK: Duration = Duration::from_millis(5);
 /// How long another process may take to fill a file that it has made.

@@ -2,7 +2,7 @@
 //!
 //! iceoryx2 0.10 keeps a bus in `/dev/shm` and in a folder of its own. It gives back what a killed process held
 //! node by node, reading the files of both: what is damaged stays for ever, makes every start fail, or holds it
-//! for ever. Here no file is read to be removed: its name says whose it is, and a lock whether that process lives.
+//! for ever. Here no file is read to be removed: its name shows whose it is, and a lock whether that process lives.
 //!
 //! Names, below a prefix that ends in `_`: `<hash>_<port>.data`, `<hash>_<sender>_<receiver>.connection`,
 //! `<hash>_<port>.event_mgmt` and `<hash>_<service>.dynamic` in `/dev/shm`; `<port>.event`,
@@ -74,7 +74,7 @@ impl Files {
     /// When something that is no use to anybody cannot be removed, or something damaged may be in use.
     pub(super) fn clear(&self, patience: Duration) -> Result<(), BusError> {
         let until = Instant::now() + patience;
-        // First the files, then who lives: whoever begins meanwhile has made none of these.
+        // First the files, then the processes: one that begins meanwhile has made none of these.
         let entries = self.entries();
         let living = self.living(&entries);
         for Entry { path, used } in entries {
@@ -97,7 +97,7 @@ impl Files {
     /// everybody. They do without where it cannot be made.
     pub(super) fn make_counter(&self) {
         let path = Path::new(room::PLACE).join(format!("{}{COUNTER}", self.prefix));
-        // Whoever finds it while it has this mode waits.
+        // A process that finds it with this mode waits.
         let flags = OFlags::WRONLY | OFlags::CREATE | OFlags::EXCL | OFlags::NOFOLLOW | OFlags::CLOEXEC;
         let Ok(file) = rustix::fs::open(&path, flags, Mode::WUSR).map(File::from) else { return };
         let mut content = [0; 16];
@@ -216,7 +216,7 @@ impl Files {
         let flags = OFlags::RDWR | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::NOCTTY | OFlags::CLOEXEC;
         let asked = Flock::from(FlockType::WriteLock);
         let locked = rustix::fs::open(&lock, flags, Mode::empty()).is_ok_and(|lock| {
-            // Whoever holds it may be in another namespace of process ids.
+            // Its holder may be in another namespace of process ids.
             matches!(fcntl_getlk(lock, &asked), Ok(Some(_)))
         });
         // One that begins has not locked yet; of another, the lock has been exchanged.

@@ -54,7 +54,7 @@ impl<T> Shared<T> {
 
 impl<T> Clone for Shared<T> {
     fn clone(&self) -> Self {
-        // Whoever clones has a handle: nothing can be dropped meanwhile. A count that wraps would
+        // A clone is made from a handle: nothing can be dropped meanwhile. A count that wraps would
         // need more handles than fit in memory, unless they are leaked: then the process ends.
         if self.inner().handles.fetch_add(1, Ordering::Relaxed) > usize::MAX / 2 {
             std::process::abort();
@@ -85,7 +85,7 @@ impl<T: fmt::Debug> fmt::Debug for Shared<T> {
 
 impl<T: Send + Abandonable> Abandonable for Shared<T> {
     unsafe fn abandon_in_place(this: NonNull<Self>) {
-        // SAFETY: the caller says that `this` is valid and not used again.
+        // SAFETY: the caller guarantees that `this` is valid and not used again.
         let this = unsafe { this.read() };
         if this.inner().handles.load(Ordering::Acquire) == 1 {
             let value = this.inner().value.data_ptr();
@@ -139,7 +139,7 @@ mod spare {
     impl Drop for Spare {
         fn drop(&mut self) {
             for (memory, layout) in self.0.iter_mut().filter_map(Option::take) {
-                // SAFETY: `give`'s caller says that it was allocated with this layout and is not used.
+                // SAFETY: `give`'s caller guarantees that it was allocated with this layout and is not used.
                 unsafe { dealloc(memory.as_ptr(), layout) };
             }
         }

@@ -2,7 +2,7 @@
 //! that other programs truncate.
 //!
 //! The kernel raises SIGBUS. Its handler puts a page of the process's own in the place of the one that is missing,
-//! so that the thread continues, and wakes whoever waits in [`lost`]: the run ends in order, with motors disabled
+//! so that the thread continues, and wakes the task that waits in [`lost`]: the run ends in order, with motors disabled
 //! and the episode closed.
 //!
 //! The same end comes when iceoryx2 panics over a table that was overwritten (`guard`).

@@ -56,7 +56,7 @@ impl Writer {
             .map_err(|error| topic_error(&spec.name, &error))?;
         let event = match spec.id {
             TopicId::Modality(modality) => Some(modality.index()),
-            // Consumers find the mask when they look; 500 wake-ups a second would tell them nothing.
+            // Consumers find the mask when they look; 500 wake-ups a second would be of no use to them.
             TopicId::Mask => None,
             TopicId::Action => Some(MAX_MODALITIES),
         };

@@ -5,7 +5,7 @@
 //! again. Two periods are never taken for less than two cycles of commands and the time that an action is
 //! on its way.
 //!
-//! Invariant: after being armed, and without an action, it says `Hold` and then perhaps `Disable`, never
+//! Invariant: after being armed, and without an action, it returns `Hold` and then perhaps `Disable`, never
 //! `Follow`.
 
 use std::time::Duration;

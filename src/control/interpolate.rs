@@ -14,7 +14,7 @@ use crate::time::Stamp;
 pub const FIRST_PERIOD: Duration = Duration::from_millis(100);
 /// Targets that come quicker are reached in this time all the same.
 const SHORTEST: Duration = Duration::from_millis(1);
-/// Targets farther apart than this had a pause between them, which says nothing of their rate.
+/// Targets farther apart than this had a pause between them, which does not count for their rate.
 const LONGEST: Duration = Duration::from_secs(1);
 
 /// See the module's comment.

@@ -5,7 +5,7 @@
 //!
 //! Invariant: pure. Time comes in as an argument, frames go in and out as values; there is no I/O, and
 //! after construction nothing here allocates.
-//! Invariant: bytes from a bus, and numbers from whoever sends actions, never make it panic.
+//! Invariant: bytes from a bus, and numbers from the sender of actions, never make it panic.
 
 pub mod can;
 pub mod damiao;

@@ -24,7 +24,7 @@
 //! arm must not continue without its elbow, nor fall because of it. None of them follows an action before the next arm.
 //! An emergency stop is a fault of no motor, with a way to stop of its own.
 //! Invariant: the first command is where the joint is. From there a commanded position changes by the
-//! slew limit at most, as softly as [`Ramp`] says, and goes nowhere beyond the limits; of a joint that is beyond them it stays or
+//! slew limit at most, as softly as [`Ramp`] allows, and goes nowhere beyond the limits; of a joint that is beyond them it stays or
 //! comes back. In MIT mode the stiffness asks for no more than the torque limit: the command comes towards the joint as
 //! fast as it may, and for the rest the stiffness is lowered.
 //! Invariant: cycles that stood still for longer than [`stalled_after`] end an arm: what happened to the motors meanwhile
@@ -230,7 +230,7 @@ impl MotorBus {
         } else {
             motor.take_feedback(frame, now, &mut self.notices)
         };
-        // At once: what a motor says next must not cover it up.
+        // At once: the next report of a motor must not cover it up.
         if self.state != BusState::Stopped
             && let Some(fault) = taken.err().or_else(|| self.judge(index))
         {
@@ -241,7 +241,7 @@ impl MotorBus {
         }
     }
 
-    /// An action: a number for each motor, and its tick. Says whether it is followed.
+    /// An action: a number for each motor, and its tick. Returns whether it is followed.
     pub fn target(&mut self, target: &[f64], tick: Stamp, now: Stamp) -> bool {
         let refusal = self.refuse(target, tick, now);
         let is_same = self.refusing == refusal;
@@ -285,7 +285,7 @@ impl MotorBus {
         true
     }
 
-    /// Enables all motors, after reading their parameters and clearing their faults. A notice says
+    /// Enables all motors, after reading their parameters and clearing their faults. A notice reports
     /// whether that went well. Changes nothing where they are enabled, or are being enabled.
     pub fn arm(&mut self, now: Stamp) {
         if matches!(self.state, BusState::Probing | BusState::Disarmed | BusState::Faulted(_) | BusState::Disabling) {

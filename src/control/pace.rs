@@ -37,7 +37,7 @@ impl Pace {
     }
 
     /// A cycle began at `now`. On the grid, cycles that were missed are left out. After an early one the grid begins
-    /// anew, an eighth of a cycle late: actions that come once a cycle find it waiting for them, not under way.
+    /// again, an eighth of a cycle late: actions that come once a cycle find it waiting for them, not under way.
     pub fn begin(&mut self, now: Stamp) {
         self.empty = self.empty.max(now).after(self.cycle * 4 / 5);
         if now < self.due {

@@ -88,7 +88,7 @@ mod tests {
 
     const STEP: Duration = Duration::from_millis(5);
 
-    /// Commands from 0 towards what `wanted` says, until `steps` are over.
+    /// Commands from 0 towards what `wanted` returns, until `steps` are over.
     fn play(ramp: &mut Ramp, limits: &Limits, steps: usize, wanted: impl Fn(usize) -> f64) -> Vec<f64> {
         let mut commands = vec![0.0];
         for step in 0..steps {

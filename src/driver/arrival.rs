@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use crate::time::Stamp;
 
-/// What a byte takes at full speed of USB, 12 Mbit/s (USB 2.0, section 7.1.11). The baud rate of a CDC-ACM device says
+/// What a byte takes at full speed of USB, 12 Mbit/s (USB 2.0, section 7.1.11). The baud rate of a CDC-ACM device means
 /// nothing about its line.
 const BYTE_TIME: Duration = Duration::from_nanos(667);
 

@@ -12,7 +12,7 @@
 //! at all.
 //!
 //! Invariant: listing never leaves a descriptor open.
-//! Invariant: a lent picture is exactly what the kernel says it wrote; row padding is taken out.
+//! Invariant: a lent picture is exactly what the kernel reports it wrote; row padding is taken out.
 //! Invariant: a picture the kernel gave up, or that arrived empty, is counted in `lost`.
 //! Invariant: dropping a camera neither waits for the device nor panics.
 
@@ -64,15 +64,15 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// Opens the node at `path` as the registry's entry `name` wishes it, and starts it.
+    /// Opens the node at `path` as the registry's entry `name` requests, and starts it.
     ///
     /// # Errors
-    /// When the node is gone, held by another program, not permitted, or does not offer the wished
+    /// When the node is gone, held by another program, not permitted, or does not offer the requested
     /// format, size, rate or controls; the last names what is offered.
     pub async fn open(name: &str, spec: &CameraSpec, path: &Path) -> Result<Self, DriverError> {
         let (name, spec, path) = (name.to_owned(), spec.clone(), path.to_owned());
         let Started { ring, layout, description, negotiated } = unblock(move || start(&name, &spec, &path)).await?;
-        // Registered only now that it streams: before, the node reports an error to whoever polls.
+        // Registered only now that it streams: before, the node reports an error to every poll.
         // SAFETY: the ring owns its node's descriptor, never replaces it, and closes it only when it is
         // dropped, which it is by or after the `AsyncFd`.
         let ring = unsafe { AsyncFd::register_with_interest(ring, Interest::READABLE | Interest::ERROR) }
@@ -197,7 +197,7 @@ fn start(name: &str, spec: &CameraSpec, path: &Path) -> Result<Started, DriverEr
     Ok(Started { ring, layout, description, negotiated })
 }
 
-/// The values of all controls that tell theirs.
+/// The values of all controls that report theirs.
 fn read_controls(node: &Node) -> BTreeMap<String, i64> {
     let begun = Instant::now();
     let offered = node.controls().into_iter().take_while(|_| begun.elapsed() < READ_BACK);

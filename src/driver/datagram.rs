@@ -77,7 +77,7 @@ pub(super) fn receive(
     let length = usize::try_from(length).map_err(|_| io::Error::last_os_error())?;
     let is_cut = message.msg_flags & libc::MSG_TRUNC != 0;
     let mut datagram = Datagram { length, is_cut, stamp_ns: None, dropped: None };
-    // SAFETY: the kernel wrote whole headers into `control`, as many as `msg_controllen` says by now, and
+    // SAFETY: the kernel wrote whole headers into `control`, as many as `msg_controllen` states by now, and
     // the macros stay within them; payloads are as long as their type, and read unaligned.
     unsafe {
         let mut next = libc::CMSG_FIRSTHDR(&raw const message);

@@ -58,7 +58,7 @@ pub struct Reading<'a> {
     pub width: u32,
     /// Image: pixels, otherwise 0.
     pub height: u32,
-    /// Samples the device or kernel says were lost since the last reading.
+    /// Samples the device or kernel reports as lost since the last reading.
     pub lost: u64,
 }
 
@@ -74,7 +74,7 @@ pub enum DriverError {
     /// Trying again later may help.
     #[error("{0}")]
     Retry(String),
-    /// Trying again cannot help before something is changed; the text says what.
+    /// Trying again cannot help before something is changed; the text names it.
     #[error("{0}")]
     Fatal(String),
 }
@@ -124,7 +124,7 @@ impl Driver {
     /// Opens the node of `spec` and starts it.
     ///
     /// # Errors
-    /// When the node is gone, cannot be opened, or cannot do what `spec` wishes.
+    /// When the node is gone, cannot be opened, or cannot do what `spec` requests.
     pub async fn open(spec: &DeviceSpec, node: &DeviceNode) -> Result<Self, DriverError> {
         match (&spec.node, node) {
             (NodeSpec::Camera(camera), DeviceNode::Video(path)) => {
@@ -201,7 +201,7 @@ impl Driver {
         }
     }
 
-    /// Has it carry out these orders and actions from now on. Says whether it takes them itself; otherwise they are to be
+    /// Has it carry out these orders and actions from now on. Returns whether it takes them itself; otherwise they are to be
     /// passed on to [`Self::order`] and [`Self::command`].
     pub fn attend(&mut self, orders: &Arc<Attended>, actions: &Arc<dyn ActionSource>) -> bool {
         match self {

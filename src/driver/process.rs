@@ -175,7 +175,7 @@ impl Child {
     pub async fn ended(&self) {
         // The readiness is never cleared: once ended, always ended.
         if self.pidfd.readable().await.is_err() {
-            // tokio is going down, and with it whoever waits.
+            // tokio is going down, and with it the waiting task.
             std::future::pending::<()>().await;
         }
     }

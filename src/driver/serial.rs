@@ -479,7 +479,7 @@ impl Framer {
         Self { framing, limit, message, aligned, overlong: false, complete: false }
     }
 
-    /// Consumes bytes up to the end of a message, and says how many.
+    /// Consumes bytes up to the end of a message, and returns how many.
     fn feed(&mut self, bytes: &[u8]) -> (usize, Cut) {
         if std::mem::take(&mut self.complete) {
             self.message.clear();
@@ -503,7 +503,7 @@ impl Framer {
     }
 
     /// Lets the first byte of a complete message go and keeps the rest as the beginning of the next:
-    /// how messages of fixed length find their boundary again. Says no for other framings, which
+    /// how messages of fixed length find their boundary again. `false` for other framings, which
     /// have boundaries of their own.
     fn slip(&mut self) -> bool {
         if !matches!(self.framing, Framing::Fixed(_)) || self.message.is_empty() {

@@ -1,7 +1,7 @@
 //! Simulated devices: what a scenario plugs in.
 //!
 //! Samples lie on an absolute grid in time that begins with the scenario, so nothing drifts, and
-//! their bytes are a function of seed and sequence, so a test can say what a recording must hold.
+//! their bytes are a function of seed and sequence, so a test knows what a recording must hold.
 //! Time is tokio's: under a paused clock a scenario runs as fast as it is read.
 //!
 //! Invariant: the sequence continues over a replug; skipped numbers are counted in `lost`.
@@ -248,7 +248,7 @@ impl Sim {
                 continue;
             }
             let due = self.grid.tick(self.next);
-            // What is on its way for long is to be had as late.
+            // A sample with a long latency becomes available that late.
             let now_stamp = stamp_of(now).before(self.device.faults.delay);
             if due <= now_stamp {
                 let newest = first_after(self.grid, now_stamp).saturating_sub(1);
@@ -362,7 +362,7 @@ fn first_after(grid: Grid, now: Stamp) -> u64 {
     grid.ticks_before(Stamp(now.0.saturating_add(1)))
 }
 
-/// Does the scenario's device send what the registry says?
+/// Does the scenario's device send what the registry declares?
 ///
 /// # Errors
 /// When kind, picture size or number of channels differ: what follows is laid out by the registry.

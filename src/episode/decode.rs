@@ -224,7 +224,7 @@ fn scalars<'a>(message: &'a [u8], into: &'a mut Vec<u8>) -> Option<Sample<'a>> {
     Some(Sample { encoding: Encoding::F64, width: u32::try_from(payload.len() / 8).ok()?, height: 0, payload })
 }
 
-/// The bytes of field `wished`; the last one counts, a missing one is empty.
+/// The bytes of field `wanted`; the last one counts, a missing one is empty.
 fn last_bytes(message: &[u8], wished: u64) -> Option<&[u8]> {
     let mut found = &[][..];
     for field in whole_protobuf(message) {

@@ -1,6 +1,6 @@
 //! Episodes as files: MCAP, read record by record, whole or not.
 //!
-//! What reads an episode, to tell of it, to repair it or to play it, reads it through a
+//! What reads an episode, to report on it, to repair it or to play it, reads it through a
 //! [`records::RecordIter`]; what only one of them needs is theirs.
 //!
 //! Invariant: no bytes make anything here panic, and memory holds one record of a file at a time.

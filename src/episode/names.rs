@@ -5,7 +5,7 @@
 //! it.
 //!
 //! Invariant: of definitions and metadata at most [`LARGEST`] bytes and [`MOST`] definitions are shown:
-//! whoever keeps them is bounded. The rest is counted.
+//! their number is bounded. The rest is counted.
 
 use std::collections::{BTreeMap, VecDeque};
 

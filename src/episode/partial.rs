@@ -4,7 +4,7 @@
 //! The lock is an advisory one of the open file (flock): it ends with the process that holds it, however that
 //! ends, and copies of the handle share it.
 //!
-//! Invariant: whoever writes a `.partial`, repairs it or takes it away holds its lock.
+//! Invariant: a process that writes, repairs or removes a `.partial` holds its lock.
 
 use std::fs::{File, TryLockError};
 use std::io;
@@ -21,7 +21,7 @@ pub(crate) const PARTIAL: &str = "partial";
 pub(crate) enum Lock {
     /// Ours, as long as the handle or a copy of it is open.
     Ours,
-    /// Somebody else writes or repairs it.
+    /// Another process writes or repairs it.
     Others,
     /// The name has gone, or means another file by now.
     Gone,

@@ -205,7 +205,7 @@ impl<R: ReadAt> RecordIter<R> {
         Ok(if self.advance()? { Some(self.record()) } else { None })
     }
 
-    /// Goes on to the next record; `false` at the end.
+    /// Moves to the next record; `false` at the end.
     pub(crate) fn advance(&mut self) -> io::Result<bool> {
         self.found = self.find()?;
         Ok(self.found.is_some())
@@ -444,7 +444,7 @@ impl<R: ReadAt> RecordIter<R> {
                     crc != 0 && chunk::is_sound(content, crc)
                 });
                 self.sure = if is_right { self.at } else { self.sure };
-                // What its check value is worth is judged by whoever takes it.
+                // Its check value is judged by the caller.
                 true
             }
             // Text has no zeros, the head of every record has.

@@ -1,5 +1,5 @@
 //! Schemas of what is recorded, written into every file. They are compiled from the `.proto` files beside them; the test
-//! `schemas_are_those_of_their_proto_files` says how.
+//! `schemas_are_those_of_their_proto_files` shows how.
 
 use crate::modality::ModalityKind;
 use crate::registry::{DeviceSpec, NodeSpec, PixelFormat};

@@ -118,7 +118,7 @@ pub enum Configuration {
 pub enum Status {
     /// All sensors were there.
     Normal,
-    /// It went on without one.
+    /// It continued without one.
     Degraded,
     /// It ended.
     Crash,
@@ -314,7 +314,7 @@ fn axes(action: &[f32]) -> Option<[f64; AXES]> {
     Some(action.map(f64::from))
 }
 
-/// Who is told of the rig: the policy, and the recorder if there is one.
+/// What follows the rig: the policy, and the recorder if there is one.
 struct Seen<'a> {
     pilot: Pilot,
     recorder: Option<&'a mut Stepped>,

@@ -206,7 +206,7 @@ impl Lockstep {
         Ok(())
     }
 
-    /// Tells the arm what to do from now on, as a policy does on the topic of actions at tick `number` of its
+    /// Gives the arm its actions from now on, as a policy does on the topic of actions at tick `number` of its
     /// control grid.
     pub fn act(&mut self, number: u64, action: [f64; AXES], taker: &mut dyn Taker) {
         self.trial.trial().command(action);

@@ -290,7 +290,7 @@ fn crop_start(size: usize, wanted: usize) -> usize {
 }
 
 /// Two pixels of YUYV in red, green and blue: ITU-R BT.601 of limited range, what V4L2 means by YUYV
-/// unless it says otherwise; coefficients in 1/65536.
+/// unless it states otherwise; coefficients in 1/65536.
 fn colors(yuyv: &[u8]) -> [u8; 2 * CHANNELS] {
     let at = |index: usize| yuyv.get(index).copied().map_or(0, i32::from);
     let (u, v) = (at(1) - 128, at(3) - 128);

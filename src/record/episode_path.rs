@@ -222,7 +222,7 @@ pub(super) fn keep(path: &EpisodePath) -> io::Result<PathBuf> {
             let (from, to) = (path.finished.display(), partial.display());
             tracing::warn!(%from, %to, "the episode was moved while it was recorded");
             if partial.extension().is_none_or(|extension| extension != PARTIAL) {
-                // Whoever moved it gave it the name it is to have.
+                // The program that moved it gave it the name it is to have.
                 return Ok(partial);
             }
             let folder = open(partial.parent().unwrap_or(Path::new("")), Missing::Refused)?;
@@ -238,7 +238,7 @@ pub(super) fn keep(path: &EpisodePath) -> io::Result<PathBuf> {
 }
 
 /// Where a file is that could not be finished; one that was removed is written again. Behind it is written `why` it is
-/// BAD, so that whoever reads it later finds that again: its summary may be GOOD by then.
+/// BAD, so that a later reader finds that again: its summary may be GOOD by then.
 pub(super) fn failed(path: &EpisodePath, why: &str) -> PathBuf {
     let mut file = &*path.file;
     let marked = file.seek(SeekFrom::End(0)).and_then(|_| file.write_all(&Failed::mark(why)));

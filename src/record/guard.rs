@@ -31,7 +31,7 @@ const EVENT_BYTES: usize = 1024;
 pub(super) struct Guard {
     file: Arc<File>,
     partial: PathBuf,
-    /// None where the system gives no inotify: then damage within the file is found by whoever reads it.
+    /// None where the system gives no inotify: then damage within the file is found by its reader.
     events: Option<OwnedFd>,
     /// Another program opened the file, for reading or for writing.
     was_opened: bool,

@@ -210,7 +210,7 @@ impl Measures {
     /// Counts samples that are missing.
     pub(super) fn missing(&mut self, id: ModalityId, lost: u64, dropped: u64) {
         if let Some(Some(lane)) = self.lanes.get_mut(id.index()) {
-            // Saturating: the numbers come from whoever publishes.
+            // Saturating: the numbers come from the publisher.
             let counts = &mut lane.meter.counts;
             counts.lost = counts.lost.saturating_add(lost);
             counts.dropped = counts.dropped.saturating_add(dropped);
@@ -375,8 +375,8 @@ pub(super) struct Meter {
     run_began_ns: u64,
     /// Are samples compared with the one before?
     compares: bool,
-    /// Length and hash of the bytes of the newest sample, unless whoever brings samples compares them. Samples that are
-    /// equal have equal ones; whoever makes two others to have them makes an episode worse, never better.
+    /// Length and hash of the bytes of the newest sample, unless the source of samples compares them. Samples that are
+    /// equal have equal ones; a collision made on purpose makes an episode worse, never better.
     newest: Option<(usize, u64)>,
 }
 

@@ -108,11 +108,11 @@ pub struct RecorderConfig {
     /// Makes the sink of an episode of the file opened for it; the file itself unless a test wants
     /// the disk to fail.
     pub sink: Opener,
-    /// Says what is free on the disk of an episode's file.
+    /// Returns what is free on the disk of an episode's file.
     pub disk: Asker,
     /// Reads the clocks.
     pub clock: Box<dyn FnMut() -> WallClock + Send>,
-    /// Says when an episode begins that is asked for now: now. A test sends what it means to lie at
+    /// Returns when an episode begins that is requested now: now. A test sends what it means to lie at
     /// the beginning from here, so that it lies there however long the machine takes.
     pub begin: Box<dyn FnMut() -> Stamp + Send>,
 }
@@ -269,7 +269,7 @@ struct Writer {
     short: Option<Short>,
     /// Files that were dropped: their names are not given again.
     dropped: Vec<PathBuf>,
-    /// Told of the session.
+    /// Receives the reports of the session.
     episode: watch::Sender<Option<Arc<Episode>>>,
     /// Room for the session's file.
     space: Option<Space>,
@@ -386,7 +386,7 @@ impl Writer {
             match self.inbox.try_recv() {
                 Ok(Order::Start(request, reply)) => {
                     let started = self.start(&request);
-                    // Whoever asked may have gone.
+                    // The requester may have ended.
                     let _ = reply.send(started);
                 }
                 Ok(Order::End(at)) => {

@@ -10,7 +10,7 @@
 //!    written.
 //! 3. A tick is evaluated once, of what was received by its deadline, `tick + sync_window +`
 //!    [`SETTLE`] `+` the longest latency of the rig, under the mask last published at or before the tick. The deadline is the frame's
-//!    `publish_time`: whoever reads the file can choose the same samples again.
+//!    `publish_time`: a reader of the file can choose the same samples again.
 //! 4. A sample received after its tick's deadline is in the file and in no frame.
 //! 5. The file is closed [`SETTLE`] `+` [`GRACE`] `+` the longest latency after `end`. A sample captured before `end` that
 //!    arrives later than that is lost and cannot be counted.

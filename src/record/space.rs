@@ -221,7 +221,7 @@ impl Space {
         Ok(())
     }
 
-    /// Bytes a second, of late.
+    /// Bytes a second, recently.
     fn rate(&mut self, now: Stamp, size: u64) -> f64 {
         while self.sizes.get(1).is_some_and(|(at, _)| now.since(*at) >= RATE_OVER) {
             self.sizes.pop_front();

@@ -1,4 +1,4 @@
-//! An episode recorded by whoever owns the clock: the same session and the same file as the `writer`
+//! An episode recorded by the owner of the clock: the same session and the same file as the `writer`
 //! thread's, without thread, bus and real time.
 //!
 //! Invariant: the moments handed in never go back.

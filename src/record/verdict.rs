@@ -7,7 +7,7 @@
 //! 3. Nothing received from a modality that was there: BAD. So is an episode in which nothing at all
 //!    was received: GOOD has at least one sample.
 //! 4. A file that is not whole, or not proven to be as it was written, is SUSPECT; one that the disk did not
-//!    take is BAD. What could not be measured is a finding of whoever could not.
+//!    take is BAD. What could not be measured is a finding of its own check.
 //! 5. An episode in which another program published on a topic of ours is SUSPECT.
 //! 6. One shorter than [`SHORTEST`] is BAD: that is too short for a demonstration.
 //! 7. One without a sample of a modality that `expect` names is SUSPECT.
@@ -150,7 +150,7 @@ pub(super) fn judge(facts: &Facts<'_>) -> Verdict {
     Verdict { grade, reasons: found.into_iter().map(|(_, text)| text).collect(), sensors: Some(sensors) }
 }
 
-/// What speaks against a modality.
+/// The findings against a modality.
 fn modality(judged: &Judged<'_>, facts: &Facts<'_>) -> Vec<(Grade, String)> {
     let Judged { quality, limits, .. } = judged;
     // As long as this a device that is there may be silent.

@@ -36,7 +36,7 @@ pub(super) struct Post {
     /// Held as long as a program reads the device.
     node: Option<Arc<Mutex<()>>>,
     turn: Arc<Mutex<()>>,
-    /// Told that the device is removed.
+    /// Notified when the device is removed.
     gone: CancellationToken,
 }
 
@@ -118,7 +118,7 @@ impl Attendant {
             let begun = self.episode.wait_for(Option::is_some).await.ok().and_then(|episode| episode.clone());
             match begun {
                 Some(episode) => Some(episode),
-                // Nobody records any more.
+                // No recorder is left.
                 None => std::future::pending().await,
             }
         };

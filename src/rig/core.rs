@@ -1,6 +1,6 @@
 //! The decisions of a rig without any I/O: slots, assignment of devices to entries, and the mask.
 //!
-//! [`Core::step`] takes one input and the time, and writes down what is to be done. Whoever calls it carries the
+//! [`Core::step`] takes one input and the time, and writes down what is to be done. The caller carries the
 //! effects out in their order: the live rig (`owner`) with tasks and shared memory, the lockstep rig with a
 //! virtual clock.
 //!
@@ -84,9 +84,9 @@ pub enum Effect {
 /// What is to be done for one modality.
 #[derive(Debug, Clone, PartialEq)]
 pub enum DeviceEffect {
-    /// Tell the running stream to end; do not wait for it.
+    /// Ask the running stream to end; do not wait for it.
     Stop,
-    /// The stream that ran until now counts no more: it was told to stop, or has ended.
+    /// The stream that ran until now no longer counts: it was asked to stop, or has ended.
     Ended,
     /// Announce that [`Core::attached`] is there.
     AnnounceAttach,

@@ -5,7 +5,7 @@
 //! that has grown to [`LARGEST`] becomes `NAME.log.1`, that one `NAME.log.2`, and so on to [`KEPT`].
 //!
 //! Invariant: who writes never waits for the disk: a thread of its own does. Lines it does not keep up
-//! with are counted and said.
+//! with are counted and reported.
 
 use std::collections::HashMap;
 use std::fs::{DirBuilder, File, OpenOptions};

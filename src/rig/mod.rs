@@ -1,10 +1,10 @@
 //! The rig: turns hot-plug events into running device streams and the physical mask.
 //!
 //! One task owns every slot. It takes hot-plug events, the reports and ends of streams, commands and
-//! deadlines, applies them to the slots, and does what the slots say.
+//! deadlines, applies them to the slots, and carries out what the slots decide.
 //!
 //! Invariant: only this module decides the mask.
-//! Invariant: nothing here waits for a device; a stream that is to end is told so and forgotten.
+//! Invariant: nothing here waits for a device; a stream that is to end is asked to and forgotten.
 //! Invariant: the end of a stream, by value or by panic, is an event like any other.
 
 mod attendant;
@@ -24,7 +24,7 @@ use crate::hotplug::HotplugError;
 use crate::modality::ModalityId;
 use presence::PresenceError;
 
-/// Why the rig cannot go on.
+/// Why the rig cannot continue.
 #[derive(Debug, thiserror::Error)]
 pub enum RigError {
     /// Plugging can no longer be watched.

@@ -1,7 +1,7 @@
 //! What a child prints, as lines of the log and of its device's file.
 //!
 //! Invariant: the lines of a child are bounded in length and in rate; what is left out is counted and
-//! said. A child that prints faster than that is held up by its pipe, as at a slow terminal, and
+//! reported. A child that prints faster than that is held up by its pipe, as at a slow terminal, and
 //! costs the rig a few reads each [`PAUSE`].
 
 use std::sync::Arc;
@@ -24,7 +24,7 @@ const BURST: f64 = 100.0;
 const RATE: f64 = 20.0;
 /// Between two reads of a child that prints too much.
 const PAUSE: Duration = Duration::from_millis(10);
-/// How often the lines left out are said.
+/// How often the count of omitted lines is logged.
 const TELL_EVERY: Duration = Duration::from_secs(5);
 /// Read at once.
 const CHUNK: usize = 16 << 10;
@@ -78,7 +78,7 @@ impl Output {
         }
     }
 
-    /// Reads what is there and says what is left to say.
+    /// Reads what is there and logs the rest.
     pub(super) fn finish(&mut self, stdout: &Receiver, stderr: &Receiver) {
         for (index, pipe) in [stdout, stderr].into_iter().enumerate() {
             // No more than a pipe holds: one that something still writes to would have no end.
@@ -174,7 +174,7 @@ impl Lines {
     }
 }
 
-/// A bucket of lines that may be said.
+/// A bucket of lines that may be logged.
 #[derive(Debug)]
 struct Limit {
     left: f64,

@@ -437,7 +437,7 @@ impl Rig {
 }
 
 impl Modality {
-    /// The stream has ended, or was told to. What the actuator reported last no longer holds: nothing is sent to it
+    /// The stream has ended, or was asked to. What the actuator reported last no longer holds: nothing is sent to it
     /// until the next arm.
     fn disarm(&mut self, board: &Board, is_problem: bool) {
         if self.arming.take().is_some_and(|last| !matches!(last, Arming::Disarmed | Arming::Faulted)) {

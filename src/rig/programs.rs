@@ -1,4 +1,4 @@
-//! All child processes of the rig: what starts them, whom they are told of, and who waits for the last.
+//! All child processes of the rig: what starts them, what they are reported to, and what waits for the last.
 
 use std::ffi::OsString;
 use std::sync::Arc;
@@ -47,7 +47,7 @@ impl Programs {
         })
     }
 
-    /// Waits until every child has ended; the programs of devices have been told to, and no episode is
+    /// Waits until every child has ended; the programs of devices have been asked to, and no episode is
     /// in progress any more.
     pub(super) async fn ended(&self) {
         self.closing.cancel();
@@ -65,13 +65,13 @@ impl Programs {
 /// Variables of a child's environment; one without a value is not to be there.
 pub(super) type Environment = Vec<(&'static str, Option<OsString>)>;
 
-/// What every child is told of its device.
+/// What every child is given about its device.
 pub(super) fn environment(spec: &DeviceSpec, attachment: &Attachment, topic: &str, prefix: &str) -> Environment {
     let text = |text: &str| Some(OsString::from(text));
     vec![
         ("DEVICE_NAME", text(&spec.name)),
         ("DEVICE_NODE", text(&attachment.node.label())),
-        // No such variable rather than one that holds what cannot be said in it.
+        // No such variable rather than one with a value that cannot be expressed.
         ("DEVICE_SERIAL", attachment.unit.serial().filter(|serial| !serial.contains('\0')).and_then(text)),
         ("DEVICE_ADDR", text(attachment.unit.place())),
         ("RAPID_TOPIC", text(topic)),

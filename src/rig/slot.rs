@@ -11,7 +11,7 @@
 //!
 //! (*) When the stream is the first to notice an unplug, the slot is Absent at once while hot-plug
 //! has yet to confirm it. If no removal comes within the cooldown, the device was never gone and is
-//! started again, which counts as a restart: its driver cannot say so for ever.
+//! started again, which counts as a restart: its driver cannot report that for ever.
 //!
 //! Invariant: what carries an older epoch changes nothing.
 //! Invariant: a cooldown delays an attachment and never drops it.
@@ -67,7 +67,7 @@ pub enum End {
 /// What is to be done after an input.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Effects<A> {
-    /// Tell this stream to end; do not wait for it.
+    /// Ask this stream to end; do not wait for it.
     pub stop: Option<Epoch>,
     /// Start a stream.
     pub start: Option<(Epoch, A)>,
@@ -125,7 +125,7 @@ impl<A: Clone> Slot<A> {
         matches!(self.state, SlotState::Streaming | SlotState::Stalled)
     }
 
-    /// What hot-plug says is attached.
+    /// What hot-plug reported as attached.
     #[must_use]
     pub const fn attached(&self) -> Option<&A> {
         self.attached.as_ref()
@@ -137,7 +137,7 @@ impl<A: Clone> Slot<A> {
         self.deadline
     }
 
-    /// Takes one input and says what is to be done.
+    /// Takes one input and returns what is to be done.
     pub fn apply(&mut self, input: Input<A>, now: Stamp) -> Effects<A> {
         match input {
             Input::Attached(attachment) => self.attach(attachment, now),
@@ -152,7 +152,7 @@ impl<A: Clone> Slot<A> {
         }
     }
 
-    /// Is this the stream that is running now? What any other says changes nothing.
+    /// Is this the stream that is running now? Reports of any other change nothing.
     #[must_use]
     pub fn is_current(&self, epoch: Epoch) -> bool {
         self.is_running() && epoch == self.epoch
@@ -163,7 +163,7 @@ impl<A: Clone> Slot<A> {
     }
 
     fn attach(&mut self, attachment: A, now: Stamp) -> Effects<A> {
-        // A new attachment over one whose removal was never told replaces it.
+        // A new attachment over one whose removal was never reported replaces it.
         let stop = self.is_running().then_some(self.epoch);
         self.attached = Some(attachment);
         self.restarts.clear();
@@ -196,7 +196,7 @@ impl<A: Clone> Slot<A> {
                 self.deadline = Some(now.after(wait));
             }
             End::Fatal => self.enter(SlotState::Failed),
-            // As often as somebody pulls the cable.
+            // As often as the cable is pulled.
             End::LinkDown => {
                 self.restarts.clear();
                 self.wait_until(now.after(FIRST_BACKOFF));
@@ -212,7 +212,7 @@ impl<A: Clone> Slot<A> {
         Effects::NONE
     }
 
-    /// How long the next restart is delayed; `None` when there were too many of late.
+    /// How long the next restart is delayed; `None` when the restart budget is exhausted.
     fn backoff(&mut self, now: Stamp) -> Option<Duration> {
         self.restarts.retain(|restart| now.since(*restart) < RESTART_WINDOW);
         (self.restarts.len() < MAX_RESTARTS).then(|| FIRST_BACKOFF * (1 << self.restarts.len()))
@@ -237,7 +237,7 @@ impl<A: Clone> Slot<A> {
             return Effects::NONE;
         }
         self.deadline = None;
-        // Said to be gone by its driver, and attached all the same.
+        // Reported gone by its driver, and attached all the same.
         if self.state == SlotState::Absent && self.attached.is_some() {
             if self.backoff(now).is_none() {
                 self.enter(SlotState::Failed);

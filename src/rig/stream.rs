@@ -1,8 +1,8 @@
 //! A stream: one device being read, from the opening of its node to its end.
 //!
 //! Invariant: between two samples a stream allocates nothing, locks nothing and logs nothing of its
-//! own; what publishing costs is said in `bus`.
-//! Invariant: a stream that was told to stop publishes no more.
+//! own; `bus` documents what publishing costs.
+//! Invariant: a stream that was asked to stop publishes nothing more.
 
 mod controls;
 mod source;
@@ -32,7 +32,7 @@ use crate::time::{Stamp, nanoseconds};
 /// A device that does not open within this time is tried again.
 const OPEN_LIMIT: Duration = Duration::from_secs(10);
 
-/// A device that is open and has sent nothing for this long is said to be silent, once an epoch. It
+/// A device that is open and has sent nothing for this long is reported silent, once an epoch. It
 /// stays Opening: what sends only when something happens may do so at any time.
 const SILENT_AFTER: Duration = Duration::from_secs(2);
 /// Cameras and programs always send: one that has sent nothing for this long since it was opened is opened
@@ -45,7 +45,7 @@ use controls::Controlled;
 pub(super) use controls::Controls;
 use source::Source;
 
-/// What a stream tells the rig while it runs.
+/// What a stream reports to the rig while it runs.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Report {
     /// The node is not opened before its link is up.
@@ -56,9 +56,9 @@ pub(super) enum Report {
     Silent(Duration),
     /// What concerns the core alone.
     Event(StreamEvent),
-    /// Samples or actions are lost, and why, told once an epoch each; or an order.
+    /// Samples or actions are lost, and why, reported once an epoch each; or an order.
     Refused(String),
-    /// What an actuator has to tell.
+    /// What an actuator reports.
     Actuator(ActuatorNotice),
 }
 
@@ -112,18 +112,18 @@ pub(super) struct Stream {
     pub(super) stop: CancellationToken,
     /// Where the program of the entry works, if it has one.
     pub(super) seat: Option<Seat>,
-    /// What it is told, if it is the actuator.
+    /// What it is ordered to do, if it is the actuator.
     pub(super) controls: Option<Controls>,
     /// Emergency stops and enabling switches that are numbers of its samples.
     pub(super) taps: Arc<[Tap]>,
-    /// The episode in progress, of which devices are told that record by themselves.
+    /// The episode in progress, for devices that record by themselves.
     pub(super) episode: EpisodeWatch,
 }
 
 impl Stream {
-    /// Reads the device until it ends or the stream is told to stop.
+    /// Reads the device until it ends or the stream is asked to stop.
     pub(super) async fn run(self) -> Ended {
-        // However it ends, a panic included, what its samples said no longer holds.
+        // However it ends, a panic included, its samples no longer count.
         let _lost = lost_at_the_end(&self.taps);
         let stopped = || Ended { end: End::Gone, reason: "stopped".to_owned() };
         let open = async {
@@ -271,7 +271,7 @@ impl Stream {
         }
     }
 
-    /// Says that the device sends nothing; ends, with the reason, when it is to be opened again.
+    /// Reports that the device sends nothing; ends, with the reason, when it is to be opened again.
     async fn silence(&self) -> String {
         let opened = Instant::now();
         let say = SILENT_AFTER.max(self.spec.stall_after);
@@ -381,7 +381,7 @@ async fn changed_controls(controls: Option<&mut Controlled>) {
 /// Returns when there is news of an episode.
 async fn changed(mut episode: EpisodeWatch) {
     if episode.changed().await.is_err() {
-        // Nobody records any more.
+        // No recorder is left.
         std::future::pending::<()>().await;
     }
 }

@@ -4,9 +4,9 @@
 //! its own (`keeper`); what it prints goes to the log (`output`); what it publishes is judged
 //! (`intake`) and lent to the stream, which publishes it under a header of ours.
 //!
-//! Invariant: nobody waits for a program to end, except its successor on the same entry.
-//! Invariant: no word of a program's header is passed on unchecked.
-//! Invariant: once the stream is told to stop, no sample of its program counts, however long the
+//! Invariant: nothing waits for a program to end, except its successor on the same entry.
+//! Invariant: no field of a program's header is passed on unchecked.
+//! Invariant: once the stream is asked to stop, no sample of its program counts, however long the
 //! program lives.
 
 mod intake;
@@ -56,7 +56,7 @@ impl Seat {
     }
 }
 
-/// A running program, as its stream sees it. Dropped, it tells the program to end.
+/// A running program, as its stream sees it. Dropped, it asks the program to end.
 #[derive(Debug)]
 pub(super) struct Worker {
     name: String,
@@ -66,7 +66,7 @@ pub(super) struct Worker {
     intake: Intake,
     /// The sample that is lent.
     given: Option<(Given, Judged)>,
-    /// Told how the program ended.
+    /// Receives how the program ended.
     ended: oneshot::Receiver<String>,
     /// How it ended; what it published before is still to be read.
     reason: Option<String>,

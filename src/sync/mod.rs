@@ -4,7 +4,7 @@
 //! [`Synchronizer::push`] in any order, an [`Observation`] comes out per tick. The recorder's frame
 //! index and a policy use the same code on the same [`Grid`].
 //!
-//! Invariant: pure: no clock, no input or output; the caller says what time it is.
+//! Invariant: pure: no clock, no input or output; the caller passes the time.
 //! Invariant: the result depends on which samples are in the rings, never on the order or the
 //! moments in which they were pushed.
 //! Invariant: nothing here allocates after construction.
@@ -47,7 +47,7 @@ pub struct SyncModality {
 /// 1. A sample counts only if it was received by `now` and stands for no later moment.
 /// 2. A sample of an older epoch than the newest one of which a sample that counts by rule 1 lies
 ///    before the end of the window does not count: what was seen before the device was last
-///    attached says nothing about what is attached. A replug later than that is another tick's:
+///    attached is no evidence of what is attached. A replug later than that is another tick's:
 ///    who looks back at a tick sees what was to be seen at it.
 /// 3. Bit clear in the mask: absent. Not valid, not stale, nothing kept, whatever the ring holds.
 /// 4. Bit set: of the samples that count, the one nearest to the tick is chosen if it lies

@@ -18,7 +18,7 @@ fn sample(capture_ms: u64, recv_ms: u64, seq: u64, epoch: u32) -> SyncSample<()>
     SyncSample { capture: Stamp(capture_ms * MS), recv: Stamp(recv_ms * MS), seq, epoch: Epoch(epoch), keep: () }
 }
 
-/// What a slot says, in short: present, valid, stale, age in ms, seq.
+/// A slot in short: present, valid, stale, age in ms, seq.
 type Said = (bool, bool, bool, i64, Option<u64>);
 
 fn check(when_stale: WhenStale, samples: &[SyncSample<()>], tick_ms: u64, now_ms: u64, mask: u64, expected: Said) {
@@ -56,7 +56,7 @@ fn each_rule_decides_as_written() {
     check(Zero, &near, 180, 300, 1, (true, false, true, 0, None));
     check(Hold, &[sample(180, 181, 1, 1)], 100, 300, 1, (true, false, true, 0, None));
     check(Hold, &[], 100, 300, 1, (true, false, true, 0, None));
-    // After a replug the old attachment's samples are gone, but only once the new one was heard, and
+    // After a replug the old attachment's samples are gone, but only once the new one has sent, and
     // not for ticks that lie before it: who looks back sees what was to be seen.
     let replug = [sample(95, 96, 8, 1), sample(150, 160, 9, 2)];
     check(Hold, &replug, 100, 155, 1, (true, true, false, 5, Some(8)));

@@ -13,7 +13,7 @@ use crate::bus::Bus;
 use crate::bus::home::Home;
 use crate::bus::tests::registry;
 
-/// How long a condition may take to come true: no requirement.
+/// How long a condition may take until it holds: no requirement.
 const PATIENCE: Duration = Duration::from_mins(1);
 
 const HASH: &str = "0354a209029e7d094a819e2d4030ea331e6caaf0";

@@ -23,7 +23,7 @@ const POSITION_VELOCITY: u16 = 0x100;
 /// Added to a motor's id in velocity mode.
 const VELOCITY: u16 = 0x200;
 
-/// Of a quantum; far more than a 64-bit float is wrong by, and far less than a motor can tell.
+/// Of a quantum; far more than a 64-bit float is wrong by, and far less than a motor resolves.
 const HAIR: f64 = 1e-6;
 
 /// A value of a command is infinite or not a number.
@@ -151,7 +151,7 @@ impl Order {
     }
 }
 
-/// What a motor says of itself: the ERR of its feedback.
+/// The state that a motor reports: the ERR of its feedback.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MotorStatus {
     /// 0.
@@ -168,7 +168,7 @@ pub enum MotorStatus {
     MosOverTemperature,
     /// 12, latched: the winding.
     RotorOverTemperature,
-    /// 13, latched: no frame for as long as its parameter TIMEOUT says.
+    /// 13, latched: no frame for the time of its parameter TIMEOUT.
     CommunicationLost,
     /// 14, latched.
     Overload,

@@ -2,7 +2,7 @@
 //!
 //! A reply comes with the id that feedback has, and looks like feedback of a motor that stands at the
 //! very beginning of its range and turns backwards at more than a third of its speed range, at one of
-//! two positions of 65,536. Whoever asks for parameters lets such a frame be a reply: taking it for
+//! two positions of 65,536. While parameters are read such a frame counts as a reply: taking it for
 //! feedback would invent a position, taking feedback for it loses one of hundreds a second.
 
 use std::fmt;

@@ -35,7 +35,7 @@ impl MotorBus {
         }
     }
 
-    /// Is something wrong with a motor, by what it says?
+    /// Is something wrong with a motor, by its reports?
     pub(super) fn judge(&self, index: usize) -> Option<Fault> {
         let motor = self.motors.get(index)?;
         let status = || motor.status_fault();
@@ -73,7 +73,7 @@ impl MotorBus {
                 Some(motor) if waited >= DISABLE_WITHIN => self.fail(Fault::NotDisabled { motor }, now),
                 Some(_) => {}
             },
-            // It says the same again.
+            // It reports the same again.
             BusState::Faulted(Fault::Unusable { .. }) => self.keep(waited, now),
             BusState::Stopped => {}
             BusState::Faulted(_) => {
@@ -100,7 +100,7 @@ impl MotorBus {
             let is_silent = motor.unanswered(now) >= self.silent_after;
             match motor.phase {
                 Phase::Off { .. } if motor.ranges.is_none() && motor.is_off() && !is_silent => motor.probe(),
-                // It may hear without being heard.
+                // It may receive although its own frames do not arrive.
                 Phase::Asked { .. } | Phase::Probed if is_silent => motor.turn_off(),
                 _ => {}
             }

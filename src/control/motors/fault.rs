@@ -24,7 +24,7 @@ pub enum Strange {
     Jump {
         /// Where it was.
         from: f64,
-        /// Where it says that it is.
+        /// The position it reports.
         to: f64,
     },
     /// It is outside its limits.
@@ -82,11 +82,11 @@ pub enum Fault {
         /// Which.
         motor: usize,
     },
-    /// A motor latched a fault, or says something else that is neither enabled nor disabled.
+    /// A motor latched a fault, or reports something else that is neither enabled nor disabled.
     Latched {
         /// Which.
         motor: usize,
-        /// What it says.
+        /// What it reports.
         status: MotorStatus,
     },
     /// A motor is hotter than it may be.

@@ -19,7 +19,7 @@ pub fn stalled_after(spec: &DamiaoSpec) -> Duration {
 }
 
 impl MotorBus {
-    /// A frame for each motor that stops it as it is to stop at the fault of another, to be sent again and again by whoever
+    /// A frame for each motor that stops it as it is to stop at the fault of another, to be sent again and again by what
     /// outlives this program; `None` where none is on.
     #[must_use]
     pub fn last_will(&self) -> Option<impl Iterator<Item = CanFrame> + '_> {
@@ -32,7 +32,7 @@ impl MotorBus {
     /// To be called before frames are fed that waited while nothing ran; [`Self::step`] does so itself.
     ///
     /// The cycles stood still for longer than [`stalled_after`]: the motors may have been stopped meanwhile, by their own
-    /// limit or by whoever outlives this program, and where the joints are is not known. That is the fault, and not what it led to.
+    /// limit or by what outlives this program, and where the joints are is not known. That is the fault, and not what it led to.
     pub fn look_for_stall(&mut self, now: Stamp) {
         let passed = self.stepped.map_or(Duration::ZERO, |last| now.since(last));
         if passed >= self.stalled_after && (self.is_armed() || self.state == BusState::Arming) {

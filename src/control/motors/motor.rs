@@ -103,7 +103,7 @@ pub(super) struct Motor {
     pub(super) status: Option<MotorStatus>,
     /// The first frame since its last answer.
     asked: Option<Stamp>,
-    /// Frames in a row that say that it is not enabled, though it was.
+    /// Frames in a row that report it as not enabled, though it was.
     off_frames: u8,
     /// Its newest two positions are those of one joint.
     agrees: bool,
@@ -205,7 +205,7 @@ impl Motor {
 
     /// Takes its feedback.
     pub(super) fn take_feedback(&mut self, frame: &CanFrame, now: Stamp, notices: &mut Notices) -> Result<(), Fault> {
-        // Before its ranges are known, what it says of itself counts alone.
+        // Before its ranges are known, only its reported state counts.
         let Some(feedback) = self.ranges.or(Ranges::new(1.0, 1.0, 1.0)).and_then(|r| Feedback::decode(frame, &r))
         else {
             return Ok(());
@@ -215,7 +215,7 @@ impl Motor {
         if let Some(ranges) = self.ranges {
             is_possible = self.is_possible(&feedback, &ranges, now, notices)?;
         }
-        // Nothing that a damaged frame says is believed.
+        // Nothing in a damaged frame is believed.
         if !is_possible {
             return Ok(());
         }
@@ -376,7 +376,7 @@ impl Motor {
             MotorMode::PositionVelocity => codec::position_velocity(slave, command, self.spec.velocity),
             MotorMode::Velocity => codec::velocity(slave, command),
         };
-        // Commands are finite: targets are, and so is what a motor says.
+        // Commands are finite: targets are, and so are the values of a motor.
         if let Ok(frame) = frame {
             send(frame);
         }

@@ -14,7 +14,7 @@ pub enum BusState {
     Disarmed,
     /// An arm was asked for: parameters are read again, faults cleared, motors enabled.
     Arming,
-    /// All are enabled and go where actions say.
+    /// All are enabled and follow actions.
     Following,
     /// All are enabled and stay where the last command was, for want of an action.
     Holding,
@@ -69,7 +69,7 @@ pub enum Notice {
     RangesDiffer {
         /// Which.
         motor: usize,
-        /// What it says.
+        /// What it reports.
         read: Ranges,
         /// PMAX, VMAX, TMAX of its kind.
         shipped: [f64; 3],

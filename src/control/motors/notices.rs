@@ -1,4 +1,4 @@
-//! The notices of a bus of motors on their way to whoever shows them.
+//! The notices of a bus of motors on their way to the display.
 
 use std::collections::VecDeque;
 use std::time::Duration;

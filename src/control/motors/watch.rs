@@ -147,7 +147,7 @@ impl Watch {
         if self.jumps < JUMPS { Ok(Some(jump)) } else { Err(jump) }
     }
 
-    /// Does the position change as the speed says?
+    /// Does the position change according to the speed?
     fn compare_speed(&mut self, feedback: &Feedback, step: f64, now: Stamp) {
         let Feedback { q, dq, .. } = *feedback;
         let is_still = |still: &Still| (q - still.position).abs() <= STEPS * step && still.speed * dq > 0.0;

@@ -7,7 +7,7 @@ use super::fault::{Fault, Part, Strange};
 use super::notice::{Notice, Reason, Refusal};
 use crate::control::damiao::parameter::Parameter;
 
-/// Something to be shown, with the names of the motors it speaks of.
+/// Something to be shown, with the names of its motors.
 #[derive(Debug)]
 pub struct Words<'a, T> {
     what: &'a T,

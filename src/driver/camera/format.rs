@@ -17,7 +17,7 @@ use crate::registry::{CameraSpec, PixelFormat};
 use crate::sample::{Encoding, FLAG_ERROR};
 use crate::time::Stamp;
 
-/// How far a rate may be from the wished one: 30000/1001 is what many cameras call 30.
+/// How far a rate may be from the requested one: 30000/1001 is what many cameras call 30.
 const RATE_TOLERANCE: f64 = 0.005;
 
 /// A camera and what it offers.
@@ -70,7 +70,7 @@ pub enum Size {
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(untagged)]
 pub enum Rates {
-    /// These; none if the driver does not say.
+    /// These; none if the driver does not list them.
     List(Vec<Rate>),
     /// Anything between slowest and fastest.
     Range {
@@ -128,7 +128,7 @@ impl Rate {
 
 impl fmt::Display for Rate {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        // Two digits tell 29.97 from 30; whole rates are shown without.
+        // Two digits distinguish 29.97 from 30; whole rates are shown without.
         let text = format!("{:.2}", self.hz());
         f.write_str(text.trim_end_matches('0').trim_end_matches('.'))
     }
@@ -220,7 +220,7 @@ pub(super) struct Agreed {
 }
 
 impl Agreed {
-    /// Layout and rate, if this is what was wished.
+    /// Layout and rate, if this is what was requested.
     pub(super) fn accept(self, spec: &CameraSpec) -> Option<(Layout, Option<Rate>)> {
         let format_is_wished =
             self.fourcc == fourcc(spec.format) && (self.width, self.height) == (spec.width, spec.height);
@@ -243,7 +243,7 @@ pub(super) fn plain_name(name: &str) -> String {
         .to_lowercase()
 }
 
-/// The control called `wished`, if it takes `value`; otherwise what to tell.
+/// The control called `wished`, if it takes `value`; otherwise the message.
 pub(super) fn find_control<'a>(
     offered: &'a [ControlInfo],
     wished: &str,
@@ -364,7 +364,7 @@ fn compact_rows(bytes: &[u8], stride: usize, row: usize, height: usize, into: &m
     }
 }
 
-/// What the kernel says of a filled buffer.
+/// What the kernel reports of a filled buffer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Frame {
     pub(super) sequence: u32,
@@ -398,7 +398,7 @@ impl Progress {
         self.lost += 1;
     }
 
-    /// A picture that is passed on; says how many were lost before it.
+    /// A picture that is passed on; returns how many were lost before it.
     pub(super) fn take(&mut self, sequence: u32) -> u64 {
         self.count(sequence);
         std::mem::take(&mut self.lost)

@@ -104,7 +104,7 @@ impl Node {
         self.capability().is_err_and(|error| is_gone(&error))
     }
 
-    /// Sets format and rate as wished and reads back what the driver made of them. What is as wished
+    /// Sets format and rate as requested and reads back what the driver made of them. What is as requested
     /// already is left alone: to set it again costs a USB camera half a dozen control transfers, and
     /// all of them lie between a replug and its first picture.
     pub(super) fn negotiate(&self, spec: &CameraSpec) -> io::Result<Agreed> {
@@ -236,7 +236,7 @@ impl AsFd for Node {
     }
 }
 
-/// What the driver says the camera is.
+/// The camera by its driver's report.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Card {
     pub(super) name: String,

@@ -164,7 +164,7 @@ impl Drop for Brakes {
         }
         let end = Stamp::now().after(ENDS_WITHIN);
         for chip in &self.chips {
-            // A message may still be there of its beginning; an error says that the thread has ended.
+            // A message may still be there of its beginning; an error means that the thread has ended.
             while chip.ended.recv_timeout(end.since(Stamp::now())).is_ok() {}
         }
     }

@@ -1,6 +1,6 @@
 //! One master for each bus of motors.
 //!
-//! Whoever drives motors over a network interface holds a socket named after it, in the abstract namespace: like the
+//! A process that drives motors over a network interface holds a socket named after it, in the abstract namespace: like the
 //! interface that is one for each network namespace, needs no file, and ends with the process. Serial lines are opened
 //! for one program alone.
 

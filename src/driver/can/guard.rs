@@ -71,7 +71,7 @@ const ENDS_WITHIN: Duration = Duration::from_millis(200);
 pub(super) struct Guard {
     socket: OwnedFd,
     process: Child,
-    /// What it heard last.
+    /// What it received last.
     heard: u8,
     /// It was reported that it does not listen.
     is_reported: bool,
@@ -168,7 +168,7 @@ impl Drop for Guard {
     }
 }
 
-/// Hands the line of a brake to the guard, or has it closed there. Says whether that was done: otherwise it is to be tried
+/// Hands the line of a brake to the guard, or has it closed there. Returns whether that was done: otherwise it is to be tried
 /// again.
 pub(super) fn hand_over(guard: &OwnedFd, motors: u16, engaged_high: bool, line: Option<BorrowedFd<'_>>) -> bool {
     let [low, high] = motors.to_le_bytes();

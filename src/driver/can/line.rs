@@ -110,7 +110,7 @@ impl Line {
         }
     }
 
-    /// Gives an order of slcan and waits for the answer; says whether it was refused. No answer is none.
+    /// Gives an order of slcan and waits for the answer; returns whether it was refused. No answer is none.
     fn order(&mut self, command: slcan::Command) -> Result<bool, LinkError> {
         let deadline = Stamp::now().after(ANSWER);
         self.put(command.encode().bytes())?;
@@ -126,7 +126,7 @@ impl Line {
                     return Ok(false);
                 }
                 let timeout = Timespec { tv_sec: 0, tv_nsec: left.subsec_nanos().into() };
-                // Whatever it says, the read and the deadline say it too.
+                // Whatever it returns, the read and the deadline show it too.
                 let _ = poll(&mut [PollFd::new(&self.fd, PollFlags::IN)], Some(&timeout));
             }
         }
@@ -237,7 +237,7 @@ impl Line {
                         self.lost += 1;
                         Decoded::Nothing
                     }
-                    // As the kernel says it of a controller that left the bus: linux/can/error.h.
+                    // As the kernel reports a controller that left the bus: linux/can/error.h.
                     Some((Kind::BusError, _)) => {
                         Decoded::Frame(CanFrame { id: 0x40, error: true, ..CanFrame::default() })
                     }

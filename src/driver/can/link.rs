@@ -46,13 +46,13 @@ pub enum LinkError {
     /// Opening again later may help.
     #[error("{0}")]
     Retry(String),
-    /// Opening again cannot help before something is changed; the text says what.
+    /// Opening again cannot help before something is changed; the text names it.
     #[error("{0}")]
     Fatal(String),
 }
 
 impl LinkError {
-    /// What it is to whoever reads the device.
+    /// The same error for the reader of the device.
     #[must_use]
     pub fn into_driver(self) -> DriverError {
         match self {
@@ -86,9 +86,9 @@ pub struct Arrival {
 pub enum Link {
     /// A network interface.
     Socket(Socket),
-    /// A serial line that speaks slcan.
+    /// A serial line with slcan.
     Slcan(Line),
-    /// A serial line that speaks as Damiao's adapter does.
+    /// A serial line with the protocol of Damiao's adapter.
     Damiao(Line),
 }
 
@@ -148,7 +148,7 @@ impl Link {
         self.as_fd().try_clone_to_owned()
     }
 
-    /// Hands a frame to the kernel. Does not wait, and does not say that the frame was on the bus.
+    /// Hands a frame to the kernel. Does not wait, and does not confirm that the frame was on the bus.
     ///
     /// # Errors
     /// [`LinkError::Full`] when the frame was not taken and may be tried again; the others end the link.
@@ -174,7 +174,7 @@ impl Link {
     /// that waits already is given even when the deadline has passed.
     ///
     /// # Errors
-    /// [`LinkError::BusOff`] when the controller says so, after which the link may still be used; the
+    /// [`LinkError::BusOff`] when the controller reports it, after which the link may still be used; the
     /// others end the link.
     pub fn recv_until(&mut self, deadline: Stamp, frame: &mut CanFrame) -> Result<Option<Arrival>, LinkError> {
         self.recv_unless_rung(deadline, frame, [const { None }; BELLS])
@@ -269,7 +269,7 @@ impl Link {
     pub const fn restarts(&self) -> bool {
         match self {
             Self::Socket(socket) => socket.restarts(),
-            // What these adapters do then, they do not tell.
+            // These adapters do not document what they do then.
             Self::Slcan(_) | Self::Damiao(_) => true,
         }
     }

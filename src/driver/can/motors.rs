@@ -153,7 +153,7 @@ impl Motors {
         self.notices.take()
     }
 
-    /// Turns the motors off and waits until they say so, for a tenth of a second at most.
+    /// Turns the motors off and waits until they report it, for a tenth of a second at most.
     pub async fn close(mut self) {
         let _ = unblock(move || {
             self.stop();
@@ -162,7 +162,7 @@ impl Motors {
         .await;
     }
 
-    /// Turns the motors off, waits as [`Self::close`] does, and says how well they were driven; `None` if the thread
+    /// Turns the motors off, waits as [`Self::close`] does, and returns how well they were driven; `None` if the thread
     /// panicked. Blocks as dropping does.
     #[must_use]
     pub fn finish(mut self) -> Option<Punctuality> {
@@ -194,7 +194,7 @@ impl Motors {
 }
 
 impl Drop for Motors {
-    /// Blocks for the cycle that is under way and until the motors say that they are off: some 20 ms, and a
+    /// Blocks for the cycle that is under way and until the motors report that they are off: some 20 ms, and a
     /// tenth of a second more where one says nothing.
     fn drop(&mut self) {
         self.stop();

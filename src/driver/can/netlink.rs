@@ -5,7 +5,7 @@
 //! `CAP_NET_ADMIN`) has it done here.
 //!
 //! Invariant: an interface that was set down while this program used it stays down until it is set up again from outside:
-//! whoever works on the bus wants no frames on it.
+//! an operator who works on the bus wants no frames on it.
 
 use std::sync::atomic::{AtomicU32, Ordering};
 
@@ -39,7 +39,7 @@ enum Need {
     Nothing,
     /// It is down.
     Up,
-    /// It is up with another bit rate, or has left the bus for good.
+    /// It is up with another bit rate, or has left the bus permanently.
     Anew,
 }
 

@@ -11,7 +11,7 @@
 //! | 13 | 3 | zero |
 //! | 16 | 8 | data, zero beyond its length |
 //!
-//! Of an error frame (bit 29) the identifier and the data say what happened, as in linux/can/error.h. The
+//! Of an error frame (bit 29) the identifier and the data describe what happened, as in linux/can/error.h. The
 //! sample is stamped with its first frame.
 //!
 //! On a busy bus frames are let wait for [`PACE`], so that a sample is worth its handling; a frame of a
@@ -84,7 +84,7 @@ impl Raw {
     /// The next batch.
     ///
     /// # Errors
-    /// [`DriverError::Gone`] when the adapter is; [`DriverError::Retry`] when the bus was left for good.
+    /// [`DriverError::Gone`] when the adapter is; [`DriverError::Retry`] when the bus was left permanently.
     pub async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
         if let Some(error) = self.ended.take() {
             return Err(error);

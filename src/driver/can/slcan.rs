@@ -1,4 +1,4 @@
-//! slcan: CAN frames as lines of text, as adapters on serial lines speak it.
+//! slcan: CAN frames as lines of text, as adapters on serial lines use them.
 //!
 //! Source: Lawicel, "CANUSB User manual" 1.5, section "ASCII commands": `S0`-`S8` bit rate, `O` open, `C` close,
 //! `Z0`/`Z1` time stamps, `t`/`T`/`r`/`R` frames; each line ends with CR. The adapter answers CR for done, BEL for
@@ -114,7 +114,7 @@ pub fn encode(frame: &CanFrame) -> Text {
     text
 }
 
-/// What an adapter says.
+/// What an adapter sends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Event {
     /// A frame, and its time stamp in ms, `0..=59999`, where the adapter gives one.
@@ -189,7 +189,7 @@ impl Decoder {
         }
     }
 
-    /// What the line that is complete says.
+    /// The meaning of the complete line.
     fn event(&self) -> Option<Event> {
         if self.overlong {
             return None;

@@ -3,20 +3,20 @@
 //! The requests are those of Open GoPro (gopro.github.io/OpenGoPro, HTTP, version 2.0): wired control on,
 //! clock set, then every 3 s a keep-alive and a look at the camera's state, which is the sample, in JSON:
 //! `{"recording":bool,"busy":bool,"battery_percent":n,"card_free_kb":n,"remaining_s":n}`, null where the
-//! camera does not say. With an episode the shutter is started and stopped (`camera`); which clip it made is written
-//! beside the episode, and the clip is fetched if the entry says so (`clip`), by the next run if this one ends before.
+//! camera does not report it. With an episode the shutter is started and stopped (`camera`); which clip it made is written
+//! beside the episode, and the clip is fetched if the entry requests it (`clip`), by the next run if this one ends before.
 //!
 //! The camera gives itself 172.2X.1YZ.51 and its host an address in the same network, XYZ being the last
 //! digits of its serial number.
 //!
 //! What must outlive a connection to a camera, and the run, is in `gopro/SERIAL.json` in the state directory ([`Books`]):
 //! that its shutter is ours, for which episode, and which clips are still to be fetched. SERIAL is the camera's serial
-//! number; without one the name of its entry. Of a clip only the path of its note is kept: whoever moves or removes an
+//! number; without one the name of its entry. Of a clip only the path of its note is kept: a user who moves or removes an
 //! episode with its note is not sent the clip.
 //!
 //! Invariant: a task talks to the camera; readers and senders of requests never wait for it.
 //! Invariant: however the connection or the run ends, the shutter that is ours and the clips that are to be fetched are
-//! known to whoever opens the camera next ([`Books`]).
+//! known to the next driver of the camera ([`Books`]).
 
 mod answer;
 mod camera;
@@ -294,7 +294,7 @@ impl Books {
                 let _ = folder.remove(name);
                 return Ok(());
             }
-            // Whoever loses the power loses the camera, too.
+            // Without power the camera is lost, too.
             folder.replace(name, &text, 0o600, Sync::Skip)
         };
         let saved = tokio::task::spawn_blocking(write).await.unwrap_or_else(|error| Err(std::io::Error::other(error)));

@@ -1,4 +1,4 @@
-//! HTTP as devices speak it: one request a connection, every wait and every size bounded.
+//! HTTP as devices use it: one request a connection, every wait and every size bounded.
 
 use std::time::Duration;
 

@@ -4,7 +4,7 @@
 //! One entry gives one kind of sample. Of `image`, each sample is the picture as it came with a comment
 //! behind its first two bytes: `{"pose":[16 numbers],"device_time":s,"wall_clock":s}`, so that nothing the
 //! phone measured is lost. Of `pose`, each sample is the 16 numbers. The phone makes one connection, so
-//! both at once are not to be had.
+//! both at once are not available.
 //!
 //! A sample's time is the phone's own, brought to our clock by the least delay that was seen
 //! ([`Clock`]).
@@ -40,7 +40,7 @@ use crate::time::Stamp;
 const INBOX: usize = 64 << 10;
 /// A picture that is not the sample has room for this much, or a byte a pixel.
 const LARGEST_UNSEEN: usize = 64 << 10;
-/// Of what a phone says of its session, so much is logged.
+/// So much of what a phone reports of its session is logged.
 const LONGEST_SESSION: usize = 500;
 /// The comment at its longest: 18 numbers, the longest of which take 330 digits.
 const COMMENT: usize = 2 << 10;
@@ -254,7 +254,7 @@ fn annotate(picture: &[u8], frame: &Frame, output: &mut Vec<u8>) -> bool {
     true
 }
 
-/// JSON has no word for what is no number.
+/// JSON cannot express what is no number.
 fn number(value: f64, output: &mut Vec<u8>) {
     let _ = if !value.is_finite() {
         output.write_all(b"null")

@@ -3,7 +3,7 @@
 /// Start of image.
 pub(super) const START: [u8; 2] = [0xff, 0xd8];
 
-/// Width and height in pixels; `None` if the picture does not say within its first segments.
+/// Width and height in pixels; `None` if its first segments do not hold them.
 pub(super) fn size(picture: &[u8]) -> Option<(u32, u32)> {
     /// More segments than any camera writes before the picture begins.
     const SEGMENTS: usize = 64;

@@ -107,7 +107,7 @@ impl Camera {
     }
 }
 
-/// Does the entry say how large its pictures are?
+/// Does the entry give the size of its pictures?
 pub(super) fn check_size(name: &str, (width, height): (u32, u32), wished: LanPicture) -> Result<(), DriverError> {
     if (width, height) == (wished.width, wished.height) {
         return Ok(());

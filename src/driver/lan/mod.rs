@@ -4,8 +4,8 @@
 //! an address that was found. Sockets are bound to the interface where there is one, so that a device
 //! behind an adapter is never mistaken for another with the same address elsewhere.
 //!
-//! Nothing reports that a device on the network is gone: every wait here has an end, and what is heard is
-//! noted in the node for whoever keeps its lease (`hotplug::lan`).
+//! Nothing reports that a device on the network is gone: every wait here has an end, and what is received is
+//! noted in the node for the keeper of its lease (`hotplug::lan`).
 //!
 //! Invariant: what a server sends is bounded: headers, bodies, pictures, packets, and the time they take.
 //! Invariant: only the device the entry means is listened to.

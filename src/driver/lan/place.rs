@@ -60,7 +60,7 @@ impl Place {
         self.address.map(|address| address.port()).filter(|port| *port > 0)
     }
 
-    /// The device was heard of, now.
+    /// The device was received from, now.
     pub(super) fn heard(&self) {
         self.last_received.now();
     }
@@ -176,7 +176,7 @@ const EVERY: Duration = Duration::from_millis(100);
 pub(super) struct Carrier {
     /// Of an adapter: `1` with a link (Documentation/ABI/testing/sysfs-class-net, `carrier`).
     file: Option<PathBuf>,
-    /// Adapters that never tell are believed to have one.
+    /// Adapters that never report are assumed to have one.
     was_up: bool,
     beat: Interval,
 }

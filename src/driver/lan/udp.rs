@@ -46,7 +46,7 @@ pub(super) struct Packets {
 }
 
 impl Packets {
-    /// Hears what comes to `port`; a packet has at most `max_bytes`.
+    /// Receives what comes to `port`; a packet has at most `max_bytes`.
     pub(super) fn open(place: Place, port: u16, max_bytes: usize) -> Result<Self, DriverError> {
         let socket = bind(&place, port).map_err(|error| port_error(port, &error))?;
         // SAFETY: the descriptor is owned by what is registered.
@@ -170,7 +170,7 @@ mod tests {
             ("127.0.0.1", None),
             ("127.0.0.9", None),
             ("::1", None),
-            // What they broadcast is to be heard as well.
+            // What they broadcast is to be received as well.
             ("192.0.2.201", Some(any)),
             ("fd00::7", Some(any_v6)),
         ] {

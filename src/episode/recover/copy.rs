@@ -52,7 +52,7 @@ pub(super) struct About<'a> {
 #[derive(Debug)]
 pub(super) struct Copied {
     pub(super) summary: Summary,
-    /// What it holds and lacks; its name and that of the original are whoever asked for it to add.
+    /// What it holds and lacks; the caller adds its name and that of the original.
     pub(super) repaired: Repaired,
     /// Nothing of the original is left out but a torn end.
     pub(super) is_lossless: bool,

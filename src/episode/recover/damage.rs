@@ -398,7 +398,7 @@ fn an_index_that_lacks_bytes_takes_no_chunk_along() {
     assert!(tried > 10_000 && wrong.is_empty(), "{} cases: {wrong:#?}", wrong.len());
 }
 
-/// A record with fields of a later version is longer than they say: what it claims to hold may be a chunk's beginning.
+/// A record with fields of a later version is longer than they are: what it claims to hold may be a chunk's beginning.
 #[test]
 fn a_record_that_claims_to_be_longer_takes_no_chunk_along() {
     let payloads = |count: u8| (0..count).map(|value| vec![value; 12]).collect::<Vec<_>>();

@@ -90,7 +90,7 @@ impl Repairs {
         let begun = SystemTime::now();
         std::thread::Builder::new().name("recover".to_owned()).spawn(move || {
             repair_all(&folder, reserve, begun, &board, &asked);
-            // Whoever waited may have gone.
+            // The waiting task may have ended.
             let _ = tell.send(());
         })?;
         Ok(Self { stop, ended })
@@ -115,7 +115,7 @@ fn repair_all(folder: &Path, reserve: Option<u64>, begun: SystemTime, board: &Bo
         Err(error) => return log(Level::Warn, format!("{}: {error}; nothing in it is repaired", folder.display())),
     };
     for entry in entries {
-        // What was made since is ours, or will be looked after by whoever starts next.
+        // What was made since is ours, or is cleaned up by the next start.
         let metadata = entry.metadata();
         let is_new = metadata.as_ref().is_ok_and(|metadata| metadata.created().is_ok_and(|made| made >= begun));
         if is_new || stop.load(Ordering::Relaxed) {

@@ -33,7 +33,7 @@ pub(super) fn end(summary: &Summary) -> BTreeMap<String, String> {
 
 /// The metadata record `rapid/recovered`: what was repaired when and by whom, what is there and what
 /// is not: the keys of [`LeftOut`](super::LeftOut), and as JSON `nameless` `{channel: messages}`. `ordered_messages` were
-/// taken without a check value, because the machine has not been started anew since they were written.
+/// taken without a check value, because the machine has not been restarted since they were written.
 pub(super) fn recovered(copied: &Copied, about: &About<'_>, size: u64) -> BTreeMap<String, String> {
     let Repaired { unread_bytes, refused_records, nameless, failed, .. } = &copied.repaired;
     let Repaired { messages, seconds, damaged_chunks, ordered_messages, .. } = copied.repaired;

@@ -92,7 +92,7 @@ impl Summary {
         Some((&origin.sha256, origin.lossless))
     }
 
-    /// Says whether every byte of the file was understood and is right.
+    /// Returns whether every byte of the file was understood and is right.
     pub(super) fn integrity(&mut self, integrity: &Integrity) {
         (self.is_sound, self.is_proven) = (integrity.sound, integrity.proven);
     }

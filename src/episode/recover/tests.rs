@@ -97,7 +97,7 @@ async fn a_torn_episode_becomes_a_whole_one_with_all_that_was_in_it() {
     assert_eq!(new.schemas, old.schemas);
     let attached = mcap::read::attachment(&whole, &new.attachment_indexes[0]).unwrap();
     assert_eq!((attached.name.as_str(), &*attached.data), ("devices.toml", registry().text.as_bytes()));
-    // To whoever inspects it, it is an episode like any other.
+    // For `inspect` it is an episode like any other.
     let inspected = crate::record::inspect::inspect(&repaired.to).unwrap();
     assert_eq!((inspected.end, inspected.messages), (FileEnd::Finished, messages.len() as u64));
     assert!((inspected.seconds - seconds).abs() < 1e-9 && inspected.dropped.is_none());
@@ -365,7 +365,7 @@ async fn of_a_damaged_finished_file_a_whole_one_is_made_beside_it() {
     let kept = strictly(&fs::read(&made.to).unwrap());
     assert!(kept.len() > 150 && kept.len() < 200, "{}", kept.len());
     assert!(kept.iter().all(|message| all.contains(message)));
-    // Left over of an episode, the same is kept for whoever wants to try more.
+    // Left over of an episode, the same is kept for further attempts.
     let file = put(&folder, "c_001.mcap.partial", &damaged);
     let made = repaired(&file);
     assert_eq!(made.original, Some(folder.path().join("c_001.mcap.damaged")));

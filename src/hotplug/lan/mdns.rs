@@ -1,11 +1,11 @@
 //! Devices that announce a service (mDNS, RFC 6762; DNS-SD, RFC 6763).
 //!
 //! The library keeps what was announced until it expires, which by default is after two minutes. So a
-//! device that its driver does not hear is asked again once a lease (RFC 6762, 10.4), and what does not
-//! answer by the end of the next is told as removed. A goodbye is told one second after it came: the
-//! library keeps to RFC 6762, 10.1, in which that is the time for somebody else to object. mdns-sd 0.21
-//! cannot ask again for an instance with a dot in its name: that one is gone when it says so, when its
-//! driver hears nothing more, or after two minutes.
+//! device that its driver does not receive from is queried again once a lease (RFC 6762, 10.4), and what does not
+//! answer by the end of the next is reported as removed. A goodbye is told one second after it came: the
+//! library keeps to RFC 6762, 10.1, in which that is the time for another host to object. mdns-sd 0.21
+//! cannot query an instance with a dot in its name again: that one is gone when it says goodbye, when its
+//! driver receives nothing more, or after two minutes.
 //!
 //! Invariant: of an announcement only the names and numbers are taken, each bounded.
 
@@ -29,14 +29,14 @@ const MOST_INSTANCES: usize = 64;
 const MOST_ADDRESSES: usize = 8;
 /// A name of an instance has 63 bytes (RFC 6763, 4.1.1).
 const LONGEST_NAME: usize = 63;
-/// The library tells of an answer that did not come at the end of the lease, give or take this.
+/// The library reports a missing answer at the end of the lease, give or take this.
 const MARGIN: Duration = Duration::from_millis(100);
-/// From the end of a lease to the next question, so that what is told of the one is not taken for the other.
+/// From the end of a lease to the next question, so that a report of the one is not taken for the other.
 const PAUSE: Duration = Duration::from_millis(200);
 /// What the app on the phone looks for, to know where to connect to.
 const VIO_SERVER: &str = "_vioserver._tcp.local.";
 
-/// The thread that speaks mDNS, which ends with this.
+/// The mDNS thread, which ends with this.
 pub(super) struct Browser {
     daemon: ServiceDaemon,
 }
@@ -99,7 +99,7 @@ impl Browser {
 
 impl Drop for Browser {
     fn drop(&mut self) {
-        // Says goodbye for what was announced; nobody waits for it.
+        // Sends a goodbye for what was announced, without waiting for it.
         let _ = self.daemon.shutdown();
     }
 }
@@ -116,7 +116,7 @@ struct Service {
     wanted: Vec<Wanted>,
     /// What is announced, by full name.
     known: BTreeMap<String, Found>,
-    /// Instances whose link went down, with that link: they are told again when it is up. The library says nothing
+    /// Instances whose link went down, with that link: they are reported again when it is up. The library reports nothing
     /// then, as they are announced as they were.
     cut: BTreeMap<String, Link>,
 }
@@ -157,7 +157,7 @@ impl Service {
         self.assign(Some(&full), now).await;
     }
 
-    /// Gives what is known to the entries, each to one. `announced` was announced just now: its lease begins anew.
+    /// Gives what is known to the entries, each to one. `announced` was announced just now: its lease begins again.
     async fn assign(&mut self, announced: Option<&str>, now: Stamp) {
         for index in 0..self.wanted.len() {
             let Some(wanted) = self.wanted.get(index) else { continue };
@@ -200,7 +200,7 @@ impl Service {
         for wanted in self.wanted.iter_mut().filter(|wanted| wanted.current.as_deref() == Some(full)) {
             let source = wanted.source(now);
             wanted.asked = None;
-            // Announcements get lost in the air; what the driver hears says more.
+            // Announcements get lost in the air; what the driver receives is better evidence.
             if source == UnplugSource::Lease && wanted.watch.is_sending(wanted.watch.length, now) {
                 tracing::debug!(device = wanted.watch.entry, "its announcement expired, but it is heard");
                 continue;
@@ -211,7 +211,7 @@ impl Service {
         self.assign(None, now).await;
     }
 
-    /// Looks at leases and links; says which instances are to be asked again, and how long they have.
+    /// Looks at leases and links; returns which instances are to be queried again, and how long they have.
     async fn look(&mut self, now: Stamp) -> Vec<(String, Duration)> {
         let mut questions = Vec::new();
         for wanted in &mut self.wanted {
@@ -245,7 +245,7 @@ impl Service {
 }
 
 impl Wanted {
-    /// Who says that its device is gone: an answer that did not come, or a goodbye.
+    /// The evidence that its device is gone: an answer that did not come, or a goodbye.
     fn source(&self, now: Stamp) -> UnplugSource {
         match self.asked {
             Some(asked) if now.since(asked).abs_diff(self.watch.length) <= MARGIN => UnplugSource::Lease,
@@ -261,7 +261,7 @@ fn found(service: &ResolvedService, domain: &str) -> Option<(String, Found)> {
 }
 
 /// An address with the scope that a link-local one needs. Of this computer's own only what was announced
-/// on it: nobody else has a device there.
+/// on it: no other entry has a device there.
 fn scoped(ip: &ScopedIp) -> Option<(IpAddr, u32)> {
     let is_own = match ip {
         ScopedIp::V4(v4) => v4.interface_ids().iter().any(|interface| interface.name == "lo"),
@@ -313,7 +313,7 @@ fn unescaped(label: &str) -> String {
     String::from_utf8_lossy(&name).into_owned()
 }
 
-/// Tells phones where to connect to.
+/// Announces to phones where to connect to.
 fn announce(daemon: &ServiceDaemon, port: u16) -> mdns_sd::Result<()> {
     let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
     let legal = |c: &char| c.is_ascii_alphanumeric() || *c == '-';

@@ -1,6 +1,6 @@
 //! Devices at a fixed address: asked once a second whether they are there.
 //!
-//! Invariant: a device that its driver hears is not asked; it may take one connection alone.
+//! Invariant: a device that its driver receives from is not queried; it may take one connection alone.
 
 use std::future::Future;
 use std::io;
@@ -25,7 +25,7 @@ const EVERY: Duration = Duration::from_secs(1);
 enum Answer {
     /// It is there.
     Here,
-    /// Its address answers, and nobody is at the port.
+    /// Its address answers, and the port is closed.
     Nobody,
     /// None.
     Silence,
@@ -55,7 +55,7 @@ pub(super) async fn watch(mut watch: Watch, server: SocketAddr, asked: SocketAdd
     }
 }
 
-/// The next question, or none if the device's driver hears it, or has the port it would be heard at.
+/// The next question, or none if the device's driver receives from it, or has the port it sends to.
 async fn next(last_received: LastReceived, driver_has_port: bool, probe: Probe, asked: SocketAddr) -> Answer {
     sleep(EVERY).await;
     let is_heard = Stamp::now().since(last_received.at()) < EVERY;
@@ -91,7 +91,7 @@ async fn http(asked: SocketAddr) -> io::Result<Answer> {
     Ok(if beginning == BEGINNING { Answer::Here } else { Answer::Silence })
 }
 
-/// Hears a packet of the device at a port of ours, which is given back at once.
+/// Receives a packet of the device at a port of ours, which is given back at once.
 async fn udp(asked: SocketAddr) -> io::Result<Answer> {
     let socket = UdpSocket::bind((own_side(Some(asked.ip())), asked.port())).await?;
     loop {

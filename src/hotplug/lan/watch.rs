@@ -1,13 +1,13 @@
-//! One entry that is looked for: from what is heard of its device to the events of its life.
+//! One entry that is looked for: from what is received of its device to the events of its life.
 //!
-//! Nothing on a network says that a cable was pulled somewhere. What was heard of within the lease is
-//! there; what was not is gone, unless something better said so before: a goodbye, or the link.
+//! Nothing on a network reports that a cable was pulled. What was received from within the lease is
+//! there; what was not is gone, unless there was better evidence before: a goodbye, or the link.
 //!
 //! The interface that leads to an address is that of the most special route (`/proc/net/route`, `/proc/net/ipv6_route`),
 //! its state the one of RFC 2863 that the kernel keeps in `/sys/class/net/NAME/operstate`. An address of our own, and
 //! one to which no route leads, has no link that could go down.
 //!
-//! Invariant: a lease is pure; each change is told once, arrivals and departures in turn.
+//! Invariant: a lease is pure; each change is reported once, arrivals and departures in turn.
 
 use std::cmp::Reverse;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
@@ -28,10 +28,10 @@ pub(super) const LOOK_EVERY: Duration = Duration::from_millis(100);
 pub(super) struct Watch {
     pub(super) entry: String,
     pub(super) length: Duration,
-    /// How much longer the lease is until the driver has heard of the device.
+    /// How much longer the lease is until the driver has received from the device.
     grace: Duration,
     lease: Lease,
-    /// What the driver hears.
+    /// What the driver receives.
     pub(super) last_received: LastReceived,
     pub(super) link: Link,
     /// Where the device is, while it is there.
@@ -53,7 +53,7 @@ impl Watch {
         }
     }
 
-    /// Its driver alone can hear it, and may be started this much later.
+    /// Its driver alone can receive from it, and may be started this much later.
     pub(super) const fn waits(mut self, grace: Duration) -> Self {
         self.grace = grace;
         self
@@ -63,18 +63,18 @@ impl Watch {
         self.lease.is_there()
     }
 
-    /// Has the driver heard of it within this time?
+    /// Has the driver received from it within this time?
     pub(super) fn is_sending(&self, within: Duration, now: Stamp) -> bool {
         self.is_there() && now.since(self.last_received.at()) < within
     }
 
-    /// It was heard of at this address.
+    /// It was received from at this address.
     pub(super) async fn found(&mut self, address: SocketAddr, instance: Option<&str>, when: Stamp) {
         let came = self.lease.heard(when) == Some(Change::Came);
         if !self.is_there() || (!came && self.address == Some(address)) {
             return;
         }
-        // Found at another address, it is told anew: the rig sees that the unit at its path is another.
+        // Found at another address, it is reported again: the rig sees that the unit at its path is another.
         self.address = Some(address);
         self.last_received = LastReceived::default();
         self.link = Link::to(address);
@@ -152,9 +152,9 @@ enum Change {
 #[derive(Debug, Clone, Copy)]
 struct Lease {
     length: Duration,
-    /// When it was last heard of, while it is there.
+    /// When it was last received from, while it is there.
     heard: Option<Stamp>,
-    /// What is older than this says nothing: it was told gone after that.
+    /// What is older than this is no evidence: it was reported gone after that.
     gone: Stamp,
 }
 
@@ -167,7 +167,7 @@ impl Lease {
         self.heard.is_some()
     }
 
-    /// Something of it was heard at `when`.
+    /// Something of it was received at `when`.
     fn heard(&mut self, when: Stamp) -> Option<Change> {
         let came = self.heard.is_none();
         if came && when < self.gone {
@@ -177,7 +177,7 @@ impl Lease {
         came.then_some(Change::Came)
     }
 
-    /// When the lease ends if nothing more is heard; never while it is not there.
+    /// When the lease ends if nothing more is received; never while it is not there.
     fn ends(&self) -> Option<Stamp> {
         Some(self.heard?.after(self.length))
     }
@@ -195,7 +195,7 @@ impl Lease {
     }
 }
 
-/// A route that says that there is none (`RTF_REJECT` of `linux/route.h`).
+/// A route that means that there is none (`RTF_REJECT` of `linux/route.h`).
 const REJECT: u32 = 0x0200;
 const INTERFACES: &str = "/sys/class/net";
 
@@ -235,7 +235,7 @@ impl Link {
     }
 }
 
-/// `unknown` is what drivers say that do not watch their carrier: loopback, some USB adapters.
+/// `unknown` is the answer of drivers that do not watch their carrier: loopback, some USB adapters.
 fn is_down(state: &str) -> bool {
     matches!(state, "down" | "lowerlayerdown" | "notpresent" | "dormant")
 }

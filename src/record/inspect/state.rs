@@ -35,7 +35,7 @@ pub(super) fn file_state<'a>(ending: &Ending<'a>) -> FileState<'a> {
         // A check value that is not right counts as much as a chunk that cannot be read.
         (FileEnd::Finished, None) if integrity.damaged_chunks == 0 && integrity.sound => match cut_short {
             Some(why) => FileState::NotWhole(why),
-            // Whoever wrote the footer: what the recorder ends, it sums up.
+            // Another program wrote the footer: the recorder writes a summary with its own.
             None if summary.is_empty() => FileState::NotWhole(UNFINISHED),
             None if !integrity.proven => FileState::NotWhole(UNPROVEN),
             None => FileState::Whole,

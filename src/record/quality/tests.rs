@@ -90,7 +90,7 @@ fn plugged_time_comes_from_events_and_opening_is_its_longest_part_outside_the_ma
         (&[(0, true)], &[(0, 1), (2_000, 0), (5_000, 1), (9_000, 0)], 10_000, 3_000),
         // Pulled out and put back: what it takes each time counts for itself.
         (&[(0, true), (3_000, false), (5_000, true)], &[(0, 0), (1_000, 1), (3_000, 0), (7_000, 1)], 8_000, 2_000),
-        // Told twice, and out before it was in.
+        // Reported twice, and out before it was in.
         (&[(1_000, false), (2_000, true), (3_000, true)], &[(0, 0)], 8_000, 8_000),
         // Without a mask nothing is known of its running.
         (&[(0, true)], &[], 10_000, 0),
@@ -181,7 +181,7 @@ fn an_absence_is_no_gap_and_no_loss_of_rate() {
     let said = quality_at(&measures, 5000);
     assert_eq!((said.presence, said.present, said.hz), (Some(0.4), 2.0, Some(100.0)));
     assert!((said.longest_gap - 0.01).abs() < 1e-9, "{}", said.longest_gap);
-    // The other one was there all the time and never spoke.
+    // The other one was there all the time and never sent.
     let other = measures.quality(id(3), BEGIN + 5000 * MS).unwrap();
     assert_eq!((other.samples, other.presence, other.longest_gap, other.hz), (0, Some(1.0), 5.0, Some(0.0)));
     assert!(measures.quality(id(1), BEGIN).is_none(), "not measured");
@@ -264,7 +264,7 @@ fn episode() -> impl Strategy<Value = Made> {
     (samples, masks).prop_map(|(mut samples, mut masks)| {
         samples.sort_unstable();
         masks.sort_unstable();
-        // An absence of no length would begin a new gap, which milliseconds cannot tell.
+        // An absence of no length would begin a new gap, which milliseconds cannot show.
         masks.dedup_by_key(|(at, _)| *at);
         (samples, masks)
     })

@@ -37,7 +37,7 @@ async fn an_episode_holds_exactly_the_captured_samples() {
     let begin: u64 = about["begin_wall_ns"].parse().unwrap();
     let end = begin + 1000 * MS;
 
-    // Every channel is named, one that never spoke too, by the schema its device lets expect.
+    // Every channel is named, one that never sent too, by the schema its device lets expect.
     let channels: BTreeMap<_, _> =
         read.summary.channels.values().map(|c| (c.topic.as_str(), c.schema.as_ref().unwrap().name.as_str())).collect();
     let expected = BTreeMap::from([

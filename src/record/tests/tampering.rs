@@ -85,7 +85,7 @@ async fn a_file_that_is_cut_or_replaced_while_it_is_recorded_ends_the_episode_an
     ];
     for (what, why, deed) in deeds {
         let (bench, finished, _, mut events) = recorded(deed).await;
-        // Nobody asks for the end.
+        // The end is not requested.
         let closed = tokio::time::timeout(PATIENCE, bench.until_closed(&mut events)).await;
         let What::Episode { file, error, verdict, .. } = closed.unwrap_or_else(|_| panic!("{what}: goes on")) else {
             unreachable!()
@@ -154,7 +154,7 @@ fn has_chunk(bytes: &[u8]) -> bool {
     false
 }
 
-/// The recorder's judgement is found again by whoever reads the file, and in what a repair makes of it.
+/// The recorder's judgement is found again by every reader of the file, and in what a repair makes of it.
 fn found_again(what: &str, why: &str, file: &Path) {
     let is_found = |file: &Path| {
         let said = inspect::list(file).verdict;

@@ -70,11 +70,11 @@ fn registry(cooldown: Duration, stall_after: Duration) -> Registry {
 
 #[derive(Clone)]
 enum Step {
-    /// A unit of the model, which sends this many numbers, is told as attached at a port.
+    /// A unit of the model, which sends this many numbers, is reported as attached at a port.
     Plug(&'static str, usize),
-    /// The cable is pulled: the device notices, hot-plug has yet to tell.
+    /// The cable is pulled: the device notices, hot-plug has not reported it yet.
     Pull(&'static str),
-    /// Hot-plug tells of the removal of a port.
+    /// Hot-plug reports the removal at a port.
     Removed(&'static str, UnplugSource),
     Silence(&'static str),
     Resume(&'static str),
@@ -85,7 +85,7 @@ enum Step {
     Until(&'static str),
     /// The mask other processes read becomes this.
     Mask(u64),
-    /// A network adapter is told as attached, whose carrier is in a file of this folder.
+    /// A network adapter is reported as attached, whose carrier is in a file of this folder.
     Adapter(PathBuf),
     /// Takes events until one that is logged holds this.
     Logged(&'static str),
@@ -200,7 +200,7 @@ async fn told(cooldown: Duration, stall_after: Duration, steps: &[Step]) -> Vec<
     told_of(&registry(cooldown, stall_after), false, steps).await
 }
 
-/// What was told after these steps and to the end of the run, by a rig that is to be armed at the start or not.
+/// What was reported after these steps and to the end of the run, by a rig that is to be armed at the start or not.
 async fn told_of(registry: &Registry, arm: bool, steps: &[Step]) -> Vec<String> {
     static NEXT: AtomicU32 = AtomicU32::new(0);
     let name = format!("owner{}x{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
@@ -379,7 +379,7 @@ async fn devices_are_told_of_the_episode_in_progress() {
     assert_eq!(first.recordings(), (0, 0), "there is no episode");
     begin(1);
     come_to(&first, (1, 0)).await;
-    // One that is silent is told as well.
+    // A silent one is reported as well.
     first.set_silent(true);
     bench.step(&Until("a stalled")).await;
     tell.send_replace(None);
@@ -495,7 +495,7 @@ impl Wake for Witnessing {
 }
 
 /// Plugs a device and pulls it out, over and over: what other threads see at the moment of each announcement, and what
-/// the file for people says after each change.
+/// the JSON file holds after each change.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_mask_comes_before_the_announcement_and_its_file_says_one_publication() {
     const ROUNDS: usize = 60;

@@ -54,7 +54,7 @@ pub enum PresenceError {
     Io {
         /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// The error of the system.
         error: std::io::Error,
     },
     /// No process publishes there.
@@ -104,7 +104,7 @@ pub(super) struct MaskFile {
 impl MaskFile {
     /// Makes the file, or takes over one whose process died.
     pub(super) fn create(path: &Path, device_count: u8) -> Result<Self, PresenceError> {
-        // First what says whose the rig is, if somebody's.
+        // First the file that shows whether another process owns the rig.
         let file = take(path)?;
         json::claim(&json_path(path)).inspect_err(|_| {
             // Under its lock, and empty or of a dead process.
@@ -120,7 +120,7 @@ impl MaskFile {
         Ok(Self { path: path.to_owned(), file, record })
     }
 
-    /// Makes the file anew where it was removed or replaced; returns whether it did. What is published next is in
+    /// Creates the file again where it was removed or replaced; returns whether it did. What is published next is in
     /// it.
     pub(super) fn restore(&mut self) -> Result<bool, PresenceError> {
         if self.is_there() {
@@ -169,7 +169,7 @@ impl Drop for MaskFile {
         if !self.is_there() {
             return;
         }
-        // While the lock is held, so that nobody else's files are removed. Another user's stays: it may not
+        // While the lock is held, so that no other process's files are removed. Another user's stays: it may not
         // be removed where everybody may write.
         let _ = std::fs::remove_file(json_path(&self.path));
         let _ = std::fs::remove_file(&self.path);
@@ -194,7 +194,7 @@ fn take(path: &Path) -> Result<File, PresenceError> {
         if !opened.is_file() || opened.nlink() > 1 {
             return Err(foreign("it is not an ordinary file of its own"));
         }
-        // Whoever owns it may write to it at any time, even if it may be written to by us.
+        // Its owner may write to it at any time, even if we may, too.
         if opened.uid() != rustix::process::geteuid().as_raw() {
             return Err(refused(path, Errno::ACCESS));
         }
@@ -244,7 +244,7 @@ fn holder(file: &Metadata) -> Option<u32> {
 /// Reads the published record, whole.
 ///
 /// # Errors
-/// When nobody publishes at `path`, or what lies there is not a mask.
+/// When no process publishes at `path`, or what lies there is not a mask.
 pub fn read_mask(path: &Path) -> Result<MaskRecord, PresenceError> {
     let io = |error: std::io::Error| match error.kind() {
         ErrorKind::NotFound => PresenceError::NotPublished { path: path.to_owned() },

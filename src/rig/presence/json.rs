@@ -73,7 +73,7 @@ pub(super) fn write(
 /// Is the name free, or what lies there ours to replace?
 pub(super) fn claim(path: &Path) -> Result<(), PresenceError> {
     let foreign = |what| Err(PresenceError::Foreign { path: path.to_owned(), what });
-    // Who can plant something between this look and the first document is told by the write.
+    // What is planted between this look and the first document is found by the write.
     match std::fs::symlink_metadata(path) {
         Ok(there) if !there.is_file() => foreign("it is not an ordinary file".to_owned()),
         Ok(there) if there.uid() != rustix::process::geteuid().as_raw() => {

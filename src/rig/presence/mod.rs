@@ -1,12 +1,12 @@
 //! Presence: publishes the physical mask for other processes, at 500 Hz and at every change.
 //!
 //! A named thread, `mask`, keeps the beat on absolute deadlines of 2 ms; it owns the file in shared
-//! memory and the mask's topic on the bus. The rig tells it a new mask by an atomic and a wake-up
+//! memory and the mask's topic on the bus. The rig passes it a new mask by an atomic and a wake-up
 //! and never waits for it.
 //!
 //! Invariant: nothing the thread does can be held up by a device, a disk or a child process.
 //! Invariant: a reader that compares the generation before and after never sees a torn record.
-//! Invariant: one publisher a file: a lock says so, and dies with its process.
+//! Invariant: one publisher a file: a lock ensures it, and dies with its process.
 
 mod file;
 mod json;
@@ -139,7 +139,7 @@ impl Drop for Presence {
         self.shared.stop.store(true, Ordering::Release);
         if let Some(thread) = self.thread.take() {
             thread.thread().unpark();
-            // The thread never waits for anything but its deadline. Whoever holds `ended` knows of a
+            // The thread never waits for anything but its deadline. The holder of `ended` learns of a
             // panic of its own.
             let _ = thread.join();
         }
@@ -148,7 +148,7 @@ impl Drop for Presence {
 
 /// What the thread owns.
 struct Beat {
-    /// Dropped by a panic too, and before the file: nobody writes beside it once it is gone.
+    /// Dropped by a panic too, and before the file: nothing writes beside it once it is gone.
     _ended: DropGuard,
     shared: Arc<Shared>,
     file: MaskFile,
@@ -198,14 +198,14 @@ impl Beat {
             if now >= due {
                 due = due.after(PERIOD);
                 if due <= now {
-                    // Held up for a period or more: go on from here rather than in a burst.
+                    // Held up for a period or more: continue from here rather than in a burst.
                     due = now.after(PERIOD);
                 }
             }
         }
     }
 
-    /// Makes the file anew if it is gone. True while that fails, which is reported once.
+    /// Creates the file again if it is gone. True while that fails, which is reported once.
     fn look(&mut self, failed: bool) -> bool {
         match self.file.restore() {
             Ok(false) => false,

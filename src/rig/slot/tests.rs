@@ -347,7 +347,7 @@ proptest! {
             slot.apply(input, now);
         }
         settle(&mut slot, &mut now);
-        // Given up by drivers that said too often that it is gone: that is the user's to end.
+        // Given up after its driver reported too often that it is gone: only the user can end that.
         if slot.state() == Failed {
             slot.apply(Input::Restart, now);
             settle(&mut slot, &mut now);

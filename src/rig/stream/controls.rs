@@ -1,10 +1,10 @@
-//! What an actuator is told: where to go, and whether it may.
+//! What an actuator is ordered: where to go, and whether it may.
 //!
 //! Actions come by the bus, orders from the run's [`Permission`].
 //!
 //! Invariant: what was given before the device was there is not for it.
 //! Invariant: a run that is to arm its actuator does so once, when the device is there for the first time, and
-//! not at all after another order, whoever gave it and whether or not the device was there.
+//! not at all after another order, whatever its origin and whether or not the device was there.
 
 use std::os::fd::OwnedFd;
 use std::sync::Arc;

@@ -63,7 +63,7 @@ impl Source {
         }
     }
 
-    /// Has it carry out these orders and actions. Says whether it takes them itself.
+    /// Has it carry out these orders and actions. Returns whether it takes them itself.
     pub(super) fn attend(&mut self, orders: &Arc<Attended>, actions: &Arc<dyn ActionSource>) -> bool {
         match self {
             Self::Driver(driver) => driver.attend(orders, actions),
@@ -78,7 +78,7 @@ impl Source {
         }
     }
 
-    /// What a program wants to know of episodes its hooks are told.
+    /// Passes episodes on to the hooks of a program.
     pub(super) fn record(&mut self, episode: Option<&Arc<Episode>>) -> Result<(), DriverError> {
         match self {
             Self::Driver(driver) => driver.record(episode),
@@ -86,7 +86,7 @@ impl Source {
         }
     }
 
-    /// The stream was told to stop.
+    /// The stream was asked to stop.
     pub(super) async fn close(self) {
         match self {
             Self::Driver(driver) => drop(timeout(CLOSE_LIMIT, driver.close()).await),
@@ -102,7 +102,7 @@ impl Source {
         }
     }
 
-    /// A source that is silent for this long is opened anew.
+    /// A source that is silent for this long is opened again.
     pub(super) fn patience(&self, stall_after: Duration) -> Option<Duration> {
         match self {
             Self::Driver(_) => None,

@@ -1,7 +1,7 @@
-//! Judging what a program publishes: its header is hearsay.
+//! Judging what a program publishes: its header is untrusted.
 //!
 //! 1. Modality and epoch must be ours: the sample of an earlier process is not one of this device.
-//! 2. The payload must be what the entry says, or the sample is refused.
+//! 2. The payload must be what the entry declares, or the sample is refused.
 //! 3. A capture time that cannot be is replaced by the time of arrival; time never goes back.
 //! 4. A hole in `seq` is a loss; a counter that jumps or begins again is none.
 //!
@@ -15,7 +15,7 @@ use crate::registry::ProcessSpec;
 use crate::sample::{Encoding, Epoch, FLAG_DEVICE_TIME, FLAG_ERROR, SampleHeader};
 use crate::time::Stamp;
 
-/// A sample that says it is older than this is not believed.
+/// A sample that claims to be older than this is not believed.
 const OLDEST: Duration = Duration::from_secs(10);
 /// A larger hole is a counter that was set.
 const LARGEST_HOLE: u64 = 1_000_000;
@@ -49,7 +49,7 @@ enum Refusal {
     NotJpeg,
 }
 
-/// What the entry says of a sample.
+/// What the entry declares of a sample.
 #[derive(Debug, Clone, Copy)]
 enum Expected {
     Scalars { channels: u32 },
@@ -103,7 +103,7 @@ impl Intake {
         };
         let said = Stamp(header.capture_ns);
         let is_possible = said <= now && now.since(said) <= OLDEST;
-        // Zero is how a program says that it does not know.
+        // Zero: the program does not know.
         if !is_possible && said != Stamp::default() && !std::mem::replace(&mut self.has_doubted, true) {
             self.complaint =
                 Some("its capture times are not those of CLOCK_MONOTONIC; the time of arrival is used".to_owned());

@@ -1,6 +1,6 @@
 //! The task of one child process: starts it, waits for its end or ends it, and reaps it.
 //!
-//! Told to stop, the group of the child gets SIGTERM, 5 s, then SIGKILL; what outlives its leader gets
+//! Asked to stop, the group of the child gets SIGTERM, 5 s, then SIGKILL; what outlives its leader gets
 //! SIGKILL at once.
 
 use std::os::unix::process::ExitStatusExt;
@@ -33,9 +33,9 @@ pub(super) struct Keeper {
     pub(super) stop: CancellationToken,
     /// The entry's turn: given back when the child is gone.
     pub(super) turn: OwnedMutexGuard<()>,
-    /// Told the process id, or why there is none.
+    /// Receives the process id, or why there is none.
     pub(super) started: oneshot::Sender<Result<u32, DriverError>>,
-    /// Told how the child ended.
+    /// Receives how the child ended.
     pub(super) ended: oneshot::Sender<String>,
 }
 
@@ -58,7 +58,7 @@ impl Keeper {
             }
         };
         let id = child.id();
-        // Where the stream has been told to stop meanwhile, nobody listens, here and below.
+        // Where the stream has been asked to stop meanwhile, nothing listens, here and below.
         let _ = started.send(Ok(id));
         programs.logbook.write(&name, &format!("started as process {id}"));
         let mut output = Output::new(&name, None, &programs);
@@ -80,13 +80,13 @@ impl Keeper {
         let _ = ended.send(reason);
         // What the child published last goes with its memory.
         let _ = timeout(LAST_SAMPLES, stop.cancelled()).await;
-        // A panic in there is said by the runtime and leaves only files behind.
+        // A panic in there is reported by the runtime and leaves only files behind.
         let _ = tokio::task::spawn_blocking(move || membership.sweep()).await;
         drop(turn);
     }
 }
 
-/// Waits for the child's end, and brings it about when told to.
+/// Waits for the child's end, and brings it about when asked to.
 async fn until_end(child: &Child, stop: &CancellationToken, hurry: &CancellationToken) -> End {
     tokio::select! {
         biased;

@@ -14,7 +14,7 @@ use crate::time::Stamp;
 const SURE: u8 = 2;
 
 impl Motor {
-    /// Can it be where it says? One that is off may be turned by hand, and its zero set; one that is damped sinks without
+    /// Can it be where it reports to be? One that is off may be turned by hand, and its zero set; one that is damped sinks without
     /// regard to where it is.
     pub(super) fn is_possible(
         &mut self,
@@ -40,7 +40,7 @@ impl Motor {
         Ok(heard.is_none())
     }
 
-    /// What is wrong with a motor that is to be enabled, or disabled, by what it says of itself.
+    /// What is wrong with a motor that is to be enabled, or disabled, by the state it reports.
     pub(in crate::control::motors) fn status_fault(&self) -> Option<Fault> {
         let motor = self.index;
         match self.status? {
@@ -59,14 +59,14 @@ impl Motor {
         self.temperatures(self.feedback.as_ref()?).into_iter().find_map(hot)
     }
 
-    /// Counts the frames that say that a motor which is on is not.
+    /// Counts the frames that report a motor as off which is on.
     pub(super) fn count_as_off(&mut self, status: MotorStatus) {
         let is_on = matches!(self.phase, Phase::On | Phase::Kept(_));
         let is_off = is_on && status != MotorStatus::Enabled;
         self.off_frames = if is_off { self.off_frames.saturating_add(1) } else { 0 };
     }
 
-    /// Will it follow a command? It says that it is enabled, or one frame alone says that it is not.
+    /// Will it follow a command? It reports that it is enabled, or a single frame reports that it is not.
     pub(super) fn may_follow(&self) -> bool {
         self.status == Some(MotorStatus::Enabled) || (1..SURE).contains(&self.off_frames)
     }

@@ -88,7 +88,7 @@ impl Motor {
         let [p, v, t] = self.read;
         let ranges = Ranges::new(p, v, t);
         if self.ranges != ranges {
-            // Counted in other ranges, it says something else.
+            // Counted in other ranges, it means something else.
             self.feedback = None;
             self.is_new = false;
         }
@@ -101,7 +101,7 @@ impl Motor {
         self.differs = differs;
     }
 
-    /// What a parameter is to be, if that is for us to say.
+    /// The value a parameter is to have, if we set it.
     pub(super) fn wanted(&self, parameter: Parameter) -> Option<Value> {
         match parameter {
             Parameter::ControlMode => Some(Value::Whole(match self.spec.mode {

@@ -65,7 +65,7 @@ fn a_silent_motor_disables_all_and_an_arm_fails_until_it_answers() {
     assert!(!world.sims[0].is_on() && !world.moved());
     world.arm();
     assert_eq!(world.run_to_fault(), Fault::Silent { motor: 1 });
-    // It is told to turn off all the while: it may hear without being heard.
+    // It is ordered to turn off all the while: it may receive although its own frames do not arrive.
     world.cycle();
     assert!(world.sent.contains(&Order::Disable.frame(2)));
     world.sims[1].silent = false;
@@ -224,7 +224,7 @@ fn a_motor_counts_as_off_when_it_confirms_after_the_order() {
         }
         world
     };
-    // What it said before is no answer to the order, which is sent all the same.
+    // Its report of before is no answer to the order, which is sent all the same.
     let mut world = enabling();
     world.disarm();
     let before = world.sims[0].feedback().unwrap();
@@ -281,7 +281,7 @@ fn motors_that_come_late_are_in_samples_after_a_fault_or_a_disarm() {
     assert_eq!(fault, Fault::Silent { motor: 1 });
     world.run(200);
     assert_eq!(world.bus.sample(&mut sample), None);
-    // Off again while it is asked: it is told to turn off, as one that may hear.
+    // Off again while it is asked: it is ordered to turn off, since it may receive.
     world.sims[1].silent = false;
     world.run(4);
     world.sims[1].silent = true;
@@ -339,7 +339,7 @@ fn motors_that_may_be_on_are_known_after_a_stop() {
     let still_on = |world: &World| world.bus.still_on().map(str::to_owned).collect::<Vec<_>>();
     let mut world = World::armed();
     assert_eq!(still_on(&world), ["joint_1", "joint_2"]);
-    // One of them has no power; what the other said before is no answer.
+    // One of them has no power; the other's report of before is no answer.
     world.sims[1].silent = true;
     let before = world.sims[0].feedback().unwrap();
     let frames = world.stop();
@@ -352,7 +352,7 @@ fn motors_that_may_be_on_are_known_after_a_stop() {
                 world.bus.feed(answer, world.now);
             }
         }
-        // Asked for again, what was said stands.
+        // Requested again, the answer stands.
         assert_eq!((world.stop().len(), still_on(&world)), (2, vec!["joint_2".to_owned()]));
     }
     assert_eq!(world.bus.state(), BusState::Stopped);

@@ -211,7 +211,7 @@ fn a_joint_that_is_held_back_is_pushed_no_harder_than_the_torque_limit() {
     }
     let pushed = world.sims[0].command.unwrap().1;
     assert!((pushed - 0.45).abs() < 1e-3, "{pushed}: 4 Nm at 20 Nm/rad are 0.2 rad");
-    // Let go, it goes on at the slew limit from there.
+    // Released, it continues at the slew limit from there.
     world.sims[0].stuck = false;
     world.target(&[2.0]);
     world.cycle();

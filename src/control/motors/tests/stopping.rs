@@ -148,7 +148,7 @@ fn at_an_emergency_stop_each_joint_stops_in_its_way_in_the_next_cycle() {
         world.run(200);
         assert_eq!((world.sims[0].is_on(), world.sims[1].is_on()), (false, way != Stop::Limp));
         assert_eq!(world.told(Notice::Fault(Fault::EmergencyStop(TRIP))), 1, "{:?}", world.notices);
-        // A disarm turns off what is held, an arm begins anew.
+        // A disarm turns off what is held, an arm begins again.
         world.disarm();
         world.run(5);
         assert!(!world.sims[1].is_on());

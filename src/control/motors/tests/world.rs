@@ -238,19 +238,19 @@ struct Judge {
 
 #[derive(Debug, Clone, Default)]
 struct Axis {
-    /// Where the machine was told last that it is, but for what is impossible, and when it was told anything.
+    /// The last position the machine received, without impossible ones, and when it received anything.
     reported: Option<f64>,
     /// Likewise how fast.
     speed: f64,
     heard: Option<Stamp>,
-    /// It told the motor to turn on.
+    /// It ordered the motor to turn on.
     told: bool,
-    /// It was told since that the motor is enabled.
+    /// It has received since that the motor is enabled.
     is_on: bool,
     /// The last command to a motor that is on, and when.
     command: Option<(f64, Stamp)>,
     unanswered: Option<Stamp>,
-    /// When it was last told to turn off.
+    /// When it was last ordered to turn off.
     off: Stamp,
 }
 
@@ -350,7 +350,7 @@ impl World {
             if is_possible {
                 (axis.reported, axis.speed) = (Some(said.q), said.dq);
             }
-            // What it said before it was told to turn off is of the past; of a frame that cannot be nothing is taken.
+            // Reports from before the order to turn off are of the past; nothing is taken from an impossible frame.
             if sent < axis.off || !is_possible {
                 continue;
             }
@@ -445,7 +445,7 @@ impl World {
                 continue;
             }
             if !axis.is_on {
-                // One frame alone may have said that it is off.
+                // A single frame may have reported it as off.
                 if keeps && !self.judge.may_move {
                     continue;
                 }
@@ -461,7 +461,7 @@ impl World {
             if let Some((before, at)) = axis.command {
                 let step = motor.slew * self.now.since(at).min(CYCLE * 2).as_secs_f64() + 2.0 * quantum;
                 assert!((command - before).abs() <= step, "from {before} to {command}");
-                // Whoever starts beyond the limits may stay there and come back, no more.
+                // A joint that starts beyond the limits may stay there and come back, no more.
                 let back = command.abs() <= before.abs() + quantum;
                 assert!(range.contains(&command) || back, "{command} is beyond the limits, at {measured}");
             }

@@ -373,7 +373,7 @@ mod tests {
         assert_eq!(ward.due(at(75)), frames);
         ward.hear(&will(&frames), at(300));
         assert_eq!(ward.due(at(301)), &[]);
-        // It stands still for good.
+        // It stands still permanently.
         assert_eq!(ward.due(at(375)), frames);
         let off = ward.post.off.clone();
         assert_eq!(ward.due(at(5_375)), off);

@@ -1,7 +1,7 @@
 //! Thread `control`: the beat of a bus of motors.
 //!
 //! A cycle: take what the bus brings until the cycle's deadline, take what was asked for, let
-//! [`MotorBus`] decide, send. [`Pace`] says when a cycle begins. The thread waits for the bus, for orders and for the
+//! [`MotorBus`] decide, send. [`Pace`] decides when a cycle begins. The thread waits for the bus, for orders and for the
 //! topic of actions at once: an order that stops the motors begins a cycle at its arrival, a fresh action begins one as
 //! soon as the bus has room for it, as a rule at its arrival too.
 //!
@@ -89,7 +89,7 @@ impl Shared {
 struct Spell(Option<Stamp>);
 
 impl Spell {
-    /// It happens at `now`. Says whether that is news.
+    /// It happens at `now`. Returns whether that is news.
     fn goes_on(&mut self, now: Stamp) -> bool {
         self.0.replace(now).is_none_or(|last| now.since(last) >= QUIET)
     }
@@ -243,7 +243,7 @@ impl Beat {
         Ok(())
     }
 
-    /// Carries out orders. Says whether one of them stops the motors, which has no time to lose.
+    /// Carries out orders. Returns whether one of them stops the motors, which has no time to lose.
     fn take_orders(&mut self, now: Stamp) -> bool {
         let bus = &mut self.powered.bus;
         let before = bus.state();
@@ -262,7 +262,7 @@ impl Beat {
         is_stop && bus.state() != before
     }
 
-    /// Takes the newest action. Says whether the motors follow it.
+    /// Takes the newest action. Returns whether the motors follow it.
     fn take_action(&mut self, now: Stamp) -> bool {
         let Some(actions) = self.shared.actions.get() else { return false };
         let mut action = [0.0; MAX_ACTION];

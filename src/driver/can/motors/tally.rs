@@ -8,7 +8,7 @@ use hdrhistogram::Histogram;
 use crate::control::motors::Counts;
 use crate::time::nanoseconds;
 
-/// Longest time the statistics tell apart, ns.
+/// Longest time the statistics distinguish, ns.
 const LONGEST: u64 = 10_000_000_000;
 
 /// How well the thread kept its beat.

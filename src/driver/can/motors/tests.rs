@@ -75,7 +75,7 @@ fn motor(bus: UdpSocket) -> (Arc<Fate>, thread::JoinHandle<UdpSocket>) {
                 }
                 let id = u16::from_ne_bytes([raw[0], raw[1]]);
                 let frame = CanFrame::standard(id, raw[8..16].try_into().unwrap());
-                // Who is not there to hear it is the thread, which has ended.
+                // The thread has ended and receives nothing.
                 let _ = bus.send(&bytes(&answer(&frame, &fate)));
             }
             bus
@@ -140,7 +140,7 @@ async fn an_emergency_stop_turns_the_motor_off_and_is_named() {
     }
     permission.arm(Stamp::now(), Stamp::now()).unwrap();
     told(&mut motors, |notice| notice.arming == Arming::Holding).await;
-    // Nobody passes it on.
+    // Nothing passes it on.
     permission.report(1, InputState::Lost, Stamp::now());
     let notice = told(&mut motors, |notice| notice.arming == Arming::Faulted).await;
     assert_eq!(notice.text, "emergency stop pendant lost: all motors are stopped");
@@ -169,7 +169,7 @@ async fn a_bus_off_without_a_return_is_told_and_ends_the_driver() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_bus_without_room_is_told() {
-    // Nobody reads at the other end.
+    // Nothing reads at the other end.
     let (link, _adapter) = damiao_link();
     let mut motors = Motors::start(link, &spec(10, 1000)).unwrap();
     let notice = told(&mut motors, |notice| notice.text.contains("the queue to the bus is full")).await;

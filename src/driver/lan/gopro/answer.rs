@@ -11,7 +11,7 @@ pub(super) struct Name {
     pub(super) file: String,
 }
 
-/// What the camera says of itself.
+/// What the camera reports of itself.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
 pub(super) struct State {
     pub(super) recording: bool,

@@ -1,4 +1,4 @@
-//! The task that speaks with a camera: keeps it awake, runs its shutter with the episodes, fetches its clips.
+//! The task that communicates with a camera: keeps it awake, runs its shutter with the episodes, fetches its clips.
 //!
 //! What is wanted is the episode in progress, what is the case the shutter in the [`Books`]: at every change and at
 //! every beat the one is made to follow the other, so that an answer which did not come, or a lost connection, delays
@@ -33,7 +33,7 @@ pub(super) type Told = Option<Option<PathBuf>>;
 /// How long things take.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Pace {
-    /// The camera switches itself off when it hears nothing for longer than this (Open GoPro, "keep alive").
+    /// The camera switches itself off when it receives nothing for longer than this (Open GoPro, "keep alive").
     pub(super) beat: Duration,
     /// A clip is in the camera's list a moment after it was stopped, usually within 1.5 s.
     pub(super) listed_within: Duration,
@@ -309,7 +309,7 @@ impl Camera {
         }
     }
 
-    /// Says that an episode is without its clip.
+    /// Reports that an episode is without its clip.
     async fn unknown(&self, shutter: &Shutter, reason: &str) {
         let newest = newest(&self.server).await.ok().flatten();
         let newest = newest.map(|Name { folder, file }| format!("; the newest on the card is {folder}/{file}"));
@@ -345,7 +345,7 @@ impl Camera {
 }
 
 impl Drop for Camera {
-    /// Says what is left undone, however the task ends.
+    /// Reports what is left undone, however the task ends.
     fn drop(&mut self) {
         let then = if self.books.are_kept() { ", and is seen to when the camera is there again" } else { "" };
         for clip in &self.pending {

@@ -1,12 +1,12 @@
 //! A clip that a camera recorded during an episode: noted beside the episode's file, and fetched.
 //!
 //! Beside `NAME.mcap` the note is `NAME.DEVICE.clip.json`, the clip `NAME.DEVICE.FILE`; while it is being
-//! fetched its name ends in `.partial`, and what is there is gone on with.
+//! fetched its name ends in `.partial`, and what is there is continued.
 //!
 //! Invariant: the camera's words become part of a path only if they are plain names.
 //! Invariant: a byte is written where it belongs or not at all, by one fetch at a time, however often fetching is
 //! begun, broken off and begun again.
-//! Invariant: an episode keeps its room on the disk, whatever the camera says of the clip's size.
+//! Invariant: an episode keeps its room on the disk, whatever size the camera reports for the clip.
 
 use std::fs::{File, OpenOptions};
 use std::io;
@@ -40,7 +40,7 @@ const LARGEST_NOTE: u64 = 64 << 10;
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Clip {
     pub(super) name: Name,
-    /// Bytes, if the camera says.
+    /// Bytes, if the camera reports them.
     pub(super) size: Option<u64>,
     pub(super) episode: PathBuf,
     device: String,

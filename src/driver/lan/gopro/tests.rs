@@ -174,7 +174,7 @@ fn a_note_is_read_as_it_was_written_and_no_other_file_is_one() {
     assert_eq!(read("/a/b.gopro.clip.json", &note.replace("\"gopro\"", "\"../gopro\"")), None);
 }
 
-/// A camera whose clips are listed when the test says so, and which loses answers if it says so.
+/// A camera whose clips are listed when the test wants it, and which loses answers if it wants that.
 #[derive(Default)]
 struct Fake {
     asked: Mutex<Vec<String>>,
@@ -292,7 +292,7 @@ impl Bench {
         bench
     }
 
-    /// Connects, anew if it is connected: then the old connection is lost.
+    /// Connects, again if it is connected: then the old connection is lost.
     async fn open(&mut self) {
         self.gopro = None;
         let state = Some(self.folder.path().join("state"));
@@ -352,7 +352,7 @@ async fn each_episode_has_the_clip_that_was_made_for_it_or_none() {
     bench.until("a note", |bench| bench.clip_of("one").is_some()).await;
     assert_eq!(bench.clip_of("one").as_deref(), Some("GX010001.MP4"));
 
-    // Somebody presses the shutter between two episodes: that clip is nobody's.
+    // The shutter is pressed by hand between two episodes: that clip belongs to none.
     bench.fake.made();
     bench.record(Some("two"));
     bench.until("recording", |bench| bench.fake.is_recording()).await;
@@ -422,12 +422,12 @@ async fn an_episode_that_ends_while_the_connection_is_lost_ends_the_clip_too() {
     let mut bench = Bench::new(false).await;
     bench.record(Some("one"));
     bench.until("recording", |bench| bench.fake.is_recording()).await;
-    // Nobody tells the new connection of an episode.
+    // The new connection is not informed of an episode.
     bench.open().await;
     bench.until("a note", |bench| bench.clip_of("one").is_some()).await;
     assert!(!bench.fake.is_recording());
 
-    // An episode that goes on is told, and its shutter stays as it is.
+    // An episode that continues is reported, and its shutter stays as it is.
     bench.record(Some("two"));
     bench.until("recording", |bench| bench.fake.is_recording()).await;
     let stops = bench.fake.asked("shutter/stop");
@@ -498,7 +498,7 @@ async fn fetched(head: &'static str, size: Option<u64>, there: &[u8]) -> (Result
 async fn a_mismatched_partial_file_is_restarted() {
     let long = [7; 100];
     for (head, size, there) in [
-        // Elsewhere than where it was asked to, or it does not say where.
+        // Elsewhere than where it was asked to, or it does not report where.
         (
             "HTTP/1.1 206 X\r\nContent-Range: bytes 2-14/15\r\nContent-Length: 13\r\n\r\nving pictures",
             None,

@@ -28,7 +28,7 @@ pub(in crate::driver::lan) enum Cut {
     Frame(Frame),
     /// The session's JSON is complete: [`Packets::payload`].
     Session,
-    /// A frame that is too large, or says of its picture what cannot be.
+    /// A frame that is too large, or describes its picture as it cannot be.
     Malformed,
 }
 

@@ -1,6 +1,6 @@
 //! The grasp-and-sort task: a block on a table, a gripper, two bins, one step a tenth of a second.
 //!
-//! The block's texture says which bin it belongs to: triangular to the left, hexagonal to the front. Only
+//! The block's texture decides which bin it belongs to: triangular to the left, hexagonal to the front. Only
 //! the gel of the tactile fingertip shows the texture, and only while it is pressed on the block.
 //!
 //! Lengths are in metres, of a large table with a large block. Everything a world does follows from its

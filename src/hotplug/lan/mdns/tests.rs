@@ -6,7 +6,7 @@ use crate::registry::{DeviceNode, Unit};
 
 const LEASE: Duration = Duration::from_secs(3);
 
-/// Entries of a service, and what they tell.
+/// Entries of a service, and what they report.
 struct Bench {
     service: Service,
     told: mpsc::Receiver<HotplugEvent>,
@@ -44,7 +44,7 @@ impl Bench {
         self.told()
     }
 
-    /// Looks every 100 ms for so long; what is to be asked again, and what is told.
+    /// Looks every 100 ms for so long; what is to be queried again, and what is reported.
     async fn pass(&mut self, ms: u64) -> (usize, Vec<String>) {
         let mut questions = 0;
         for _ in 0..ms / 100 {
@@ -133,7 +133,7 @@ async fn each_instance_is_one_entry_and_a_named_one_the_one_of_its_name() {
     assert_eq!(bench.announced("b", &["127.0.0.1:2"]).await, ["+named b 127.0.0.1:2"]);
     assert_eq!(bench.announced("c", &["127.0.0.1:3"]).await, ["+right c 127.0.0.1:3"]);
     assert!(bench.announced("d", &["127.0.0.1:4"]).await.is_empty());
-    // Whoever waits takes the place of one that left.
+    // A waiting one takes the place of one that left.
     assert_eq!(bench.removed("a").await, ["-/lan/left goodbye", "+left d 127.0.0.1:4"]);
 }
 
@@ -147,7 +147,7 @@ async fn a_link_that_was_down_for_a_moment_brings_its_device_back() {
     std::fs::write(&state, "down\n").expect("written");
     bench.service.wanted[0].watch.lead_over(Link::of(folder.path()));
     assert_eq!(bench.pass(1000).await, (0, vec!["-/lan/phone link".to_owned()]));
-    // Another's announcement says nothing of it.
+    // Another's announcement is no evidence of it.
     assert_eq!(bench.announced("b", &["127.0.0.1:6"]).await, ["+phone b 127.0.0.1:6"]);
     assert_eq!(bench.removed("b").await, ["-/lan/phone goodbye"]);
     std::fs::write(&state, "up\n").expect("written");

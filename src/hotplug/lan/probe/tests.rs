@@ -21,7 +21,7 @@ async fn server<F: Future<Output = ()> + Send>(answer: impl Fn(TcpStream) -> F +
     address
 }
 
-/// A port that nobody is at.
+/// A closed port.
 fn nobody() -> SocketAddr {
     let listener = std::net::TcpListener::bind((LOCAL, 0)).expect("a port");
     listener.local_addr().expect("an address")
@@ -73,7 +73,7 @@ async fn packets_of_the_device_are_heard_and_the_port_is_given_back() {
     assert_eq!(answer, Answer::Here);
     drop(heard);
     UdpSocket::bind(port).await.expect("the port is free for the driver");
-    // Of somebody else they say nothing.
+    // They are no evidence of another device.
     let elsewhere = SocketAddr::from(([127, 0, 0, 9], nobody().port()));
     let mut heard = Box::pin(ask(Probe::Udp, elsewhere));
     let answer = loop {
@@ -135,7 +135,7 @@ async fn a_lease_waits_for_a_driver_that_is_started_later() {
     watch.look(begin).await;
     watch.look(last_received.at().after(EVERY)).await;
     assert!(!watch.is_there());
-    // One that was never heard is gone at last.
+    // One that never sent is gone at last.
     watch.found(nobody(), None, begin.after(EVERY * 20)).await;
     watch.look(begin.after(EVERY * 23)).await;
     assert!(!watch.is_there());
@@ -150,7 +150,7 @@ async fn a_device_appears_and_disappears_and_a_sending_one_is_not_probed() {
     let Some(HotplugEvent::Added(attachment)) = told.recv().await else { panic!("not found") };
     let DeviceNode::Lan { last_received, .. } = attachment.node else { panic!("not on the network") };
     drop(listener.accept().await);
-    // While its driver hears it, nobody connects.
+    // While its driver receives from it, no probe connects.
     for _ in 0..30 {
         last_received.now();
         let asked = timeout(Duration::from_millis(100), listener.accept()).await;

@@ -6,7 +6,7 @@ const LENGTH: Duration = Duration::from_nanos(3);
 
 #[derive(Debug, Clone, Copy)]
 enum Step {
-    /// Heard of at this moment.
+    /// Received from at this moment.
     Heard(u64),
     /// Looked at.
     Look(u64),

@@ -54,7 +54,7 @@ const UP_DISARMED: [&str; 3] = ["a at 1", "a opening", "a streaming"];
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn an_arm_at_the_start_is_given_once() {
     let again = ["a at 1", "a backoff", "a opening", "a streaming"];
-    // A disarm, to hear that nothing armed it before.
+    // A disarm, to learn that nothing armed it before.
     let end = [Give(Order::Disarm), Until("a disarmed")];
     let plug = || [Plug("1", NUMBERS), Until("a streaming")];
     let replugged = || [Removed("1", UnplugSource::Kernel), Until("a absent")].into_iter().chain(plug());
