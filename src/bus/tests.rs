@@ -183,7 +183,7 @@ fn a_subscriber_killed_while_it_holds_samples_costs_no_sample_and_its_place_is_g
     let registry = registry(16);
     let bus = Bus::open(&registry, Some(&name)).expect("bus");
     let writer = bus.writer(TopicId::Modality(registry.devices[0].id)).expect("writer");
-    let told = std::env::temp_dir().join(&name);
+    let reported = std::env::temp_dir().join(&name);
     for _ in 0..3 {
         let mut process = std::process::Command::new(std::env::current_exe().expect("this test"))
             .args(["--exact", "bus::tests::held_samples_helper", "--nocapture"])
@@ -191,14 +191,14 @@ fn a_subscriber_killed_while_it_holds_samples_costs_no_sample_and_its_place_is_g
             .stdout(std::process::Stdio::null())
             .spawn()
             .expect("process");
-        while !told.exists() {
+        while !reported.exists() {
             assert!(process.try_wait().expect("process").is_none(), "the helper ended");
             writer.publish(SampleHeader::default(), &[1; 64]).expect("the pool is enough");
             std::thread::sleep(Duration::from_millis(1));
         }
         process.kill().expect("kill");
         process.wait().expect("killed");
-        std::fs::remove_file(&told).expect("clean");
+        std::fs::remove_file(&reported).expect("clean");
         for _ in 0..1000 {
             writer.publish(SampleHeader::default(), &[1; 64]).expect("the pool is enough");
         }

@@ -212,7 +212,7 @@ impl MotorBus {
             // A command of one or two numbers may be shorter.
             let is_frame = !(frame.extended || frame.remote || frame.error);
             if let Some(motor) = self.motors.iter().position(|motor| is_frame && motor.is_commanded_by(frame)) {
-                self.heard_master(motor, now);
+                self.received_master(motor, now);
             }
             return;
         }
@@ -220,7 +220,7 @@ impl MotorBus {
         let Some(index) = self.motors.iter().position(|motor| motor.sent(frame, reply.as_ref())) else {
             self.counts.strangers += 1;
             if let Some(motor) = self.motors.iter().position(|motor| motor.is_commanded_by(frame)) {
-                self.heard_master(motor, now);
+                self.received_master(motor, now);
             }
             return;
         };
@@ -250,7 +250,7 @@ impl MotorBus {
             self.counts.refused += 1;
             // Another reason is another beginning.
             if self.refused.look(is_same, now) || self.refused.look(true, now) {
-                self.notices.tell(Notice::Refused(refusal));
+                self.notices.notify(Notice::Refused(refusal));
             }
         } else {
             self.refused.look(false, now);
@@ -267,7 +267,7 @@ impl MotorBus {
             let Some(clamped) = self.limits.get_mut(motor).and_then(|limits| limits.clamp(*target)) else { continue };
             let is_beyond = clamped.is_beyond;
             if self.clamped.get_mut(motor).is_some_and(|seldom| seldom.look(is_beyond, now)) {
-                self.notices.tell(Notice::Clamped { motor, target: *target, used: clamped.value });
+                self.notices.notify(Notice::Clamped { motor, target: *target, used: clamped.value });
             }
             if let Some(slot) = self.targets.get_mut(motor) {
                 *slot = clamped.value;
@@ -280,7 +280,7 @@ impl MotorBus {
         self.counts.actions += 1;
         if self.state == BusState::Holding {
             self.enter(BusState::Following, now);
-            self.notices.tell(Notice::Following);
+            self.notices.notify(Notice::Following);
         }
         true
     }
@@ -298,7 +298,7 @@ impl MotorBus {
             self.turn_off();
             self.is_returning = false;
             self.enter(BusState::Arming, now);
-            self.notices.tell(Notice::Arming);
+            self.notices.notify(Notice::Arming);
         }
     }
 

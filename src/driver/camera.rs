@@ -209,16 +209,16 @@ fn set_controls(name: &str, spec: &CameraSpec, node: &Node, path: &Path) -> Resu
         return Ok(());
     }
     let offered = node.controls();
-    for (wished, value) in &spec.controls {
+    for (requested, value) in &spec.controls {
         let control =
-            format::find_control(&offered, wished, *value).map_err(|why| format::control_error(name, path, &why))?;
+            format::find_control(&offered, requested, *value).map_err(|why| format::control_error(name, path, &why))?;
         node.set_control(control.id, *value).map_err(|error| match error.raw_os_error() {
             Some(libc::ENODEV) => DriverError::Gone,
             _ => format::control_error(
                 name,
                 path,
                 &format!(
-                    "{wished} cannot be set to {value} now ({error}): where an automatic mode governs it, switch that \
+                    "{requested} cannot be set to {value} now ({error}): where an automatic mode governs it, switch that \
                      off in an earlier line"
                 ),
             ),

@@ -275,7 +275,7 @@ impl Driver {
     }
 }
 
-fn wrong_kind(spec: &DeviceSpec, wished: &str, node: &DeviceNode) -> DriverError {
+fn wrong_kind(spec: &DeviceSpec, requested: &str, node: &DeviceNode) -> DriverError {
     let is = match node {
         DeviceNode::Video(_) => "a camera",
         DeviceNode::Tty(_) => "a serial line",
@@ -285,7 +285,7 @@ fn wrong_kind(spec: &DeviceSpec, wished: &str, node: &DeviceNode) -> DriverError
         DeviceNode::Sim(_) => "simulated",
     };
     DriverError::Fatal(format!(
-        "[device.{}] is a {wished} and {} is {is}: correct `node` or the identity of the entry",
+        "[device.{}] is a {requested} and {} is {is}: correct `node` or the identity of the entry",
         spec.name,
         node.label()
     ))

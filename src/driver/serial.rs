@@ -333,11 +333,11 @@ fn f32le(message: &[u8], values: &mut [f64]) -> bool {
 }
 
 fn json(message: &[u8], values: &mut [f64]) -> bool {
-    let wished = values.len();
+    let requested = values.len();
     let mut sink = Sink { values, count: 0 };
     let mut deserializer = serde_json::Deserializer::from_slice(message);
     let read = deserializer.deserialize_any(Document(&mut sink)).and_then(|()| deserializer.end());
-    read.is_ok() && sink.count == wished
+    read.is_ok() && sink.count == requested
 }
 
 struct Sink<'a> {

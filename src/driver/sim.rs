@@ -367,7 +367,7 @@ fn first_after(grid: Grid, now: Stamp) -> u64 {
 /// # Errors
 /// When kind, picture size or number of channels differ: what follows is laid out by the registry.
 pub(super) fn check(spec: &DeviceSpec, device: &SimDevice) -> Result<(), DriverError> {
-    let (sends, wished) = match (&device.source, &spec.node) {
+    let (sends, requested) = match (&device.source, &spec.node) {
         (SimSource::Camera { width, height, .. }, NodeSpec::Camera(camera)) => {
             if (*width, *height) == (camera.width, camera.height) {
                 return Ok(());
@@ -398,7 +398,7 @@ pub(super) fn check(spec: &DeviceSpec, device: &SimDevice) -> Result<(), DriverE
         }
     };
     Err(DriverError::Fatal(format!(
-        "the scenario's device {} sends {sends}, [device.{}] says {wished}: make them equal",
+        "the scenario's device {} sends {sends}, [device.{}] says {requested}: make them equal",
         device.name, spec.name
     )))
 }

@@ -225,11 +225,11 @@ fn scalars<'a>(message: &'a [u8], into: &'a mut Vec<u8>) -> Option<Sample<'a>> {
 }
 
 /// The bytes of field `wanted`; the last one counts, a missing one is empty.
-fn last_bytes(message: &[u8], wished: u64) -> Option<&[u8]> {
+fn last_bytes(message: &[u8], requested: u64) -> Option<&[u8]> {
     let mut found = &[][..];
     for field in whole_protobuf(message) {
         if let (number, Proto::Bytes(bytes)) = field?
-            && number == wished
+            && number == requested
         {
             found = bytes;
         }

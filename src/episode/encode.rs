@@ -296,8 +296,8 @@ mod tests {
         assert_eq!(number(&message, "mask"), 0x8000_0000_0000_0001);
         assert_eq!((number(&message, "sequence"), wall(&message)), (u64::MAX.into(), WALL));
 
-        let said = EventText { kind: "attach", device: "cam", text: "cam attached", json: "{}" };
-        event(&mut out, WALL, &said);
+        let report = EventText { kind: "attach", device: "cam", text: "cam attached", json: "{}" };
+        event(&mut out, WALL, &report);
         let message = decode(EVENT, &out);
         assert_eq!([text(&message, "kind"), text(&message, "device")], ["attach", "cam"]);
         assert_eq!([text(&message, "text"), text(&message, "json")], ["cam attached", "{}"]);
@@ -324,7 +324,7 @@ mod tests {
         let message = decode(FRAME, &out);
         assert_eq!((number(&message, "index"), number(&message, "mask")), (300, 1 | 1 << 63));
         let list = message.get_field_by_name("modalities").unwrap();
-        let said: Vec<_> = list
+        let report: Vec<_> = list
             .as_list()
             .unwrap()
             .iter()
@@ -337,6 +337,6 @@ mod tests {
             .collect();
         let expected =
             [(0, [1, 1, 0], -5, Some(0)), (1, [0, 0, 0], 0, None), (63, [1, 0, 1], 97, Some(u64::MAX.into()))];
-        assert_eq!(said, expected);
+        assert_eq!(report, expected);
     }
 }

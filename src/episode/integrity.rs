@@ -53,7 +53,7 @@ impl LeftOut {
     pub fn sentences(&self, damaged_chunks: u64) -> Vec<String> {
         let Self { gaps, oversized_records, swollen_chunks, excess_records, repeated_chunks, .. } = *self;
         let Self { nameless_messages, other_chunks, bytes_before, bytes_behind, .. } = *self;
-        let said = [
+        let report = [
             (damaged_chunks, "damaged chunk", "left out"),
             (gaps, "place", "not readable"),
             (oversized_records, "record", "left out: larger than 256 MiB"),
@@ -65,13 +65,13 @@ impl LeftOut {
             (bytes_before, "byte", "left out: before the beginning of the file"),
             (bytes_behind, "byte", "left out: behind the end of the file"),
         ];
-        let said = said.into_iter().filter(|(count, ..)| *count > 0);
-        let mut said: Vec<String> = said.map(|(count, what, why)| format!("{} {why}", is(count, what))).collect();
+        let report = report.into_iter().filter(|(count, ..)| *count > 0);
+        let mut report: Vec<String> = report.map(|(count, what, why)| format!("{} {why}", is(count, what))).collect();
         if self.unproven_bytes > 0 {
             let messages = is(self.unproven_messages, "message");
-            said.push(format!("{messages} left out: in a chunk that is cut, and nothing proves that they are whole"));
+            report.push(format!("{messages} left out: in a chunk that is cut, and nothing proves that they are whole"));
         }
-        said
+        report
     }
 
     fn is_nothing(&self) -> bool {

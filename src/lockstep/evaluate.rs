@@ -209,7 +209,7 @@ impl Bench<'_> {
         let timings = if recording.is_some() { Vec::new() } else { Timing::of_trial(seed, self.registry, &scenario) };
         let mut rig = Lockstep::new(self.registry, scenario, begun, &timings)?;
         self.model.reset();
-        let (recorder, told) = match recording {
+        let (recorder, reported) = match recording {
             Some(Recording { recorder, request, library, .. }) => (Some(recorder), Some((request, library))),
             None => (None, None),
         };
@@ -220,7 +220,7 @@ impl Bench<'_> {
             rig.deliver(&mut witness)?;
             rig.rest(&mut witness)?;
         }
-        if let (Some(recorder), Some((request, library))) = (&mut witness.recorder, told) {
+        if let (Some(recorder), Some((request, library))) = (&mut witness.recorder, reported) {
             recorder.begin(request, rig.now())?;
             recorder.event(&Event { stamp: rig.now(), what: self.bundle.begins(library.to_owned(), false) });
         }

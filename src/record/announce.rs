@@ -60,15 +60,15 @@ impl Announced {
         }
         // Of these some are normal: what is announced would make the episode suspect by now.
         let expected = counts.expected();
-        for (count, told, limit, what) in [
+        for (count, reported, limit, what) in [
             (counts.lost, &mut self.lost, lost, "lost by the device"),
             (counts.damaged, &mut self.damaged, damaged, "damaged"),
             (counts.late, &mut self.late, late, "too late for their frame"),
         ] {
             let beyond = limit.is_some_and(|limit| count as f64 > limit * expected as f64);
-            if beyond && count >= told.saturating_add(LEAST_SAMPLES) {
-                news.push(format!("{} samples {what}", count - *told));
-                *told = count;
+            if beyond && count >= reported.saturating_add(LEAST_SAMPLES) {
+                news.push(format!("{} samples {what}", count - *reported));
+                *reported = count;
             }
         }
         let still = frozen.is_some_and(|limit| meter.run.length_ns > nanoseconds(limit));

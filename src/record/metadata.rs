@@ -60,7 +60,7 @@ pub(super) fn beginning(
     let tags: Map<String, Value> =
         configuration.tags.iter().map(|(key, value)| (key.clone(), value.clone().into())).collect();
     let host = rustix::system::uname();
-    let mut said = text_map([
+    let mut report = text_map([
         ("software", concat!("rapid ", env!("CARGO_PKG_VERSION")).to_owned()),
         ("rig", registry.rig.name.clone()),
         ("task", task.to_owned()),
@@ -80,10 +80,10 @@ pub(super) fn beginning(
         ("begin_monotonic_ns", begin.0.to_string()),
         ("wall_minus_monotonic_ns", clock.wall_ns(Stamp(0)).to_string()),
     ]);
-    said.extend(units.policy().map(|policy| (POLICY.to_owned(), policy.to_string())));
+    report.extend(units.policy().map(|policy| (POLICY.to_owned(), policy.to_string())));
     // A repair trusts what was written last only where the kernel that wrote it still runs.
-    said.extend(episode::boot_id().map(|id| (BOOT_ID.to_owned(), id)));
-    said
+    report.extend(episode::boot_id().map(|id| (BOOT_ID.to_owned(), id)));
+    report
 }
 
 /// Contents of the record at the end.
@@ -123,7 +123,7 @@ pub(super) fn end(ending: &Ending<'_>) -> BTreeMap<String, String> {
     let sum = |count: fn(&Quality) -> u64| {
         modalities.iter().map(|judged| count(judged.quality)).fold(0, u64::saturating_add).to_string()
     };
-    let mut said = text_map([
+    let mut report = text_map([
         ("verdict", ending.verdict.grade.word().to_owned()),
         ("reasons", json!(ending.verdict.reasons).to_string()),
         ("sensors", json!(ending.verdict.sensors).to_string()),
@@ -141,11 +141,11 @@ pub(super) fn end(ending: &Ending<'_>) -> BTreeMap<String, String> {
         ("serials", ending.units.serials().to_string()),
         ("provenance", ending.units.epochs(ending.begin).to_string()),
     ]);
-    said.extend(ending.units.policy().map(|policy| (POLICY.to_owned(), policy.to_string())));
+    report.extend(ending.units.policy().map(|policy| (POLICY.to_owned(), policy.to_string())));
     let others = (!publishers.is_empty()).then(|| json!(publishers).to_string());
-    said.extend(others.map(|others| (publishers::KEY.to_owned(), others)));
-    said.extend(ending.cut_short.map(|reason| (CUT_SHORT.to_owned(), reason.to_owned())));
-    said
+    report.extend(others.map(|others| (publishers::KEY.to_owned(), others)));
+    report.extend(ending.cut_short.map(|reason| (CUT_SHORT.to_owned(), reason.to_owned())));
+    report
 }
 
 /// The configuration an episode is recorded with: modules, tags, and the sensors that were present. As JSON the value of
@@ -166,7 +166,7 @@ pub(super) const CONFIGURATION: &str = "configuration";
 
 impl Configuration {
     /// With the declared modules and tags, and the mask of the beginning.
-    pub(super) fn of(registry: &Registry, said: &[String], tags: &[(String, String)], mask: PhysicalMask) -> Self {
+    pub(super) fn of(registry: &Registry, report: &[String], tags: &[(String, String)], mask: PhysicalMask) -> Self {
         let is_present = |name: &String| registry.named(name).is_some_and(|device| mask.contains(device.id));
         let mut found = Self {
             modules: Vec::new(),
@@ -175,7 +175,7 @@ impl Configuration {
         };
         for module in &registry.modules {
             let sensed = !module.devices.is_empty() && module.devices.iter().all(is_present);
-            if !sensed && !said.contains(&module.name) {
+            if !sensed && !report.contains(&module.name) {
                 continue;
             }
             found.modules.push(module.name.clone());
@@ -198,10 +198,10 @@ mod tests {
         let modules = "\n[module.tactile]\nslot = \"tip\"\ntags = [\"finger=tactile\"]\ndevices = [\"tactile_tip\"]\n\
             [module.soft]\nslot = \"tip\"\ntags = [\"finger=soft\", \"colour=red\"]\n[module.never]\nslot = \"front\"\n";
         let registry = Registry::parse(&format!("{}{modules}", crate::registry::BUILTIN), None).unwrap().registry;
-        let of = |said: &[&str], tags: &[(&str, &str)], mask| {
-            let said: Vec<String> = said.iter().map(|name| (*name).to_owned()).collect();
+        let of = |report: &[&str], tags: &[(&str, &str)], mask| {
+            let report: Vec<String> = report.iter().map(|name| (*name).to_owned()).collect();
             let tags: Vec<_> = tags.iter().map(|(key, value)| ((*key).to_owned(), (*value).to_owned())).collect();
-            let found = Configuration::of(&registry, &said, &tags, PhysicalMask(mask));
+            let found = Configuration::of(&registry, &report, &tags, PhysicalMask(mask));
             let tags: Vec<String> = found.tags.iter().map(|(key, value)| format!("{key}={value}")).collect();
             format!("{} | {} | {}", found.modules.join(" "), found.present.join(" "), tags.join(" "))
         };

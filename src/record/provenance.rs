@@ -115,12 +115,12 @@ impl Units {
     pub(super) fn epochs(&self, begin: Stamp) -> Value {
         let seconds = |at: Stamp| at.since(begin).as_secs_f64() - begin.since(at).as_secs_f64();
         let one = |epoch: &Incarnation| {
-            let mut said = json!(epoch.provenance);
-            if let Value::Object(fields) = &mut said {
+            let mut report = json!(epoch.provenance);
+            if let Value::Object(fields) = &mut report {
                 fields.insert("from_s".to_owned(), seconds(epoch.opened).into());
                 fields.insert("to_s".to_owned(), epoch.ended.map(seconds).into());
             }
-            said
+            report
         };
         let all = self.epochs.iter();
         all.map(|(device, epochs)| (device.clone(), epochs.iter().map(one).collect::<Value>())).collect()
@@ -195,7 +195,7 @@ mod tests {
             units.take(&event);
         }
         let epochs = units.epochs(BEGIN);
-        let said: Vec<_> = epochs["cam"]
+        let report: Vec<_> = epochs["cam"]
             .as_array()
             .unwrap()
             .iter()
@@ -206,7 +206,7 @@ mod tests {
             (Some(2), Some("B"), Some(5.0), Some(6.5)),
             (Some(3), Some("B"), Some(6.5), None),
         ];
-        assert_eq!(said, expected);
+        assert_eq!(report, expected);
         assert_eq!(epochs["cam"][0]["vid"], "046d");
         assert_eq!(units.serials(), json!({"cam": "B"}));
     }
@@ -238,13 +238,13 @@ mod tests {
         assert_eq!(Units::new(&attached).policy(), None);
         attached.take(&policy("before"));
         let mut units = Units::new(&attached);
-        let told = |name: &str| Some(json!({"name": name, "hash": "ff", "dry_run": true}));
-        assert_eq!(units.policy(), told("before"));
+        let reported = |name: &str| Some(json!({"name": name, "hash": "ff", "dry_run": true}));
+        assert_eq!(units.policy(), reported("before"));
         // It ran, although it does no more.
         units.take(&end);
-        assert_eq!(units.policy(), told("before"));
+        assert_eq!(units.policy(), reported("before"));
         units.take(&policy("within"));
-        assert_eq!(units.policy(), told("within"));
+        assert_eq!(units.policy(), reported("within"));
         attached.take(&end);
         assert_eq!(Units::new(&attached).policy(), None, "it ended before the episode");
     }

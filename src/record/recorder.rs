@@ -151,12 +151,12 @@ impl Recorder {
         let (orders, inbox) = mpsc::channel();
         let events = config.board.events();
         let ended = CancellationToken::new();
-        let (tell, episode) = watch::channel(None);
+        let (notify, episode) = watch::channel(None);
         let guard = ended.clone().drop_guard();
         let thread = std::thread::Builder::new().name("writer".to_owned()).spawn(move || {
             // Dropped by a panic too.
             let _guard = guard;
-            Writer::new(config, inbox, events, tell).run(source);
+            Writer::new(config, inbox, events, notify).run(source);
         })?;
         Ok(Self { orders: Some(orders), thread: Some(thread), ended, episode })
     }

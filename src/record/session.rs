@@ -96,8 +96,8 @@ impl Session {
         let units = Units::new(attached);
         let mask = masks.at(begin).map_or(PhysicalMask::default(), |(_, mask, _)| *mask);
         let configuration = Configuration::of(&registry, &request.modules, &request.tags, mask);
-        let said = metadata::beginning(&registry, &request.task, &configuration, &units, clock, begin);
-        let mut file = EpisodeFile::begin(sink, &registry, clock, begin, said, Guard::begin(&path))?;
+        let report = metadata::beginning(&registry, &request.task, &configuration, &units, clock, begin);
+        let mut file = EpisodeFile::begin(sink, &registry, clock, begin, report, Guard::begin(&path))?;
         let settle = SETTLE + registry.devices.iter().map(|device| device.latency).max().unwrap_or_default();
         let mut measures = Measures::new(&Measured::all(&registry), Frames::of(&registry, begin, settle));
         for device in registry.devices.iter().filter(|device| attached.has(&device.name)) {
@@ -386,8 +386,8 @@ impl Session {
     fn write_event(&mut self, event: &Event, json: &serde_json::Value) -> io::Result<()> {
         let field = |name| json.get(name).and_then(serde_json::Value::as_str).unwrap_or_default();
         let text = event.what.describe().sentence;
-        let said = EventText { kind: field("event"), device: field("device"), text: &text, json: &json.to_string() };
-        self.file.event(self.events, event.stamp, &said)?;
+        let report = EventText { kind: field("event"), device: field("device"), text: &text, json: &json.to_string() };
+        self.file.event(self.events, event.stamp, &report)?;
         if let What::Log { level, text } = &event.what {
             self.file.log(self.logs, event.stamp, *level, text)?;
             self.logs += 1;

@@ -95,8 +95,8 @@ pub(super) struct Space {
     asked: Stamp,
     sizes: VecDeque<(Stamp, u64)>,
     left: Option<Duration>,
-    told_low: bool,
-    told_removed: bool,
+    reported_low: bool,
+    reported_removed: bool,
 }
 
 impl Space {
@@ -124,8 +124,8 @@ impl Space {
             asked: now,
             sizes: VecDeque::from([(now, 0)]),
             left: None,
-            told_low: false,
-            told_removed: false,
+            reported_low: false,
+            reported_removed: false,
         };
         let full = |free| RecordError::NoRoom { folder: folder.to_owned(), free, reserve };
         if disk.size > 0 && room(disk.free, reserve, 0.0) == Room::Spent {
@@ -166,13 +166,13 @@ impl Space {
             self.left = if let Room::Low(left) = room { Some(left) } else { None };
             match room {
                 Room::Spent => return Some(Finding::Spent(self.spent(free))),
-                Room::Low(left) if !std::mem::replace(&mut self.told_low, true) => {
+                Room::Low(left) if !std::mem::replace(&mut self.reported_low, true) => {
                     return Some(Finding::Low { free, left });
                 }
                 Room::Low(_) | Room::Ample => {}
             }
         }
-        (stat.st_nlink == 0 && !std::mem::replace(&mut self.told_removed, true)).then_some(Finding::Removed)
+        (stat.st_nlink == 0 && !std::mem::replace(&mut self.reported_removed, true)).then_some(Finding::Removed)
     }
 
     /// Time left while the disk is nearly full.

@@ -253,11 +253,11 @@ impl Bench {
         self.mask(0b11, 1, Stamp::now().0);
         self.script.taken().await;
         let script = self.script.clone();
-        let (tell, told) = std::sync::mpsc::channel();
+        let (notify, reported) = std::sync::mpsc::channel();
         let at_begin: AtBegin = Box::new(move |begin| {
             let t0 = begin.after(Duration::from_millis(1));
             script.one_second(t0.0);
-            tell.send(t0).unwrap();
+            notify.send(t0).unwrap();
         });
         *self.at_begin.lock().unwrap() = Some(at_begin);
         let finished = self.recorder.start(self.request(Some(Duration::from_secs(1)))).await.unwrap();
@@ -271,7 +271,7 @@ impl Bench {
         };
         self.board.announce(attach);
         self.board.announce(What::Log { level: Level::Info, text: "hello".to_owned() });
-        (finished, told.recv().unwrap())
+        (finished, reported.recv().unwrap())
     }
 
     /// Waits until a file has its final name.

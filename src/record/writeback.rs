@@ -71,7 +71,7 @@ mod tests {
 
     #[test]
     fn a_blocked_disk_delays_no_caller() {
-        let (go_on, wait) = mpsc::channel::<()>();
+        let (keep_going, wait) = mpsc::channel::<()>();
         let (begun, begins) = mpsc::channel();
         let synced = Arc::new(AtomicU32::new(0));
         let counted = Arc::clone(&synced);
@@ -88,7 +88,7 @@ mod tests {
             assert!(writeback.ask().is_some());
         }
         for _ in 0..2 {
-            go_on.send(()).unwrap();
+            keep_going.send(()).unwrap();
         }
         writeback.end().unwrap();
         // Once for what was asked first, once for all that came meanwhile.

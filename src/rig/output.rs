@@ -41,7 +41,7 @@ pub(super) struct Output {
     lines: [Lines; 2],
     limit: Limit,
     left_out: u64,
-    told: Stamp,
+    reported: Stamp,
 }
 
 impl Output {
@@ -56,7 +56,7 @@ impl Output {
             lines: [Lines::default(), Lines::default()],
             limit: Limit::new(now),
             left_out: 0,
-            told: now,
+            reported: now,
         }
     }
 
@@ -67,8 +67,8 @@ impl Output {
             tokio::select! {
                 result = stdout.readable(), if out => self.look(0, result.is_ok().then_some(stdout)),
                 result = stderr.readable(), if err => self.look(1, result.is_ok().then_some(stderr)),
-                () = sleep(TELL_EVERY.saturating_sub(Stamp::now().since(self.told))), if self.left_out > 0 => {
-                    self.tell();
+                () = sleep(TELL_EVERY.saturating_sub(Stamp::now().since(self.reported))), if self.left_out > 0 => {
+                    self.notify();
                 }
                 else => std::future::pending().await,
             }
@@ -88,10 +88,10 @@ impl Output {
             if let Some(lines) = self.lines.get_mut(index)
                 && let Some(line) = lines.rest()
             {
-                self.say(&line);
+                self.print(&line);
             }
         }
-        self.tell();
+        self.notify();
     }
 
     /// Reads once; without a pipe there is nothing more to read.
@@ -106,11 +106,11 @@ impl Output {
         lines.closed = read == 0;
         let complete = lines.take(chunk.get(..read).unwrap_or_default());
         for line in complete {
-            self.say(&line);
+            self.print(&line);
         }
     }
 
-    fn say(&mut self, line: &str) {
+    fn print(&mut self, line: &str) {
         if !self.limit.allows(Stamp::now()) {
             self.left_out += 1;
             return;
@@ -118,8 +118,8 @@ impl Output {
         self.note(Level::Info, line);
     }
 
-    fn tell(&mut self) {
-        self.told = Stamp::now();
+    fn notify(&mut self) {
+        self.reported = Stamp::now();
         let left_out = std::mem::take(&mut self.left_out);
         if left_out > 0 {
             self.note(Level::Warn, &format!("prints too much: {left_out} lines are left out"));

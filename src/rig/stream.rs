@@ -274,14 +274,14 @@ impl Stream {
     /// Reports that the device sends nothing; ends, with the reason, when it is to be opened again.
     async fn silence(&self) -> String {
         let opened = Instant::now();
-        let say = SILENT_AFTER.max(self.spec.stall_after);
-        let Some(at) = opened.checked_add(say) else { return std::future::pending().await };
+        let print = SILENT_AFTER.max(self.spec.stall_after);
+        let Some(at) = opened.checked_add(print) else { return std::future::pending().await };
         sleep_until(at).await;
-        self.report(Report::Silent(say)).await;
+        self.report(Report::Silent(print)).await;
         if !matches!(self.spec.node, NodeSpec::Camera(_)) || self.attachment.node.is_recording() {
             return std::future::pending().await;
         }
-        let limit = START_LIMIT.max(2 * say);
+        let limit = START_LIMIT.max(2 * print);
         sleep_until(opened + limit).await;
         format!("open, but sent nothing for {} s", limit.as_secs())
     }

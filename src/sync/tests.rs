@@ -116,7 +116,7 @@ fn synchronizer(samples: &[(u8, SyncSample<()>)]) -> Synchronizer<()> {
 }
 
 /// An observation without the handles, which name places in a ring.
-fn said(observation: &Observation) -> Vec<Said> {
+fn report(observation: &Observation) -> Vec<Said> {
     observation.slots.iter().map(|s| (s.present, s.valid, s.stale, s.age_ns, s.seq)).collect()
 }
 
@@ -163,19 +163,19 @@ proptest! {
         let (tick, now) = (Stamp(tick * MS), Stamp((tick + late) * MS));
         let mut one = synchronizer(&samples);
         let mut other = synchronizer(&shuffled);
-        prop_assert_eq!(said(one.observe(tick, now, PhysicalMask(mask))), said(other.observe(tick, now, PhysicalMask(mask))));
+        prop_assert_eq!(report(one.observe(tick, now, PhysicalMask(mask))), report(other.observe(tick, now, PhysicalMask(mask))));
     }
 
     #[test]
     fn a_sample_received_after_now_changes_nothing(samples in samples(), extra in samples(), tick in 0_u64..350, late in 0_u64..150) {
         let (tick, now) = (Stamp(tick * MS), Stamp((tick + late) * MS));
-        let before = said(synchronizer(&samples).observe(tick, now, PhysicalMask(7)));
+        let before = report(synchronizer(&samples).observe(tick, now, PhysicalMask(7)));
         let mut sync = synchronizer(&samples[..samples.len().min(4)]);
-        let few = said(sync.observe(tick, now, PhysicalMask(7)));
+        let few = report(sync.observe(tick, now, PhysicalMask(7)));
         for (bit, sample) in extra {
             sync.push(id(bit), SyncSample { recv: Stamp(now.0 + 1 + sample.recv.0), ..sample });
         }
-        prop_assert_eq!(said(sync.observe(tick, now, PhysicalMask(7))), few);
+        prop_assert_eq!(report(sync.observe(tick, now, PhysicalMask(7))), few);
         prop_assert_eq!(before.len(), 3);
     }
 
@@ -185,7 +185,7 @@ proptest! {
         tick in 0_u64..350, late in 0_u64..150, mask in 0_u64..8,
     ) {
         let (tick, now) = (Stamp(tick * MS), Stamp((tick + late) * MS));
-        let prompt = said(synchronizer(&samples).observe(tick, now, PhysicalMask(mask)));
+        let prompt = report(synchronizer(&samples).observe(tick, now, PhysicalMask(mask)));
         let modalities = [(0, WhenStale::Hold), (1, WhenStale::Zero), (2, WhenStale::Hold)].map(|(bit, when_stale)| {
             let latency = Duration::from_nanos(latencies[usize::from(bit)]);
             SyncModality { latency, ..modality(bit, when_stale) }
@@ -195,7 +195,7 @@ proptest! {
             let capture = Stamp(sample.capture.0 + latencies[usize::from(*bit)]);
             sync.push(id(*bit), SyncSample { capture, ..*sample });
         }
-        prop_assert_eq!(said(sync.observe(tick, now, PhysicalMask(mask))), prompt);
+        prop_assert_eq!(report(sync.observe(tick, now, PhysicalMask(mask))), prompt);
     }
 
     #[test]

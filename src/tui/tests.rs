@@ -349,8 +349,8 @@ async fn a_busy_program_is_shown_and_a_gone_one_ends_the_screen() {
     let end = shutdown.clone();
     let mut notice = None;
     drive(&board, &desk(&sender), &shutdown, typed(&[KeyCode::Char(' ')]), |model| {
-        if let Some(said) = model.notice() {
-            notice = Some(said.to_owned());
+        if let Some(report) = model.notice() {
+            notice = Some(report.to_owned());
             end.cancel();
         }
         Ok(())
@@ -388,7 +388,7 @@ async fn pasted_text_drops_nothing_whether_the_terminal_marks_it_or_not() {
     let end = shutdown.clone();
     let desk = desk(&sender);
     let screen = drive(&board, &desk, &shutdown, events, |model| {
-        asked |= model.notice().is_some_and(|said| said.starts_with("y deletes a_001.mcap"));
+        asked |= model.notice().is_some_and(|report| report.starts_with("y deletes a_001.mcap"));
         Ok(())
     });
     let app = async {

@@ -76,24 +76,24 @@ fn member(name: &str, stays: bool) -> (Child, String) {
     };
     let mut child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
     let output = BufReader::new(child.stdout.take().unwrap());
-    let (tell, told) = mpsc::channel();
+    let (notify, reported) = mpsc::channel();
     std::thread::spawn(move || {
         for line in output.lines().map_while(Result::ok) {
             // The harness prints the test's name in front of its first line.
-            let said = line.find("opened").or_else(|| line.find("refused")).map(|at| line[at..].to_owned());
-            let _ = said.map(|said| tell.send(said));
+            let report = line.find("opened").or_else(|| line.find("refused")).map(|at| line[at..].to_owned());
+            let _ = report.map(|report| notify.send(report));
         }
     });
-    let said = told.recv_timeout(PATIENCE).unwrap_or_else(|_| {
+    let report = reported.recv_timeout(PATIENCE).unwrap_or_else(|_| {
         let _ = child.kill();
         format!("nothing, and ended with {:?}", child.wait())
     });
-    (child, said)
+    (child, report)
 }
 
 fn killed(name: &str) {
-    let (mut child, said) = member(name, true);
-    assert_eq!(said, "opened");
+    let (mut child, report) = member(name, true);
+    assert_eq!(report, "opened");
     child.kill().unwrap();
     child.wait().unwrap();
 }
@@ -231,8 +231,8 @@ fn a_start_removes_what_dead_processes_left_of_other_instances_and_nothing_of_li
         assert_eq!(prefix_of(&name), prefix, "{name}");
     }
     let [dead, living, new] = ["da", "lb", "nc"].map(|which| format!("oth{which}{}", std::process::id()));
-    let (mut stays, said) = member(&living, true);
-    assert_eq!(said, "opened");
+    let (mut stays, report) = member(&living, true);
+    assert_eq!(report, "opened");
     killed(&dead);
     let used = files(&living);
     assert!(!files(&dead).is_empty());
@@ -268,12 +268,12 @@ impl Drop for Kept {
 #[test]
 fn what_a_living_process_uses_stays_and_damage_to_it_is_named() {
     let name = format!("live{}", std::process::id());
-    let (mut first, said) = member(&name, true);
-    assert_eq!(said, "opened");
+    let (mut first, report) = member(&name, true);
+    assert_eq!(report, "opened");
     let used = files(&name);
-    let (mut second, said) = member(&name, false);
+    let (mut second, report) = member(&name, false);
     second.wait().unwrap();
-    assert_eq!((said.as_str(), files(&name)), ("opened", used));
+    assert_eq!((report.as_str(), files(&name)), ("opened", used));
     for (kind, _) in kinds(&name) {
         for damage in Damage::ALL {
             let before = files(&name);
@@ -281,12 +281,12 @@ fn what_a_living_process_uses_stays_and_damage_to_it_is_named() {
             let there = std::fs::symlink_metadata(&path).unwrap();
             let kept = Kept::aside(&path);
             damage.make(&path, &there);
-            let (mut second, said) = member(&name, false);
+            let (mut second, report) = member(&name, false);
             second.wait().unwrap();
-            let named = said.contains("rm -r /dev/shm/iox2_") || said.contains("rm -r /tmp/iceoryx2/");
+            let named = report.contains("rm -r /dev/shm/iox2_") || report.contains("rm -r /tmp/iceoryx2/");
             // What is not there has no name of its own.
-            let missing = matches!(damage, Damage::Gone) && said.contains("end the programs that use the bus");
-            assert!(said == "opened" || named || missing, "{kind} {damage:?}: {said}");
+            let missing = matches!(damage, Damage::Gone) && report.contains("end the programs that use the bus");
+            assert!(report == "opened" || named || missing, "{kind} {damage:?}: {report}");
             drop(kept);
             if files(&name) == before {
                 continue;
@@ -294,8 +294,8 @@ fn what_a_living_process_uses_stays_and_damage_to_it_is_named() {
             // To iceoryx2, a process without its lock is dead. It ends, and the next one finds all in order.
             first.kill().unwrap();
             first.wait().unwrap();
-            let (next, said) = member(&name, true);
-            assert_eq!(said, "opened", "after {kind} {damage:?}");
+            let (next, report) = member(&name, true);
+            assert_eq!(report, "opened", "after {kind} {damage:?}");
             first = next;
         }
     }

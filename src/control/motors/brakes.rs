@@ -64,7 +64,7 @@ impl MotorBus {
             let is = brakes.of(index);
             motor.take_brake(if is == BrakeIs::Engaged && motor.releases() { BrakeIs::Moving } else { is }, now);
             if motor.misses_brake() {
-                self.notices.tell(Notice::NotBraked { motor: index });
+                self.notices.notify(Notice::NotBraked { motor: index });
             }
         }
         let is_needed = matches!(self.state, BusState::Arming | BusState::Following | BusState::Holding);

@@ -60,7 +60,7 @@ impl MotorBus {
                 Verdict::Disable => self.disable(Reason::Deadman, now),
                 Verdict::Hold if self.state == BusState::Following => {
                     self.hold(now);
-                    self.notices.tell(Notice::Holding);
+                    self.notices.notify(Notice::Holding);
                     self.follow(now, passed);
                 }
                 Verdict::Hold | Verdict::Follow => self.follow(now, passed),
@@ -68,7 +68,7 @@ impl MotorBus {
             BusState::Disabling => match self.motors.iter().position(|motor| !motor.is_off()) {
                 None => {
                     self.enter(BusState::Disarmed, now);
-                    self.notices.tell(Notice::Disabled(self.reason));
+                    self.notices.notify(Notice::Disabled(self.reason));
                 }
                 Some(motor) if waited >= DISABLE_WITHIN => self.fail(Fault::NotDisabled { motor }, now),
                 Some(_) => {}
@@ -120,25 +120,25 @@ impl MotorBus {
     fn probe(&mut self, waited: Duration, now: Stamp) {
         if self.ask() {
             self.enter(BusState::Disarmed, now);
-            self.notices.tell(Notice::Ready);
+            self.notices.notify(Notice::Ready);
         } else if waited >= PROBE_WITHIN {
             let missed = |motor: &Motor| motor.phase != Phase::Probed && !motor.missed;
             while let Some(motor) = self.motors.iter().position(missed) {
                 if let Some(missed) = self.motors.get_mut(motor) {
                     missed.missed = true;
                 }
-                self.notices.tell(Notice::Unanswered { motor });
+                self.notices.notify(Notice::Unanswered { motor });
             }
         }
     }
 
     /// Another program commands a motor: an arm with two masters is a fault.
-    pub(super) fn heard_master(&mut self, motor: usize, now: Stamp) {
+    pub(super) fn received_master(&mut self, motor: usize, now: Stamp) {
         let is_news = self.other_master.replace((motor, now)).is_none_or(|(_, last)| now.since(last) >= ONE_MASTER);
         match self.state {
             BusState::Arming | BusState::Following | BusState::Holding => self.fail(Fault::OtherMaster { motor }, now),
             BusState::Probing | BusState::Disarmed | BusState::Disabling | BusState::Faulted(_) if is_news => {
-                self.notices.tell(Notice::OtherMaster { motor });
+                self.notices.notify(Notice::OtherMaster { motor });
             }
             _ => {}
         }
@@ -172,7 +172,7 @@ impl MotorBus {
             self.line.restart(&self.commands);
             self.ramps.iter_mut().for_each(Ramp::restart);
             self.hold(now);
-            self.notices.tell(if self.is_returning { Notice::Returning } else { Notice::Armed });
+            self.notices.notify(if self.is_returning { Notice::Returning } else { Notice::Armed });
         } else if waited >= ARM_WITHIN.max(self.cycle * ARM_CYCLES) + self.slowest_brake
             && let Some(fault) = self.motors.iter().find_map(Motor::arm_fault)
         {
@@ -275,13 +275,13 @@ impl MotorBus {
 
     fn report_stopped(&mut self, fault: Fault) {
         self.counts.faults += 1;
-        self.notices.tell(Notice::Fault(fault));
+        self.notices.notify(Notice::Fault(fault));
         self.name_latched(Some(fault));
         let braked = self.bits(Motor::waits_for_brake);
         let kept = |stop| self.bits(|motor| motor.phase == Phase::Kept(stop)) & !braked;
         let [damped, held] = [Stop::Damp, Stop::Hold].map(kept);
         if damped | held | braked != 0 {
-            self.notices.tell(Notice::Kept { damped, held, braked });
+            self.notices.notify(Notice::Kept { damped, held, braked });
         }
     }
 
@@ -290,7 +290,7 @@ impl MotorBus {
         for (motor, latching) in self.motors.iter_mut().enumerate() {
             let Some(status) = latching.status.filter(|status| status.is_fault()) else { continue };
             if latching.named.replace(status) != Some(status) && reported != Some(Fault::Latched { motor, status }) {
-                self.notices.tell(Notice::Latched { motor, status });
+                self.notices.notify(Notice::Latched { motor, status });
             }
         }
     }

@@ -48,7 +48,7 @@ const COOLER: f64 = 5.0;
 pub(super) enum Phase {
     /// To be disabled; `told` is set once a frame was sent.
     Off {
-        told: bool,
+        reported: bool,
     },
     /// Asked for `PROBE[at]`, or ordered to set it, from what it was.
     Asked {
@@ -131,7 +131,7 @@ impl Motor {
         let units = timeout.as_micros().div_ceil(u128::from(TIMEOUT_UNIT_US)).max(1);
         Self {
             spec: spec.clone(),
-            phase: Phase::Off { told: false },
+            phase: Phase::Off { reported: false },
             ranges: None,
             feedback: None,
             seen: Stamp(0),
@@ -173,7 +173,7 @@ impl Motor {
     pub(super) fn turn_off(&mut self) {
         self.watch.reset();
         self.dismiss_brake();
-        self.phase = Phase::Off { told: false };
+        self.phase = Phase::Off { reported: false };
     }
 
     /// It was stopped by a fault, and is still enabled.
@@ -183,8 +183,8 @@ impl Motor {
 
     /// It is being ordered to turn off for the last time.
     pub(super) const fn stop(&mut self) {
-        if !matches!(self.phase, Phase::Off { told: true }) {
-            self.phase = Phase::Off { told: true };
+        if !matches!(self.phase, Phase::Off { reported: true }) {
+            self.phase = Phase::Off { reported: true };
             self.status = None;
         }
     }
@@ -192,7 +192,7 @@ impl Motor {
     /// It was ordered to turn off, and has since reported that it is not enabled.
     pub(super) fn is_off(&self) -> bool {
         match self.phase {
-            Phase::Off { told } => told && self.status.is_some_and(|status| status != MotorStatus::Enabled),
+            Phase::Off { reported } => reported && self.status.is_some_and(|status| status != MotorStatus::Enabled),
             Phase::Asked { .. } | Phase::Probed => true,
             Phase::Clearing | Phase::Enabling | Phase::On | Phase::Kept(_) => false,
         }
@@ -235,7 +235,7 @@ impl Motor {
             let Some(warm) = self.warm.get_mut(at) else { continue };
             if celsius >= limit - WARM && !*warm {
                 *warm = true;
-                notices.tell(Notice::Warm { motor: self.index, part, celsius, limit });
+                notices.notify(Notice::Warm { motor: self.index, part, celsius, limit });
             } else if celsius < limit - WARM - COOLER {
                 *warm = false;
             }
@@ -278,7 +278,7 @@ impl Motor {
             }
             self.phase = Phase::Clearing;
             if status.is_fault() {
-                notices.tell(Notice::Cleared { motor: self.index, status });
+                notices.notify(Notice::Cleared { motor: self.index, status });
             }
             if self.spec.mode != MotorMode::Velocity {
                 let [low, high] = within(self.spec.position, ranges.position());
@@ -318,13 +318,13 @@ impl Motor {
         }
         match self.phase {
             Phase::Off { .. } if self.is_off() && !is_silent => send(parameter::refresh(slave)),
-            Phase::Off { told } => {
+            Phase::Off { reported } => {
                 send(Order::Disable.frame(slave));
-                if !told {
+                if !reported {
                     // An earlier report is no answer to this.
                     self.status = None;
                 }
-                self.phase = Phase::Off { told: true };
+                self.phase = Phase::Off { reported: true };
             }
             Phase::Asked { at, setting } => {
                 let parameter = PROBE.get(at).copied().unwrap_or(Parameter::ControlMode);

@@ -44,7 +44,7 @@ impl Notices {
         Self { waiting: VecDeque::with_capacity(Self::ROOM), lost: 0 }
     }
 
-    pub(super) fn tell(&mut self, notice: Notice) {
+    pub(super) fn notify(&mut self, notice: Notice) {
         if self.waiting.len() >= Self::ROOM {
             self.waiting.pop_front();
             self.lost += 1;

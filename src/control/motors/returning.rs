@@ -27,7 +27,7 @@ impl MotorBus {
         {
             self.is_returning = false;
             self.hold(now);
-            self.notices.tell(Notice::Returned);
+            self.notices.notify(Notice::Returned);
         }
     }
 }

@@ -44,7 +44,7 @@ fn motors_are_asked_set_up_and_watched_without_being_enabled() {
         "{:?}",
         world.notices
     );
-    assert_eq!((world.told(timeout(0)), world.told(timeout(1)), world.told(Notice::Ready)), (1, 1, 1));
+    assert_eq!((world.notified(timeout(0)), world.notified(timeout(1)), world.notified(Notice::Ready)), (1, 1, 1));
     assert_eq!((world.sims[0].timeout, world.sims[1].timeout, world.sims[1].mode), (8000, 8000, 1));
     // From here, a sample each cycle.
     world.run(2);
@@ -98,8 +98,8 @@ fn unpowered_motors_are_awaited_and_reported_once() {
     world.sims[1].silent = true;
     world.run(1000);
     assert_eq!(world.bus.state(), BusState::Probing);
-    assert_eq!(world.told(Notice::Unanswered { motor: 1 }), 1);
-    assert_eq!(world.told(Notice::Unanswered { motor: 0 }), 0);
+    assert_eq!(world.notified(Notice::Unanswered { motor: 1 }), 1);
+    assert_eq!(world.notified(Notice::Unanswered { motor: 0 }), 0);
     world.sims[1].silent = false;
     world.run_until(BusState::Disarmed);
 }
@@ -114,7 +114,7 @@ fn parameters_that_nothing_can_be_done_with_are_a_fault() {
         let mut world = World::new(spec(vec![motor(1, 0x11, MIT)]));
         world.sims[0].ranges = ranges;
         // Its feedback cannot be simulated with such ranges, nor is it needed.
-        let mut told = false;
+        let mut reported = false;
         for _ in 0..20 {
             world.now = world.now.after(world::CYCLE);
             let mut sent = Vec::new();
@@ -128,10 +128,10 @@ fn parameters_that_nothing_can_be_done_with_are_a_fault() {
                 };
                 world.bus.feed(&answer.unwrap(), world.now);
             }
-            told |= matches!(world.bus.state(),
+            reported |= matches!(world.bus.state(),
                 BusState::Faulted(Fault::Unusable { motor: 0, parameter: what, .. }) if what == parameter);
         }
-        assert!(told, "{parameter}: {:?}", world.bus.state());
+        assert!(reported, "{parameter}: {:?}", world.bus.state());
     }
     let mut world = World::new(spec(vec![motor(1, 0x11, MIT)]));
     world.sims[0].mode = 2;

@@ -64,7 +64,7 @@ impl Spell {
         strange: Option<Strange>,
         now: Stamp,
         [word, limit]: [Duration; 2],
-        tell: &mut dyn FnMut(Strange),
+        notify: &mut dyn FnMut(Strange),
     ) -> Option<Strange> {
         let Some(strange) = strange else {
             self.absent = self.absent.saturating_add(1);
@@ -80,7 +80,7 @@ impl Spell {
         let is_news = self.reported.is_none_or(|last| last < since && now.since(last) >= AGAIN);
         if lasted >= word && is_news {
             self.reported = Some(now);
-            tell(strange);
+            notify(strange);
         }
         (lasted >= limit).then_some(strange)
     }
@@ -90,7 +90,7 @@ impl Spell {
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Watch {
     /// When its newest frame came.
-    heard: Option<Stamp>,
+    received: Option<Stamp>,
     jumps: u32,
     still: Option<Still>,
     spells: [Spell; 7],
@@ -119,7 +119,7 @@ pub(super) struct Commanded {
 impl Watch {
     /// It was turned off: what it did is of the past.
     pub(super) fn reset(&mut self) {
-        *self = Self { heard: self.heard, ..Self::default() };
+        *self = Self { received: self.received, ..Self::default() };
     }
 
     /// A frame came at `now` of a motor that is on, after one with the feedback `before`. Is its position one that
@@ -127,14 +127,14 @@ impl Watch {
     ///
     /// # Errors
     /// When it is the last of several that are not.
-    pub(super) fn hear(
+    pub(super) fn receive(
         &mut self,
         before: Option<&Feedback>,
         feedback: &Feedback,
         (spec, ranges): (&MotorSpec, &Ranges),
         now: Stamp,
     ) -> Result<Option<Strange>, Strange> {
-        let last = self.heard.replace(now);
+        let last = self.received.replace(now);
         let step = 2.0 * ranges.position() / f64::from(u16::MAX);
         self.compare_speed(feedback, step, now);
         let (Some(before), Some(last)) = (before, last) else { return Ok(None) };
@@ -180,7 +180,7 @@ impl Watch {
         now: Stamp,
         notices: &mut Notices,
     ) -> Option<Strange> {
-        let mut tell = |what| notices.tell(Notice::Strange { motor: index, what });
+        let mut notify = |what| notices.notify(Notice::Strange { motor: index, what });
         let at_once = Duration::ZERO;
         let never = Duration::MAX;
         // Time passes in which no frame comes.
@@ -195,7 +195,7 @@ impl Watch {
             (lagging(spec, feedback, commanded), [at_once, LAG_AFTER]),
         ];
         let looks = self.spells.iter_mut().zip(table);
-        let lasting = looks.map(|(spell, (strange, limits))| spell.look(strange, now, limits, &mut tell));
+        let lasting = looks.map(|(spell, (strange, limits))| spell.look(strange, now, limits, &mut notify));
         // Each is looked at, also behind one that lasts.
         lasting.fold(None, Option::or)
     }

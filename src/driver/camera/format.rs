@@ -222,10 +222,10 @@ pub(super) struct Agreed {
 impl Agreed {
     /// Layout and rate, if this is what was requested.
     pub(super) fn accept(self, spec: &CameraSpec) -> Option<(Layout, Option<Rate>)> {
-        let format_is_wished =
+        let format_is_requested =
             self.fourcc == fourcc(spec.format) && (self.width, self.height) == (spec.width, spec.height);
-        let rate_is_wished = self.rate.is_none_or(|rate| rate.is_near(spec.fps));
-        if !format_is_wished || !rate_is_wished {
+        let rate_is_requested = self.rate.is_none_or(|rate| rate.is_near(spec.fps));
+        if !format_is_requested || !rate_is_requested {
             return None;
         }
         let stride = self.bytes_per_line as usize;
@@ -246,15 +246,15 @@ pub(super) fn plain_name(name: &str) -> String {
 /// The control called `wished`, if it takes `value`; otherwise the message.
 pub(super) fn find_control<'a>(
     offered: &'a [ControlInfo],
-    wished: &str,
+    requested: &str,
     value: i64,
 ) -> Result<&'a ControlInfo, String> {
-    let Some(control) = offered.iter().find(|control| plain_name(&control.name) == plain_name(wished)) else {
+    let Some(control) = offered.iter().find(|control| plain_name(&control.name) == plain_name(requested)) else {
         let names = offered.iter().map(|control| plain_name(&control.name)).collect::<Vec<_>>().join(", ");
-        return Err(format!("no control {wished}; it offers {}", if names.is_empty() { "none" } else { &names }));
+        return Err(format!("no control {requested}; it offers {}", if names.is_empty() { "none" } else { &names }));
     };
     if !(control.minimum..=control.maximum).contains(&value) {
-        return Err(format!("{wished} = {value} is out of range {}..={}", control.minimum, control.maximum));
+        return Err(format!("{requested} = {value} is out of range {}..={}", control.minimum, control.maximum));
     }
     Ok(control)
 }

@@ -72,7 +72,7 @@ pub(super) struct Guard {
     socket: OwnedFd,
     process: Child,
     /// What it received last.
-    heard: u8,
+    received: u8,
     /// It was reported that it does not listen.
     is_reported: bool,
 }
@@ -100,7 +100,7 @@ impl Guard {
             .stdout(Stdio::from(link.duplicate()?));
         // SAFETY: between fork and exec only system calls are made: no allocation, no lock. Errors are plain numbers.
         unsafe { command.pre_exec(prepare) };
-        Ok(Self { socket: ours, process: command.spawn()?, heard: OFF, is_reported: false })
+        Ok(Self { socket: ours, process: command.spawn()?, received: OFF, is_reported: false })
     }
 
     /// A cycle is over. Returns why the guard is of no use any more, the first time that it is.
@@ -118,13 +118,13 @@ impl Guard {
                 }
             }
         }
-        if message[0] == OFF && self.heard == OFF {
+        if message[0] == OFF && self.received == OFF {
             return None;
         }
         let sent = send(&self.socket, message.get(..length)?, SendFlags::DONTWAIT | SendFlags::NOSIGNAL);
         let problem = match sent {
             Ok(_) => {
-                self.heard = message[0];
+                self.received = message[0];
                 return None;
             }
             Err(Errno::INTR | Errno::NOMEM | Errno::NOBUFS) => return None,

@@ -85,10 +85,10 @@ impl Motors {
         let powered =
             powered.map_err(|error| DriverError::Retry(format!("no thread for the motors' brakes: {error}")))?;
         let description = format!("{}, {} motors at {} Hz", powered.description(), spec.motors.len(), spec.hz);
-        let (told, samples) = mpsc::channel(SAMPLES);
-        let (tell, notices) = mpsc::channel(NOTICES);
+        let (reported, samples) = mpsc::channel(SAMPLES);
+        let (notify, notices) = mpsc::channel(NOTICES);
         let shared = Arc::<Shared>::default();
-        let beat = Beat::new(powered, spec, told, tell, Arc::clone(&shared));
+        let beat = Beat::new(powered, spec, reported, notify, Arc::clone(&shared));
         let thread = std::thread::Builder::new().name(CONTROL_THREAD.to_owned()).spawn(move || beat.run());
         let thread = thread.map_err(|error| DriverError::Retry(format!("no thread for the motors: {error}")))?;
         Ok(Self {

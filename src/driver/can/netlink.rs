@@ -110,7 +110,7 @@ pub(super) fn bring_up(name: &str, bitrate: u32) -> Result<Ready, LinkError> {
         Need::Up if stays_down(details.index) => return Err(set_down(name)),
         Need::Up => {}
         Need::Anew => {
-            tracing::warn!(interface = name, ?state.bitrate, wished = bitrate, "the interface is set up again");
+            tracing::warn!(interface = name, ?state.bitrate, requested = bitrate, "the interface is set up again");
             interface.bring_down().map_err(|error| not_set(name, bitrate, &state, &error))?;
         }
     }

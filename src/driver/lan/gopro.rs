@@ -64,7 +64,7 @@ pub(super) struct Clips {
 #[derive(Debug)]
 pub(super) struct Gopro {
     states: mpsc::Receiver<Result<State, DriverError>>,
-    told: watch::Sender<Told>,
+    reported: watch::Sender<Told>,
     task: AbortOnDropHandle<()>,
     model: Option<String>,
     payload: Vec<u8>,
@@ -94,11 +94,11 @@ impl Gopro {
         }
         let serial = answer::serial(&info);
         let books = Books::open(state.as_deref(), serial.as_deref().unwrap_or(name)).await;
-        let (tell, states) = mpsc::channel(4);
-        let (told, tasks) = watch::channel(None);
-        let camera = Camera::new(name, server, clips, books, tell, pace).await;
+        let (notify, states) = mpsc::channel(4);
+        let (reported, tasks) = watch::channel(None);
+        let camera = Camera::new(name, server, clips, books, notify, pace).await;
         let task = AbortOnDropHandle::new(tokio::spawn(camera.run(tasks)));
-        Ok(Self { states, told, task, model: answer::model(&info), payload: Vec::new() })
+        Ok(Self { states, reported, task, model: answer::model(&info), payload: Vec::new() })
     }
 
     pub(super) async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
@@ -120,14 +120,14 @@ impl Gopro {
 
     /// The episode that will be `episode` begins, or with `None` the one in progress ends.
     pub(super) fn record(&self, episode: Option<PathBuf>) {
-        self.told.send_replace(Some(episode));
+        self.reported.send_replace(Some(episode));
     }
 
     /// Stops the shutter, if it is ours, and notes the clip.
     pub(super) async fn close(self) {
-        let Self { told, task, states, .. } = self;
-        told.send_replace(Some(None));
-        drop((told, states));
+        let Self { reported, task, states, .. } = self;
+        reported.send_replace(Some(None));
+        drop((reported, states));
         // Who gives this up leaves the task its time: the camera is not to record on.
         let _ = task.detach().await;
     }
@@ -218,7 +218,7 @@ struct Books {
     /// `None` where there is no folder for it.
     file: Option<PathBuf>,
     pages: Pages,
-    is_said: bool,
+    is_stated: bool,
 }
 
 #[derive(Debug, Default, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -243,7 +243,7 @@ impl Books {
             )
             .ok()
         });
-        Self { file: Some(file), pages: pages.await.ok().flatten().unwrap_or_default(), is_said: false }
+        Self { file: Some(file), pages: pages.await.ok().flatten().unwrap_or_default(), is_stated: false }
     }
 
     const fn shutter(&self) -> Option<&Shutter> {
@@ -279,7 +279,7 @@ impl Books {
 
     /// Is it on the disk, so that another run continues with it?
     const fn are_kept(&self) -> bool {
-        self.file.is_some() && !self.is_said
+        self.file.is_some() && !self.is_stated
     }
 
     async fn save(&mut self) {
@@ -298,10 +298,10 @@ impl Books {
             folder.replace(name, &text, 0o600, Sync::Skip)
         };
         let saved = tokio::task::spawn_blocking(write).await.unwrap_or_else(|error| Err(std::io::Error::other(error)));
-        if let (Err(error), false) = (&saved, self.is_said) {
+        if let (Err(error), false) = (&saved, self.is_stated) {
             tracing::warn!(%error, "what the camera still has for us is known to this run alone");
         }
-        self.is_said = saved.is_err();
+        self.is_stated = saved.is_err();
     }
 }
 

@@ -52,7 +52,7 @@ pub(super) async fn get(server: &Server, path: &str, from: u64, limit: Duration)
         let request = request.body(Empty::<Bytes>::new());
         let request = request.map_err(|error| DriverError::Fatal(format!("{path:?} cannot be asked for: {error}")))?;
         let reply = sender.send_request(request).await.map_err(odd)?;
-        server.place.heard();
+        server.place.received();
         let (head, body) = reply.into_parts();
         let server = server.clone();
         Ok(Reply { server, status: head.status, headers: head.headers, body, _connection: connection })
@@ -101,7 +101,7 @@ impl Reply {
         loop {
             match self.body.frame().await {
                 Some(Ok(frame)) => {
-                    self.server.place.heard();
+                    self.server.place.received();
                     // Trailers are nothing to us.
                     if let Ok(bytes) = frame.into_data() {
                         return Ok(Some(bytes));

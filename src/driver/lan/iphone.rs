@@ -192,7 +192,7 @@ impl Phone {
             Ok(0) => Err(self.place.lost("the phone closed the connection")),
             Ok(count) => {
                 (connection.taken, connection.filled, connection.arrived) = (0, count, Stamp::now());
-                self.place.heard();
+                self.place.received();
                 Ok(())
             }
             Err(error) => Err(self.place.lost(error)),
@@ -205,7 +205,7 @@ impl Phone {
             tracing::debug!(device = self.name, %from, "a stranger connected and was sent away");
             return Ok(());
         }
-        self.place.heard();
+        self.place.received();
         let largest = match self.stream {
             PhoneStream::Image => self.max_bytes.saturating_sub(COMMENT),
             // The picture is let go, but comes before that.

@@ -108,14 +108,14 @@ impl Camera {
 }
 
 /// Does the entry give the size of its pictures?
-pub(super) fn check_size(name: &str, (width, height): (u32, u32), wished: LanPicture) -> Result<(), DriverError> {
-    if (width, height) == (wished.width, wished.height) {
+pub(super) fn check_size(name: &str, (width, height): (u32, u32), requested: LanPicture) -> Result<(), DriverError> {
+    if (width, height) == (requested.width, requested.height) {
         return Ok(());
     }
     Err(DriverError::Fatal(format!(
         "its pictures are {width}x{height}: write width = {width} and height = {height} in [device.{name}.lan], or set \
          the camera to {}x{}",
-        wished.width, wished.height
+        requested.width, requested.height
     )))
 }
 

@@ -58,7 +58,7 @@ pub(super) struct Multipart {
     length: Option<usize>,
     body: Vec<u8>,
     /// The part was handed over, and `body` begins again.
-    told: bool,
+    reported: bool,
     largest: usize,
 }
 
@@ -77,7 +77,7 @@ impl Multipart {
             head: 0,
             length: None,
             body: Vec::new(),
-            told: false,
+            reported: false,
             largest,
         })
     }
@@ -89,7 +89,7 @@ impl Multipart {
 
     /// Consumes bytes up to the end of at most one part.
     pub(super) fn feed(&mut self, bytes: &[u8]) -> (usize, Cut) {
-        if std::mem::take(&mut self.told) {
+        if std::mem::take(&mut self.reported) {
             self.body.clear();
         }
         let mut taken = 0;
@@ -148,7 +148,7 @@ impl Multipart {
         }
         self.next_line();
         let cut = if self.body.len() > self.largest { Cut::Malformed } else { Cut::Part };
-        self.told = true;
+        self.reported = true;
         self.begin(is_last);
         (count, cut)
     }
@@ -213,7 +213,7 @@ impl Multipart {
     /// The body is whole.
     fn complete(&mut self) -> Cut {
         self.state = State::Between;
-        self.told = true;
+        self.reported = true;
         Cut::Part
     }
 
@@ -227,7 +227,7 @@ impl Multipart {
     /// After a boundary.
     fn begin(&mut self, is_last: bool) {
         (self.head, self.length) = (0, None);
-        if !self.told {
+        if !self.reported {
             self.body.clear();
         }
         self.state = if is_last { State::Between } else { State::Head };

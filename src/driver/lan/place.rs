@@ -61,7 +61,7 @@ impl Place {
     }
 
     /// The device was received from, now.
-    pub(super) fn heard(&self) {
+    pub(super) fn received(&self) {
         self.last_received.now();
     }
 
@@ -208,7 +208,7 @@ impl Carrier {
         loop {
             self.beat.tick().await;
             match fs::read(file) {
-                Ok(told) if told.starts_with(b"1") => return,
+                Ok(reported) if reported.starts_with(b"1") => return,
                 Err(error) if error.kind() == io::ErrorKind::NotFound => return,
                 // Of an interface that is down nothing is known.
                 _ => {}

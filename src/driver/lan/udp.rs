@@ -102,7 +102,7 @@ impl Packets {
         if !from.is_some_and(|from| self.place.means(from)) {
             return None;
         }
-        self.place.heard();
+        self.place.received();
         if received.is_cut {
             self.lost += 1;
             return None;

@@ -8,7 +8,7 @@ use std::os::unix::ffi::OsStringExt;
 
 use super::super::chunk_writer::{Channel, ChunkWriter};
 use super::copy::recover_bytes;
-use super::tests::{go_on, names, put, recorded};
+use super::tests::{keep_going, names, put, recorded};
 use super::{FileEnd, Outcome, RecoverError, left_behind, recover};
 use crate::episode::op;
 use crate::episode::own::EpisodeId;
@@ -196,8 +196,8 @@ async fn of_a_torn_chunk_nothing_is_taken_after_a_reboot() {
         let page = torn.start + 200 + (torn.len() - 6000) * case / 30;
         partial[page..page + 4096].fill(0);
         let path = put(&folder, "a_001.mcap.partial", &partial);
-        let said = recover(&path, &mut go_on).unwrap();
-        let Outcome::Repaired(repaired) = &said.outcome else { panic!("{said:?}") };
+        let report = recover(&path, &mut keep_going).unwrap();
+        let Outcome::Repaired(repaired) = &report.outcome else { panic!("{report:?}") };
         let kept = strictly(&fs::read(&repaired.to).unwrap());
         assert_eq!((kept.len(), repaired.ordered_messages), (whole, 0));
         assert!(original.starts_with(&kept));
@@ -206,7 +206,7 @@ async fn of_a_torn_chunk_nothing_is_taken_after_a_reboot() {
         let about = &metadata(&fs::read(&repaired.to).unwrap())["rapid/recovered"];
         assert_eq!(about["unproven_messages"], left_out.unproven_messages.to_string());
         assert_eq!((about["lossless"].as_str(), about["ordered_messages"].as_str()), ("false", "0"));
-        assert!(said.sentence().1.contains("nothing proves that they are whole"), "{}", said.sentence().1);
+        assert!(report.sentence().1.contains("nothing proves that they are whole"), "{}", report.sentence().1);
         let shown = crate::record::inspect::inspect(&repaired.to).unwrap();
         assert_eq!(shown.recovered["unproven_bytes"], left_out.unproven_bytes.to_string());
         assert_eq!(fs::read(repaired.original.as_ref().unwrap()).unwrap(), partial);
@@ -224,8 +224,8 @@ async fn damage_before_the_first_chunk_is_not_emptiness() {
     let mut partial = unfinished(&bytes).to_vec();
     partial[11] ^= 1;
     let path = put(&folder, "a_001.mcap.partial", &partial);
-    let said = recover(&path, &mut go_on).unwrap();
-    let Outcome::Repaired(repaired) = said.outcome else { panic!("{said:?}") };
+    let report = recover(&path, &mut keep_going).unwrap();
+    let Outcome::Repaired(repaired) = report.outcome else { panic!("{report:?}") };
     let whole = fs::read(&repaired.to).unwrap();
     assert_eq!((strictly(&whole), repaired.left_out.gaps), (all, 1));
     assert_eq!(metadata(&whole)["rapid"], metadata(&bytes)["rapid"]);
@@ -235,8 +235,8 @@ async fn damage_before_the_first_chunk_is_not_emptiness() {
         let mut partial = unfinished(&bytes).to_vec();
         partial[from..to].fill(0);
         let path = put(&folder, &format!("{name}_001.mcap.partial"), &partial);
-        let said = recover(&path, &mut go_on).unwrap();
-        let kept = match said.outcome {
+        let report = recover(&path, &mut keep_going).unwrap();
+        let kept = match report.outcome {
             Outcome::Repaired(repaired) if name == "b" => repaired.original.unwrap(),
             Outcome::Unreadable { kept, .. } if name == "c" => kept,
             other => panic!("{other:?}"),
@@ -250,17 +250,17 @@ async fn a_file_is_already_repaired_by_its_content_not_by_its_name_and_size() {
     let (folder, bytes) = recorded().await;
     let partial = unfinished(&bytes).to_vec();
     let path = put(&folder, "a_001.mcap.partial", &partial);
-    let Outcome::Repaired(first) = recover(&path, &mut go_on).unwrap().outcome else { panic!() };
+    let Outcome::Repaired(first) = recover(&path, &mut keep_going).unwrap().outcome else { panic!() };
     let mut other = partial.clone();
     other[largest(&chunks(&bytes)).1.end - 500] ^= 1;
     fs::write(&path, &other).unwrap();
-    let said = recover(&path, &mut go_on).unwrap();
-    let Outcome::Repaired(second) = &said.outcome else { panic!("{said:?}") };
+    let report = recover(&path, &mut keep_going).unwrap();
+    let Outcome::Repaired(second) = &report.outcome else { panic!("{report:?}") };
     assert!(second.to != first.to && second.damaged_chunks == 1);
     assert_eq!(fs::read(second.original.as_ref().unwrap()).unwrap(), other);
     fs::write(&path, &partial).unwrap();
-    let said = recover(&path, &mut go_on).unwrap();
-    assert_eq!(said.outcome, Outcome::AlreadyRepaired { to: first.to, kept: None });
+    let report = recover(&path, &mut keep_going).unwrap();
+    assert_eq!(report.outcome, Outcome::AlreadyRepaired { to: first.to, kept: None });
 }
 
 #[tokio::test]
@@ -271,7 +271,7 @@ async fn names_that_are_no_text_are_repaired_too() {
     };
     fs::write(name(".partial"), unfinished(&bytes)).unwrap();
     assert_eq!(left_behind(folder.path()).unwrap(), [name(".partial")]);
-    let Outcome::Repaired(repaired) = recover(&name(".partial"), &mut go_on).unwrap().outcome else { panic!() };
+    let Outcome::Repaired(repaired) = recover(&name(".partial"), &mut keep_going).unwrap().outcome else { panic!() };
     assert_eq!(repaired.to, name(""));
 }
 
@@ -458,14 +458,14 @@ async fn an_episode_behind_other_bytes_is_found_and_of_several_the_first() {
             for behind in [&[][..], &[0; 1024], &[&[0; 512][..], &other].concat()] {
                 let archive = [prefix, state, behind].concat();
                 let path = put(&folder, "a_001.mcap.partial", &archive);
-                let said = recover(&path, &mut go_on).unwrap();
-                let Outcome::Repaired(repaired) = &said.outcome else { panic!("{said:?}") };
+                let report = recover(&path, &mut keep_going).unwrap();
+                let Outcome::Repaired(repaired) = &report.outcome else { panic!("{report:?}") };
                 let whole = fs::read(&repaired.to).unwrap();
                 assert_eq!(strictly(&whole), all, "{} and {} bytes", prefix.len(), behind.len());
                 assert_eq!(metadata(&whole)["rapid"], metadata(&bytes)["rapid"]);
                 assert_eq!(repaired.left_out.bytes_before, prefix.len() as u64);
                 // Each byte is counted once.
-                let sentence = said.sentence().1;
+                let sentence = report.sentence().1;
                 let finished = repaired.end == FileEnd::Finished;
                 let is_all_known = finished && behind.iter().all(|byte| *byte == 0);
                 assert!(repaired.unread_bytes == 0 || !is_all_known, "{sentence}");
@@ -532,11 +532,11 @@ fn a_long_search_is_watched_and_ends_when_it_is_interrupted() {
     let folder = tempfile::tempdir().unwrap();
     let path = put(&folder, "a_001.mcap.partial", &hostile());
     let mut calls = 0_u64;
-    let said = recover(&path, &mut |_, _| {
+    let report = recover(&path, &mut |_, _| {
         calls += 1;
         ControlFlow::Continue(())
     });
-    assert!(matches!(said.unwrap().outcome, Outcome::Unreadable { .. }));
+    assert!(matches!(report.unwrap().outcome, Outcome::Unreadable { .. }));
     println!("{calls} calls for {} bytes", hostile().len());
     // The hash alone reads each byte once; the search reads every candidate.
     assert!(calls > 8 + 16);

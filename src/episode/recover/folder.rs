@@ -85,13 +85,13 @@ impl Repairs {
     /// When the system gives no thread.
     pub fn start(folder: PathBuf, reserve: Option<u64>, board: Arc<Board>) -> io::Result<Self> {
         let stop = Arc::new(AtomicBool::new(false));
-        let (tell, ended) = mpsc::channel();
+        let (notify, ended) = mpsc::channel();
         let asked = Arc::clone(&stop);
         let begun = SystemTime::now();
         std::thread::Builder::new().name("recover".to_owned()).spawn(move || {
             repair_all(&folder, reserve, begun, &board, &asked);
             // The waiting task may have ended.
-            let _ = tell.send(());
+            let _ = notify.send(());
         })?;
         Ok(Self { stop, ended })
     }

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use super::super::chunk_writer::{Channel, ChunkWriter};
 use super::damage::{Chunk, chunks, largest, unfinished};
-use super::tests::{go_on, names, put, recorded, repaired};
+use super::tests::{keep_going, names, put, recorded, repaired};
 use super::{FileEnd, Outcome, RecoverError, recover};
 use crate::episode::own::EpisodeId;
 use crate::episode::record_iter::MAGIC;
@@ -34,10 +34,10 @@ async fn a_whole_episode_whose_name_is_taken_gets_a_free_one_and_stays_as_it_is(
         plant(&folder.path().join("a_001.mcap"));
         for free in ["a_001.recovered.mcap", "a_001.recovered-2.mcap"] {
             let partial = put(&folder, "a_001.mcap.partial", &bytes);
-            let said = recover(&partial, &mut go_on).unwrap();
+            let report = recover(&partial, &mut keep_going).unwrap();
             let to = folder.path().join(free);
-            assert_eq!(said.outcome, Outcome::Whole { to: to.clone() }, "{what}");
-            assert!(said.sentence().1.contains(free), "{what}: {}", said.sentence().1);
+            assert_eq!(report.outcome, Outcome::Whole { to: to.clone() }, "{what}");
+            assert!(report.sentence().1.contains(free), "{what}: {}", report.sentence().1);
             assert_eq!(fs::read(&to).unwrap(), bytes, "{what}");
             let seen = inspect(&to).unwrap();
             assert_eq!(seen.verdict.verdict(), seen.recorded_verdict.as_ref(), "{what}");
@@ -86,8 +86,8 @@ async fn no_chunk_of_ours_is_believed_without_its_check_value() {
         for (what, chunk, bytes) in without_check_values(state, &chunks) {
             let what = format!("{name}, {what}, {:?}", chunk.content);
             let file = put(&folder, name, &bytes);
-            let said = recover(&file, &mut go_on).unwrap();
-            let kept = match &said.outcome {
+            let report = recover(&file, &mut keep_going).unwrap();
+            let kept = match &report.outcome {
                 Outcome::Repaired(repaired) => {
                     assert_eq!((repaired.damaged_chunks, repaired.original.is_some()), (1, true), "{what}");
                     strictly(&fs::read(&repaired.to).unwrap())
@@ -133,8 +133,8 @@ async fn of_a_torn_chunk_every_byte_is_counted_and_messages_are_reported_as_unpr
             let taken = ends[..=count].iter().filter(|(_, is_message)| *is_message).count() as u64;
             let partial = put(&folder, "a_001.mcap.partial", &bytes);
             let seen = inspect(&partial).unwrap();
-            let said = recover(&partial, &mut go_on).unwrap();
-            let Outcome::Repaired(made) = &said.outcome else { panic!("{said:?}") };
+            let report = recover(&partial, &mut keep_going).unwrap();
+            let Outcome::Repaired(made) = &report.outcome else { panic!("{report:?}") };
             let what = format!("{count} records, {left} bytes");
             assert_eq!(
                 (made.ordered_messages, made.unread_bytes, made.end),
@@ -144,12 +144,12 @@ async fn of_a_torn_chunk_every_byte_is_counted_and_messages_are_reported_as_unpr
             assert_eq!((seen.ordered_messages, seen.unread_bytes), (taken, left as u64), "{what}");
             let about = &metadata(&fs::read(&made.to).unwrap())["rapid/recovered"];
             assert_eq!((&about["ordered_messages"], &about["unread_bytes"]), (&taken.to_string(), &left.to_string()));
-            assert!(taken == 0 || said.sentence().1.contains("without a check value"), "{}", said.sentence().1);
-            assert!(left > 0 || !said.sentence().1.contains("0 bytes"), "{}", said.sentence().1);
+            assert!(taken == 0 || report.sentence().1.contains("without a check value"), "{}", report.sentence().1);
+            assert!(left > 0 || !report.sentence().1.contains("0 bytes"), "{}", report.sentence().1);
             let shown = inspect(&made.to).unwrap();
             for shown in [&shown, &seen] {
-                let is_said = shown.verdict.reasons().iter().any(|reason| reason.contains("without a check value"));
-                assert!(taken == 0 || is_said, "{what}: {:?}", shown.verdict);
+                let is_stated = shown.verdict.reasons().iter().any(|reason| reason.contains("without a check value"));
+                assert!(taken == 0 || is_stated, "{what}: {:?}", shown.verdict);
                 assert_ne!(shown.verdict.grade(), Some(crate::status::Grade::Good));
             }
             fs::remove_file(&made.to).unwrap();
@@ -186,10 +186,10 @@ fn accounts_for_all(what: &str, seen: &Inspection, bytes: &[u8]) {
 /// The same episode in many chunks, as a slower one has them.
 fn in_small_chunks(bytes: &[u8]) -> Vec<u8> {
     let summary = mcap::Summary::read(bytes).unwrap().unwrap();
-    let mut said = metadata(bytes);
+    let mut report = metadata(bytes);
     let mut whole = Vec::new();
     let mut file = ChunkWriter::new(&mut whole, Some(EpisodeId::new(1, 1))).unwrap();
-    file.metadata("rapid", said.remove("rapid").unwrap()).unwrap();
+    file.metadata("rapid", report.remove("rapid").unwrap()).unwrap();
     for (id, schema) in &summary.schemas {
         file.schema(Some(*id), &schema.name, &schema.encoding, &schema.data).unwrap();
     }
@@ -208,7 +208,7 @@ fn in_small_chunks(bytes: &[u8]) -> Vec<u8> {
             file.flush().unwrap();
         }
     }
-    file.metadata("rapid/summary", said.remove("rapid/summary").unwrap()).unwrap();
+    file.metadata("rapid/summary", report.remove("rapid/summary").unwrap()).unwrap();
     file.finish().unwrap();
     whole
 }
@@ -261,8 +261,8 @@ async fn recover_and_inspect_agree_on_whole_files() {
             let file = put(&folder, name, &bytes);
             let reasons = inspect(&file).unwrap();
             let is_whole = !reasons.verdict.reasons().iter().any(|reason| reason.contains("not whole"));
-            let said = recover(&file, &mut go_on).unwrap();
-            assert_eq!(matches!(said.outcome, Outcome::Whole { .. }), is_whole, "{what}, {name}: {said:?}");
+            let report = recover(&file, &mut keep_going).unwrap();
+            assert_eq!(matches!(report.outcome, Outcome::Whole { .. }), is_whole, "{what}, {name}: {report:?}");
             for name in names(folder.path()) {
                 fs::remove_file(folder.path().join(name)).unwrap();
             }
@@ -289,12 +289,12 @@ async fn the_repair_of_a_file_without_one_of_its_chunks_reports_it() {
     let (folder, mut bytes) = recorded().await;
     let cut = chunks(&bytes)[1].content.clone();
     bytes.drain(cut.start - 9..cut.end);
-    let said = recover(&put(&folder, "a_001.mcap", &bytes), &mut go_on).unwrap();
-    assert!(said.sentence().1.contains("parts of it may be missing"), "{said:?}");
+    let report = recover(&put(&folder, "a_001.mcap", &bytes), &mut keep_going).unwrap();
+    assert!(report.sentence().1.contains("parts of it may be missing"), "{report:?}");
     // A file of which nothing is missing has no such word.
-    let Outcome::Repaired(made) = said.outcome else { panic!("{said:?}") };
-    let said = recover(&made.to, &mut go_on).unwrap();
-    assert!(!said.sentence().1.contains("missing"), "{said:?}");
+    let Outcome::Repaired(made) = report.outcome else { panic!("{report:?}") };
+    let report = recover(&made.to, &mut keep_going).unwrap();
+    assert!(!report.sentence().1.contains("missing"), "{report:?}");
 }
 
 /// Where the records of a file begin that stand outside its chunks.
@@ -328,24 +328,24 @@ async fn unread_bytes_are_reported_and_the_original_is_kept() {
             assert_ne!(seen.verdict.grade(), Some(crate::status::Grade::Good), "{what}");
             let reasons = seen.verdict.reasons().join("; ");
             assert!(reasons.contains("not readable") || reasons.contains("left out"), "{what}: {reasons}");
-            let original = match recover(&file, &mut go_on) {
-                Ok(said) => match &said.outcome {
+            let original = match recover(&file, &mut keep_going) {
+                Ok(report) => match &report.outcome {
                     Outcome::Repaired(made) => {
                         let kept = strictly(&fs::read(&made.to).unwrap());
                         let is_second = cut < is_known && !kept.is_empty() && other.starts_with(&kept);
-                        assert!(is_second || all.starts_with(&kept), "{what}: {said:?}");
+                        assert!(is_second || all.starts_with(&kept), "{what}: {report:?}");
                         // Chunks that can be read, damaged ones and those of the second, are counted as chunks.
                         let is_counted = made.damaged_chunks + made.left_out.other_chunks > 0
                             || made.unread_bytes >= behind.len() as u64 / 2;
-                        assert!(is_second || is_counted, "{what}: {said:?}");
+                        assert!(is_second || is_counted, "{what}: {report:?}");
                         let counts = [
                             crate::text::counted(made.unread_bytes, "byte"),
                             crate::text::counted(made.damaged_chunks, "damaged chunk"),
                             "another episode's".to_owned(),
                         ];
-                        let sentence = said.sentence().1;
+                        let sentence = report.sentence().1;
                         assert!(is_second || counts.iter().any(|count| sentence.contains(count)), "{what}: {sentence}");
-                        made.original.clone().unwrap_or_else(|| panic!("{what}: not kept: {said:?}"))
+                        made.original.clone().unwrap_or_else(|| panic!("{what}: not kept: {report:?}"))
                     }
                     Outcome::Unreadable { kept, .. } => kept.clone(),
                     other => panic!("{what}: {other:?}"),

@@ -20,7 +20,7 @@ pub(super) fn end(summary: &Summary) -> BTreeMap<String, String> {
     let mut modalities = Map::new();
     for channel in summary.channels.values() {
         let Some(name) = &channel.modality else { continue };
-        let before = modalities.get(name).and_then(|said| said["samples"].as_u64()).unwrap_or(0);
+        let before = modalities.get(name).and_then(|report| report["samples"].as_u64()).unwrap_or(0);
         modalities.insert(name.clone(), json!({"samples": before.saturating_add(channel.messages)}));
     }
     text_map([
@@ -38,7 +38,7 @@ pub(super) fn recovered(copied: &Copied, about: &About<'_>, size: u64) -> BTreeM
     let Repaired { unread_bytes, refused_records, nameless, failed, .. } = &copied.repaired;
     let Repaired { messages, seconds, damaged_chunks, ordered_messages, .. } = copied.repaired;
     let end = serde_json::to_value(copied.repaired.end).ok();
-    let mut said = text_map([
+    let mut report = text_map([
         ("software", concat!("rapid ", env!("CARGO_PKG_VERSION")).to_owned()),
         ("time", time::rfc3339(about.time_ns)),
         ("source", about.name.to_owned()),
@@ -56,10 +56,10 @@ pub(super) fn recovered(copied: &Copied, about: &About<'_>, size: u64) -> BTreeM
         (LOSSLESS, copied.is_lossless.to_string()),
     ]);
     if let Ok(Value::Object(left_out)) = serde_json::to_value(copied.repaired.left_out) {
-        said.extend(left_out.into_iter().map(|(key, count)| (key, count.to_string())));
+        report.extend(left_out.into_iter().map(|(key, count)| (key, count.to_string())));
     }
-    said.extend(failed.iter().map(|why| (FAILED.to_owned(), why.clone())));
-    said
+    report.extend(failed.iter().map(|why| (FAILED.to_owned(), why.clone())));
+    report
 }
 
 /// The `rapid/summary` of an episode that its recorder called BAD only after it had written that.
@@ -75,14 +75,14 @@ impl Recovered {
         let (level, text) = match &self.outcome {
             Outcome::Repaired(repaired) => {
                 let whole = repaired.original.is_none() && repaired.failed.is_none();
-                let mut said = repaired.sentence();
+                let mut report = repaired.sentence();
                 if repaired.to != self.file.with_extension("") {
-                    said = format!("{said}; now {}", name(&repaired.to));
+                    report = format!("{report}; now {}", name(&repaired.to));
                 }
                 if let Some(original) = repaired.original.as_ref().filter(|original| **original != self.file) {
-                    said = format!("{said}; all of it is kept in {}", name(original));
+                    report = format!("{report}; all of it is kept in {}", name(original));
                 }
-                (if whole { Level::Info } else { Level::Warn }, said)
+                (if whole { Level::Info } else { Level::Warn }, report)
             }
             Outcome::Whole { to } if *to == self.file => (Level::Info, "whole; nothing to repair".to_owned()),
             Outcome::Whole { to } => (Level::Info, format!("whole; it only lacked its name, {}", name(to))),
@@ -112,10 +112,10 @@ impl Repaired {
     }
 
     fn sentence(&self) -> String {
-        let mut said = format!("repaired, {:.1} s, {}", self.seconds, text::counted(self.messages, "message"));
+        let mut report = format!("repaired, {:.1} s, {}", self.seconds, text::counted(self.messages, "message"));
         let mut but = |text: String| {
-            said.push_str("; ");
-            said.push_str(&text);
+            report.push_str("; ");
+            report.push_str(&text);
         };
         if let Some(why) = &self.failed {
             but(format!("BAD: {why}"));
@@ -153,7 +153,7 @@ impl Repaired {
             1 => but("1 record that makes no sense is left out".to_owned()),
             records => but(format!("{} records that make no sense are left out", text::count(records))),
         }
-        said
+        report
     }
 }
 
@@ -163,7 +163,7 @@ mod tests {
 
     #[test]
     fn counts_of_one_are_singular() {
-        let said = |count| {
+        let report = |count| {
             let repaired = Repaired {
                 to: "a.mcap".into(),
                 original: None,
@@ -182,13 +182,13 @@ mod tests {
             repaired.sentence()
         };
         assert_eq!(
-            said(1),
+            report(1),
             "repaired, 1.0 s, 1 message; the last second may be missing: 1 byte at the end was torn; \
              1 damaged chunk is left out; 1 place is not readable; 1 message is left out: the definition of the channel is lost; \
              of channels 7 (1); 1 record that makes no sense is left out"
         );
         assert_eq!(
-            said(2000),
+            report(2000),
             "repaired, 1.0 s, 2,000 messages; the last second may be missing: 2,000 bytes at the end were torn; \
              2,000 damaged chunks are left out; 2,000 places are not readable; 2,000 messages are left out: the definition \
              of the channel is lost; of channels 7 (2000); 2,000 records that make no sense are left out"

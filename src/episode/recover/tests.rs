@@ -13,12 +13,12 @@ use crate::record::Sink;
 use crate::record::tests::{Bench, registry};
 use crate::status::{Grade, Level};
 
-pub(super) fn go_on(_: u64, _: u64) -> ControlFlow<()> {
+pub(super) fn keep_going(_: u64, _: u64) -> ControlFlow<()> {
     ControlFlow::Continue(())
 }
 
 pub(super) fn repaired(path: &Path) -> Repaired {
-    match recover(path, &mut go_on).unwrap().outcome {
+    match recover(path, &mut keep_going).unwrap().outcome {
         Outcome::Repaired(repaired) => *repaired,
         other => panic!("{other:?}"),
     }
@@ -51,8 +51,8 @@ async fn a_torn_episode_becomes_a_whole_one_with_all_that_was_in_it() {
     let original = strictly(&bytes);
     let cut = bytes.len() * 3 / 5;
     let partial = put(&folder, "20261121_t_003.mcap.partial", &bytes[..cut]);
-    let said = recover(&partial, &mut go_on).unwrap();
-    let Outcome::Repaired(ref repaired) = said.outcome else { panic!("{said:?}") };
+    let report = recover(&partial, &mut keep_going).unwrap();
+    let Outcome::Repaired(ref repaired) = report.outcome else { panic!("{report:?}") };
     assert_eq!(names(folder.path()), ["20261121_t_003.mcap"]);
     assert_eq!(repaired.to, folder.path().join("20261121_t_003.mcap"));
     let whole = fs::read(&repaired.to).unwrap();
@@ -61,7 +61,7 @@ async fn a_torn_episode_becomes_a_whole_one_with_all_that_was_in_it() {
     assert_eq!((repaired.messages, repaired.end), (messages.len() as u64, FileEnd::Torn));
     assert_eq!((repaired.damaged_chunks, repaired.refused_records, &repaired.original), (0, 0, &None));
     assert!(repaired.unread_bytes > 0 && repaired.ordered_messages > 0);
-    let (level, sentence) = said.sentence();
+    let (level, sentence) = report.sentence();
     let expected = format!(
         "20261121_t_003.mcap.partial: repaired, {:.1} s, {} messages; the last second may be missing: {} bytes at the end were torn; \
          {} messages of a torn chunk taken without a check value, written since this machine was started",
@@ -154,7 +154,7 @@ fn whatever_happened_to_a_file_the_repaired_one_is_whole() {
             if let Some(whole) = recover_bytes(&mutated(&bytes, &mutations)) {
                 strictly(&whole);
                 // Repaired once, it needs no repair.
-                let summary = copy::summary(&*whole, whole.len() as u64, &mut go_on).unwrap().unwrap();
+                let summary = copy::summary(&*whole, whole.len() as u64, &mut keep_going).unwrap().unwrap();
                 prop_assert!(summary.is_whole());
             }
         });
@@ -167,7 +167,7 @@ async fn a_file_being_written_is_left_alone() {
     let partial = put(&folder, "a_001.mcap.partial", &bytes[..bytes.len() / 2]);
     let held = File::open(&partial).unwrap();
     held.lock().unwrap();
-    let error = recover(&partial, &mut go_on).unwrap_err();
+    let error = recover(&partial, &mut keep_going).unwrap_err();
     assert!(matches!(error, RecoverError::Busy(_)), "{error}");
     assert_eq!(names(folder.path()), ["a_001.mcap.partial"]);
     drop(held);
@@ -178,7 +178,7 @@ async fn a_file_being_written_is_left_alone() {
     let (finished, _) = bench.one_second().await;
     let partial = finished.with_extension("mcap.partial");
     while !finished.exists() {
-        match recover(&partial, &mut go_on) {
+        match recover(&partial, &mut keep_going) {
             Err(RecoverError::Busy(_)) => {}
             Err(RecoverError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {}
             other => panic!("{other:?}"),
@@ -193,10 +193,13 @@ async fn a_file_being_written_is_left_alone() {
 async fn files_without_messages_are_reported_and_kept() {
     let (folder, bytes) = recorded().await;
     let empty = put(&folder, "a_001.mcap.partial", b"");
-    assert_eq!(recover(&empty, &mut go_on).unwrap().outcome, Outcome::Empty { kept: None });
+    assert_eq!(recover(&empty, &mut keep_going).unwrap().outcome, Outcome::Empty { kept: None });
     let noise = put(&folder, "a_002.mcap.partial", b"no MCAP file");
     let kept = folder.path().join("a_002.mcap.damaged");
-    assert_eq!(recover(&noise, &mut go_on).unwrap().outcome, Outcome::Unreadable { kept: kept.clone(), failed: None });
+    assert_eq!(
+        recover(&noise, &mut keep_going).unwrap().outcome,
+        Outcome::Unreadable { kept: kept.clone(), failed: None }
+    );
     assert_eq!(fs::read(kept).unwrap(), b"no MCAP file");
     // Header, metadata and channels, as they are on the disk when an episode has just begun.
     let mut bare = bytes.clone();
@@ -204,11 +207,11 @@ async fn files_without_messages_are_reported_and_kept() {
     bare.truncate(bytes.windows(first.len()).position(|window| window == first).unwrap());
     let bare = put(&folder, "a_003.mcap.partial", &bare);
     let kept = folder.path().join("a_003.mcap.empty");
-    assert_eq!(recover(&bare, &mut go_on).unwrap().outcome, Outcome::Empty { kept: Some(kept) });
+    assert_eq!(recover(&bare, &mut keep_going).unwrap().outcome, Outcome::Empty { kept: Some(kept) });
     assert_eq!(names(folder.path()), ["a_002.mcap.damaged", "a_003.mcap.empty"]);
     // A second one of that name does not replace the first.
     let noise = put(&folder, "a_002.mcap.partial", b"other");
-    recover(&noise, &mut go_on).unwrap();
+    recover(&noise, &mut keep_going).unwrap();
     assert_eq!(names(folder.path()), ["a_002.mcap.damaged", "a_002.mcap.damaged-2", "a_003.mcap.empty"]);
 }
 
@@ -230,7 +233,7 @@ async fn a_repair_that_was_ended_is_made_again() {
     assert_eq!(names(folder.path()), ["a_001.mcap"]);
     // By a kill between the two last steps: the repaired file has its name, the original is there too.
     fs::write(&partial, &many).unwrap();
-    let again = recover(&partial, &mut go_on).unwrap();
+    let again = recover(&partial, &mut keep_going).unwrap();
     assert_eq!(again.outcome, Outcome::AlreadyRepaired { to: first.to.clone(), kept: None });
     assert_eq!(names(folder.path()), ["a_001.mcap"]);
     // A file of that name that is something else is not taken for it, nor replaced.
@@ -252,10 +255,10 @@ fn unread_parts_of_an_interrupted_repair_are_kept_by_the_next() {
     assert!(first.damaged_chunks > 0 && first.original.is_some());
     // By a kill between the two last steps: the repaired file has its name, the original is not set aside.
     fs::rename(first.original.unwrap(), &partial).unwrap();
-    let said = recover(&partial, &mut go_on).unwrap();
+    let report = recover(&partial, &mut keep_going).unwrap();
     let kept = folder.path().join("a_001.mcap.damaged");
-    assert_eq!(said.outcome, Outcome::AlreadyRepaired { to: first.to, kept: Some(kept.clone()) });
-    assert_eq!((said.sentence().0, fs::read(&kept).unwrap()), (Level::Warn, damaged));
+    assert_eq!(report.outcome, Outcome::AlreadyRepaired { to: first.to, kept: Some(kept.clone()) });
+    assert_eq!((report.sentence().0, fs::read(&kept).unwrap()), (Level::Warn, damaged));
     assert_eq!(names(folder.path()), ["a_001.mcap", "a_001.mcap.damaged"]);
 }
 
@@ -306,7 +309,7 @@ fn a_disk_full_at_any_byte_is_an_error() {
     let needed = recover_bytes(&bytes).unwrap().len();
     for room in (0..needed).step_by(13) {
         let disk = SmallDisk(Vec::new(), room);
-        let copied = copy::copy(&*bytes, bytes.len() as u64, &about, disk, &mut go_on);
+        let copied = copy::copy(&*bytes, bytes.len() as u64, &about, disk, &mut keep_going);
         assert!(matches!(copied, Err(Error::Write(error)) if error.kind() == io::ErrorKind::StorageFull), "{room}");
     }
 }
@@ -316,10 +319,10 @@ async fn an_episode_that_only_lacks_its_name_gets_it() {
     let (folder, bytes) = recorded().await;
     let partial = put(&folder, "a_001.mcap.partial", &bytes);
     let to = folder.path().join("a_001.mcap");
-    assert_eq!(recover(&partial, &mut go_on).unwrap().outcome, Outcome::Whole { to: to.clone() });
+    assert_eq!(recover(&partial, &mut keep_going).unwrap().outcome, Outcome::Whole { to: to.clone() });
     assert_eq!(names(folder.path()), ["a_001.mcap"]);
     assert_eq!(fs::read(&to).unwrap(), bytes);
-    assert_eq!(recover(&to, &mut go_on).unwrap().outcome, Outcome::Whole { to: to.clone() });
+    assert_eq!(recover(&to, &mut keep_going).unwrap().outcome, Outcome::Whole { to: to.clone() });
     assert_eq!(fs::read(&to).unwrap(), bytes);
 }
 
@@ -332,7 +335,7 @@ async fn a_repair_is_found_again_under_whatever_name_it_has() {
         put(&folder, other, b"another file");
         let made = repaired(&cut);
         for _ in 0..2 {
-            let again = recover(&cut, &mut go_on).unwrap();
+            let again = recover(&cut, &mut keep_going).unwrap();
             assert_eq!(again.outcome, Outcome::AlreadyRepaired { to: made.to.clone(), kept: None });
         }
         fs::remove_file(&made.to).unwrap();
@@ -348,7 +351,7 @@ async fn of_a_damaged_finished_file_a_whole_one_is_made_beside_it() {
     assert_eq!((&made.to, &made.original), (&folder.path().join("a_001.recovered.mcap"), &Some(cut.clone())));
     assert_eq!(strictly(&fs::read(&made.to).unwrap()), original);
     assert_eq!(fs::read(&cut).unwrap(), bytes[..bytes.len() - 30]);
-    let again = recover(&cut, &mut go_on).unwrap();
+    let again = recover(&cut, &mut keep_going).unwrap();
     assert_eq!(again.outcome, Outcome::AlreadyRepaired { to: made.to.clone(), kept: None });
     // The recorder had written its summary: that one is kept, and there is no second one.
     assert_eq!(metadata(&fs::read(&made.to).unwrap())["rapid/summary"], metadata(&bytes)["rapid/summary"]);
@@ -384,15 +387,15 @@ fn other_things_than_files_are_errors_and_not_touched() {
     std::os::unix::fs::symlink(at("nowhere"), at("dangling.mcap.partial")).unwrap();
     let before = names(folder.path());
     for name in ["folder", "pipe", "link", "dangling"] {
-        let error = recover(&at(&format!("{name}.mcap.partial")), &mut go_on).unwrap_err();
+        let error = recover(&at(&format!("{name}.mcap.partial")), &mut keep_going).unwrap_err();
         assert!(matches!(error, RecoverError::NotFile(_)) && error.is_bad_argument(), "{name}: {error}");
     }
-    assert!(matches!(recover(Path::new("/dev/zero"), &mut go_on), Err(RecoverError::NotFile(_))));
-    assert!(recover(&at("missing.mcap"), &mut go_on).unwrap_err().is_bad_argument());
+    assert!(matches!(recover(Path::new("/dev/zero"), &mut keep_going), Err(RecoverError::NotFile(_))));
+    assert!(recover(&at("missing.mcap"), &mut keep_going).unwrap_err().is_bad_argument());
     fs::write(at("text.mcap"), "no").unwrap();
-    assert!(matches!(recover(&at("text.mcap"), &mut go_on), Err(RecoverError::NotMcap(_))));
+    assert!(matches!(recover(&at("text.mcap"), &mut keep_going), Err(RecoverError::NotMcap(_))));
     fs::write(at("bare.mcap"), MAGIC).unwrap();
-    assert!(matches!(recover(&at("bare.mcap"), &mut go_on), Err(RecoverError::Nothing(_))));
+    assert!(matches!(recover(&at("bare.mcap"), &mut keep_going), Err(RecoverError::Nothing(_))));
     assert_eq!(left_behind(folder.path()).unwrap(), Vec::<PathBuf>::new());
     fs::remove_file(at("text.mcap")).unwrap();
     fs::remove_file(at("bare.mcap")).unwrap();
@@ -418,7 +421,7 @@ async fn two_repairs_at_once_make_one_file() {
         let outcomes: Vec<_> = std::thread::scope(|scope| {
             let repair = || {
                 together.wait();
-                recover(&partial, &mut go_on)
+                recover(&partial, &mut keep_going)
             };
             let threads: Vec<_> = (0..4).map(|_| scope.spawn(repair)).collect();
             threads.into_iter().map(|thread| thread.join().unwrap()).collect()

@@ -58,8 +58,8 @@ pub(super) async fn watch(mut watch: Watch, server: SocketAddr, asked: SocketAdd
 /// The next question, or none if the device's driver receives from it, or has the port it sends to.
 async fn next(last_received: LastReceived, driver_has_port: bool, probe: Probe, asked: SocketAddr) -> Answer {
     sleep(EVERY).await;
-    let is_heard = Stamp::now().since(last_received.at()) < EVERY;
-    if is_heard || driver_has_port { Answer::Silence } else { ask(probe, asked).await }
+    let is_received = Stamp::now().since(last_received.at()) < EVERY;
+    if is_received || driver_has_port { Answer::Silence } else { ask(probe, asked).await }
 }
 
 async fn ask(probe: Probe, asked: SocketAddr) -> Answer {

@@ -70,7 +70,7 @@ impl Watch {
 
     /// It was received from at this address.
     pub(super) async fn found(&mut self, address: SocketAddr, instance: Option<&str>, when: Stamp) {
-        let came = self.lease.heard(when) == Some(Change::Came);
+        let came = self.lease.received(when) == Some(Change::Came);
         if !self.is_there() || (!came && self.address == Some(address)) {
             return;
         }
@@ -85,7 +85,7 @@ impl Watch {
         };
         let node = DeviceNode::Lan { address, last_received: self.last_received.clone() };
         let attachment = Attachment { syspath: self.syspath(), node, unit: Unit::Lan(unit), driver: None };
-        self.tell(HotplugEvent::Added(attachment)).await;
+        self.notify(HotplugEvent::Added(attachment)).await;
     }
 
     /// It is known to be gone.
@@ -97,7 +97,7 @@ impl Watch {
     /// It is announced, which holds the lease.
     pub(super) fn renew(&mut self, now: Stamp) {
         if self.is_there() {
-            self.lease.heard(now);
+            self.lease.received(now);
         }
     }
 
@@ -106,12 +106,12 @@ impl Watch {
         if !self.is_there() {
             return;
         }
-        let heard = self.last_received.at();
-        self.lease.heard(heard);
+        let received = self.last_received.at();
+        self.lease.received(received);
         if self.link.is_down() {
             return self.gone(UnplugSource::Link, now).await;
         }
-        let grace = if heard == Stamp::default() { self.grace } else { Duration::ZERO };
+        let grace = if received == Stamp::default() { self.grace } else { Duration::ZERO };
         let change = self.lease.look(now.before(grace));
         self.went(change, UnplugSource::Lease, now).await;
     }
@@ -120,11 +120,11 @@ impl Watch {
         if change == Some(Change::Went) {
             self.address = None;
             let removed = HotplugEvent::Removed { syspath: self.syspath(), noticed: now, source };
-            self.tell(removed).await;
+            self.notify(removed).await;
         }
     }
 
-    async fn tell(&self, event: HotplugEvent) {
+    async fn notify(&self, event: HotplugEvent) {
         // The rig reads until it ends, and this with it.
         let _ = self.events.send(event).await;
     }
@@ -153,33 +153,33 @@ enum Change {
 struct Lease {
     length: Duration,
     /// When it was last received from, while it is there.
-    heard: Option<Stamp>,
+    received: Option<Stamp>,
     /// What is older than this is no evidence: it was reported gone after that.
     gone: Stamp,
 }
 
 impl Lease {
     fn new(length: Duration) -> Self {
-        Self { length, heard: None, gone: Stamp::default() }
+        Self { length, received: None, gone: Stamp::default() }
     }
 
     const fn is_there(&self) -> bool {
-        self.heard.is_some()
+        self.received.is_some()
     }
 
     /// Something of it was received at `when`.
-    fn heard(&mut self, when: Stamp) -> Option<Change> {
-        let came = self.heard.is_none();
+    fn received(&mut self, when: Stamp) -> Option<Change> {
+        let came = self.received.is_none();
         if came && when < self.gone {
             return None;
         }
-        self.heard = self.heard.max(Some(when));
+        self.received = self.received.max(Some(when));
         came.then_some(Change::Came)
     }
 
     /// When the lease ends if nothing more is received; never while it is not there.
     fn ends(&self) -> Option<Stamp> {
-        Some(self.heard?.after(self.length))
+        Some(self.received?.after(self.length))
     }
 
     /// Is the lease over?
@@ -189,7 +189,7 @@ impl Lease {
 
     /// It is known to be gone.
     fn end(&mut self, now: Stamp) -> Option<Change> {
-        self.heard.take()?;
+        self.received.take()?;
         self.gone = now;
         Some(Change::Went)
     }

@@ -199,11 +199,11 @@ impl Collected {
     pub(super) fn report(mut self, path: &Path, size: u64, integrity: Integrity, failed: Option<Failed>) -> Inspection {
         let recorded = failed.as_ref().map_or(size, |failed| failed.at);
         let failed = failed.map(|failed| failed.why).or_else(|| self.recovered.get(FAILED).cloned());
-        let said = |map: &BTreeMap<String, String>, key: &str| map.get(key).cloned().unwrap_or_default();
-        let begin_ns = said(&self.about, "begin_wall_ns").parse().ok().or(self.first).unwrap_or(0);
+        let answer = |map: &BTreeMap<String, String>, key: &str| map.get(key).cloned().unwrap_or_default();
+        let begin_ns = answer(&self.about, "begin_wall_ns").parse().ok().or(self.first).unwrap_or(0);
         let is_ours = integrity.writer == Writer::Rapid || self.is_ours || failed.is_some();
-        let told = said(&self.summary, "duration_s").parse().ok().filter(|seconds: &f64| seconds.is_finite());
-        let seconds = told.unwrap_or_else(|| from(begin_ns, self.last)).max(0.0);
+        let reported = answer(&self.summary, "duration_s").parse().ok().filter(|seconds: &f64| seconds.is_finite());
+        let seconds = reported.unwrap_or_else(|| from(begin_ns, self.last)).max(0.0);
         let mut events = std::mem::take(&mut self.events);
         for (at, event) in &mut events {
             event.at = from(begin_ns, *at);
@@ -211,7 +211,7 @@ impl Collected {
         let judge = self.judge.take();
         let opened =
             std::mem::take(&mut self.opened).into_iter().map(|(at, json)| (from(begin_ns, at), json)).collect();
-        let units = units::told(&said(&self.summary, "provenance"), &said(&self.about, "provenance"), opened);
+        let units = units::reported(&answer(&self.summary, "provenance"), &answer(&self.about, "provenance"), opened);
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saturates, as wanted")]
         let end_ns = begin_ns.saturating_add((seconds * 1e9).round() as u64);
         let policy =
@@ -247,13 +247,13 @@ impl Collected {
             left_out: integrity.left_out,
             ordered_messages: integrity.ordered_messages,
             recovered: self.recovered,
-            software: said(&self.about, "software"),
-            commit: said(&self.about, "commit"),
-            host: said(&self.about, "host"),
-            kernel: said(&self.about, "kernel"),
-            rig: said(&self.about, "rig"),
-            task: said(&self.about, "task"),
-            tags: serde_json::from_str(&said(&self.about, "tags")).unwrap_or_default(),
+            software: answer(&self.about, "software"),
+            commit: answer(&self.about, "commit"),
+            host: answer(&self.about, "host"),
+            kernel: answer(&self.about, "kernel"),
+            rig: answer(&self.about, "rig"),
+            task: answer(&self.about, "task"),
+            tags: serde_json::from_str(&answer(&self.about, "tags")).unwrap_or_default(),
             modules,
             present_at_begin,
             begin_ns,
@@ -261,7 +261,7 @@ impl Collected {
             messages: counted.messages,
             dropped: state::sum(&self.summary, "dropped", &modalities, |quality| quality.dropped),
             lost: state::sum(&self.summary, "lost", &modalities, |quality| quality.lost),
-            damaged: said(&self.summary, "damaged").parse().ok(),
+            damaged: answer(&self.summary, "damaged").parse().ok(),
             frames: counted.frames,
             skew: judge.and_then(|judge| judge.skew()),
             modalities,

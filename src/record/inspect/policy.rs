@@ -54,7 +54,7 @@ pub struct HoldReport {
 #[derive(Debug, Default)]
 pub(super) struct Gathered {
     /// From the last event `policy`.
-    told: Option<Value>,
+    reported: Option<Value>,
     seen: bool,
     late: u64,
     /// From the observation to the chunk, microseconds: of the first [`MAX_LATENCIES`] chunks, and of all.
@@ -75,14 +75,14 @@ impl Gathered {
 
     /// Takes an event of a policy, as JSON.
     pub(super) fn event(&mut self, at_ns: u64, kind: &str, json: &str) {
-        let Ok(said) = serde_json::from_str::<Value>(json) else { return };
+        let Ok(answer) = serde_json::from_str::<Value>(json) else { return };
         self.seen = true;
         match kind {
-            "policy" => self.told = Some(said),
-            "chunk" => self.chunk(&said),
+            "policy" => self.reported = Some(answer),
+            "chunk" => self.chunk(&answer),
             "hold" => {
                 self.close(at_ns);
-                let text = |key: &str| said.get(key).and_then(Value::as_str).unwrap_or_default();
+                let text = |key: &str| answer.get(key).and_then(Value::as_str).unwrap_or_default();
                 let (reason, device) = (text("reason"), text("device"));
                 let reason = if device.is_empty() { reason.to_owned() } else { format!("{reason}: {device}") };
                 self.open = Some((at_ns, reason));
@@ -91,8 +91,8 @@ impl Gathered {
         }
     }
 
-    fn chunk(&mut self, said: &Value) {
-        let ms = said.get("latency_ms").and_then(Value::as_f64).unwrap_or(0.0);
+    fn chunk(&mut self, answer: &Value) {
+        let ms = answer.get("latency_ms").and_then(Value::as_f64).unwrap_or(0.0);
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saturates, as wanted")]
         let us = (ms * 1e3).round() as u32;
         if self.latencies.len() < MAX_LATENCIES {
@@ -100,7 +100,7 @@ impl Gathered {
         }
         self.all_latencies.get_or_insert_with(Tally::default).push(u64::from(us) * 1000);
         self.chunks += 1;
-        self.late += u64::from(said.get("skipped").and_then(Value::as_u64).is_some_and(|skipped| skipped > 0));
+        self.late += u64::from(answer.get("skipped").and_then(Value::as_u64).is_some_and(|skipped| skipped > 0));
     }
 
     fn close(&mut self, at_ns: u64) {
@@ -133,10 +133,10 @@ impl Gathered {
         if !self.seen && recorded.is_none() {
             return None;
         }
-        let told = self.told.take();
+        let reported = self.reported.take();
         let of = |event: &str, record: &str| {
-            let told = told.as_ref().and_then(|told| told.get(event));
-            told.or_else(|| recorded.as_ref()?.get(record)).cloned().unwrap_or_default()
+            let reported = reported.as_ref().and_then(|reported| reported.get(event));
+            reported.or_else(|| recorded.as_ref()?.get(record)).cloned().unwrap_or_default()
         };
         let text = |event, record| of(event, record).as_str().unwrap_or_default().to_owned();
         let latency = self.latency();
@@ -211,13 +211,16 @@ mod tests {
             (9, "act", r#"{"tick": 90}"#),
             (10, "hold", r#"{"device": "arm", "reason": "missing"}"#),
         ]);
-        let said = gathered.report(12 * S, [None, None]).unwrap();
-        assert_eq!((said.name.as_str(), said.hash.as_str(), said.dry_run), ("tactile-id", "0123456789abcdef", true));
-        assert_eq!((said.chunks, said.late_chunks), (2, 1));
-        assert_eq!(said.latency, Some(Lateness { p50: 30.5, p99: 30.5, max: 40.0 }));
+        let answer = gathered.report(12 * S, [None, None]).unwrap();
+        assert_eq!(
+            (answer.name.as_str(), answer.hash.as_str(), answer.dry_run),
+            ("tactile-id", "0123456789abcdef", true)
+        );
+        assert_eq!((answer.chunks, answer.late_chunks), (2, 1));
+        assert_eq!(answer.latency, Some(Lateness { p50: 30.5, p99: 30.5, max: 40.0 }));
         let hold = |reason: &str, count, seconds| HoldReport { reason: reason.to_owned(), count, seconds };
-        assert_eq!(said.holds, [hold("missing: arm", 2, 5.0), hold("waiting", 2, 2.0)]);
-        let (line, reasons) = words(&said);
+        assert_eq!(answer.holds, [hold("missing: arm", 2, 5.0), hold("waiting", 2, 2.0)]);
+        let (line, reasons) = words(&answer);
         assert_eq!(
             line.join("  "),
             "tactile-id  hash 0123456789ab  dry run: nothing moved  2 chunks  1 late  latency 30.5/30.5/40.0 ms  4 holds, 7.0 s"
@@ -228,9 +231,9 @@ mod tests {
     #[test]
     fn without_events_the_metadata_are_used() {
         let record = r#"{"name": "tactile-id", "hash": "ff", "dry_run": true}"#.to_owned();
-        let said = gathered(&[(1, "act", "{}")]).report(S, [None, Some(&record)]).unwrap();
-        assert_eq!((said.name.as_str(), said.hash.as_str(), said.dry_run), ("tactile-id", "ff", true));
-        assert_eq!((said.chunks, said.latency, said.holds.len()), (0, None, 0));
+        let answer = gathered(&[(1, "act", "{}")]).report(S, [None, Some(&record)]).unwrap();
+        assert_eq!((answer.name.as_str(), answer.hash.as_str(), answer.dry_run), ("tactile-id", "ff", true));
+        assert_eq!((answer.chunks, answer.latency, answer.holds.len()), (0, None, 0));
         assert!(Gathered::default().report(S, [Some(&record), None]).is_some());
         assert_eq!(Gathered::default().report(S, [Some(&"7".to_owned()), Some(&"x".to_owned())]), None);
     }
@@ -248,8 +251,8 @@ mod tests {
         for n in 0..100 {
             gathered.event(0, "hold", &format!(r#"{{"reason": "{n}"}}"#));
         }
-        let said = gathered.report(0, [None, None]).unwrap();
-        assert_eq!((said.chunks, said.holds.len()), (2, MAX_REASONS + 1));
-        assert_eq!(words(&said).0.first().map(String::as_str), Some("?"));
+        let answer = gathered.report(0, [None, None]).unwrap();
+        assert_eq!((answer.chunks, answer.holds.len()), (2, MAX_REASONS + 1));
+        assert_eq!(words(&answer).0.first().map(String::as_str), Some("?"));
     }
 }

@@ -31,7 +31,7 @@ pub(super) fn file_state<'a>(ending: &Ending<'a>) -> FileState<'a> {
     }
     let cut_short = summary.get(CUT_SHORT);
     match (integrity.end, *repaired) {
-        (FileEnd::Finished, Some(said)) => FileState::NotWhole(said),
+        (FileEnd::Finished, Some(report)) => FileState::NotWhole(report),
         // A check value that is not right counts as much as a chunk that cannot be read.
         (FileEnd::Finished, None) if integrity.damaged_chunks == 0 && integrity.sound => match cut_short {
             Some(why) => FileState::NotWhole(why),
@@ -61,19 +61,19 @@ pub(super) fn repaired(recovered: &BTreeMap<String, String>) -> Option<String> {
     let count = |key: &str| recovered.get(key).and_then(|count| count.parse::<u64>().ok()).unwrap_or(0);
     let counts = recovered.keys().map(|key| (key.clone(), Value::from(count(key)))).collect();
     let left_out: LeftOut = serde_json::from_value(Value::Object(counts)).unwrap_or_default();
-    let mut said = vec!["it was repaired".to_owned()];
+    let mut report = vec!["it was repaired".to_owned()];
     match recovered.get("end").map(String::as_str) {
-        Some("unfinished" | "torn") => said.push("what came last may be missing".to_owned()),
-        Some("damaged") => said.push("its end could not be read".to_owned()),
+        Some("unfinished" | "torn") => report.push("what came last may be missing".to_owned()),
+        Some("damaged") => report.push("its end could not be read".to_owned()),
         _ => {}
     }
-    said.extend(left_out.sentences(count("damaged_chunks")));
+    report.extend(left_out.sentences(count("damaged_chunks")));
     if count("refused_records") > 0 {
-        said.push("records that make no sense are left out".to_owned());
+        report.push("records that make no sense are left out".to_owned());
     }
     let ordered = count("ordered_messages");
-    said.extend((ordered > 0).then(|| unverified(ordered)));
-    (!recovered.is_empty()).then(|| said.join("; "))
+    report.extend((ordered > 0).then(|| unverified(ordered)));
+    (!recovered.is_empty()).then(|| report.join("; "))
 }
 
 /// So many messages of a chunk that was cut are there, although nothing shows whether a bit of them changed.
@@ -139,29 +139,30 @@ pub(super) fn doubts(ending: &Ending<'_>) -> Vec<String> {
         (empty, "sample", "without content"),
     ];
     let counted = counted.into_iter().filter(|(count, ..)| *count > 0);
-    let mut said: Vec<String> =
+    let mut report: Vec<String> =
         counted.map(|(count, what, rest)| format!("{} {rest}", text::counted(count, what))).collect();
     let twice = [(abouts, ABOUT), (summaries, SUMMARY)].into_iter().filter(|(count, _)| *count > 1);
-    said.extend(twice.map(|(count, name)| format!("it has {count} metadata records {name:?}, of which one is right")));
+    report
+        .extend(twice.map(|(count, name)| format!("it has {count} metadata records {name:?}, of which one is right")));
     let registry = match attached {
         Some(true) => None,
         Some(false) => Some("the registry attached to it is not that of its metadata"),
         None => Some("the registry is not attached to it"),
     };
-    said.extend(registry.map(str::to_owned));
+    report.extend(registry.map(str::to_owned));
     if ending.file.end == FileEnd::Finished && !ending.file.indexed {
-        said.push("it has no index".to_owned());
+        report.push("it has no index".to_owned());
     }
     let named = EpisodeId::of(ending.about).zip(ending.file.episode);
     if named.is_some_and(|(metadata, chunks)| metadata != chunks) {
-        said.push("its metadata and its samples are of different episodes".to_owned());
+        report.push("its metadata and its samples are of different episodes".to_owned());
     }
-    said.extend(length(ending));
+    report.extend(length(ending));
     let (unproven, frames) = (ending.file.ordered_messages, ending.counted.missing_frames);
-    said.extend((unproven > 0).then(|| unverified(unproven)));
+    report.extend((unproven > 0).then(|| unverified(unproven)));
     let are = if frames == 1 { "frame is" } else { "frames are" };
-    said.extend((frames > 0).then(|| format!("{frames} {are} not in the file (limit 0)")));
-    said
+    report.extend((frames > 0).then(|| format!("{frames} {are} not in the file (limit 0)")));
+    report
 }
 
 /// Is the file as long as its summary states? A recorder that ends an episode writes every frame before its end.

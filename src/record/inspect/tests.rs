@@ -25,14 +25,17 @@ async fn episode() -> (Bench, PathBuf) {
 #[tokio::test]
 async fn a_finished_episode_is_reported_as_recorded() {
     let (_bench, file) = episode().await;
-    let said = inspect(&file).unwrap();
-    assert_eq!((said.end, said.unread_bytes, said.damaged_chunks), (FileEnd::Finished, 0, 0));
-    assert_eq!((said.rig.as_str(), said.task.as_str(), said.tags["finger"].as_str()), ("bench", "place block", "soft"));
-    assert_eq!((said.seconds, said.frames, said.dropped), (1.0, 30, Some(1)));
-    assert_eq!((said.lost, said.damaged), (Some(7), Some(1)));
-    let names: Vec<_> = said.modalities.iter().map(|m| (m.bit, m.name.as_str())).collect();
+    let report = inspect(&file).unwrap();
+    assert_eq!((report.end, report.unread_bytes, report.damaged_chunks), (FileEnd::Finished, 0, 0));
+    assert_eq!(
+        (report.rig.as_str(), report.task.as_str(), report.tags["finger"].as_str()),
+        ("bench", "place block", "soft")
+    );
+    assert_eq!((report.seconds, report.frames, report.dropped), (1.0, 30, Some(1)));
+    assert_eq!((report.lost, report.damaged), (Some(7), Some(1)));
+    let names: Vec<_> = report.modalities.iter().map(|m| (m.bit, m.name.as_str())).collect();
     assert_eq!(names, [(0, "cam_wrist"), (1, "tof"), (5, "never"), (7, "raw")]);
-    let [cam, tof, never, raw] = said.modalities.as_slice() else { unreachable!() };
+    let [cam, tof, never, raw] = report.modalities.as_slice() else { unreachable!() };
 
     // The camera is away from 300 to 600 ms of the script, which begins a little after the episode.
     let [first, second] = cam.present.as_slice() else { panic!("{:?}", cam.present) };
@@ -41,9 +44,9 @@ async fn a_finished_episode_is_reported_as_recorded() {
     // The absence is neither a gap nor a loss of rate.
     assert!((0.02..0.1).contains(&cam.topic.longest_gap), "{}", cam.topic.longest_gap);
     assert!((30.0..36.0).contains(&cam.topic.hz), "{}", cam.topic.hz);
-    assert_eq!(said.recorded_verdict.as_ref(), said.verdict.verdict(), "the recorder says the same");
-    assert!(said.verdict.reasons().iter().any(|reason| reason.starts_with("tof: 7 of ")), "{:?}", said.verdict);
-    let frame = said.topics.iter().find(|topic| topic.topic == "/rapid/frame").unwrap();
+    assert_eq!(report.recorded_verdict.as_ref(), report.verdict.verdict(), "the recorder says the same");
+    assert!(report.verdict.reasons().iter().any(|reason| reason.starts_with("tof: 7 of ")), "{:?}", report.verdict);
+    let frame = report.topics.iter().find(|topic| topic.topic == "/rapid/frame").unwrap();
     assert_eq!((frame.messages, frame.lateness), (30, None));
     assert_eq!(cam.topic.lateness, Some(Lateness { p50: 5.0, p99: 5.0, max: 5.0 }));
     assert!(cam.frames_valid > 10 && cam.frames_valid + cam.frames_stale < 25);
@@ -51,19 +54,20 @@ async fn a_finished_episode_is_reported_as_recorded() {
     assert!((90.0..101.0).contains(&tof.topic.hz), "{}", tof.topic.hz);
     assert_eq!((never.topic.messages, never.presence, never.topic.lateness), (0, Some(0.0), None));
     assert!(raw.frames_stale > 10 && raw.frames_valid > 0);
-    let masks: Vec<_> = said.mask.iter().map(|edge| edge.mask.as_str()).collect();
+    let masks: Vec<_> = report.mask.iter().map(|edge| edge.mask.as_str()).collect();
     assert_eq!(masks, ["0x03", "0x83", "0x82", "0x83"]);
     // The recorder's own lines about losses come when they come.
-    let announced = said.events.iter().filter(|event| !event.text.contains("lost"));
+    let announced = report.events.iter().filter(|event| !event.text.contains("lost"));
     let kinds: Vec<_> = announced.take(3).map(|event| event.kind.as_str()).collect();
     assert_eq!(kinds, ["recording", "attach", "log"]);
-    assert!(said.topics.iter().all(|topic| topic.missing == 0), "{:?}", said.topics);
-    let together: u64 = said.topics.iter().chain(said.modalities.iter().map(|m| &m.topic)).map(|t| t.messages).sum();
-    assert_eq!(together, said.messages);
-    let shown = render(&said, 80, Paint::Ansi);
+    assert!(report.topics.iter().all(|topic| topic.missing == 0), "{:?}", report.topics);
+    let together: u64 =
+        report.topics.iter().chain(report.modalities.iter().map(|m| &m.topic)).map(|t| t.messages).sum();
+    assert_eq!(together, report.messages);
+    let shown = render(&report, 80, Paint::Ansi);
     assert!(shown.contains("\x1b[32m█") && shown.contains("   0 %") && !shown.contains("-0 %"), "{shown}");
-    assert!(render(&said, 80, Paint::Plain).lines().all(|line| line.chars().count() <= 80));
-    let json = serde_json::to_value(&said).unwrap();
+    assert!(render(&report, 80, Paint::Plain).lines().all(|line| line.chars().count() <= 80));
+    let json = serde_json::to_value(&report).unwrap();
     assert_eq!((&json["end"], &json["modalities"][1]["missing"]), (&"finished".into(), &8.into()));
 }
 
@@ -75,23 +79,23 @@ async fn a_truncated_or_damaged_file_is_read_up_to_the_damage() {
     assert!(bytes.len() > 20_000);
     let mut before = 0;
     for cut in (0..bytes.len()).step_by(61) {
-        let Some(said) = of(&bytes[..cut]) else {
+        let Some(report) = of(&bytes[..cut]) else {
             assert!(cut < mcap::MAGIC.len());
             continue;
         };
-        assert_ne!(said.end, FileEnd::Finished, "cut at {cut}");
-        assert!((before..=whole.messages).contains(&said.messages), "cut at {cut}");
-        before = said.messages;
-        assert!(!render(&said, 80, Paint::Ansi).is_empty());
+        assert_ne!(report.end, FileEnd::Finished, "cut at {cut}");
+        assert!((before..=whole.messages).contains(&report.messages), "cut at {cut}");
+        before = report.messages;
+        assert!(!render(&report, 80, Paint::Ansi).is_empty());
     }
     assert_eq!(before, whole.messages);
     let mut noticed = 0;
     for at in (0..bytes.len()).step_by(37) {
         let mut flipped = bytes.clone();
         flipped[at] ^= 1 << (at % 8);
-        if let Some(said) = of(&flipped) {
-            noticed += usize::from(said.damaged_chunks > 0 || said.end != FileEnd::Finished);
-            assert!(!render(&said, 80, Paint::Plain).is_empty());
+        if let Some(report) = of(&flipped) {
+            noticed += usize::from(report.damaged_chunks > 0 || report.end != FileEnd::Finished);
+            assert!(!render(&report, 80, Paint::Plain).is_empty());
         }
     }
     // Whatever lies in a chunk is under its CRC, and chunks are most of the file.
@@ -103,8 +107,8 @@ fn any_damaged_file_has_a_report() {
     let config = ProptestConfig { cases: 300, failure_persistence: None, ..ProptestConfig::default() };
     for bytes in testing::layouts().map(testing::episode) {
         proptest!(config.clone(), |(mutations in testing::mutations())| {
-            if let Some(said) = inspect_bytes(&testing::mutated(&bytes, &mutations)) {
-                prop_assert!(!render(&said, 80, Paint::Plain).is_empty());
+            if let Some(report) = inspect_bytes(&testing::mutated(&bytes, &mutations)) {
+                prop_assert!(!render(&report, 80, Paint::Plain).is_empty());
             }
         });
     }
@@ -146,18 +150,18 @@ async fn a_policy_is_reported_with_its_bundle_and_its_holds() {
             ],
         )
         .await;
-    let said = inspect(&file).unwrap();
-    let policy = said.policy.as_ref().unwrap();
+    let report = inspect(&file).unwrap();
+    let policy = report.policy.as_ref().unwrap();
     assert_eq!((policy.name.as_str(), policy.hash.as_str(), policy.dry_run), ("tactile-id", "0123456789abcdef", false));
     assert_eq!((policy.chunks, policy.late_chunks), (2, 1));
     assert_eq!(policy.latency, Some(Lateness { p50: 30.0, p99: 30.0, max: 50.0 }));
     let [hold] = policy.holds.as_slice() else { panic!("{:?}", policy.holds) };
     assert_eq!((hold.reason.as_str(), hold.count), ("missing: arm", 1));
     assert!((0.0..0.5).contains(&hold.seconds), "{}", hold.seconds);
-    let shown = render(&said, 80, Paint::Plain);
+    let shown = render(&report, 80, Paint::Plain);
     assert!(shown.contains("tactile-id  hash 0123456789ab  2 chunks  1 late  latency 30.0/30.0/50.0 ms"), "{shown}");
     assert!(shown.contains("s in 1 hold: missing: arm\n") && !shown.contains("chunk of tick"), "{shown}");
-    assert_eq!(serde_json::to_value(&said).unwrap()["policy"]["hash"], "0123456789abcdef");
+    assert_eq!(serde_json::to_value(&report).unwrap()["policy"]["hash"], "0123456789abcdef");
 
     // A killed run leaves what stands at the beginning.
     let bytes = std::fs::read(&file).unwrap();
@@ -190,9 +194,9 @@ fn chunks_of_other_writers_are_opened_and_their_damage_survived() {
         writer.finish().unwrap();
         drop(writer);
         let bytes = file.into_inner();
-        let said = of(&bytes).unwrap();
-        assert_eq!((said.end, said.messages, said.topics.len()), (FileEnd::Finished, 50, 1), "{compression:?}");
-        assert!((said.topics[0].hz - 100.0).abs() < 1e-6 && (said.seconds - 0.49).abs() < 1e-9);
+        let report = of(&bytes).unwrap();
+        assert_eq!((report.end, report.messages, report.topics.len()), (FileEnd::Finished, 50, 1), "{compression:?}");
+        assert!((report.topics[0].hz - 100.0).abs() < 1e-6 && (report.seconds - 0.49).abs() < 1e-9);
         for at in 0..bytes.len() {
             for bit in 0..8 {
                 let mut flipped = bytes.clone();
@@ -229,7 +233,7 @@ fn the_report_on_a_screen() {
         lateness,
     };
     let late = Some(Lateness { p50: 12.3, p99: 40.0, max: 41.5 });
-    let said = Inspection {
+    let report = Inspection {
         file: PathBuf::from("/data/20261121_place-block_001.mcap"),
         bytes: 7_400_000,
         end: FileEnd::Torn,
@@ -319,7 +323,7 @@ fn the_report_on_a_screen() {
             },
         ],
     };
-    insta::assert_snapshot!(render(&said, 60, Paint::Plain));
+    insta::assert_snapshot!(render(&report, 60, Paint::Plain));
 }
 
 #[tokio::test]

@@ -11,7 +11,7 @@ pub(super) type Units = BTreeMap<String, Vec<Value>>;
 
 /// From the summary; in a file without one, from the record at its beginning and the events
 /// `opened`, which came `at` so many seconds after the beginning.
-pub(super) fn told(summary: &str, beginning: &str, opened: Vec<(f64, String)>) -> Units {
+pub(super) fn reported(summary: &str, beginning: &str, opened: Vec<(f64, String)>) -> Units {
     if let Ok(units) = serde_json::from_str(summary) {
         return units;
     }
@@ -110,10 +110,10 @@ mod tests {
         let opened = r#"{"stamp": 5, "event": "opened", "device": "cam", "bit": 0, "epoch": 2, "serial": "B"}"#;
         let hostile = ["", "[]", "{\"device\": 7}", "nul"];
         let opened = hostile.into_iter().chain([opened]).map(|text| (4.5, text.to_owned())).collect();
-        let units = told("", beginning, opened);
+        let units = reported("", beginning, opened);
         assert_eq!(units["cam"][1], json!({"epoch": 2, "serial": "B", "from_s": 4.5, "to_s": null}));
         assert_eq!((units.len(), units["cam"].len()), (1, 2));
-        assert!(told("{}", beginning, Vec::new()).is_empty());
-        assert!(told("7", "x", Vec::new()).is_empty());
+        assert!(reported("{}", beginning, Vec::new()).is_empty());
+        assert!(reported("7", "x", Vec::new()).is_empty());
     }
 }

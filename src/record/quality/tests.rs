@@ -72,8 +72,8 @@ fn damaged_counts_flagged_samples_and_torn_pictures_once() {
         let n = n as u64;
         measures.sample(id(0), &Seen { flagged, jpeg, ..seen(n, n * 10, 1, payload) });
     }
-    let said = quality_at(&measures, 100);
-    assert_eq!((said.samples, said.damaged, said.truncated, said.bytes), (5, 3, 2, 5 + 5 + 3 + 3 + 13));
+    let report = quality_at(&measures, 100);
+    assert_eq!((report.samples, report.damaged, report.truncated, report.bytes), (5, 3, 2, 5 + 5 + 3 + 3 + 13));
 }
 
 #[test]
@@ -105,9 +105,9 @@ fn plugged_time_comes_from_events_and_opening_is_its_longest_part_outside_the_ma
         for (at, there) in *events {
             measures.plugged(id(0), BEGIN + at * MS, *there);
         }
-        let said = quality_at(&measures, 10_000);
+        let report = quality_at(&measures, 10_000);
         let seconds = |ms: u64| ms as f64 / 1e3;
-        assert_eq!((said.plugged, said.opening), (seconds(*plugged), seconds(*opening)), "{events:?} {masks:?}");
+        assert_eq!((report.plugged, report.opening), (seconds(*plugged), seconds(*opening)), "{events:?} {masks:?}");
     }
 }
 
@@ -132,9 +132,9 @@ fn equal_pictures_are_frozen_and_equal_numbers_are_not() {
             let n = n as u64;
             measures.sample(id(0), &seen(n, n * 100, 1, *payload));
         }
-        let said = quality_at(&measures, 1000);
-        assert_eq!((said.repeated, said.frozen_samples), (repeated, frozen_samples), "{kind:?}");
-        assert!((said.frozen - frozen).abs() < 1e-9, "{kind:?}: {}", said.frozen);
+        let report = quality_at(&measures, 1000);
+        assert_eq!((report.repeated, report.frozen_samples), (repeated, frozen_samples), "{kind:?}");
+        assert!((report.frozen - frozen).abs() < 1e-9, "{kind:?}: {}", report.frozen);
     }
 }
 
@@ -178,9 +178,9 @@ fn an_absence_is_no_gap_and_no_loss_of_rate() {
             measures.mask(BEGIN + 1000 * MS, PhysicalMask(0b1000));
         }
     }
-    let said = quality_at(&measures, 5000);
-    assert_eq!((said.presence, said.present, said.hz), (Some(0.4), 2.0, Some(100.0)));
-    assert!((said.longest_gap - 0.01).abs() < 1e-9, "{}", said.longest_gap);
+    let report = quality_at(&measures, 5000);
+    assert_eq!((report.presence, report.present, report.hz), (Some(0.4), 2.0, Some(100.0)));
+    assert!((report.longest_gap - 0.01).abs() < 1e-9, "{}", report.longest_gap);
     // The other one was there all the time and never sent.
     let other = measures.quality(id(3), BEGIN + 5000 * MS).unwrap();
     assert_eq!((other.samples, other.presence, other.longest_gap, other.hz), (0, Some(1.0), 5.0, Some(0.0)));
@@ -217,9 +217,9 @@ fn a_clock_that_runs_differently_drifts_and_one_that_is_ahead_is_in_the_future()
         quality_at(&measures, seconds * 1000)
     };
     for seconds in [4, 30, 600] {
-        let said = run(0, 5, seconds);
-        assert!(said.clock_drift.unwrap().abs() < 1e-9, "jitter is no drift: {said:?}");
-        assert!(said.clock_ahead.abs() < 1e-9);
+        let report = run(0, 5, seconds);
+        assert!(report.clock_drift.unwrap().abs() < 1e-9, "jitter is no drift: {report:?}");
+        assert!(report.clock_ahead.abs() < 1e-9);
     }
     // From the earliest of the first quarter to that of the last lie three quarters of an episode.
     let slow = run(-1000, 5, 30).clock_drift.unwrap();
@@ -246,10 +246,10 @@ fn frames_give_sample_offsets_from_the_tick_and_their_spread() {
     for (a, b) in [(ms(5), ms(-5)), (ms(10), ms(10)), (ms(3), None), (None, None)] {
         measures.frame([(id(0), true, a), (id(3), b.is_some(), b), (id(9), true, ms(900))].into_iter());
     }
-    let said = quality_at(&measures, 100);
-    assert_eq!((said.frames_present, said.frames_valid), (4, 3));
-    assert!((said.offset.unwrap().max - 10.0).abs() < 1e-9);
-    assert!((said.offset.unwrap().p50 - 5.0).abs() < 0.1, "{said:?}");
+    let report = quality_at(&measures, 100);
+    assert_eq!((report.frames_present, report.frames_valid), (4, 3));
+    assert!((report.offset.unwrap().max - 10.0).abs() < 1e-9);
+    assert!((report.offset.unwrap().p50 - 5.0).abs() < 0.1, "{report:?}");
     let skew = measures.skew().unwrap();
     assert!((skew.max - 10.0).abs() < 1e-9 && skew.p50 < 1e-9, "{skew:?}");
 }
@@ -282,12 +282,12 @@ proptest! {
             measures.mask(BEGIN + at * MS, PhysicalMask(*mask));
         }
         measures.settle();
-        let said = quality_at(&measures, 3000);
-        prop_assert_eq!(said.samples, samples.len() as u64);
+        let report = quality_at(&measures, 3000);
+        prop_assert_eq!(report.samples, samples.len() as u64);
         let repeated = samples.windows(2).filter(|pair| pair[0].1 == pair[1].1).count();
-        prop_assert_eq!(said.repeated, repeated as u64);
+        prop_assert_eq!(report.repeated, repeated as u64);
         let duplicates = samples.windows(2).filter(|pair| pair[0].0 == pair[1].0).count();
-        prop_assert_eq!(said.duplicates, duplicates as u64);
+        prop_assert_eq!(report.duplicates, duplicates as u64);
 
         let is_present = |ms: u64| match masks.iter().rfind(|(at, _)| *at <= ms) {
             Some((_, mask)) => mask & 1 == 1,
@@ -302,8 +302,8 @@ proptest! {
             present += u64::from(is_present(ms));
             longest = longest.max(run);
         }
-        prop_assert!((said.present - present as f64 / 1e3).abs() < 1e-6, "{} {present}", said.present);
-        prop_assert!((said.longest_gap - f64::from(longest) / 1e3).abs() < 1e-6, "{} {longest}", said.longest_gap);
+        prop_assert!((report.present - present as f64 / 1e3).abs() < 1e-6, "{} {present}", report.present);
+        prop_assert!((report.longest_gap - f64::from(longest) / 1e3).abs() < 1e-6, "{} {longest}", report.longest_gap);
     }
 
     /// Hostile numbers: nothing panics, no count exceeds what came.
@@ -317,10 +317,10 @@ proptest! {
             measures.missing(id(0), *seq, *recv_ns);
             measures.frame([(id(0), *jpeg, Some(seq.cast_signed()))].into_iter());
         }
-        let said = measures.quality(id(0), end).unwrap();
+        let report = measures.quality(id(0), end).unwrap();
         let most = samples.len() as u64;
-        prop_assert!(said.samples == most && said.late <= most && said.duplicates <= most && said.truncated <= most);
-        prop_assert!(serde_json::to_string(&said).is_ok());
+        prop_assert!(report.samples == most && report.late <= most && report.duplicates <= most && report.truncated <= most);
+        prop_assert!(serde_json::to_string(&report).is_ok());
     }
 }
 

@@ -17,7 +17,7 @@ async fn an_episode_holds_exactly_the_captured_samples() {
     let reasons = ["tof: 1 of 1", "tof: 7 of 1", "raw: 1 of 2 samples damaged (limit 5 %)", "raw: no sample for "];
     assert_eq!(verdict.grade, Grade::Bad);
     for reason in reasons {
-        assert!(verdict.reasons.iter().any(|said| said.starts_with(reason)), "{reason:?} in {:?}", verdict.reasons);
+        assert!(verdict.reasons.iter().any(|answer| answer.starts_with(reason)), "{reason:?} in {:?}", verdict.reasons);
     }
     assert_eq!(verdict.reasons.len(), reasons.len(), "{:?}", verdict.reasons);
     assert_eq!(bytes, std::fs::metadata(&finished).unwrap().len());
@@ -140,17 +140,17 @@ fn check_frames(read: &Read, begin: u64) {
             let held = known.iter().filter(|k| k.1 <= *tick).max_by_key(|k| k.1).copied();
             let chosen = if present == 1 { nearest.or(held) } else { None };
             let valid = present == 1 && nearest.is_some();
-            let said = ["present", "valid", "stale"].map(|flag| number(slot, flag) == 1);
-            assert_eq!(said, [present == 1, valid, present == 1 && !valid], "{topic} in frame {index}");
+            let answer = ["present", "valid", "stale"].map(|flag| number(slot, flag) == 1);
+            assert_eq!(answer, [present == 1, valid, present == 1 && !valid], "{topic} in frame {index}");
             let seq = slot.has_field_by_name("seq").then(|| number(slot, "seq"));
             assert_eq!(seq, chosen.map(|c| c.2.into()), "{topic} in frame {index}");
             let age = chosen.map_or(0, |c| i128::from(*tick) - i128::from(c.1));
             assert_eq!(number(slot, "age_ns"), age);
-            *seen.entry((topic, said)).or_insert(0) += 1;
+            *seen.entry((topic, answer)).or_insert(0) += 1;
         }
     }
     // The script makes each case happen.
-    let count = |topic, said| seen.get(&(topic, said)).copied().unwrap_or(0);
+    let count = |topic, answer| seen.get(&(topic, answer)).copied().unwrap_or(0);
     assert!(count("/rapid/cam_wrist", [true, true, false]) > 10);
     assert!(count("/rapid/cam_wrist", [false, false, false]) > 7);
     assert_eq!(count("/rapid/never", [false, false, false]), 30);

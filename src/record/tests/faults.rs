@@ -134,9 +134,9 @@ async fn a_file_that_failed_gets_no_end_that_makes_it_look_whole() {
     let What::Episode { file, error, verdict, .. } = closed else { unreachable!() };
     assert!(error.unwrap().contains("cable pulled"));
     assert_eq!(verdict.grade, Grade::Bad);
-    let said = inspect::inspect(&file).unwrap();
-    assert_eq!((said.end, said.recorded_verdict), (inspect::FileEnd::Unfinished, None));
-    assert_ne!(said.verdict.grade().unwrap(), Grade::Good);
+    let answer = inspect::inspect(&file).unwrap();
+    assert_eq!((answer.end, answer.recorded_verdict), (inspect::FileEnd::Unfinished, None));
+    assert_ne!(answer.verdict.grade().unwrap(), Grade::Good);
     let repaired = recover::recover(&file, &mut |_, _| std::ops::ControlFlow::Continue(())).unwrap();
     assert!(matches!(repaired.outcome, recover::Outcome::Repaired(_)), "{repaired:?}");
 }
@@ -161,17 +161,17 @@ async fn a_footer_without_our_summary_makes_no_episode_whole() {
         writer.write(&message.unwrap()).unwrap();
     }
     drop(writer);
-    let said = inspect::inspect(&partial).unwrap();
+    let answer = inspect::inspect(&partial).unwrap();
     let reason = "the file is not whole: the recorder has not finished it";
-    assert_eq!(said.end, inspect::FileEnd::Finished);
-    assert!(said.verdict.reasons().contains(&reason), "{:?}", said.verdict);
-    let said = recover::recover(&partial, &mut |_, _| std::ops::ControlFlow::Continue(())).unwrap();
-    let recover::Outcome::Repaired(repaired) = said.outcome else { panic!("{said:?}") };
+    assert_eq!(answer.end, inspect::FileEnd::Finished);
+    assert!(answer.verdict.reasons().contains(&reason), "{:?}", answer.verdict);
+    let answer = recover::recover(&partial, &mut |_, _| std::ops::ControlFlow::Continue(())).unwrap();
+    let recover::Outcome::Repaired(repaired) = answer.outcome else { panic!("{answer:?}") };
     // Nothing of it is left out, and nothing of it is kept.
     assert!(repaired.original.is_none() && !partial.exists());
-    let said = inspect::inspect(&repaired.to).unwrap();
-    let reasons = said.verdict.reasons();
-    assert!(reasons.iter().any(|said| said.contains("it was repaired")), "{reasons:?}");
+    let answer = inspect::inspect(&repaired.to).unwrap();
+    let reasons = answer.verdict.reasons();
+    assert!(reasons.iter().any(|answer| answer.contains("it was repaired")), "{reasons:?}");
 }
 
 /// A disk that takes everything and keeps nothing for sure.
@@ -224,14 +224,14 @@ async fn a_partial_file_holds_all_flushed_messages() {
         bench.sample(TOF, 1, seq, Stamp::now().0, 0);
     }
     // As a kill would leave it: the file as it is at a moment before its end.
-    let said = loop {
+    let answer = loop {
         match inspect::inspect(&partial) {
-            Ok(said) if said.modalities.iter().any(|m| m.topic.messages == 10) => break said,
+            Ok(answer) if answer.modalities.iter().any(|m| m.topic.messages == 10) => break answer,
             _ => tokio::time::sleep(Duration::from_millis(20)).await,
         }
     };
-    assert_eq!((said.end, said.damaged_chunks, said.dropped), (inspect::FileEnd::Unfinished, 0, None));
-    assert_eq!((said.rig.as_str(), said.modalities.len()), ("bench", 4));
+    assert_eq!((answer.end, answer.damaged_chunks, answer.dropped), (inspect::FileEnd::Unfinished, 0, None));
+    assert_eq!((answer.rig.as_str(), answer.modalities.len()), ("bench", 4));
     assert!(!finished.exists());
     bench.recorder.stop().await.unwrap();
     assert!(finished.exists() && !partial.exists());
@@ -252,9 +252,9 @@ async fn a_panic_leaves_a_finished_file_and_is_reported() {
     assert_eq!(file, finished);
     assert!(error.unwrap().contains("scripted panic"));
     // A reader of the file sees the recorder's verdict.
-    let said = inspect::inspect(&finished).unwrap();
-    assert!(said.recorded_verdict.as_ref().unwrap().reasons.iter().any(|said| said.contains("scripted panic")));
-    assert_eq!(said.verdict.verdict(), said.recorded_verdict.as_ref());
+    let answer = inspect::inspect(&finished).unwrap();
+    assert!(answer.recorded_verdict.as_ref().unwrap().reasons.iter().any(|answer| answer.contains("scripted panic")));
+    assert_eq!(answer.verdict.verdict(), answer.recorded_verdict.as_ref());
     assert_eq!(read(&finished).on("/rapid/tof").count(), 1);
     assert!(matches!(bench.recorder.start(bench.request(None)).await, Err(RecordError::Ended)));
 }

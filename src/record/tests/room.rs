@@ -35,10 +35,10 @@ async fn a_full_disk_is_reported_once_and_ends_the_episode_with_a_whole_file() {
     bench.sample(TOF, 1, 0, Stamp::now().0, 0);
     free.store(GIB + (GIB >> 1), Ordering::Relaxed);
     let low = until(&mut events, |what| matches!(what, What::DiskLow { .. })).await;
-    let What::DiskLow { folder, free: told, seconds } = low else { unreachable!() };
+    let What::DiskLow { folder, free: reported, seconds } = low else { unreachable!() };
     assert_eq!(folder, finished.parent().unwrap());
     // What is set aside for the file counts as free.
-    assert!((GIB + (GIB >> 1)..2 * GIB).contains(&told) && seconds > 0, "{told} {seconds}");
+    assert!((GIB + (GIB >> 1)..2 * GIB).contains(&reported) && seconds > 0, "{reported} {seconds}");
     while bench.board.snapshot().recording.is_none_or(|status| status.room.is_none()) {
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
@@ -53,22 +53,23 @@ async fn a_full_disk_is_reported_once_and_ends_the_episode_with_a_whole_file() {
     assert!(error.contains("nearly full") && error.contains("disk_reserve") && error.contains("--out"), "{error}");
     let read = read(&finished);
     assert_eq!(read.metadata["rapid/summary"]["cut_short"], error);
-    let said = inspect::inspect(&finished).unwrap();
+    let answer = inspect::inspect(&finished).unwrap();
     assert!(
-        said.verdict.verdict().unwrap().grade > Grade::Good && said.verdict.verdict().unwrap().why().contains(&error),
+        answer.verdict.verdict().unwrap().grade > Grade::Good
+            && answer.verdict.verdict().unwrap().why().contains(&error),
         "{:?}",
-        said.verdict
+        answer.verdict
     );
-    assert_eq!(said.verdict.verdict(), said.recorded_verdict.as_ref());
+    assert_eq!(answer.verdict.verdict(), answer.recorded_verdict.as_ref());
     assert_eq!(read.on("/rapid/tof").count(), 1);
     assert_eq!(read.on("/rapid/event").filter(|message| text(&message.4, "kind") == "disk_low").count(), 1);
     assert_eq!(bench.board.snapshot().last_episode, Some(finished));
 
     let error = bench.recorder.start(bench.request(None)).await.unwrap_err();
     assert!(matches!(error, RecordError::NoRoom { reserve: GIB, .. }), "{error}");
-    let said = error.to_string();
-    assert!(said.contains("/out: ") && said.contains("939.5 MB free") && said.contains("1.1 GB"), "{said}");
-    assert!(said.contains("disk_reserve under [rig]") && said.contains("--out"), "{said}");
+    let answer = error.to_string();
+    assert!(answer.contains("/out: ") && answer.contains("939.5 MB free") && answer.contains("1.1 GB"), "{answer}");
+    assert!(answer.contains("disk_reserve under [rig]") && answer.contains("--out"), "{answer}");
     assert_eq!(std::fs::read_dir(bench.folder.path().join("out")).unwrap().count(), 1, "nothing was left");
 
     // Room again.
@@ -200,10 +201,10 @@ async fn a_clock_step_is_an_event_and_times_never_decrease() {
     let report = bench.recorder.stop().await.unwrap();
     assert_eq!((report.error, report.file.as_path()), (None, finished.as_path()));
     let read = read(&finished);
-    let told: Vec<_> = read.on("/rapid/event").filter(|message| text(&message.4, "kind") == "clock_step").collect();
-    assert_eq!(told.len(), 2);
-    assert!(text(&told[0].4, "text").contains("forward by 3600.000 s"), "{}", text(&told[0].4, "text"));
-    assert!(text(&told[1].4, "text").contains("back by 7200.000 s"), "{}", text(&told[1].4, "text"));
+    let reported: Vec<_> = read.on("/rapid/event").filter(|message| text(&message.4, "kind") == "clock_step").collect();
+    assert_eq!(reported.len(), 2);
+    assert!(text(&reported[0].4, "text").contains("forward by 3600.000 s"), "{}", text(&reported[0].4, "text"));
+    assert!(text(&reported[1].4, "text").contains("back by 7200.000 s"), "{}", text(&reported[1].4, "text"));
     for topic in ["/rapid/tof", "/rapid/event", "/rapid/frame"] {
         let times: Vec<u64> = read.on(topic).map(|message| message.2).collect();
         assert!(times.len() > 1 && times.is_sorted_by(|a, b| a < b), "{topic}: {times:?}");

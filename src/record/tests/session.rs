@@ -118,15 +118,15 @@ fn losses_are_announced_once_a_second_and_counted_all() {
     assert_eq!(session.status(Stamp(0)).dropped, u64::MAX);
     let report = session.finish(Stamp(3001 * MS), &masks, None, &[]);
     assert_eq!((report.error, report.dropped), (None, u64::MAX));
-    let mut said = Vec::new();
+    let mut answer = Vec::new();
     while let Ok(event) = events.try_recv() {
         if let What::Log { level: Level::Warn, text } = event.what {
-            said.push(text);
+            answer.push(text);
         }
     }
     let lost = |count: u64, name: &str| format!("{name}: {count} samples lost on the way to the file");
     let both = |count, own| format!("{}, {own} samples lost by the device", lost(count, "tof"));
-    assert_eq!(said, [lost(2, "tof"), both(200, 101), lost(u64::MAX, "cam_wrist"), both(196, 98)]);
+    assert_eq!(answer, [lost(2, "tof"), both(200, 101), lost(u64::MAX, "cam_wrist"), both(196, 98)]);
     let tallies = &read(&report.file).metadata["rapid/summary"]["modalities"];
     let tallies: serde_json::Value = serde_json::from_str(tallies).unwrap();
     assert_eq!((&tallies["tof"]["samples"], &tallies["tof"]["dropped"]), (&200.into(), &398.into()));
@@ -224,12 +224,12 @@ async fn a_device_that_is_plugged_in_and_never_sends_is_missed_by_recorder_and_i
             bench.sample(TOF, 1, n, t0 + n * 10 * MS, 0);
         }
         bench.until_file(&finished).await;
-        let said = inspect::inspect(&finished).unwrap();
-        let reasons = said.verdict.reasons();
+        let answer = inspect::inspect(&finished).unwrap();
+        let reasons = answer.verdict.reasons();
         assert_eq!(reasons.iter().any(|reason| reason.starts_with(silent)), missed, "{before}: {reasons:?}");
-        assert_eq!(said.verdict.verdict().unwrap().grade > Grade::Good, missed, "{reasons:?}");
-        assert_eq!(said.verdict.verdict(), said.recorded_verdict.as_ref());
-        let never = said.modalities.iter().find(|modality| modality.name == "never").unwrap();
+        assert_eq!(answer.verdict.verdict().unwrap().grade > Grade::Good, missed, "{reasons:?}");
+        assert_eq!(answer.verdict.verdict(), answer.recorded_verdict.as_ref());
+        let never = answer.modalities.iter().find(|modality| modality.name == "never").unwrap();
         let plugged = never.quality.unwrap().plugged;
         assert!(if missed { (0.49..0.51).contains(&plugged) } else { plugged < 0.4 }, "{plugged}");
     }
@@ -291,15 +291,15 @@ fn lost_actions_are_suspect_by_the_recorder_and_by_inspect_with_and_without_its_
             .collect();
         let grade = if lost.is_some() { Grade::Suspect } else { Grade::Good };
         assert_eq!((report.verdict.grade, &report.verdict.reasons), (grade, &reasons), "{what}");
-        let said = inspect::inspect(&report.file).unwrap();
-        assert_eq!(said.verdict.verdict(), Some(&report.verdict), "{what}");
+        let answer = inspect::inspect(&report.file).unwrap();
+        assert_eq!(answer.verdict.verdict(), Some(&report.verdict), "{what}");
         // Without the summary: of a killed run, whose numbers are all there is.
         let bytes = std::fs::read(&report.file).unwrap();
         let summary = bytes.windows(13).position(|window| window == b"rapid/summary").unwrap();
         let killed = folder.path().join("killed.mcap");
         std::fs::write(&killed, &bytes[..summary]).unwrap();
-        let said = inspect::inspect(&killed).unwrap();
-        let mut of_actions = said.verdict.reasons();
+        let answer = inspect::inspect(&killed).unwrap();
+        let mut of_actions = answer.verdict.reasons();
         of_actions.retain(|reason| reason.contains("action"));
         assert_eq!(of_actions, reasons, "{what}, killed");
     }

@@ -39,8 +39,8 @@ async fn a_short_episode_can_be_dropped_once_and_its_name_is_not_given_again() {
     assert_eq!((snapshot.last_episode, snapshot.last_verdict, snapshot.short_episode), (None, None, None));
     bench.until_closed(&mut events).await;
     assert_eq!(events.recv().await.unwrap().what, What::Dropped { file: file.clone(), seconds: 0.2 });
-    let said = &snapshot.log.last().unwrap().text;
-    assert!(said.starts_with("episode ") && said.ends_with("_001.mcap dropped; it was 0.2 s long"), "{said}");
+    let report = &snapshot.log.last().unwrap().text;
+    assert!(report.starts_with("episode ") && report.ends_with("_001.mcap dropped; it was 0.2 s long"), "{report}");
     assert!(matches!(bench.recorder.drop_short(file.clone()).await, Err(RecordError::Kept(_))));
     // Devices and programs that record on their own know the name as the dropped episode's.
     let next = recorded(&bench, 200).await;

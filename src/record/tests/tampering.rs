@@ -157,24 +157,24 @@ fn has_chunk(bytes: &[u8]) -> bool {
 /// The recorder's judgement is found again by every reader of the file, and in what a repair makes of it.
 fn found_again(what: &str, why: &str, file: &Path) {
     let is_found = |file: &Path| {
-        let said = inspect::list(file).verdict;
-        assert_eq!(said.grade(), Some(Grade::Bad), "{what}: {}: {said:?}", file.display());
-        assert!(said.reasons().iter().any(|reason| reason.contains(why)), "{what}: {}: {said:?}", file.display());
+        let answer = inspect::list(file).verdict;
+        assert_eq!(answer.grade(), Some(Grade::Bad), "{what}: {}: {answer:?}", file.display());
+        assert!(answer.reasons().iter().any(|reason| reason.contains(why)), "{what}: {}: {answer:?}", file.display());
     };
     is_found(file);
     // In another folder: a test may still have to see what is in this one.
     let folder = tempfile::tempdir().unwrap();
     let partial = folder.path().join(file.file_name().unwrap());
     std::fs::copy(file, &partial).unwrap();
-    let said = recover::recover(&partial, &mut |_, _| std::ops::ControlFlow::Continue(())).unwrap();
-    assert!(said.sentence().1.contains(why), "{what}: {}", said.sentence().1);
-    let repaired = match &said.outcome {
+    let answer = recover::recover(&partial, &mut |_, _| std::ops::ControlFlow::Continue(())).unwrap();
+    assert!(answer.sentence().1.contains(why), "{what}: {}", answer.sentence().1);
+    let repaired = match &answer.outcome {
         recover::Outcome::Repaired(repaired) => repaired,
         // What the other program left of it ends within the first chunk.
         recover::Outcome::Unreadable { kept, .. } if !has_chunk(&std::fs::read(file).unwrap()) => {
             return is_found(kept);
         }
-        _ => panic!("{what}: {said:?}"),
+        _ => panic!("{what}: {answer:?}"),
     };
     is_found(&repaired.to);
     // Once more, as it is repaired again or given its name.
@@ -241,8 +241,8 @@ async fn an_episode_whose_name_was_taken_gets_the_next_one_and_keeps_its_verdict
         let number = if what == "two files" { "_003.mcap" } else { "_002.mcap" };
         let expected = finished.to_str().unwrap().replace("_001.mcap", number);
         assert_eq!(report.file, Path::new(&expected), "{what}");
-        let said = inspect::inspect(&report.file).unwrap();
-        assert_eq!(said.verdict.verdict(), Some(&report.verdict), "{what}");
+        let answer = inspect::inspect(&report.file).unwrap();
+        assert_eq!(answer.verdict.verdict(), Some(&report.verdict), "{what}");
         assert!(!report.verdict.why().contains("not whole") && !report.verdict.why().contains("written"), "{what}");
         assert_eq!(read(&report.file).on("/rapid/cam_wrist").count(), 400, "{what}");
         let there = std::fs::symlink_metadata(&finished).unwrap();

@@ -119,15 +119,15 @@ fn every_check_has_its_words_and_its_two_limits() {
         &["cam: no sample for 3.0 s while present (limit 500 ms)"],
     );
     let ticks = |valid, missed| move |q: &mut Quality| (q.frames_valid, q.frames_missed) = (valid, missed);
-    let says = |valid, ticks, limit| {
+    let states = |valid, ticks, limit| {
         format!("cam: {valid} of {ticks} ticks have a valid sample while present (limit {limit} %; see sync_window)")
     };
     is(ticks(90, 10), Good, &[]);
-    is(ticks(89, 11), Suspect, &[&says(89, 100, 90)]);
-    is(ticks(50, 50), Suspect, &[&says(50, 100, 90)]);
-    is(ticks(49, 51), Bad, &[&says(49, 100, 50)]);
+    is(ticks(89, 11), Suspect, &[&states(89, 100, 90)]);
+    is(ticks(50, 50), Suspect, &[&states(50, 100, 90)]);
+    is(ticks(49, 51), Bad, &[&states(49, 100, 50)]);
     // As T8 has it: none of 140.
-    is(ticks(0, 138), Bad, &[&says(0, 138, 50)]);
+    is(ticks(0, 138), Bad, &[&states(0, 138, 50)]);
     // Too short to have a rate.
     is(|q| (q.present, q.hz) = (0.9, Some(3.0)), Good, &[]);
 }
@@ -138,8 +138,8 @@ fn an_episode_of_a_moment_is_bad_and_so_many_actions_are_missing() {
     let modalities = [Judged { name: "cam", quality: &quality, limits: limits() }];
     let of = |seconds, actions| {
         let missing = Missing { actions, ..Missing::default() };
-        let said = judge(&Facts { missing, seconds, ..facts(&modalities, FileState::Whole) });
-        (said.grade, said.why())
+        let report = judge(&Facts { missing, seconds, ..facts(&modalities, FileState::Whole) });
+        (report.grade, report.why())
     };
     assert_eq!(of(0.0, 0), (Grade::Bad, "too short: 0 ms (limit 500 ms)".to_owned()));
     assert_eq!(of(0.499, 0).0, Grade::Bad);
@@ -158,10 +158,10 @@ fn an_expected_sensor_without_samples_is_suspect_and_verdicts_name_missing_ones(
         (names(&["cam"]), vec![]),
         (names(&["cam", "gel"]), vec!["gel: took no part, and is expected (expect under [rig])"]),
     ] {
-        let said = judge(&Facts { expect: &expect, ..facts(&modalities, FileState::Whole) });
-        assert_eq!(said.reasons, reasons);
-        assert_eq!(said.grade == Grade::Suspect, !reasons.is_empty());
-        assert_eq!(said.sensors(), "1 of 3 sensors, without tof, gel");
+        let report = judge(&Facts { expect: &expect, ..facts(&modalities, FileState::Whole) });
+        assert_eq!(report.reasons, reasons);
+        assert_eq!(report.grade == Grade::Suspect, !reasons.is_empty());
+        assert_eq!(report.sensors(), "1 of 3 sensors, without tof, gel");
     }
 }
 
@@ -176,9 +176,9 @@ fn a_modality_that_was_there_and_sent_nothing_is_bad_and_one_that_was_not_is_not
         ];
         judge(&facts(&modalities, FileState::Whole))
     };
-    let said = both(&silent(3.0));
-    assert_eq!(said.reasons, ["tof: nothing was received, although it was present for 3.0 s"]);
-    assert_eq!(said.grade, Grade::Bad);
+    let report = both(&silent(3.0));
+    assert_eq!(report.reasons, ["tof: nothing was received, although it was present for 3.0 s"]);
+    assert_eq!(report.grade, Grade::Bad);
     // Plugged in a moment before the end; never plugged in.
     assert_eq!(both(&silent(0.3)).grade, Grade::Good);
     assert_eq!(both(&silent(0.0)).grade, Grade::Good);
@@ -190,15 +190,15 @@ fn a_modality_that_was_there_and_sent_nothing_is_bad_and_one_that_was_not_is_not
 #[test]
 fn a_device_that_is_plugged_in_and_does_not_run_is_missed_and_one_that_starts_is_not() {
     use Grade::{Good, Suspect};
-    let says = |seconds: f64, quality: Quality, limits: VerdictSpec| {
+    let states = |seconds: f64, quality: Quality, limits: VerdictSpec| {
         let talks = good();
         let modalities =
             [Judged { name: "cam", quality: &talks, limits }, Judged { name: "tof", quality: &quality, limits }];
-        let said = judge(&Facts { seconds, ..facts(&modalities, FileState::Whole) });
-        (said.grade, said.why())
+        let report = judge(&Facts { seconds, ..facts(&modalities, FileState::Whole) });
+        (report.grade, report.why())
     };
     let never = |plugged| Quality { samples: 0, present: 0.0, plugged, opening: plugged, hz: None, ..good() };
-    for (seconds, plugged, said) in [
+    for (seconds, plugged, report) in [
         (10.0, 10.0, Some("tof: plugged in for 10.0 s and sent nothing (limit 5.0 s)")),
         (60.0, 5.1, Some("tof: plugged in for 5.1 s and sent nothing (limit 5.0 s)")),
         (3.0, 3.0, Some("tof: plugged in for 3.0 s and sent nothing (limit half the episode)")),
@@ -207,17 +207,17 @@ fn a_device_that_is_plugged_in_and_does_not_run_is_missed_and_one_that_starts_is
         (3.0, 1.4, None),
         (10.0, 0.0, None),
     ] {
-        let expected = said.map_or((Good, String::new()), |said| (Suspect, said.to_owned()));
-        assert_eq!(says(seconds, never(plugged), limits()), expected, "{plugged} of {seconds} s");
+        let expected = report.map_or((Good, String::new()), |report| (Suspect, report.to_owned()));
+        assert_eq!(states(seconds, never(plugged), limits()), expected, "{plugged} of {seconds} s");
     }
     // One that ran, and was started again for too long.
     let restarted = |opening| Quality { plugged: 9.0, opening, ..good() };
-    assert_eq!(says(10.0, restarted(4.9), limits()).0, Good);
-    let said = "tof: plugged in for 5.5 s without running (limit 5.0 s)";
-    assert_eq!(says(10.0, restarted(5.5), limits()), (Suspect, said.to_owned()));
+    assert_eq!(states(10.0, restarted(4.9), limits()).0, Good);
+    let report = "tof: plugged in for 5.5 s without running (limit 5.0 s)";
+    assert_eq!(states(10.0, restarted(5.5), limits()), (Suspect, report.to_owned()));
     let mut off = limits();
     off.suspect.opening = None;
-    assert_eq!(says(10.0, never(10.0), off).0, Good);
+    assert_eq!(states(10.0, never(10.0), off).0, Good);
 }
 
 #[test]
@@ -225,14 +225,14 @@ fn the_file_and_its_losses_count_and_the_gravest_reason_comes_first() {
     let quality = Quality { lost: 5, ..good() };
     let modalities = [Judged { name: "cam", quality: &quality, limits: limits() }];
     let of = |file| Facts { missing: Missing { masks: 2, actions: 0, events: 1 }, ..facts(&modalities, file) };
-    let said = judge(&of(FileState::NotWhole("it was recovered")));
+    let report = judge(&of(FileState::NotWhole("it was recovered")));
     let lost = "cam: 5 of 215 samples lost by the device (limit 1 %)";
     let missing = ["2 publications of the mask are not in the file (limit 0)", "1 event is not in the file (limit 0)"];
-    assert_eq!(said.reasons, ["the file is not whole: it was recovered", lost, missing[0], missing[1]]);
-    assert_eq!(said.grade, Grade::Suspect);
-    let said = judge(&of(FileState::Failed("no space left on device")));
-    assert_eq!(said.reasons[0], "the file could not be written: no space left on device");
-    assert_eq!(said.grade, Grade::Bad);
+    assert_eq!(report.reasons, ["the file is not whole: it was recovered", lost, missing[0], missing[1]]);
+    assert_eq!(report.grade, Grade::Suspect);
+    let report = judge(&of(FileState::Failed("no space left on device")));
+    assert_eq!(report.reasons[0], "the file could not be written: no space left on device");
+    assert_eq!(report.grade, Grade::Bad);
     let together = Quality { dropped: 5, ..good() };
     let modalities = [Judged { name: "cam", quality: &together, limits: limits() }];
     let facts = Facts { losses: Losses::Together, ..facts(&modalities, FileState::Whole) };
@@ -274,8 +274,8 @@ fn a_disabled_check_gives_no_reason() {
     };
     let limits = VerdictSpec { suspect: off, bad: off, hz: Some(30.0) };
     let modalities = [Judged { name: "cam", quality: &quality, limits }];
-    let said = judge(&facts(&modalities, FileState::Whole));
-    assert_eq!((said.grade, said.reasons.len()), (Grade::Good, 0));
+    let report = judge(&facts(&modalities, FileState::Whole));
+    assert_eq!((report.grade, report.reasons.len()), (Grade::Good, 0));
 }
 
 proptest! {

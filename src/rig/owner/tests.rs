@@ -101,7 +101,7 @@ struct Bench {
     events: broadcast::Receiver<Event>,
     units: HashMap<&'static str, Arc<SimDevice>>,
     path: PathBuf,
-    told: Vec<String>,
+    reported: Vec<String>,
 }
 
 impl Bench {
@@ -113,7 +113,7 @@ impl Bench {
                 self.units.insert(port, Arc::clone(&unit));
                 let usb = UsbIdentity { vid: 1, pid: 2, serial: None, port: (*port).into(), ..UsbIdentity::default() };
                 let syspath = PathBuf::from("/test").join(port);
-                self.tell(HotplugEvent::Added(Attachment {
+                self.notify(HotplugEvent::Added(Attachment {
                     syspath,
                     node: DeviceNode::Sim(unit),
                     unit: usb.into(),
@@ -123,7 +123,7 @@ impl Bench {
             Pull(port) => self.units[port].unplug(),
             Removed(port, source) => {
                 let syspath = PathBuf::from("/test").join(port);
-                self.tell(HotplugEvent::Removed { syspath, noticed: Stamp::now(), source: *source });
+                self.notify(HotplugEvent::Removed { syspath, noticed: Stamp::now(), source: *source });
             }
             Silence(port) => self.units[port].set_silent(true),
             Resume(port) => self.units[port].set_silent(false),
@@ -142,16 +142,16 @@ impl Bench {
             }
             Until(wanted) => loop {
                 let event = timeout(PATIENCE, self.events.recv()).await;
-                let event = event.unwrap_or_else(|_| panic!("no {wanted:?} after {:?}", self.told)).expect("event");
+                let event = event.unwrap_or_else(|_| panic!("no {wanted:?} after {:?}", self.reported)).expect("event");
                 let Some(word) = word(&event.what) else { continue };
-                self.told.push(word.clone());
+                self.reported.push(word.clone());
                 if word == *wanted {
                     return;
                 }
             },
             Adapter(folder) => {
                 let usb = UsbIdentity { vid: 1, pid: 2, port: "1".into(), ..UsbIdentity::default() };
-                self.tell(HotplugEvent::Added(Attachment {
+                self.notify(HotplugEvent::Added(Attachment {
                     syspath: PathBuf::from("/test/1"),
                     node: DeviceNode::Net(folder.display().to_string()),
                     unit: usb.into(),
@@ -160,8 +160,8 @@ impl Bench {
             }
             Logged(wanted) => loop {
                 let event = timeout(PATIENCE, self.events.recv()).await;
-                let event = event.unwrap_or_else(|_| panic!("no {wanted:?} after {:?}", self.told)).expect("event");
-                self.told.extend(word(&event.what));
+                let event = event.unwrap_or_else(|_| panic!("no {wanted:?} after {:?}", self.reported)).expect("event");
+                self.reported.extend(word(&event.what));
                 if matches!(&event.what, What::Log { text, .. } if text.contains(wanted)) {
                     return;
                 }
@@ -173,14 +173,14 @@ impl Bench {
             Mask(wanted) => {
                 let begun = Instant::now();
                 while !read_mask(&self.path).is_ok_and(|record| record.mask.0 == *wanted) {
-                    assert!(begun.elapsed() < PATIENCE, "mask is not {wanted:#x} after {:?}", self.told);
+                    assert!(begun.elapsed() < PATIENCE, "mask is not {wanted:#x} after {:?}", self.reported);
                     tokio::time::sleep(Duration::from_millis(1)).await;
                 }
             }
         }
     }
 
-    fn tell(&self, event: HotplugEvent) {
+    fn notify(&self, event: HotplugEvent) {
         self.hotplug.unbounded_send(Ok(event)).expect("rig");
     }
 }
@@ -196,12 +196,12 @@ fn word(what: &What) -> Option<String> {
     }
 }
 
-async fn told(cooldown: Duration, stall_after: Duration, steps: &[Step]) -> Vec<String> {
-    told_of(&registry(cooldown, stall_after), false, steps).await
+async fn reported(cooldown: Duration, stall_after: Duration, steps: &[Step]) -> Vec<String> {
+    reported_of(&registry(cooldown, stall_after), false, steps).await
 }
 
 /// What was reported after these steps and to the end of the run, by a rig that is to be armed at the start or not.
-async fn told_of(registry: &Registry, arm: bool, steps: &[Step]) -> Vec<String> {
+async fn reported_of(registry: &Registry, arm: bool, steps: &[Step]) -> Vec<String> {
     static NEXT: AtomicU32 = AtomicU32::new(0);
     let name = format!("owner{}x{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
     let path = PathBuf::from(format!("/dev/shm/rapid_test_mask_{name}"));
@@ -214,8 +214,15 @@ async fn told_of(registry: &Registry, arm: bool, steps: &[Step]) -> Vec<String> 
     let stop = CancellationToken::new();
     let permission = Arc::new(Permission::new(arm));
     let mut rig = Rig::new(registry, &bus, presence, Arc::clone(&board)).obeying(&permission);
-    let mut bench =
-        Bench { hotplug, commands, permission, events: board.events(), units: HashMap::new(), path, told: Vec::new() };
+    let mut bench = Bench {
+        hotplug,
+        commands,
+        permission,
+        events: board.events(),
+        units: HashMap::new(),
+        path,
+        reported: Vec::new(),
+    };
     let running = tokio::spawn({
         let stop = stop.clone();
         async move { rig.run(Box::pin(plugged), asked, stop).await }
@@ -226,9 +233,9 @@ async fn told_of(registry: &Registry, arm: bool, steps: &[Step]) -> Vec<String> 
     stop.cancel();
     running.await.expect("no panic").expect("no error");
     while let Ok(event) = bench.events.try_recv() {
-        bench.told.extend(word(&event.what));
+        bench.reported.extend(word(&event.what));
     }
-    bench.told
+    bench.reported
 }
 
 #[expect(clippy::too_many_lines, reason = "a table")]
@@ -334,7 +341,7 @@ async fn the_first_witness_wins_and_no_replug_is_lost() {
         ),
     ];
     for (name, steps, expected) in table {
-        let got = told(Duration::from_millis(100), Duration::from_millis(150), steps).await;
+        let got = reported(Duration::from_millis(100), Duration::from_millis(150), steps).await;
         assert_eq!(got, [up, *expected].concat(), "{name}");
     }
 }
@@ -350,26 +357,26 @@ async fn devices_are_told_of_the_episode_in_progress() {
     let presence = Presence::start(claim, bus.writer(TopicId::Mask).expect("mask"), Arc::clone(&board)).expect("mask");
     let (hotplug, plugged) = unbounded();
     let (commands, asked) = mpsc::channel(4);
-    let (tell, episode) = watch::channel(None);
+    let (notify, episode) = watch::channel(None);
     let stop = CancellationToken::new();
     let mut rig = Rig::new(&registry, &bus, presence, Arc::clone(&board)).following(episode);
     let permission = Arc::default();
     let events = board.events();
-    let mut bench = Bench { hotplug, commands, permission, events, units: HashMap::new(), path, told: Vec::new() };
+    let mut bench = Bench { hotplug, commands, permission, events, units: HashMap::new(), path, reported: Vec::new() };
     let running = tokio::spawn({
         let stop = stop.clone();
         async move { rig.run(Box::pin(plugged), asked, stop).await }
     });
-    let come_to = async |unit: &Arc<SimDevice>, told: (u32, u32)| {
+    let come_to = async |unit: &Arc<SimDevice>, reported: (u32, u32)| {
         let begun = Instant::now();
-        while unit.recordings() != told {
-            assert!(begun.elapsed() < PATIENCE, "{:?} instead of {told:?}", unit.recordings());
+        while unit.recordings() != reported {
+            assert!(begun.elapsed() < PATIENCE, "{:?} instead of {reported:?}", unit.recordings());
             tokio::time::sleep(Duration::from_millis(1)).await;
         }
     };
     let begin = |number: u8| {
         let file = PathBuf::from(format!("/episodes/{number}.mcap"));
-        tell.send_replace(Some(Arc::new(crate::status::Episode::new(&file))));
+        notify.send_replace(Some(Arc::new(crate::status::Episode::new(&file))));
     };
 
     for step in [Plug("1", CHANNELS), Until("a streaming")] {
@@ -382,7 +389,7 @@ async fn devices_are_told_of_the_episode_in_progress() {
     // A silent one is reported as well.
     first.set_silent(true);
     bench.step(&Until("a stalled")).await;
-    tell.send_replace(None);
+    notify.send_replace(None);
     come_to(&first, (1, 1)).await;
     begin(2);
     come_to(&first, (2, 1)).await;
@@ -420,14 +427,14 @@ async fn a_device_behind_an_adapter_is_not_opened_before_its_cable_is_in() {
         // It is no interface of this machine.
         Until("a absent"),
     ];
-    assert_eq!(told_of(&registry, false, &steps).await[..4], ["a at 1", "a opening", "a gone link", "a absent"]);
+    assert_eq!(reported_of(&registry, false, &steps).await[..4], ["a at 1", "a opening", "a gone link", "a absent"]);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_failed_device_is_started_again_by_hand() {
     // It sends three numbers and the entry wants two.
     let steps = [Plug("1", 3), Until("a failed"), Mask(0), Restart(0), Until("a failed"), Restart(1)];
-    let got = told(Duration::from_millis(100), Duration::from_millis(150), &steps).await;
+    let got = reported(Duration::from_millis(100), Duration::from_millis(150), &steps).await;
     assert_eq!(got, ["a at 1", "a opening", "a failed", "a opening", "a failed"]);
 }
 
@@ -435,7 +442,7 @@ async fn a_failed_device_is_started_again_by_hand() {
 async fn a_stream_that_panics_is_started_again_and_its_bit_stays_clear() {
     // A time no clock can hold, which the registry refuses, makes the stream panic once it is open.
     let steps = [Plug("1", CHANNELS), Until("a backoff"), Mask(0), Until("a backoff"), Mask(0)];
-    let got = told(Duration::from_millis(100), Duration::MAX, &steps).await;
+    let got = reported(Duration::from_millis(100), Duration::MAX, &steps).await;
     assert_eq!(got, ["a at 1", "a opening", "a backoff", "a opening", "a backoff"]);
 }
 
@@ -527,7 +534,7 @@ async fn the_mask_comes_before_the_announcement_and_its_file_says_one_publicatio
         async move { rig.run(Box::pin(plugged), asked, stop).await }
     });
     let mut published = HashMap::new();
-    let mut said = Vec::new();
+    let mut report = Vec::new();
     for round in 0..ROUNDS {
         let source = SimSource::Serial { channels: CHANNELS, hz: 200, seed: 1 };
         let unit = Arc::new(SimDevice::new("1", source, Stamp::now()));
@@ -549,7 +556,7 @@ async fn the_mask_comes_before_the_announcement_and_its_file_says_one_publicatio
             sleep(Duration::from_millis(1)).await;
             let text = std::fs::read_to_string(crate::rig::presence::json_path(&path)).unwrap_or_default();
             let document: serde_json::Value = serde_json::from_str(&text).unwrap_or_default();
-            said.extend(document["sequence"].as_u64().zip(document["mask"].as_str().map(str::to_owned)));
+            report.extend(document["sequence"].as_u64().zip(document["mask"].as_str().map(str::to_owned)));
         }
         let mut take = |topic: TopicId, header: &crate::sample::SampleHeader, payload: &[u8]| {
             if topic == TopicId::Mask {
@@ -562,8 +569,8 @@ async fn the_mask_comes_before_the_announcement_and_its_file_says_one_publicatio
     running.await.expect("no panic").expect("no error");
     let announced: Vec<bool> = announced.try_iter().collect();
     assert_eq!(announced, [false; ROUNDS], "removals that were announced before the mask are true");
-    assert!(said.len() > ROUNDS, "{} documents", said.len());
-    for (sequence, mask) in said {
+    assert!(report.len() > ROUNDS, "{} documents", report.len());
+    for (sequence, mask) in report {
         let was = published.get(&sequence).map(|mask| format!("0x{mask:02x}"));
         assert!(was.is_none_or(|was| was == mask), "publication {sequence} was not of {mask}");
     }

@@ -107,9 +107,9 @@ fn what_others_planted_is_named_and_neither_waited_for_nor_written_to() {
         rustix::fs::mknodat(rustix::fs::CWD, path, rustix::fs::FileType::Fifo, 0o666.into(), 0).expect("pipe");
     };
     let refused = |path: &Path, error: PresenceError| {
-        let said = error.to_string();
-        assert!(matches!(error, PresenceError::Foreign { .. }), "{said}");
-        assert!(said.ends_with(&format!("remove it: rm -r {}", path.display())), "{said}");
+        let report = error.to_string();
+        assert!(matches!(error, PresenceError::Foreign { .. }), "{report}");
+        assert!(report.ends_with(&format!("remove it: rm -r {}", path.display())), "{report}");
     };
     pipe(&path);
     refused(&path, Claim::new(&path, 1).expect_err("a pipe as the mask"));
@@ -208,8 +208,11 @@ fn a_part_of_a_mask_is_named_with_its_cause() {
     let path = folder.path().join("mask");
     for bytes in [0, 1, crate::mask::RECORD_LEN / 2, crate::mask::RECORD_LEN - 1] {
         std::fs::write(&path, vec![0; bytes]).expect("write");
-        let said = read_mask(&path).expect_err("a part of a mask").to_string();
+        let report = read_mask(&path).expect_err("a part of a mask").to_string();
         let name = path.display().to_string();
-        assert!(said.starts_with(&name) && said.contains("only part of a mask is there"), "{bytes} bytes: {said}");
+        assert!(
+            report.starts_with(&name) && report.contains("only part of a mask is there"),
+            "{bytes} bytes: {report}"
+        );
     }
 }

@@ -101,10 +101,10 @@ impl Intake {
                 return None;
             }
         };
-        let said = Stamp(header.capture_ns);
-        let is_possible = said <= now && now.since(said) <= OLDEST;
+        let report = Stamp(header.capture_ns);
+        let is_possible = report <= now && now.since(report) <= OLDEST;
         // Zero: the program does not know.
-        if !is_possible && said != Stamp::default() && !std::mem::replace(&mut self.has_doubted, true) {
+        if !is_possible && report != Stamp::default() && !std::mem::replace(&mut self.has_doubted, true) {
             self.complaint =
                 Some("its capture times are not those of CLOCK_MONOTONIC; the time of arrival is used".to_owned());
         }
@@ -112,7 +112,7 @@ impl Intake {
         if !is_possible {
             flags &= !FLAG_DEVICE_TIME;
         }
-        let captured = if is_possible { said } else { now }.max(self.newest);
+        let captured = if is_possible { report } else { now }.max(self.newest);
         self.newest = captured;
         let hole = self.last.and_then(|last| header.seq.checked_sub(last)?.checked_sub(1));
         self.last = Some(header.seq);
@@ -142,9 +142,9 @@ impl Intake {
                 Expected::Image { width, height },
                 Some(encoding @ (Encoding::Mjpeg | Encoding::Yuyv | Encoding::Grey)),
             ) => {
-                let says = (header.width, header.height);
-                if says != (width, height) && says != (0, 0) {
-                    return Err(Refusal::Picture(says.0, says.1, width, height));
+                let states = (header.width, header.height);
+                if states != (width, height) && states != (0, 0) {
+                    return Err(Refusal::Picture(states.0, states.1, width, height));
                 }
                 let pixels = u64::from(width) * u64::from(height);
                 match encoding {
@@ -164,9 +164,9 @@ impl Intake {
     }
 }
 
-fn exact(payload: &[u8], wished: u64) -> Result<(), Refusal> {
-    let wished = usize::try_from(wished).unwrap_or(usize::MAX);
-    if payload.len() == wished { Ok(()) } else { Err(Refusal::Size(payload.len(), wished)) }
+fn exact(payload: &[u8], requested: u64) -> Result<(), Refusal> {
+    let requested = usize::try_from(requested).unwrap_or(usize::MAX);
+    if payload.len() == requested { Ok(()) } else { Err(Refusal::Size(payload.len(), requested)) }
 }
 
 #[cfg(test)]

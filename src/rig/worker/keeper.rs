@@ -141,14 +141,14 @@ mod tests {
     #[test]
     fn an_end_is_told_in_words() {
         // As wait(2) encodes them: the code in the second byte, a signal in the first.
-        for (raw, told) in [
+        for (raw, reported) in [
             (0, "its process ended with code 0"),
             (3 << 8, "its process ended with code 3"),
             (11, "its process was ended by SIGSEGV"),
             (128 + 6, "its process was ended by SIGABRT"),
             (34, "its process was ended by signal 34"),
         ] {
-            assert_eq!(describe(ExitStatus::from_raw(raw)), told);
+            assert_eq!(describe(ExitStatus::from_raw(raw)), reported);
         }
     }
 }

@@ -71,7 +71,7 @@ fn a_dry_run_is_marked_and_unknown_values_are_dashes() {
 fn long_and_hostile_text_keeps_the_columns() {
     let hostile = "\x1b[2J\x1b[Hgone\r\n\u{202e}reversed";
     let axis = |name: &str, value: f64, unit: &str| (name.to_owned(), value, unit.to_owned());
-    let said = PolicyStatus {
+    let report = PolicyStatus {
         name: format!("{hostile} 相机手腕左侧的相机 a name of a policy that is far too long for a rule"),
         dry_run: true,
         hold: Some(Hold { device: Some("wörter ".repeat(30)), reason: hostile.to_owned() }),
@@ -85,8 +85,8 @@ fn long_and_hostile_text_keeps_the_columns() {
         actions: u64::MAX,
         ..policy()
     };
-    let acting = with(three_streaming(), PolicyStatus { hold: None, ..said.clone() });
-    let model = with(three_streaming(), said);
+    let acting = with(three_streaming(), PolicyStatus { hold: None, ..report.clone() });
+    let model = with(three_streaming(), report);
     for (name, size) in [("60x12", SMALL), ("80x24", USUAL)] {
         let screen = draw(&model, size, THEME);
         assert!(screen.buffer().content.iter().all(|cell| !cell.symbol().contains(char::is_control)));

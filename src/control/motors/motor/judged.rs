@@ -28,16 +28,16 @@ impl Motor {
             .feedback
             .as_ref()
             .filter(|_| matches!(self.phase, Phase::Enabling | Phase::On | Phase::Kept(Stop::Hold | Stop::Brake)));
-        let heard = self
+        let received = self
             .watch
-            .hear(before, feedback, (&self.spec, ranges), now)
+            .receive(before, feedback, (&self.spec, ranges), now)
             .map_err(|what| Fault::Strange { motor, what })?;
-        if let Some(what) = heard
+        if let Some(what) = received
             && self.watch.is_first_jump()
         {
-            notices.tell(Notice::Strange { motor, what });
+            notices.notify(Notice::Strange { motor, what });
         }
-        Ok(heard.is_none())
+        Ok(received.is_none())
     }
 
     /// What is wrong with a motor that is to be enabled, or disabled, by the state it reports.

@@ -52,7 +52,7 @@ impl Motor {
         match self.wanted(reply.parameter) {
             Some(wanted) if reply.value == wanted => {
                 if let Some(was) = setting {
-                    notices.tell(Notice::ParameterSet { motor, parameter: reply.parameter, was, is: wanted });
+                    notices.notify(Notice::ParameterSet { motor, parameter: reply.parameter, was, is: wanted });
                 }
             }
             Some(_) if setting.is_none() => {
@@ -96,7 +96,7 @@ impl Motor {
         let Some(read) = ranges else { return };
         let differs = !model::is_shipped(self.spec.kind, &read);
         if differs && !self.differs {
-            notices.tell(Notice::RangesDiffer { motor: self.index, read, shipped: model::shipped(self.spec.kind) });
+            notices.notify(Notice::RangesDiffer { motor: self.index, read, shipped: model::shipped(self.spec.kind) });
         }
         self.differs = differs;
     }

@@ -12,11 +12,11 @@ fn an_arm_starts_where_the_joints_are() {
     assert!(world.sims.iter().all(Sim::is_on));
     world.run(20);
     assert!((world.sims[0].q - 1.5).abs() < 1e-3 && (world.sims[1].q + 0.75).abs() < 1e-3);
-    assert_eq!((world.told(Notice::Arming), world.told(Notice::Armed)), (1, 1));
+    assert_eq!((world.notified(Notice::Arming), world.notified(Notice::Armed)), (1, 1));
     // Once more is nothing new.
     world.arm();
     world.cycle();
-    assert_eq!((world.bus.state(), world.told(Notice::Arming)), (BusState::Holding, 1));
+    assert_eq!((world.bus.state(), world.notified(Notice::Arming)), (BusState::Holding, 1));
 }
 
 #[test]
@@ -37,7 +37,7 @@ fn an_arm_clears_a_fault_and_fails_while_it_lasts() {
     world.arm();
     world.run_until(BusState::Holding);
     let cleared = Notice::Cleared { motor: 1, status: MotorStatus::CommunicationLost };
-    assert_eq!(world.told(cleared), 1, "{:?}", world.notices);
+    assert_eq!(world.notified(cleared), 1, "{:?}", world.notices);
     world.disarm();
     world.run_until(BusState::Disarmed);
 
@@ -137,12 +137,16 @@ fn a_fault_between_two_cycles_is_not_masked_by_later_frames() {
 fn an_overheating_motor_is_reported_and_then_disables_all() {
     let mut world = World::armed();
     let warm = |celsius| Notice::Warm { motor: 0, part: Part::Mos, celsius, limit: 80.0 };
-    for (mos, told) in [(69, 0), (70, 1), (68, 1), (75, 1), (64, 1), (71, 2), (79, 2)] {
+    for (mos, reported) in [(69, 0), (70, 1), (68, 1), (75, 1), (64, 1), (71, 2), (79, 2)] {
         world.sims[0].mos = mos;
         world.run(3);
-        assert_eq!(world.notices.iter().filter(|notice| matches!(notice, Notice::Warm { .. })).count(), told, "{mos}");
+        assert_eq!(
+            world.notices.iter().filter(|notice| matches!(notice, Notice::Warm { .. })).count(),
+            reported,
+            "{mos}"
+        );
     }
-    assert_eq!((world.told(warm(70.0)), world.told(warm(71.0))), (1, 1));
+    assert_eq!((world.notified(warm(70.0)), world.notified(warm(71.0))), (1, 1));
     world.sims[0].rotor = 100;
     assert_eq!(world.run_to_fault(), Fault::Hot { motor: 0, part: Part::Rotor, celsius: 100.0, limit: 100.0 });
     world.run(2);
@@ -207,7 +211,7 @@ fn a_disarm_ends_an_arm_at_any_moment() {
         world.run_until(BusState::Disarmed);
         world.run(5);
         assert!(!world.sims.iter().any(Sim::is_on), "{cycles}");
-        assert_eq!(world.told(Notice::Disabled(Reason::Asked)), 1);
+        assert_eq!(world.notified(Notice::Disabled(Reason::Asked)), 1);
         world.arm();
         world.run_until(BusState::Holding);
     }
@@ -240,7 +244,7 @@ fn a_motor_counts_as_off_when_it_confirms_after_the_order() {
     world.run(1);
     world.disarm();
     assert_eq!(world.run_to_fault(), Fault::Silent { motor: 0 });
-    assert_eq!(world.told(Notice::Disabled(Reason::Asked)), 0);
+    assert_eq!(world.notified(Notice::Disabled(Reason::Asked)), 0);
 }
 
 #[test]
@@ -249,7 +253,7 @@ fn an_arm_while_motors_are_disabled_waits_for_that() {
     world.disarm();
     world.arm();
     world.run_until(BusState::Holding);
-    assert_eq!(world.told(Notice::Armed), 2);
+    assert_eq!(world.notified(Notice::Armed), 2);
 }
 
 #[test]

@@ -64,7 +64,7 @@ fn a_joint_that_stops_by_its_brake_holds_until_that_does_and_is_disabled_then() 
         world.cycle();
         world.run_to_fault();
         world.cycle();
-        assert_eq!(world.told(Notice::Kept { damped: 0, held: 0, braked: 2 }), 1, "{:?}", world.notices);
+        assert_eq!(world.notified(Notice::Kept { damped: 0, held: 0, braked: 2 }), 1, "{:?}", world.notices);
         assert_eq!(world.bus.releases(), 0, "it is engaged at once");
         let (begun, held) = (world.now, world.sims[1].q);
         while world.sims[1].is_on() {
@@ -132,7 +132,7 @@ fn a_joint_that_has_sunk_is_not_driven_back_up_by_an_emergency_stop() {
             assert!(world.sims[1].q <= last + 1e-3, "it goes back up from {last} to {}", world.sims[1].q);
         }
         assert_eq!(world.sims[1].is_on(), is_broken, "its brake holds it, or its motor damps it");
-        assert_eq!(world.told(Notice::NotBraked { motor: 1 }), usize::from(is_broken), "{:?}", world.notices);
+        assert_eq!(world.notified(Notice::NotBraked { motor: 1 }), usize::from(is_broken), "{:?}", world.notices);
     }
 }
 
@@ -223,7 +223,7 @@ fn a_sound_joint_does_not_fall_because_its_brake_cannot_be_driven() {
         world.run(100);
         assert!(world.sims[1].is_on());
         let kept = Notice::Kept { damped: is_damped, held: 2 - is_damped, braked: 0 };
-        assert_eq!(world.told(kept), 1, "{:?}", world.notices);
+        assert_eq!(world.notified(kept), 1, "{:?}", world.notices);
     }
 }
 

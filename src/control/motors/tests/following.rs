@@ -10,7 +10,7 @@ fn an_action_is_reached_when_the_next_is_due() {
     let mut world = World::armed();
     world.target(&[0.25, 0.25]);
     world.run(PERIOD);
-    assert_eq!((world.bus.state(), world.told(Notice::Following)), (BusState::Following, 1));
+    assert_eq!((world.bus.state(), world.notified(Notice::Following)), (BusState::Following, 1));
     // 0.4 rad in 100 ms: 4 rad/s, below the slew limit of 5 rad/s.
     assert!(world.target(&[0.65, 0.05]));
     world.run(PERIOD / 2);
@@ -60,8 +60,8 @@ fn targets_beyond_the_limits_are_clamped() {
         world.run(PERIOD);
     }
     assert!((world.sims[0].q - 2.0).abs() < 1e-3 && (world.sims[1].q + 2.0).abs() < 1e-3);
-    assert_eq!(world.told(Notice::Clamped { motor: 0, target: 7.0, used: 2.0 }), 1);
-    assert_eq!(world.told(Notice::Clamped { motor: 1, target: -1e9, used: -2.0 }), 1);
+    assert_eq!(world.notified(Notice::Clamped { motor: 0, target: 7.0, used: 2.0 }), 1);
+    assert_eq!(world.notified(Notice::Clamped { motor: 1, target: -1e9, used: -2.0 }), 1);
     assert_eq!(world.bus.counts().clamped, 20);
 }
 
@@ -74,7 +74,7 @@ fn limits_beyond_what_the_motor_counts_in_end_there() {
     world.run_until(BusState::Holding);
     world.target(&[1.9]);
     world.cycle();
-    assert_eq!(world.told(Notice::Clamped { motor: 0, target: 1.9, used: 1.5 }), 1);
+    assert_eq!(world.notified(Notice::Clamped { motor: 0, target: 1.9, used: 1.5 }), 1);
 }
 
 #[test]
@@ -99,7 +99,7 @@ fn actions_that_cannot_be_followed_move_nothing_and_do_not_feed_the_deadman() {
             assert!(!world.bus.target(target, tick, world.now));
             world.cycle();
         }
-        assert_eq!(world.told(Notice::Refused(refusal)), 1);
+        assert_eq!(world.notified(Notice::Refused(refusal)), 1);
         assert_eq!(world.bus.counts().refused, 12 * PERIOD as u64);
         assert!((world.sims[0].q - 0.25).abs() < 1e-3);
         assert_eq!(world.bus.state(), BusState::Disarmed, "{refusal:?}");
@@ -141,7 +141,7 @@ fn without_actions_motors_hold_and_are_then_disabled() {
         world.run(cycles - 1);
         assert_eq!(world.bus.state(), BusState::Following);
         world.cycle();
-        assert_eq!((world.bus.state(), world.told(Notice::Holding)), (BusState::Holding, 1));
+        assert_eq!((world.bus.state(), world.notified(Notice::Holding)), (BusState::Holding, 1));
         let held = world.sims[0].q;
         world.run(30);
         assert!((world.sims[0].q - held).abs() < 1e-3);
@@ -151,7 +151,7 @@ fn without_actions_motors_hold_and_are_then_disabled() {
         world.run(cycles + 199);
         assert_eq!(world.bus.state(), BusState::Holding);
         world.run_until(BusState::Disarmed);
-        assert_eq!(world.told(Notice::Disabled(Reason::Deadman)), 1);
+        assert_eq!(world.notified(Notice::Disabled(Reason::Deadman)), 1);
         assert!(!world.target(&[1.0]));
         world.run(20);
         assert!(!world.moved());
@@ -193,7 +193,7 @@ fn an_arm_without_an_action_does_not_last() {
     world.run(199);
     assert!(world.bus.is_armed());
     world.run_until(BusState::Disarmed);
-    assert_eq!(world.told(Notice::Disabled(Reason::Deadman)), 1);
+    assert_eq!(world.notified(Notice::Disabled(Reason::Deadman)), 1);
 }
 
 #[test]
@@ -345,5 +345,5 @@ fn what_begins_within_a_second_of_the_last_report_is_reported_if_it_lasts() {
         world.run(20);
         world.target(&[8.0, 0.25]);
     }
-    assert_eq!(world.told(Notice::Clamped { motor: 0, target: 8.0, used: 2.0 }), 1, "{:?}", world.notices);
+    assert_eq!(world.notified(Notice::Clamped { motor: 0, target: 8.0, used: 2.0 }), 1, "{:?}", world.notices);
 }

@@ -20,9 +20,9 @@ fn a_joint_outside_its_limits_comes_back_slowly_and_follows_nothing_meanwhile() 
         world.bus.arm_back(world.now);
         world.arm();
         world.run_until(BusState::Holding);
-        assert_eq!(world.told(Notice::Returning), 1, "{:?}", world.notices);
+        assert_eq!(world.notified(Notice::Returning), 1, "{:?}", world.notices);
         let (mut before, begun) = (world.sims[1].q, world.now);
-        while world.told(Notice::Returned) == 0 {
+        while world.notified(Notice::Returned) == 0 {
             assert!(world.now.since(begun) < Duration::from_secs(20), "{mode:?}: {}", world.sims[1].q);
             assert!(!world.target(&[0.25, 0.25]), "{mode:?}: an action is followed on the way back");
             world.cycle();
@@ -59,6 +59,6 @@ fn an_arm_that_drives_back_is_one_like_any_other_within_the_limits() {
     world.arm();
     world.run_until(BusState::Holding);
     world.run(2);
-    assert_eq!(world.told(Notice::Returned), 1);
+    assert_eq!(world.notified(Notice::Returned), 1);
     assert!(world.target(&[0.25, 1.0]));
 }

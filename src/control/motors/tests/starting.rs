@@ -51,7 +51,7 @@ fn the_first_action_after_an_arm_is_near_and_the_next_may_be_far() {
         assert!(!world.target(&[1.5]));
         world.run(10);
     }
-    assert_eq!(world.told(Notice::Refused(Refusal::Far { motor: 0 })), 1, "{:?}", world.notices);
+    assert_eq!(world.notified(Notice::Refused(Refusal::Far { motor: 0 })), 1, "{:?}", world.notices);
     assert!((world.sims[0].q - 0.25).abs() < 1e-3 && world.bus.state() == BusState::Holding);
     assert!(world.target(&[0.4]));
     world.run(10);
@@ -114,12 +114,12 @@ fn an_unseen_fault_is_reported_before_arming_clears_it() {
     // Before anything is known of them.
     world.arm();
     assert_eq!(world.run_to_fault(), Fault::Latched { motor: 0, status: lost });
-    assert_eq!(world.told(Notice::Latched { motor: 1, status: hot }), 1, "{:?}", world.notices);
+    assert_eq!(world.notified(Notice::Latched { motor: 1, status: hot }), 1, "{:?}", world.notices);
     assert_eq!((world.sims[0].status, world.sims[1].status), (lost, hot));
     world.arm();
     world.run_until(BusState::Holding);
     for (motor, status) in [(0, lost), (1, hot)] {
-        assert_eq!(world.told(Notice::Cleared { motor, status }), 1);
+        assert_eq!(world.notified(Notice::Cleared { motor, status }), 1);
     }
 }
 
@@ -132,7 +132,7 @@ fn a_fault_that_comes_to_light_behind_another_is_reported_at_once() {
     world.sims[1].status = MotorStatus::CommunicationLost;
     world.run(3);
     let latched = Notice::Latched { motor: 1, status: MotorStatus::CommunicationLost };
-    assert_eq!((world.bus.state(), world.told(latched)), (BusState::Faulted(fault), 1));
+    assert_eq!((world.bus.state(), world.notified(latched)), (BusState::Faulted(fault), 1));
     world.arm();
     world.run_until(BusState::Holding);
 }

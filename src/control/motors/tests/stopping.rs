@@ -32,7 +32,7 @@ fn by_default_a_faulty_joint_is_limp_and_the_others_are_damped() {
         trouble(&mut world.sims[0]);
         let fault = world.run_to_fault();
         assert_eq!(fault.motor(), Some(0));
-        assert_eq!(world.told(Notice::Kept { damped: 2, held: 0, braked: 0 }), 1, "{:?}", world.notices);
+        assert_eq!(world.notified(Notice::Kept { damped: 2, held: 0, braked: 0 }), 1, "{:?}", world.notices);
         // No action moves it, however long it is kept so.
         for _ in 0..20 {
             assert!(!world.target(&[1.0, 1.0]));
@@ -109,7 +109,7 @@ fn a_joint_that_is_too_hot_stops_as_it_is_to_and_is_reported_once() {
         let fault = world.run_to_fault();
         world.run(100);
         assert_eq!(world.sims[1].is_on(), is_on, "{own_fault:?}");
-        assert_eq!((world.told(Notice::Fault(fault)), world.bus.counts().faults), (1, 1));
+        assert_eq!((world.notified(Notice::Fault(fault)), world.bus.counts().faults), (1, 1));
     }
 }
 
@@ -141,13 +141,13 @@ fn at_an_emergency_stop_each_joint_stops_in_its_way_in_the_next_cycle() {
         assert_eq!(world.bus.state(), BusState::Faulted(Fault::EmergencyStop(TRIP)));
         let disabled = Order::Disable.frame(1);
         assert!(world.sent.contains(&disabled), "the first is limp: {:x?}", world.sent);
-        assert_eq!(world.told(Notice::Kept { damped, held, braked: 0 }), usize::from(damped | held != 0));
+        assert_eq!(world.notified(Notice::Kept { damped, held, braked: 0 }), usize::from(damped | held != 0));
         // Pressed again, or lost meanwhile: that is the same stop.
         emergency(&mut world);
         assert!(!world.target(&[1.0, 1.0]));
         world.run(200);
         assert_eq!((world.sims[0].is_on(), world.sims[1].is_on()), (false, way != Stop::Limp));
-        assert_eq!(world.told(Notice::Fault(Fault::EmergencyStop(TRIP))), 1, "{:?}", world.notices);
+        assert_eq!(world.notified(Notice::Fault(Fault::EmergencyStop(TRIP))), 1, "{:?}", world.notices);
         // A disarm turns off what is held, an arm begins again.
         world.disarm();
         world.run(5);

@@ -163,8 +163,8 @@ fn a_speed_without_a_movement_is_a_frozen_encoder() {
             while let Some(notice) = world.bus.take_notice() {
                 world.notices.push(notice);
             }
-            let said = words(&world).iter().filter(|word| word.contains("encoder stands still")).count();
-            assert_eq!(said, usize::from(cycle >= 7), "{mode:?}: {cycle} cycles, {:?}", words(&world));
+            let report = words(&world).iter().filter(|word| word.contains("encoder stands still")).count();
+            assert_eq!(report, usize::from(cycle >= 7), "{mode:?}: {cycle} cycles, {:?}", words(&world));
             if let BusState::Faulted(fault) = world.bus.state() {
                 let after = world.now.since(begun).as_millis();
                 assert!(matches!(fault, Fault::Strange { what: Strange::Frozen { .. }, .. }), "{fault:?}");

@@ -242,9 +242,9 @@ struct Axis {
     reported: Option<f64>,
     /// Likewise how fast.
     speed: f64,
-    heard: Option<Stamp>,
+    received: Option<Stamp>,
     /// It ordered the motor to turn on.
-    told: bool,
+    notified: bool,
     /// It has received since that the motor is enabled.
     is_on: bool,
     /// The last command to a motor that is on, and when.
@@ -305,7 +305,7 @@ impl World {
         if !self.judge.may_move || !was_arming && self.bus.state() == BusState::Arming {
             // What motors reported before is of the past: the bus may have seen a fault in a frame that cannot be, of
             // which the judge takes nothing.
-            self.judge.axes.iter_mut().for_each(|axis| (axis.told, axis.is_on) = (false, false));
+            self.judge.axes.iter_mut().for_each(|axis| (axis.notified, axis.is_on) = (false, false));
         }
         (self.judge.may_move, self.judge.may_keep) = (true, true);
     }
@@ -341,14 +341,14 @@ impl World {
                 continue;
             }
             let [p, v, t] = sim.ranges;
-            let said = Feedback::decode(frame, &Ranges::new(p, v, t).unwrap()).unwrap();
+            let report = Feedback::decode(frame, &Ranges::new(p, v, t).unwrap()).unwrap();
             axis.unanswered = None;
-            let passed = axis.heard.replace(self.now).map_or(Duration::ZERO, |heard| self.now.since(heard));
+            let passed = axis.received.replace(self.now).map_or(Duration::ZERO, |received| self.now.since(received));
             let fastest = (axis.speed.abs() + 1.25 * motor.velocity + 0.5).min(v);
             let reach = fastest * (passed.as_secs_f64() + 0.02) + 4.0 * p / 65_535.0;
-            let is_possible = !axis.told || axis.reported.is_none_or(|before| (said.q - before).abs() <= reach);
+            let is_possible = !axis.notified || axis.reported.is_none_or(|before| (report.q - before).abs() <= reach);
             if is_possible {
-                (axis.reported, axis.speed) = (Some(said.q), said.dq);
+                (axis.reported, axis.speed) = (Some(report.q), report.dq);
             }
             // Reports from before the order to turn off are of the past; nothing is taken from an impossible frame.
             if sent < axis.off || !is_possible {
@@ -356,8 +356,8 @@ impl World {
             }
             // Once armed, and once it was on, whatever is not on ends it all.
             let was_on = axis.is_on;
-            axis.is_on = axis.told && said.status == MotorStatus::Enabled;
-            let too_hot = f64::from(said.mos) >= motor.max_mos || f64::from(said.rotor) >= motor.max_rotor;
+            axis.is_on = axis.notified && report.status == MotorStatus::Enabled;
+            let too_hot = f64::from(report.mos) >= motor.max_mos || f64::from(report.rotor) >= motor.max_rotor;
             self.judge.may_move &= !(was_on && (!axis.is_on || too_hot));
         }
     }
@@ -392,8 +392,12 @@ impl World {
     fn turn_brakes(&mut self) {
         let released = self.bus.releases();
         for (index, (sim, motor)) in self.sims.iter().zip(&self.spec.motors).enumerate() {
-            let told = self.judge.axes[index].told || sim.is_on();
-            assert!(released >> index & 1 == 0 || told, "the brake of {} is released, and its motor off", motor.name);
+            let notified = self.judge.axes[index].notified || sim.is_on();
+            assert!(
+                released >> index & 1 == 0 || notified,
+                "the brake of {} is released, and its motor off",
+                motor.name
+            );
         }
         if !self.are_brakes_stuck {
             self.brakes.released = released;
@@ -413,10 +417,10 @@ impl World {
             }
             let unanswered = axis.unanswered.map_or(Duration::ZERO, |since| self.now.since(since));
             if is_order && frame.data[7] == 0xfd {
-                *axis = Axis { told: false, is_on: false, command: None, off: self.now, ..axis.clone() };
+                *axis = Axis { notified: false, is_on: false, command: None, off: self.now, ..axis.clone() };
             }
             if is_order && frame.data[7] == 0xfc {
-                (axis.told, axis.command) = (true, None);
+                (axis.notified, axis.command) = (true, None);
                 assert!(self.judge.may_move, "a motor was enabled without an arm");
             }
             if is_order || ![slave, slave + 0x100, slave + 0x200].contains(&frame.id) {
@@ -502,7 +506,7 @@ impl World {
         !self.sent.iter().all(harmless)
     }
 
-    pub(super) fn told(&self, notice: Notice) -> usize {
-        self.notices.iter().filter(|told| **told == notice).count()
+    pub(super) fn notified(&self, notice: Notice) -> usize {
+        self.notices.iter().filter(|notified| **notified == notice).count()
     }
 }

@@ -169,12 +169,12 @@ proptest! {
         for number in 0..40_u64 {
             let captured = BEGIN + number * FRAME;
             let arrived = captured + delay;
-            let (said, is_wrong) = match wrong.get(usize::try_from(number).unwrap()) {
+            let (report, is_wrong) = match wrong.get(usize::try_from(number).unwrap()) {
                 Some(Wrong::Later) => (arrived + 1000, true),
                 Some(Wrong::Earlier) => (captured.saturating_sub(BEGIN / 2), true),
                 Some(Wrong::Nothing) | None => (captured, false),
             };
-            let (stamp, is_kernels) = progress.stamp(&frame(0, Some(said)), Stamp(arrived));
+            let (stamp, is_kernels) = progress.stamp(&frame(0, Some(report)), Stamp(arrived));
             prop_assert!(stamp > last, "{stamp:?} after {last:?}");
             last = stamp;
             if is_wrong {

@@ -81,7 +81,7 @@ impl Ward {
     }
 
     /// A message came.
-    fn hear(&mut self, message: &[u8], now: Stamp) {
+    fn receive(&mut self, message: &[u8], now: Stamp) {
         match message {
             [ON, low, high, frames @ ..] => {
                 self.engages_first = u16::from_le_bytes([*low, *high]);
@@ -111,8 +111,8 @@ impl Ward {
 
     /// The frames of now, if any are to be sent.
     fn due(&mut self, now: Stamp) -> &[CanFrame] {
-        if let State::Watching(heard) = self.state
-            && now.since(heard) >= self.post.stalled_after
+        if let State::Watching(received) = self.state
+            && now.since(received) >= self.post.stalled_after
         {
             self.state = State::Stopping(now);
         }
@@ -138,7 +138,7 @@ impl Ward {
     /// When [`Self::due`] is to be asked again, if no message comes; `None` is never.
     fn next(&self, now: Stamp) -> Option<Duration> {
         match self.state {
-            State::Watching(heard) => Some(heard.after(self.post.stalled_after).since(now)),
+            State::Watching(received) => Some(received.after(self.post.stalled_after).since(now)),
             State::Stopping(_) => Some(ROUND),
             State::Done => Some(Duration::ZERO),
             State::Idle | State::Stopped => None,
@@ -215,7 +215,7 @@ fn listen(ward: &mut Ward, brakes: &mut Held, input: BorrowedFd<'_>) {
                 [BRAKE, low, high, level] => {
                     brakes.take(u16::from_le_bytes([*low, *high]), *level == 1, descriptor(&mut control));
                 }
-                message => ward.hear(message, Stamp::now()),
+                message => ward.receive(message, Stamp::now()),
             },
             Err(Errno::INTR) => {}
             Err(_) => return,
@@ -304,10 +304,10 @@ mod tests {
     fn it_sends_nothing_while_cycles_come_and_nothing_while_no_motor_is_on() {
         let mut ward = ward();
         for ms in 0..200 {
-            ward.hear(&will(&[damping(5), damping(6)]), at(ms * 74));
+            ward.receive(&will(&[damping(5), damping(6)]), at(ms * 74));
             assert_eq!(ward.due(at(ms * 74 + 74)), &[], "{ms}");
         }
-        ward.hear(&[OFF], at(20_000));
+        ward.receive(&[OFF], at(20_000));
         assert_eq!(ward.due(at(30_000)), &[]);
         assert_eq!(ward.next(at(30_000)), None);
         ward.lose(at(30_000));
@@ -319,7 +319,7 @@ mod tests {
     fn a_death_stops_the_motors_at_once_as_they_are_to_stop_and_later_disables_them() {
         let mut ward = ward();
         let frames = [damping(5), damping(6)];
-        ward.hear(&will(&frames), at(0));
+        ward.receive(&will(&frames), at(0));
         ward.lose(at(3));
         for ms in [3, 8, 5_002] {
             assert_eq!(ward.due(at(ms)), frames, "{ms}");
@@ -334,7 +334,7 @@ mod tests {
     #[test]
     fn brakes_engage_before_motors_that_were_kept_on_are_disabled() {
         let mut ward = ward();
-        ward.hear(&will(&[damping(5), damping(6)]), at(0));
+        ward.receive(&will(&[damping(5), damping(6)]), at(0));
         assert_eq!(ward.engages(at(0)), 0);
         ward.lose(at(0));
         ward.due(at(0));
@@ -350,7 +350,7 @@ mod tests {
     fn ward_of_limp() -> Ward {
         let mut ward = ward();
         let off = ward.post.off.clone();
-        ward.hear(&will(&off), at(0));
+        ward.receive(&will(&off), at(0));
         ward.lose(at(1));
         ward
     }
@@ -368,10 +368,10 @@ mod tests {
     fn a_process_that_stands_still_is_stopped_for_and_watched_again_when_it_runs() {
         let mut ward = ward();
         let frames = [damping(5), damping(6)];
-        ward.hear(&will(&frames), at(0));
+        ward.receive(&will(&frames), at(0));
         assert_eq!(ward.next(at(0)), Some(Duration::from_millis(75)));
         assert_eq!(ward.due(at(75)), frames);
-        ward.hear(&will(&frames), at(300));
+        ward.receive(&will(&frames), at(300));
         assert_eq!(ward.due(at(301)), &[]);
         // It stands still permanently.
         assert_eq!(ward.due(at(375)), frames);
@@ -379,9 +379,9 @@ mod tests {
         assert_eq!(ward.due(at(5_375)), off);
         ward.due(at(5_475));
         assert_eq!((ward.state, ward.next(at(5_475))), (State::Stopped, None));
-        ward.hear(&will(&frames), at(9_000));
+        ward.receive(&will(&frames), at(9_000));
         assert_eq!(ward.state, State::Watching(at(9_000)));
-        ward.hear(&[DISMISSED], at(9_001));
+        ward.receive(&[DISMISSED], at(9_001));
         assert_eq!(ward.state, State::Done);
     }
 }

@@ -117,11 +117,11 @@ fn damiaos_adapter_carries_frames_both_ways() {
     assert_eq!((sent[..4].to_vec(), sent[13], sent[28]), (vec![0x55, 0xaa, 0x1e, 3], 5, 0xfc));
 
     let frame = CanFrame::standard(0x15, [1, 2, 3, 4, 5, 6, 7, 8]);
-    let mut told = received(&frame);
-    told.extend(received(&frame).iter().enumerate().map(|(at, byte)| if at == 1 { 0x01 } else { *byte }));
-    told.extend(received(&frame).iter().enumerate().map(|(at, byte)| if at == 1 { 0x02 } else { *byte }));
-    told.extend(received(&CanFrame { id: 0x16, ..frame }));
-    adapter.write_all(&told).unwrap();
+    let mut reported = received(&frame);
+    reported.extend(received(&frame).iter().enumerate().map(|(at, byte)| if at == 1 { 0x01 } else { *byte }));
+    reported.extend(received(&frame).iter().enumerate().map(|(at, byte)| if at == 1 { 0x02 } else { *byte }));
+    reported.extend(received(&CanFrame { id: 0x16, ..frame }));
+    adapter.write_all(&reported).unwrap();
     let mut found = CanFrame::default();
     for id in [0x15, 0x16] {
         assert!(link.recv_until(soon(), &mut found).unwrap().is_some());

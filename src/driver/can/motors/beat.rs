@@ -90,7 +90,7 @@ struct Spell(Option<Stamp>);
 
 impl Spell {
     /// It happens at `now`. Returns whether that is news.
-    fn goes_on(&mut self, now: Stamp) -> bool {
+    fn continues(&mut self, now: Stamp) -> bool {
         self.0.replace(now).is_none_or(|last| now.since(last) >= QUIET)
     }
 }
@@ -164,7 +164,7 @@ impl Beat {
             let _ = self.shared.reason.set(error.clone());
         }
         // What happened in the last cycle.
-        self.tell();
+        self.notify();
         let Self { powered, samples, notices, tally, shared, .. } = self;
         let counts = powered.bus.counts();
         // Before the log, which may block, and before the channels close: who sees that they did may exit.
@@ -199,7 +199,7 @@ impl Beat {
                 self.tally.late(now.since(pace.due()));
             }
             self.step(now)?;
-            self.tell();
+            self.notify();
             pace.begin(now);
             is_fresh = false;
         }
@@ -237,7 +237,7 @@ impl Beat {
         self.tally.unsent += link.take_refused();
         let lost = link.take_lost();
         self.tally.lost_frames += lost;
-        if lost > 0 && self.losing.goes_on(Stamp::now()) {
+        if lost > 0 && self.losing.continues(Stamp::now()) {
             self.complain("frames of the bus are lost before they can be read".to_owned());
         }
         Ok(())
@@ -276,7 +276,7 @@ impl Beat {
                 is_followed
             }
             Err(refused) => {
-                if self.strange.goes_on(now) {
+                if self.strange.continues(now) {
                     self.complain(refused.to_string());
                 }
                 false
@@ -305,7 +305,7 @@ impl Beat {
             self.tally.on_the_wire(Stamp::now().0.saturating_sub(tick.0));
         }
         self.tally.full += full;
-        if full > 0 && self.full.goes_on(now) {
+        if full > 0 && self.full.continues(now) {
             self.complain(LinkError::Full.to_string());
         }
         if let Some(trouble) = trouble {
@@ -346,7 +346,7 @@ impl Beat {
     }
 
     /// Reports what happened, as far as there is room; the rest waits.
-    fn tell(&mut self) {
+    fn notify(&mut self) {
         let bus = &mut self.powered.bus;
         while let Ok(place) = self.notices.try_reserve() {
             let (text, is_problem) = if let Some(text) = self.troubles.pop_front() {

@@ -111,7 +111,7 @@ fn answer(frame: &CanFrame, fate: &Fate) -> CanFrame {
 }
 
 /// Takes notices until one is as `wanted`.
-async fn told(motors: &mut Motors, wanted: impl Fn(&ActuatorNotice) -> bool) -> ActuatorNotice {
+async fn reported(motors: &mut Motors, wanted: impl Fn(&ActuatorNotice) -> bool) -> ActuatorNotice {
     let mut ticks = interval(Duration::from_millis(1));
     let mut all = Vec::new();
     let begun = Instant::now();
@@ -139,10 +139,10 @@ async fn an_emergency_stop_turns_the_motor_off_and_is_named() {
         permission.report(stop, InputState::Runs, Stamp::now());
     }
     permission.arm(Stamp::now(), Stamp::now()).unwrap();
-    told(&mut motors, |notice| notice.arming == Arming::Holding).await;
+    reported(&mut motors, |notice| notice.arming == Arming::Holding).await;
     // Nothing passes it on.
     permission.report(1, InputState::Lost, Stamp::now());
-    let notice = told(&mut motors, |notice| notice.arming == Arming::Faulted).await;
+    let notice = reported(&mut motors, |notice| notice.arming == Arming::Faulted).await;
     assert_eq!(notice.text, "emergency stop pendant lost: all motors are stopped");
     assert!(notice.is_problem);
     let begun = Instant::now();
@@ -162,7 +162,7 @@ async fn a_bus_off_without_a_return_is_told_and_ends_the_driver() {
     bus.send(&bytes(&CanFrame { id: 0x40, error: true, len: 8, ..CanFrame::default() })).unwrap();
     let ended = timeout(PATIENCE, motors.read()).await.expect("it ends");
     assert!(matches!(ended, Err(DriverError::Retry(text)) if text.contains("bus-off")));
-    let notice = told(&mut motors, |notice| notice.text.contains("bus-off")).await;
+    let notice = reported(&mut motors, |notice| notice.text.contains("bus-off")).await;
     assert!(notice.is_problem && notice.arming == Arming::Disarmed, "{notice:?}");
     assert!(motors.order(Order::Arm).is_err(), "nobody is there to take it");
 }
@@ -172,7 +172,7 @@ async fn a_bus_without_room_is_told() {
     // Nothing reads at the other end.
     let (link, _adapter) = damiao_link();
     let mut motors = Motors::start(link, &spec(10, 1000)).unwrap();
-    let notice = told(&mut motors, |notice| notice.text.contains("the queue to the bus is full")).await;
+    let notice = reported(&mut motors, |notice| notice.text.contains("the queue to the bus is full")).await;
     assert!(notice.is_problem, "{notice:?}");
 }
 
@@ -181,17 +181,17 @@ async fn the_last_order_counts_and_a_disarm_is_always_carried_out() {
     let (link, bus) = bus();
     let (fate, thread) = motor(bus);
     let mut motors = Motors::start(link, &spec(1, 10)).unwrap();
-    told(&mut motors, |notice| notice.text.contains("all motors have answered")).await;
+    reported(&mut motors, |notice| notice.text.contains("all motors have answered")).await;
     motors.order(Order::Arm).unwrap();
-    told(&mut motors, |notice| notice.arming == Arming::Holding).await;
+    reported(&mut motors, |notice| notice.arming == Arming::Holding).await;
     // The last word counts, and a disarm is always one.
     motors.order(Order::Disarm).unwrap();
     motors.order(Order::Arm).unwrap();
-    told(&mut motors, |notice| notice.text == "motors are being armed").await;
-    told(&mut motors, |notice| notice.arming == Arming::Holding).await;
+    reported(&mut motors, |notice| notice.text == "motors are being armed").await;
+    reported(&mut motors, |notice| notice.arming == Arming::Holding).await;
     motors.order(Order::Arm).unwrap();
     motors.order(Order::Disarm).unwrap();
-    told(&mut motors, |notice| notice.text == "motors are disabled").await;
+    reported(&mut motors, |notice| notice.text == "motors are disabled").await;
     assert!(!fate.is_on.load(Ordering::Acquire));
     motors.close().await;
     fate.ends.store(true, Ordering::Release);
@@ -215,7 +215,7 @@ async fn notices_wait_for_room() {
         }
     }
     for _ in 0..COUNT {
-        told(&mut motors, |notice| notice.text.contains("of at most 80 °C")).await;
+        reported(&mut motors, |notice| notice.text.contains("of at most 80 °C")).await;
     }
 }
 
@@ -225,7 +225,7 @@ async fn a_motor_that_misses_orders_is_told_to_turn_off_until_it_says_that_it_is
     let (fate, thread) = motor(bus);
     let mut motors = Motors::start(link, &spec(1, 200)).unwrap();
     motors.order(Order::Arm).unwrap();
-    told(&mut motors, |notice| notice.arming == Arming::Holding).await;
+    reported(&mut motors, |notice| notice.arming == Arming::Holding).await;
     assert!(fate.is_on.load(Ordering::Acquire));
     fate.deaf_to.store(6, Ordering::Release);
     motors.close().await;
@@ -260,8 +260,8 @@ async fn the_time_of_a_sample_is_the_kernels_only_where_it_stamped_all_frames() 
             while adapter.read_exact(&mut sent).is_ok() {
                 let frame =
                     CanFrame::standard(u16::from_le_bytes([sent[13], sent[14]]), sent[21..29].try_into().unwrap());
-                let told = crate::driver::can::link::tests::received(&answer(&frame, &fate));
-                if adapter.write_all(&told).is_err() {
+                let reported = crate::driver::can::link::tests::received(&answer(&frame, &fate));
+                if adapter.write_all(&reported).is_err() {
                     return;
                 }
             }

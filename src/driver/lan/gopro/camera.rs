@@ -68,7 +68,7 @@ pub(super) struct Camera {
     /// Until then clips may come to be listed whose episodes are not known.
     unclear_until: Option<Instant>,
     /// What the camera refused was reported.
-    is_said: bool,
+    is_stated: bool,
     /// Clips that are still to be fetched; the first is being fetched.
     pending: VecDeque<Clip>,
     fetching: Option<AbortOnDropHandle<Result<(), Failure>>>,
@@ -94,7 +94,7 @@ impl Camera {
             wanted: None,
             unlisted: None,
             unclear_until: None,
-            is_said: false,
+            is_stated: false,
             pending: VecDeque::new(),
             fetching: None,
         };
@@ -124,19 +124,19 @@ impl Camera {
     }
 
     /// Runs until its owner is dropped, or the camera does not answer.
-    pub(super) async fn run(mut self, mut told: watch::Receiver<Told>) {
+    pub(super) async fn run(mut self, mut reported: watch::Receiver<Told>) {
         let mut beat = interval(self.pace.beat);
         beat.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let mut is_first = true;
         loop {
             tokio::select! {
                 biased;
-                changed = told.changed() => {
+                changed = reported.changed() => {
                     if changed.is_err() {
                         return;
                     }
-                    self.wanted.clone_from(&told.borrow_and_update());
-                    self.is_said = false;
+                    self.wanted.clone_from(&reported.borrow_and_update());
+                    self.is_stated = false;
                     self.settle().await;
                 }
                 _ = beat.tick() => {
@@ -222,7 +222,7 @@ impl Camera {
         };
         self.books.set_shutter(Some(Shutter { episode, before })).await;
         let Err(error) = ask(&self.server, "/gopro/camera/shutter/start").await else {
-            if self.is_said {
+            if self.is_stated {
                 tracing::warn!(device = self.name, "records now, not from the beginning of the episode");
             }
             return;
@@ -232,7 +232,7 @@ impl Camera {
             return;
         }
         self.books.set_shutter(None).await;
-        if !std::mem::replace(&mut self.is_said, true) {
+        if !std::mem::replace(&mut self.is_stated, true) {
             tracing::error!(device = self.name, %error, "the camera does not record this episode; it is asked again");
         }
     }
@@ -242,13 +242,13 @@ impl Camera {
         if let Err(error) = ask(&self.server, "/gopro/camera/shutter/stop").await
             && !self.look().await.is_ok_and(|state| !state.recording)
         {
-            if !std::mem::replace(&mut self.is_said, true) {
+            if !std::mem::replace(&mut self.is_stated, true) {
                 tracing::error!(device = self.name, %error, "the camera records on; it is asked again to stop");
             }
             return false;
         }
         self.books.set_shutter(None).await;
-        self.is_said = false;
+        self.is_stated = false;
         if let Before::Unknown(reason) = &shutter.before {
             self.unknown(&shutter, reason).await;
             self.unclear_until = Some(Instant::now() + self.pace.listed_at_the_latest);
@@ -295,11 +295,11 @@ impl Camera {
         let size = info.ok().and_then(|info| answer::size(&info));
         let clip = Clip::new(name, size, episode, &self.name);
         let (noted, url) = (clip.clone(), clip.url(&self.server));
-        let (Name { file, folder }, said) = (clip.name.clone(), url.clone());
+        let (Name { file, folder }, report) = (clip.name.clone(), url.clone());
         let written = tokio::task::spawn_blocking(move || noted.note(&url)).await;
         if let Err(error) = written.unwrap_or_else(|error| Err(std::io::Error::other(error))) {
             let note = clip.note_path();
-            tracing::error!(device = self.name, %error, "{} cannot be written: the clip is {said}", note.display());
+            tracing::error!(device = self.name, %error, "{} cannot be written: the clip is {report}", note.display());
             return;
         }
         tracing::info!(device = self.name, clip = file, folder, size, "recorded");

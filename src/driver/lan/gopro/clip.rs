@@ -119,7 +119,7 @@ pub(super) async fn fetch(clip: Clip, server: Server, reserve: Option<u64>) -> R
     let mut part = target.clone().into_os_string();
     part.push(".partial");
     let part = PathBuf::from(part);
-    let mut progress = Progress { device: clip.device.clone(), file: clip.name.file.clone(), told: 0 };
+    let mut progress = Progress { device: clip.device.clone(), file: clip.name.file.clone(), reported: 0 };
     let (mut failed, mut furthest) = (0, length(&part));
     loop {
         let attempted = async {
@@ -165,19 +165,19 @@ async fn attempt(clip: &Clip, server: &Server, mut part: Part, progress: &mut Pr
     match reply.status {
         StatusCode::PARTIAL_CONTENT if begins(&reply) == Some(part.there) => {}
         StatusCode::PARTIAL_CONTENT => {
-            part.begin_anew()?;
+            part.begin_again()?;
             return Err(off("the camera continued at another byte than requested"));
         }
         // All of it is there.
         StatusCode::RANGE_NOT_SATISFIABLE if part.there > 0 && clip.size == Some(part.there) => return Ok(()),
         StatusCode::RANGE_NOT_SATISFIABLE if part.there > 0 => {
-            part.begin_anew()?;
+            part.begin_again()?;
             return Err(off("more is there than the camera has"));
         }
         status @ (StatusCode::NOT_FOUND | StatusCode::GONE) => {
             return Err(Broken::Finally(Failure::Lost(format!("the camera answers {status}"))));
         }
-        status if status.is_success() => part.begin_anew()?,
+        status if status.is_success() => part.begin_again()?,
         status => return Err(stays(format_args!("the camera answers {status}"))),
     }
     let from = part.there;
@@ -203,7 +203,7 @@ async fn attempt(clip: &Clip, server: &Server, mut part: Part, progress: &mut Pr
                 return Err(stays("the camera sends more than it announced"));
             }
             (part, block) = part.write(block, is_last).await?;
-            progress.tell(got, whole);
+            progress.notify(got, whole);
         }
         if is_last {
             break;
@@ -214,7 +214,7 @@ async fn attempt(clip: &Clip, server: &Server, mut part: Part, progress: &mut Pr
             Err(off(format_args!("the camera stopped at {} of {whole} bytes", part.there)))
         }
         _ if part.file.metadata().map(|metadata| metadata.len()).ok() != Some(part.there) => {
-            part.begin_anew()?;
+            part.begin_again()?;
             Err(off("what was written is not what came"))
         }
         _ => Ok(()),
@@ -264,7 +264,7 @@ impl Part {
         Ok(())
     }
 
-    fn begin_anew(&mut self) -> Result<(), Broken> {
+    fn begin_again(&mut self) -> Result<(), Broken> {
         self.truncate().map_err(|error| stays(format_args!("{}: {error}", self.path.display())))
     }
 
@@ -325,15 +325,15 @@ fn length(path: &Path) -> u64 {
 struct Progress {
     device: String,
     file: String,
-    told: u64,
+    reported: u64,
 }
 
 impl Progress {
-    fn tell(&mut self, got: u64, whole: Option<u64>) {
+    fn notify(&mut self, got: u64, whole: Option<u64>) {
         let Some(whole) = whole.filter(|whole| *whole > 0) else { return };
         let tenth = got.saturating_mul(10) / whole;
-        if tenth > self.told {
-            self.told = tenth;
+        if tenth > self.reported {
+            self.reported = tenth;
             tracing::info!(device = self.device, "fetching {}: {} %", self.file, tenth * 10);
         }
     }

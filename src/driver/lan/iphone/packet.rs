@@ -54,7 +54,7 @@ pub(in crate::driver::lan) struct Packets {
     /// What comes is let go.
     skips: bool,
     /// The message was handed over, and `payload` begins again.
-    told: bool,
+    reported: bool,
     largest_picture: usize,
 }
 
@@ -66,7 +66,7 @@ impl Packets {
             payload: Vec::new(),
             missing: 0,
             skips: false,
-            told: false,
+            reported: false,
             largest_picture,
         }
     }
@@ -79,7 +79,7 @@ impl Packets {
 
     /// Consumes bytes up to the end of at most one message.
     pub(in crate::driver::lan) fn feed(&mut self, bytes: &[u8]) -> (usize, Cut) {
-        if std::mem::take(&mut self.told) {
+        if std::mem::take(&mut self.reported) {
             self.payload.clear();
             self.header_filled = 0;
         }
@@ -137,13 +137,13 @@ impl Packets {
     }
 
     fn complete(&mut self) -> Cut {
-        self.told = true;
+        self.reported = true;
         let kind = self.header[4];
         if self.skips {
             // Reported when it began.
             self.payload.clear();
             self.header_filled = 0;
-            self.told = false;
+            self.reported = false;
             return Cut::Open;
         }
         match kind {
@@ -151,7 +151,7 @@ impl Packets {
             FRAME => frame(&self.payload).map_or(Cut::Malformed, Cut::Frame),
             _ => {
                 self.header_filled = 0;
-                self.told = false;
+                self.reported = false;
                 Cut::Open
             }
         }

@@ -17,15 +17,15 @@ async fn in_the_background_a_folder_is_repaired_and_reported() {
     let board = Arc::new(Board::new(&registry()));
     let mut events = board.events();
     let repairs = Repairs::start(folder.path().to_owned(), Some(1 << 20), Arc::clone(&board)).unwrap();
-    let mut said = Vec::new();
+    let mut report = Vec::new();
     for _ in 0..3 {
-        said.push(events.recv().await.unwrap().what);
+        report.push(events.recv().await.unwrap().what);
     }
-    let What::Recovered { file, messages, text, .. } = &said[0] else { panic!("{said:?}") };
+    let What::Recovered { file, messages, text, .. } = &report[0] else { panic!("{report:?}") };
     assert_eq!((file, strictly(&fs::read(file).unwrap()).len() as u64), (&folder.path().join("a_001.mcap"), *messages));
     assert!(text.contains("a_001.mcap.partial: repaired, "), "{text}");
-    assert!(matches!(&said[1], What::Log { text, .. } if text.ends_with("a_002.mcap.partial: of no bytes; removed")));
-    assert!(matches!(&said[2], What::Log { text, .. } if text.contains("a_003.mcap.partial: another rapid")));
+    assert!(matches!(&report[1], What::Log { text, .. } if text.ends_with("a_002.mcap.partial: of no bytes; removed")));
+    assert!(matches!(&report[2], What::Log { text, .. } if text.contains("a_003.mcap.partial: another rapid")));
     drop(repairs);
     // A finished file is left alone.
     assert_eq!(names(folder.path()), ["a_001.mcap", "a_003.mcap.partial", "a_004.mcap"]);

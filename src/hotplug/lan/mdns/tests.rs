@@ -9,15 +9,15 @@ const LEASE: Duration = Duration::from_secs(3);
 /// Entries of a service, and what they report.
 struct Bench {
     service: Service,
-    told: mpsc::Receiver<HotplugEvent>,
+    reported: mpsc::Receiver<HotplugEvent>,
     now: Stamp,
 }
 
 impl Bench {
     fn new(entries: &[(&str, Option<&str>)]) -> Self {
-        let (tell, told) = mpsc::channel(64);
+        let (notify, reported) = mpsc::channel(64);
         let wanted = entries.iter().map(|(entry, instance)| Wanted {
-            watch: Watch::new(entry, LEASE, tell.clone()),
+            watch: Watch::new(entry, LEASE, notify.clone()),
             instance: instance.map(str::to_owned),
             port: None,
             current: None,
@@ -29,19 +29,19 @@ impl Bench {
             known: BTreeMap::new(),
             cut: BTreeMap::new(),
         };
-        Self { service, told, now: Stamp(1_000_000_000_000) }
+        Self { service, reported, now: Stamp(1_000_000_000_000) }
     }
 
     async fn announced(&mut self, name: &str, addresses: &[&str]) -> Vec<String> {
         let addresses = addresses.iter().map(|address| address.parse().expect("an address")).collect();
         let found = Found { name: name.into(), addresses };
         self.service.announced(format!("{name}._s._tcp.local."), found, self.now).await;
-        self.told()
+        self.reported()
     }
 
     async fn removed(&mut self, name: &str) -> Vec<String> {
         self.service.removed(&format!("{name}._s._tcp.local."), self.now).await;
-        self.told()
+        self.reported()
     }
 
     /// Looks every 100 ms for so long; what is to be queried again, and what is reported.
@@ -51,13 +51,13 @@ impl Bench {
             self.now = self.now.after(LOOK_EVERY);
             questions += self.service.look(self.now).await.len();
         }
-        (questions, self.told())
+        (questions, self.reported())
     }
 
-    fn told(&mut self) -> Vec<String> {
-        let mut told = Vec::new();
-        while let Ok(event) = self.told.try_recv() {
-            told.push(match event {
+    fn reported(&mut self) -> Vec<String> {
+        let mut reported = Vec::new();
+        while let Ok(event) = self.reported.try_recv() {
+            reported.push(match event {
                 HotplugEvent::Added(attachment) => {
                     let (Unit::Lan(lan), DeviceNode::Lan { address, .. }) = (&attachment.unit, &attachment.node) else {
                         panic!("not on the network: {attachment:?}")
@@ -68,7 +68,7 @@ impl Bench {
                 HotplugEvent::Removed { syspath, source, .. } => format!("-{} {}", syspath.display(), source.word()),
             });
         }
-        told
+        reported
     }
 }
 
@@ -107,7 +107,7 @@ async fn what_its_driver_hears_outlasts_a_lost_announcement_and_not_a_goodbye() 
         bench.now = Stamp::now().before(Duration::from_secs(10));
         let found = Found { name: "a".into(), addresses: vec![([127, 0, 0, 1], 5).into()] };
         bench.service.announced("a._s._tcp.local.".into(), found, bench.now).await;
-        let Ok(HotplugEvent::Added(attachment)) = bench.told.try_recv() else { panic!("not told") };
+        let Ok(HotplugEvent::Added(attachment)) = bench.reported.try_recv() else { panic!("not told") };
         let DeviceNode::Lan { last_received, .. } = attachment.node else { panic!("not on the network") };
         bench.service.wanted[0].asked = Some(bench.now);
         bench.now = bench.now.after(if goodbye { LEASE / 2 } else { LEASE });

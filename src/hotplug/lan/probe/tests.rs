@@ -63,22 +63,22 @@ async fn a_reply_is_distinguished_from_silence() {
 async fn packets_of_the_device_are_heard_and_the_port_is_given_back() {
     let port = nobody();
     let sender = UdpSocket::bind((LOCAL, 0)).await.expect("a port");
-    let mut heard = Box::pin(ask(Probe::Udp, port));
+    let mut received = Box::pin(ask(Probe::Udp, port));
     let answer = loop {
         tokio::select! {
-            answer = &mut heard => break answer,
+            answer = &mut received => break answer,
             () = sleep(Duration::from_millis(5)) => { let _ = sender.send_to(b"x", port).await; }
         }
     };
     assert_eq!(answer, Answer::Here);
-    drop(heard);
+    drop(received);
     UdpSocket::bind(port).await.expect("the port is free for the driver");
     // They are no evidence of another device.
     let elsewhere = SocketAddr::from(([127, 0, 0, 9], nobody().port()));
-    let mut heard = Box::pin(ask(Probe::Udp, elsewhere));
+    let mut received = Box::pin(ask(Probe::Udp, elsewhere));
     let answer = loop {
         tokio::select! {
-            answer = &mut heard => break answer,
+            answer = &mut received => break answer,
             () = sleep(Duration::from_millis(5)) => {
                 let _ = sender.send_to(b"x", (LOCAL, elsewhere.port())).await;
             }
@@ -90,43 +90,43 @@ async fn packets_of_the_device_are_heard_and_the_port_is_given_back() {
 #[tokio::test]
 async fn a_device_on_this_machine_is_not_listened_for_on_the_network() {
     let asked = nobody();
-    let mut heard = Box::pin(ask(Probe::Udp, asked));
+    let mut received = Box::pin(ask(Probe::Udp, asked));
     let is_held = || std::net::UdpSocket::bind(asked).is_err();
     while !is_held() {
         tokio::select! {
-            answer = &mut heard => panic!("{answer:?} although nothing is sent"),
+            answer = &mut received => panic!("{answer:?} although nothing is sent"),
             () = sleep(Duration::from_millis(1)) => {}
         }
     }
     let elsewhere = std::net::UdpSocket::bind((std::net::Ipv4Addr::new(127, 0, 0, 2), asked.port()));
     assert!(elsewhere.is_ok(), "more than {asked} is bound: {elsewhere:?}");
-    drop(heard);
+    drop(received);
 }
 
 #[tokio::test]
 async fn a_refused_probe_proves_nothing_while_the_driver_holds_the_connection() {
     let listener = TcpListener::bind((LOCAL, 0)).await.expect("a port");
     let address = listener.local_addr().expect("an address");
-    let (tell, mut told) = mpsc::channel(8);
+    let (notify, mut reported) = mpsc::channel(8);
     let lease = EVERY * 4;
-    tokio::spawn(watch(Watch::new("cam", lease, tell), address, address, Probe::Tcp));
-    let Some(HotplugEvent::Added(attachment)) = told.recv().await else { panic!("not found") };
+    tokio::spawn(watch(Watch::new("cam", lease, notify), address, address, Probe::Tcp));
+    let Some(HotplugEvent::Added(attachment)) = reported.recv().await else { panic!("not found") };
     let DeviceNode::Lan { last_received, .. } = attachment.node else { panic!("not on the network") };
     // It has a connection, and sends more seldom than it would be asked.
     drop(listener);
     last_received.now();
     let since = last_received.at();
-    let Some(HotplugEvent::Removed { noticed, .. }) = told.recv().await else { panic!("not gone") };
+    let Some(HotplugEvent::Removed { noticed, .. }) = reported.recv().await else { panic!("not gone") };
     assert!(noticed.since(since) >= lease, "gone after {:?}", noticed.since(since));
 }
 
 #[tokio::test]
 async fn a_lease_waits_for_a_driver_that_is_started_later() {
-    let (tell, mut told) = mpsc::channel(8);
-    let mut watch = Watch::new("lidar", EVERY, tell).waits(EVERY * 2);
+    let (notify, mut reported) = mpsc::channel(8);
+    let mut watch = Watch::new("lidar", EVERY, notify).waits(EVERY * 2);
     let begin = Stamp::now();
     watch.found(nobody(), None, begin).await;
-    let Some(HotplugEvent::Added(attachment)) = told.recv().await else { panic!("not found") };
+    let Some(HotplugEvent::Added(attachment)) = reported.recv().await else { panic!("not found") };
     let DeviceNode::Lan { last_received, .. } = attachment.node else { panic!("not on the network") };
     watch.look(begin.after(EVERY * 2)).await;
     assert!(watch.is_there(), "its driver has not begun");
@@ -145,9 +145,9 @@ async fn a_lease_waits_for_a_driver_that_is_started_later() {
 async fn a_device_appears_and_disappears_and_a_sending_one_is_not_probed() {
     let listener = TcpListener::bind((LOCAL, 0)).await.expect("a port");
     let address = listener.local_addr().expect("an address");
-    let (tell, mut told) = mpsc::channel(8);
-    tokio::spawn(watch(Watch::new("cam", EVERY * 3, tell), address, address, Probe::Tcp));
-    let Some(HotplugEvent::Added(attachment)) = told.recv().await else { panic!("not found") };
+    let (notify, mut reported) = mpsc::channel(8);
+    tokio::spawn(watch(Watch::new("cam", EVERY * 3, notify), address, address, Probe::Tcp));
+    let Some(HotplugEvent::Added(attachment)) = reported.recv().await else { panic!("not found") };
     let DeviceNode::Lan { last_received, .. } = attachment.node else { panic!("not on the network") };
     drop(listener.accept().await);
     // While its driver receives from it, no probe connects.
@@ -157,8 +157,8 @@ async fn a_device_appears_and_disappears_and_a_sending_one_is_not_probed() {
         assert!(asked.is_err(), "asked although it sends");
     }
     drop(listener);
-    let Some(HotplugEvent::Removed { source, .. }) = told.recv().await else { panic!("not gone") };
+    let Some(HotplugEvent::Removed { source, .. }) = reported.recv().await else { panic!("not gone") };
     assert_eq!(source, UnplugSource::Lease);
     let _listener = TcpListener::bind(address).await.expect("the port again");
-    assert!(matches!(told.recv().await, Some(HotplugEvent::Added(_))), "found again");
+    assert!(matches!(reported.recv().await, Some(HotplugEvent::Added(_))), "found again");
 }

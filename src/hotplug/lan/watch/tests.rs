@@ -17,7 +17,7 @@ use Step::{End, Heard, Look};
 
 fn play(lease: &mut Lease, step: Step) -> Option<Change> {
     match step {
-        Heard(at) => lease.heard(Stamp(at)),
+        Heard(at) => lease.received(Stamp(at)),
         Look(at) => lease.look(Stamp(at)),
         End(at) => lease.end(Stamp(at)),
     }
@@ -41,9 +41,9 @@ fn a_lease_is_renewed_expires_and_restarts() {
     ];
     for (name, steps, expected) in table {
         let mut lease = Lease::new(LENGTH);
-        let told = steps.iter().filter_map(|step| play(&mut lease, *step));
-        let told: Vec<_> = told.map(|change| if change == Change::Came { "came" } else { "went" }).collect();
-        assert_eq!(told, *expected, "{name}");
+        let reported = steps.iter().filter_map(|step| play(&mut lease, *step));
+        let reported: Vec<_> = reported.map(|change| if change == Change::Came { "came" } else { "went" }).collect();
+        assert_eq!(reported, *expected, "{name}");
     }
 }
 
@@ -51,21 +51,21 @@ proptest! {
     #[test]
     fn arrivals_and_departures_take_turns(steps in prop::collection::vec((0_u64..4, 0_u8..3), 0..200)) {
         let mut lease = Lease::new(LENGTH);
-        let (mut now, mut heard, mut there) = (1, 0, false);
+        let (mut now, mut received, mut there) = (1, 0, false);
         for (later, kind) in steps {
             now += later;
             let change = play(&mut lease, [Heard(now), Look(now), End(now)][usize::from(kind)]);
             if kind == 0 && (there || change.is_some()) {
-                heard = now;
+                received = now;
             }
             match change {
                 Some(Change::Came) => { prop_assert!(!there); there = true; }
                 Some(Change::Went) => {
                     prop_assert!(there);
-                    prop_assert!(kind == 2 || now >= heard + 3, "let go within the lease");
+                    prop_assert!(kind == 2 || now >= received + 3, "let go within the lease");
                     there = false;
                 }
-                None => prop_assert!(kind != 1 || !there || now < heard + 3, "held beyond the lease"),
+                None => prop_assert!(kind != 1 || !there || now < received + 3, "held beyond the lease"),
             }
             prop_assert_eq!(lease.is_there(), there);
             prop_assert_eq!(lease.ends().is_some(), there);

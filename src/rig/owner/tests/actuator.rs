@@ -98,13 +98,13 @@ async fn an_arm_at_the_start_is_given_once() {
     ];
     for (name, at_start, steps, expected) in table {
         let steps: Vec<Step> = steps.into_iter().chain(end.clone()).collect();
-        assert_eq!(told_of(&arm(), at_start, &steps).await, expected, "{name}");
+        assert_eq!(reported_of(&arm(), at_start, &steps).await, expected, "{name}");
     }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn an_order_arms_and_the_end_of_a_run_disarms() {
     let steps = [Plug("1", NUMBERS), Until("a streaming"), Give(Order::Arm), Until("a armed")];
-    let told = told_of(&arm(), false, &steps).await;
-    assert_eq!(told, [&UP_DISARMED[..], &["a armed", "a disarmed"]].concat());
+    let reported = reported_of(&arm(), false, &steps).await;
+    assert_eq!(reported, [&UP_DISARMED[..], &["a armed", "a disarmed"]].concat());
 }

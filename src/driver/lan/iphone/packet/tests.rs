@@ -30,29 +30,29 @@ enum Told {
     Malformed,
 }
 
-fn told(stream: &[u8], size: usize) -> Vec<Told> {
+fn reported(stream: &[u8], size: usize) -> Vec<Told> {
     let mut packets = Packets::new(100);
-    let mut told = Vec::new();
+    let mut reported = Vec::new();
     for mut piece in stream.chunks(size.max(1)) {
         while !piece.is_empty() {
             let (taken, cut) = packets.feed(piece);
             piece = &piece[taken..];
             match cut {
                 Cut::Open => assert!(piece.is_empty(), "stopped early"),
-                Cut::Frame(frame) => told.push(Told::Picture(packets.payload().to_vec(), frame.device_time)),
-                Cut::Session => told.push(Told::Session(packets.payload().to_vec())),
-                Cut::Malformed => told.push(Told::Malformed),
+                Cut::Frame(frame) => reported.push(Told::Picture(packets.payload().to_vec(), frame.device_time)),
+                Cut::Session => reported.push(Told::Session(packets.payload().to_vec())),
+                Cut::Malformed => reported.push(Told::Malformed),
             }
         }
     }
     assert!(packets.payload.capacity() <= LARGEST_SESSION.max(4 * (FRAME_HEAD + 100)), "memory is bounded");
-    told
+    reported
 }
 
 #[track_caller]
 fn check(stream: &[u8], expected: &[Told]) {
     for size in [1, 3, 8, 85, stream.len()] {
-        assert_eq!(told(stream, size), expected, "pieces of {size}");
+        assert_eq!(reported(stream, size), expected, "pieces of {size}");
     }
 }
 
@@ -120,6 +120,6 @@ proptest! {
         }
         stream.extend(tail);
         // Poses and times of random bytes may be NaN, which equals nothing.
-        prop_assert_eq!(format!("{:?}", told(&stream, size)), format!("{:?}", told(&stream, stream.len())));
+        prop_assert_eq!(format!("{:?}", reported(&stream, size)), format!("{:?}", reported(&stream, stream.len())));
     }
 }
