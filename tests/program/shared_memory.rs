@@ -303,7 +303,7 @@ fn files_that_are_removed_during_a_run_are_named_and_the_mask_is_made_again() {
     let dynamic = dynamic.expect("a file of the bus");
     std::fs::remove_file(&dynamic).expect("a file of the bus");
     let log = || std::fs::read_to_string(place.path("log")).expect("standard error");
-    let anew = format!("{}: removed or replaced during the run; made anew", place.mask_file().display());
+    let anew = format!("{}: removed or replaced during the run; created again", place.mask_file().display());
     until("the mask", || log().contains(&anew) && place.mask_file().exists());
     until("the warning", || log().contains(&format!("{}: removed during the run", dynamic.display())));
     running.signal(Signal::INT);

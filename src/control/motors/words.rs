@@ -99,7 +99,9 @@ impl fmt::Display for Words<'_, Fault> {
             Fault::EmergencyStop(trip) => f.write_str(&trip.text(self.stops)),
             Fault::NotEnabled { motor } => write!(f, "motor {} does not become enabled", self.name(motor)),
             Fault::NotDisabled { motor } => write!(f, "motor {} does not become disabled", self.name(motor)),
-            Fault::Unread { motor, parameter } => write!(f, "motor {} does not tell its {parameter}", self.name(motor)),
+            Fault::Unread { motor, parameter } => {
+                write!(f, "motor {} does not report its {parameter}", self.name(motor))
+            }
             Fault::Unusable { motor, parameter: Parameter::PMax, value }
                 if value.number().is_finite() && value.number() > 0.0 =>
             {

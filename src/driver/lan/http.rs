@@ -32,7 +32,7 @@ pub(super) struct Reply {
 pub(super) async fn get(server: &Server, path: &str, from: u64, limit: Duration) -> Result<Reply, DriverError> {
     let ask = async {
         let stream = server.connect().await?;
-        let odd = |error: hyper::Error| server.place.lost(format_args!("it does not speak HTTP: {}", causes(&error)));
+        let odd = |error: hyper::Error| server.place.lost(format_args!("its answer is not HTTP: {}", causes(&error)));
         // What cameras' servers are known to get wrong is let pass.
         let (mut sender, connection) = http1::Builder::new()
             .max_buf_size(LONGEST_HEAD)

@@ -76,7 +76,7 @@ impl Browser {
         };
         for port in phones {
             if let Err(error) = announce(&daemon, *port) {
-                tracing::error!(%error, port, "phones are not told where to connect to");
+                tracing::error!(%error, port, "phones cannot find this machine");
             }
         }
         Some(Self { daemon })
@@ -202,7 +202,10 @@ impl Service {
             wanted.asked = None;
             // Announcements get lost in the air; what the driver receives is better evidence.
             if source == UnplugSource::Lease && wanted.watch.is_sending(wanted.watch.length, now) {
-                tracing::debug!(device = wanted.watch.entry, "its announcement expired, but it is heard");
+                tracing::debug!(
+                    device = wanted.watch.entry,
+                    "its announcement expired, but its driver receives from it"
+                );
                 continue;
             }
             wanted.current = None;

@@ -44,7 +44,7 @@ async fn a_finished_episode_is_reported_as_recorded() {
     // The absence is neither a gap nor a loss of rate.
     assert!((0.02..0.1).contains(&cam.topic.longest_gap), "{}", cam.topic.longest_gap);
     assert!((30.0..36.0).contains(&cam.topic.hz), "{}", cam.topic.hz);
-    assert_eq!(report.recorded_verdict.as_ref(), report.verdict.verdict(), "the recorder says the same");
+    assert_eq!(report.recorded_verdict.as_ref(), report.verdict.verdict(), "the recorder has the same");
     assert!(report.verdict.reasons().iter().any(|reason| reason.starts_with("tof: 7 of ")), "{:?}", report.verdict);
     let frame = report.topics.iter().find(|topic| topic.topic == "/rapid/frame").unwrap();
     assert_eq!((frame.messages, frame.lateness), (30, None));

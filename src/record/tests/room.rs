@@ -153,14 +153,14 @@ async fn a_removed_file_is_reported_while_recording_and_takes_no_other_name() {
     let finished = bench.recorder.start(bench.request(None)).await.unwrap();
     std::fs::remove_file(finished.with_extension("mcap.partial")).unwrap();
     until(&mut events, |what| matches!(what, What::Log { text, .. } if text.contains("removed while"))).await;
-    std::fs::write(&finished, "of somebody else").unwrap();
+    std::fs::write(&finished, "of another program").unwrap();
     let report = bench.recorder.stop().await.unwrap();
     assert_eq!(
         report.file.file_name().unwrap().to_str().unwrap(),
         format!("{}-2.mcap", finished.file_stem().unwrap().to_str().unwrap())
     );
     read(&report.file);
-    assert_eq!(std::fs::read_to_string(&finished).unwrap(), "of somebody else");
+    assert_eq!(std::fs::read_to_string(&finished).unwrap(), "of another program");
 }
 
 #[tokio::test]
@@ -170,12 +170,12 @@ async fn a_folder_that_is_moved_and_replaced_is_followed() {
     let (out, elsewhere) = (finished.parent().unwrap(), bench.folder.path().join("elsewhere"));
     std::fs::rename(out, &elsewhere).unwrap();
     std::fs::create_dir(out).unwrap();
-    std::fs::write(finished.with_extension("mcap.partial"), "of somebody else").unwrap();
+    std::fs::write(finished.with_extension("mcap.partial"), "of another program").unwrap();
     let report = bench.recorder.stop().await.unwrap();
     assert_eq!((report.error, &report.file), (None, &elsewhere.join(finished.file_name().unwrap())));
     read(&report.file);
     assert_eq!(std::fs::read_dir(&elsewhere).unwrap().count(), 1);
-    assert_eq!(std::fs::read_to_string(finished.with_extension("mcap.partial")).unwrap(), "of somebody else");
+    assert_eq!(std::fs::read_to_string(finished.with_extension("mcap.partial")).unwrap(), "of another program");
 }
 
 #[tokio::test]

@@ -73,13 +73,13 @@ async fn a_file_that_is_cut_or_replaced_while_it_is_recorded_ends_the_episode_an
         }),
         ("replaced by renaming", "another program put another file in its place", |file| {
             let other = file.with_file_name("other");
-            std::fs::write(&other, "of somebody else").unwrap();
+            std::fs::write(&other, "of another program").unwrap();
             std::fs::rename(&other, file).unwrap();
             None
         }),
         ("removed, and another made", "another program put another file in its place", |file| {
             std::fs::remove_file(file).unwrap();
-            std::fs::write(file, "of somebody else").unwrap();
+            std::fs::write(file, "of another program").unwrap();
             None
         }),
     ];
@@ -99,7 +99,7 @@ async fn a_file_that_is_cut_or_replaced_while_it_is_recorded_ends_the_episode_an
         found_again(what, why, &file);
         if why.contains("place") {
             let partial = finished.with_extension("mcap.partial");
-            assert_eq!(std::fs::read_to_string(partial).unwrap(), "of somebody else", "{what}");
+            assert_eq!(std::fs::read_to_string(partial).unwrap(), "of another program", "{what}");
             // What was recorded is kept beside it.
             assert!(std::fs::metadata(&file).unwrap().len() >= ENOUGH, "{what}: {}", file.display());
         }

@@ -79,7 +79,7 @@ pub enum PresenceError {
     },
     /// It is shorter than a mask.
     #[error(
-        "{path}: only part of a mask is there: it was cut, or its disk was full; the next start of rapid writes it anew"
+        "{path}: only part of a mask is there: it was cut, or its disk was full; the next start of rapid writes it again"
     )]
     Cut {
         /// The file.

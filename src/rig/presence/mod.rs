@@ -211,11 +211,13 @@ impl Beat {
             Ok(false) => false,
             Ok(true) => {
                 let path = self.file.path().display();
-                tracing::warn!("{path}: removed or replaced during the run; made anew: its readers must open it again");
+                tracing::warn!(
+                    "{path}: removed or replaced during the run; created again: its readers must open it again"
+                );
                 false
             }
             Err(error) if !failed => {
-                tracing::warn!(%error, "the physical mask was removed during the run, and cannot be made anew");
+                tracing::warn!(%error, "the physical mask was removed during the run, and cannot be created again");
                 true
             }
             Err(_) => true,

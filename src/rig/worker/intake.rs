@@ -35,9 +35,9 @@ pub(super) struct Judged {
 /// Why a sample is refused.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 enum Refusal {
-    #[error("its samples say modality {0}, not {1}: a program must send RAPID_BIT as id")]
+    #[error("its samples carry modality {0}, not {1}: a program must send RAPID_BIT as id")]
     Id(u32, u32),
-    #[error("its samples say epoch {0}, not {1}: a program must send RAPID_EPOCH as epoch")]
+    #[error("its samples carry epoch {0}, not {1}: a program must send RAPID_EPOCH as epoch")]
     Epoch(u32, u32),
     #[error("its samples have encoding {0}, which is none of {1}")]
     Encoding(u32, &'static str),
@@ -45,7 +45,7 @@ enum Refusal {
     Size(usize, usize),
     #[error("its pictures are {0}x{1}, not {2}x{3}: correct the program or the entry")]
     Picture(u32, u32, u32, u32),
-    #[error("its pictures are not JPEG as they say")]
+    #[error("its pictures are not JPEG as they declare")]
     NotJpeg,
 }
 

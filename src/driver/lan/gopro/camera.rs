@@ -167,7 +167,7 @@ impl Camera {
         ask(&self.server, "/gopro/camera/keep_alive").await?;
         let asked = Stamp::now();
         let answer = ask(&self.server, "/gopro/camera/state").await?;
-        answer::state(&answer, asked).ok_or_else(|| self.server.place.lost("its state is not what a GoPro says"))
+        answer::state(&answer, asked).ok_or_else(|| self.server.place.lost("its state is not what a GoPro reports"))
     }
 
     /// Makes the shutter follow the episodes.

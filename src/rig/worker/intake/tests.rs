@@ -37,21 +37,21 @@ fn samples_that_contradict_the_entry_are_rejected_with_a_reason() {
             &[2][..],
             other(4, 7),
             16,
-            "its samples say modality 4, not 3: a program must send RAPID_BIT as id".into(),
+            "its samples carry modality 4, not 3: a program must send RAPID_BIT as id".into(),
         ),
         (
             Scalars,
             &[2],
             other(3, 6),
             16,
-            "its samples say epoch 6, not 7: a program must send RAPID_EPOCH as epoch".into(),
+            "its samples carry epoch 6, not 7: a program must send RAPID_EPOCH as epoch".into(),
         ),
         (Scalars, &[2], header(F64), 15, format!("its samples have 15 bytes, not 16: {correct}")),
         (Scalars, &[2], header(Bytes), 16, "its samples have encoding 0, which is none of 4 (f64)".into()),
         (Scalars, &[2], strange, 16, "its samples have encoding 99, which is none of 4 (f64)".into()),
         (Image, &[2, 4], picture(Grey, 4, 2), 9, format!("its samples have 9 bytes, not 8: {correct}")),
         (Image, &[2, 4], picture(Yuyv, 2, 4), 16, format!("its pictures are 2x4, not 4x2: {correct}")),
-        (Image, &[2, 4], picture(Mjpeg, 4, 2), 16, "its pictures are not JPEG as they say".into()),
+        (Image, &[2, 4], picture(Mjpeg, 4, 2), 16, "its pictures are not JPEG as they declare".into()),
     ];
     for (kind, shape, header, bytes, expected) in table {
         assert_eq!(complaint(kind, shape, header, &vec![0; bytes]), expected);
