@@ -5,17 +5,19 @@ use std::future::Pending;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use super::{DriverError, Reading};
+use super::{Agreed, DriverError, Reading};
 use tokio::sync::mpsc;
 
 use crate::action::{ActionSource, ActuatorNotice, Order};
 use crate::permission::Attended;
-use crate::provenance::Negotiated;
 use crate::registry::DeviceNode;
 
 /// Never opened.
 #[derive(Debug)]
-pub struct Absent(Infallible);
+pub struct Absent {
+    pub(super) agreed: Agreed,
+    never: Infallible,
+}
 
 impl Absent {
     #[must_use]
@@ -24,41 +26,31 @@ impl Absent {
     }
 
     pub fn read(&mut self) -> Pending<Result<Reading<'_>, DriverError>> {
-        match self.0 {}
+        match self.never {}
     }
 
     pub fn order(&mut self, _: Order) -> Result<(), DriverError> {
-        match self.0 {}
+        match self.never {}
     }
 
     pub fn attend(&mut self, _: &Arc<Attended>) {
-        match self.0 {}
+        match self.never {}
     }
 
     pub fn follow(&mut self, _: Arc<dyn ActionSource>) {
-        match self.0 {}
+        match self.never {}
     }
 
     pub fn notices(&mut self) -> Option<mpsc::Receiver<ActuatorNotice>> {
-        match self.0 {}
+        match self.never {}
     }
 
     pub fn record(&mut self, _: Option<PathBuf>) -> Result<(), DriverError> {
-        match self.0 {}
+        match self.never {}
     }
 
     pub fn close(self) -> Pending<()> {
-        match self.0 {}
-    }
-
-    #[must_use]
-    pub fn description(&self) -> &str {
-        match self.0 {}
-    }
-
-    #[must_use]
-    pub fn negotiated(&self) -> Negotiated {
-        match self.0 {}
+        match self.never {}
     }
 }
 

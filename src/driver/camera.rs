@@ -36,8 +36,7 @@ use v4l::video::Capture as _;
 
 use self::format::{Frame, Layout, Progress, fourcc_text};
 use self::node::{Node, Ring, open_error, setup_error};
-use super::{DriverError, Reading, unblock};
-use crate::provenance::Negotiated;
+use super::{Agreed, DriverError, Reading, unblock};
 use crate::registry::CameraSpec;
 use crate::sample::FLAG_DEVICE_TIME;
 use crate::time::Stamp;
@@ -59,8 +58,8 @@ pub struct Camera {
     progress: Progress,
     /// Rows without their padding, for cameras that pad them.
     compact: Vec<u8>,
-    description: String,
-    negotiated: Negotiated,
+    /// With the controls as they stood when it was started.
+    pub(super) agreed: Agreed,
 }
 
 impl Camera {
@@ -71,14 +70,14 @@ impl Camera {
     /// format, size, rate or controls; the last names what is offered.
     pub async fn open(name: &str, spec: &CameraSpec, path: &Path) -> Result<Self, DriverError> {
         let (name, spec, path) = (name.to_owned(), spec.clone(), path.to_owned());
-        let Started { ring, layout, description, negotiated } = unblock(move || start(&name, &spec, &path)).await?;
+        let Started { ring, layout, agreed } = unblock(move || start(&name, &spec, &path)).await?;
         // Registered only now that it streams: before, the node reports an error to every poll.
         // SAFETY: the ring owns its node's descriptor, never replaces it, and closes it only when it is
         // dropped, which it is by or after the `AsyncFd`.
         let ring = unsafe { AsyncFd::register_with_interest(ring, Interest::READABLE | Interest::ERROR) }
             .map_err(|error| DriverError::Retry(format!("the node cannot be polled: {}", io::Error::from(error))))?;
         let compact = Vec::with_capacity(if layout.is_padded() { layout.picture_bytes() } else { 0 });
-        Ok(Self { ring: Some(ring), layout, progress: Progress::default(), compact, description, negotiated })
+        Ok(Self { ring: Some(ring), layout, progress: Progress::default(), compact, agreed })
     }
 
     /// The next picture.
@@ -111,18 +110,6 @@ impl Camera {
         };
         let Layout { width, height, .. } = self.layout;
         Ok(Reading { bytes, encoding: self.layout.encoding(), captured, flags, width, height, lost })
-    }
-
-    /// Format, size, rate and driver as agreed.
-    #[must_use]
-    pub fn description(&self) -> &str {
-        &self.description
-    }
-
-    /// The same for the recording, with the controls as they stood when the camera was started.
-    #[must_use]
-    pub fn negotiated(&self) -> Negotiated {
-        self.negotiated.clone()
     }
 }
 
@@ -171,8 +158,7 @@ fn stream_error(ring: &Ring, error: &io::Error) -> DriverError {
 struct Started {
     ring: Ring,
     layout: Layout,
-    description: String,
-    negotiated: Negotiated,
+    agreed: Agreed,
 }
 
 fn start(name: &str, spec: &CameraSpec, path: &Path) -> Result<Started, DriverError> {
@@ -194,7 +180,7 @@ fn start(name: &str, spec: &CameraSpec, path: &Path) -> Result<Started, DriverEr
     let description = format::describe(&card, layout, rate);
     let negotiated = format::negotiated(card, layout, rate, read_controls(&node));
     let ring = Ring::start(node).map_err(|error| node::setup_error(path, "stream", &error))?;
-    Ok(Started { ring, layout, description, negotiated })
+    Ok(Started { ring, layout, agreed: Agreed { description, negotiated } })
 }
 
 /// The values of all controls that report theirs.

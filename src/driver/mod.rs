@@ -62,6 +62,15 @@ pub struct Reading<'a> {
     pub lost: u64,
 }
 
+/// What was agreed with a device when it was opened.
+#[derive(Debug, Clone, Default)]
+pub struct Agreed {
+    /// For people.
+    pub description: String,
+    /// For the recording.
+    pub negotiated: Negotiated,
+}
+
 /// Why a device cannot be opened or read, by what to do next.
 #[derive(Debug, thiserror::Error)]
 pub enum DriverError {
@@ -256,22 +265,14 @@ impl Driver {
     /// What was agreed with the device: format, rate, driver, for people.
     #[must_use]
     pub fn description(&self) -> String {
-        match self {
-            Self::Camera(driver) => driver.description().to_owned(),
-            Self::Serial(driver) => driver.description().to_owned(),
-            Self::Motors(driver) => driver.description().to_owned(),
-            Self::Can(driver) => driver.description().to_owned(),
-            Self::Lan(driver) => driver.description().to_owned(),
-            Self::Sim(driver) => driver.description(),
-            Self::Replay(driver) => driver.description().to_owned(),
-        }
+        each!(self, driver => driver.agreed.description.clone())
     }
 
     /// What was agreed with the device, for the recording. Of the driver only what the open node
     /// reports: a serial line reports nothing.
     #[must_use]
     pub fn negotiated(&self) -> Negotiated {
-        each!(self, driver => driver.negotiated())
+        each!(self, driver => driver.agreed.negotiated.clone())
     }
 }
 

@@ -21,7 +21,7 @@ use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
 use super::sim::stamp_of;
-use super::{DriverError, Reading, unblock};
+use super::{Agreed, DriverError, Reading, unblock};
 use crate::episode::decode::{Content, Kind, Sample, Scratch};
 use crate::episode::reader::{Channel, Item, Reader};
 use crate::episode::record_iter::{FileEnd, MAGIC};
@@ -61,7 +61,7 @@ pub struct Replay {
     /// The batch after `playing`; `None` once the file is used up.
     reading: Option<JoinHandle<Batch>>,
     begin_ns: u64,
-    description: String,
+    pub(super) agreed: Agreed,
 }
 
 #[derive(Debug)]
@@ -90,7 +90,12 @@ impl Replay {
         let description = format!("replay of {topic} in {}", file.display());
         let messages = unblock(move || play(&file, &topic, from_ns)).await?;
         let reading = Some(tokio::task::spawn_blocking(move || batch(messages, begin_ns, Vec::new())));
-        Ok(Self { device, playing: Vec::new(), next: 0, reading, begin_ns, description })
+        // For a recording of the replay the file takes the place of the device.
+        let version = Some(env!("CARGO_PKG_VERSION").to_owned());
+        let driver = Some(KernelDriver { name: "rapid-replay".to_owned(), version });
+        let negotiated = Negotiated { driver, bus: Some(description.clone()), ..Negotiated::default() };
+        let agreed = Agreed { description, negotiated };
+        Ok(Self { device, playing: Vec::new(), next: 0, reading, begin_ns, agreed })
     }
 
     /// The next recorded sample, when it is due.
@@ -106,20 +111,6 @@ impl Replay {
         };
         self.next += 1;
         Ok(Reading { bytes: payload, encoding, captured, flags: FLAG_DEVICE_TIME, width, height, lost: 0 })
-    }
-
-    /// What is played.
-    #[must_use]
-    pub fn description(&self) -> &str {
-        &self.description
-    }
-
-    /// The same for a recording of the replay: the file takes the place of the device.
-    #[must_use]
-    pub fn negotiated(&self) -> Negotiated {
-        let version = Some(env!("CARGO_PKG_VERSION").to_owned());
-        let driver = Some(KernelDriver { name: "rapid-replay".to_owned(), version });
-        Negotiated { driver, bus: Some(self.description.clone()), ..Negotiated::default() }
     }
 
     /// Waits until the message at `next` is due.

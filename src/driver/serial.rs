@@ -20,7 +20,7 @@ use serde::de::{DeserializeSeed, Deserializer, Error as _, IgnoredAny, MapAccess
 use tokio::io::AsyncReadExt as _;
 use tokio_serial::{ClearBuffer, SerialPort as _, SerialPortBuilder, SerialStream};
 
-use super::{DriverError, Reading, arrival, unblock};
+use super::{Agreed, DriverError, Reading, arrival, unblock};
 use crate::provenance::{Format, Negotiated};
 use crate::registry::{Framing, Parse, SerialSpec};
 use crate::sample::Encoding;
@@ -47,8 +47,7 @@ pub struct Serial {
     /// Of the last message.
     stamped: Stamp,
     lost: u64,
-    description: String,
-    format: Format,
+    pub(super) agreed: Agreed,
 }
 
 impl Serial {
@@ -75,8 +74,7 @@ impl Serial {
             arrived: Stamp::default(),
             stamped: Stamp::default(),
             lost: 0,
-            description,
-            format,
+            agreed: Agreed { description, negotiated: Negotiated { format: Some(format), ..Negotiated::default() } },
         })
     }
 
@@ -113,18 +111,6 @@ impl Serial {
             }
         }
         false
-    }
-
-    /// What was opened, and how it is read.
-    #[must_use]
-    pub fn description(&self) -> &str {
-        &self.description
-    }
-
-    /// The same for the recording.
-    #[must_use]
-    pub fn negotiated(&self) -> Negotiated {
-        Negotiated { format: Some(self.format.clone()), ..Negotiated::default() }
     }
 }
 

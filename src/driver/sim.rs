@@ -20,7 +20,7 @@ use tokio::time::Instant;
 
 use self::joints::Joints;
 use self::pictures::{PICTURES, Pictures, encode, fill, write_picture};
-use super::{DriverError, Reading, unblock};
+use super::{Agreed, DriverError, Reading, unblock};
 #[cfg(feature = "motors")]
 use crate::control::can::CanFrame;
 #[cfg(feature = "motors")]
@@ -58,6 +58,7 @@ pub struct Sim {
     /// The sample in `payload` is to be sent once more, with this stamp.
     again: Option<Stamp>,
     controls: BTreeMap<String, i64>,
+    pub(super) agreed: Agreed,
     /// Its motors, if it has some.
     pub(super) joints: Joints,
     /// It was ordered to record.
@@ -114,6 +115,7 @@ impl Sim {
             owed: 0,
             again: None,
             controls,
+            agreed: Agreed::default(),
             joints: Joints::default(),
             records: false,
         })
@@ -133,6 +135,7 @@ impl Sim {
         if let NodeSpec::Can(can) = spec {
             self.joints = Joints::new(can.channels() / MOTOR_CHANNELS);
         }
+        self.agreed = Agreed { description: self.description(), negotiated: self.negotiated() };
         self
     }
 
@@ -261,8 +264,7 @@ impl Sim {
     }
 
     /// What the device is.
-    #[must_use]
-    pub fn description(&self) -> String {
+    fn description(&self) -> String {
         match self.device.source {
             SimSource::Camera { width, height, fps, .. } => {
                 format!("simulated camera, MJPG {width}x{height} at {fps} fps")
@@ -281,8 +283,7 @@ impl Sim {
     }
 
     /// The same for the recording.
-    #[must_use]
-    pub fn negotiated(&self) -> Negotiated {
+    fn negotiated(&self) -> Negotiated {
         let format = match self.device.source {
             SimSource::Camera { width, height, fps, .. } => {
                 Some(Format::Pictures { fourcc: "MJPG".to_owned(), width, height, fps: Some(fps.into()) })

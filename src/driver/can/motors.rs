@@ -20,7 +20,7 @@ use super::guard::Guard;
 use super::link::{Link, LinkError};
 use crate::action::{ActionSource, ActuatorNotice, Order};
 use crate::control::motors::SAMPLE_VALUES;
-use crate::driver::{DriverError, Reading, unblock};
+use crate::driver::{Agreed, DriverError, Reading, unblock};
 use crate::panics::CONTROL_THREAD;
 use crate::permission::Attended;
 use crate::provenance::{Format, Negotiated};
@@ -38,8 +38,7 @@ const NOTICES: usize = 64;
 /// See the module's comment.
 #[derive(Debug)]
 pub struct Motors {
-    description: String,
-    hz: u32,
+    pub(in crate::driver) agreed: Agreed,
     axes: usize,
     samples: mpsc::Receiver<Sample>,
     notices: Option<mpsc::Receiver<ActuatorNotice>>,
@@ -91,9 +90,11 @@ impl Motors {
         let beat = Beat::new(powered, spec, reported, notify, Arc::clone(&shared));
         let thread = std::thread::Builder::new().name(CONTROL_THREAD.to_owned()).spawn(move || beat.run());
         let thread = thread.map_err(|error| DriverError::Retry(format!("no thread for the motors: {error}")))?;
+        let format =
+            Format::Messages { baud: None, channels: spec.motors.len() * SAMPLE_VALUES, hz: Some(f64::from(spec.hz)) };
+        let negotiated = Negotiated { card: Some(description.clone()), format: Some(format), ..Negotiated::default() };
         Ok(Self {
-            description,
-            hz: spec.hz,
+            agreed: Agreed { description, negotiated },
             axes: spec.motors.len(),
             samples,
             notices: Some(notices),
@@ -168,20 +169,6 @@ impl Motors {
     pub fn finish(mut self) -> Option<Punctuality> {
         self.stop();
         self.shared.punctuality.get().cloned()
-    }
-
-    /// What was opened, for people.
-    #[must_use]
-    pub fn description(&self) -> &str {
-        &self.description
-    }
-
-    /// What was agreed.
-    #[must_use]
-    pub fn negotiated(&self) -> Negotiated {
-        let channels = self.axes * SAMPLE_VALUES;
-        let format = Some(Format::Messages { baud: None, channels, hz: Some(f64::from(self.hz)) });
-        Negotiated { card: Some(self.description.clone()), format, ..Negotiated::default() }
     }
 
     fn stop(&mut self) {

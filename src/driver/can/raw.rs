@@ -24,7 +24,7 @@ use std::time::Duration;
 
 use super::link::{AsyncLink, Link, LinkError, Received, is_bus_off};
 use super::socket::can_id;
-use crate::driver::{DriverError, Reading, unblock};
+use crate::driver::{Agreed, DriverError, Reading, unblock};
 use crate::provenance::{Format, Negotiated};
 use crate::registry::{CAN_BATCH, CAN_RECORD, CanSpec, DeviceNode};
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
@@ -43,8 +43,7 @@ pub struct Raw {
     taken: Stamp,
     /// Why there is no next batch.
     ended: Option<DriverError>,
-    description: String,
-    format: Format,
+    pub(in crate::driver) agreed: Agreed,
 }
 
 impl Raw {
@@ -70,14 +69,14 @@ impl Raw {
     }
 
     fn on(link: Link, format: Format) -> Result<Self, DriverError> {
+        let description = format!("{}, frames as they come", link.description());
         Ok(Self {
-            description: format!("{}, frames as they come", link.description()),
             link: AsyncLink::new(link).map_err(LinkError::into_driver)?,
             waiting: Box::new([Received::default(); CAN_BATCH]),
             payload: Vec::with_capacity(CAN_BATCH * CAN_RECORD),
             taken: Stamp::default(),
             ended: None,
-            format,
+            agreed: Agreed { description, negotiated: Negotiated { format: Some(format), ..Negotiated::default() } },
         })
     }
 
@@ -116,18 +115,6 @@ impl Raw {
             height: 0,
             lost,
         })
-    }
-
-    /// What was opened.
-    #[must_use]
-    pub fn description(&self) -> &str {
-        &self.description
-    }
-
-    /// The same for the recording.
-    #[must_use]
-    pub fn negotiated(&self) -> Negotiated {
-        Negotiated { format: Some(self.format.clone()), ..Negotiated::default() }
     }
 }
 

@@ -21,7 +21,7 @@ mod udp;
 
 use std::time::Duration;
 
-use super::{DriverError, Reading};
+use super::{Agreed, DriverError, Reading};
 use crate::provenance::{Format, Negotiated};
 use crate::registry::{DeviceNode, DeviceSpec, LanFind, LanPicture, LanProtocol, LanSpec};
 use place::Carrier;
@@ -36,8 +36,7 @@ const PATIENCE: Duration = Duration::from_secs(5);
 pub struct Lan {
     protocol: Protocol,
     carrier: Carrier,
-    description: String,
-    negotiated: Negotiated,
+    pub(super) agreed: Agreed,
 }
 
 #[derive(Debug)]
@@ -84,7 +83,7 @@ impl Lan {
         let (description, format) = describe(lan, &at);
         let card = if let Protocol::Gopro(gopro) = &protocol { gopro.card() } else { None };
         let negotiated = Negotiated { card, bus: Some(at), format, ..Negotiated::default() };
-        Ok(Self { protocol, carrier: Carrier::of(node), description, negotiated })
+        Ok(Self { protocol, carrier: Carrier::of(node), agreed: Agreed { description, negotiated } })
     }
 
     /// The next sample.
@@ -126,18 +125,6 @@ impl Lan {
         if let Protocol::Gopro(gopro) = self.protocol {
             gopro.close().await;
         }
-    }
-
-    /// What was opened, for people.
-    #[must_use]
-    pub fn description(&self) -> &str {
-        &self.description
-    }
-
-    /// The same for the recording.
-    #[must_use]
-    pub fn negotiated(&self) -> Negotiated {
-        self.negotiated.clone()
     }
 }
 
