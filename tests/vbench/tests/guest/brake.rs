@@ -18,8 +18,8 @@ const ENGAGES_IN_MS: u64 = 200;
 const BUS: &str = r#"adapter = "damiao"
 protocol = "damiao"
 hz = 50
-timeout = "3s"
-silent_after = "1s"
+timeout = "8s"
+silent_after = "3s"
 disable_after = "never"
 [[device.arm.can.motors]]
 name = "joint"

@@ -17,8 +17,8 @@ fn bus(adapter: &str) -> String {
         r#"adapter = "{adapter}"
 protocol = "damiao"
 hz = 50
-timeout = "3s"
-silent_after = "1s"
+timeout = "6s"
+silent_after = "3s"
 disable_after = "never"
 motors = [{{ name = "joint", slave = 0x05, master = 0x15, type = "DM4310", mode = "position", position = [-1.0, 1.0], other_fault = "limp" }}]"#
     )
@@ -42,7 +42,7 @@ for round in 0:socketcan:KILL 1:slcan:KILL 2:damiao:KILL 0:socketcan:STOP; do
   kill -$signal $rapid_pid
   wait_for 60 logged motor_disabled "\"device\":$device" || fail "$kind: the motor was not disabled"
   # Longer than the motor's own limit.
-  sleep 4
+  sleep 7
   emu ask $device
   [ $signal = STOP ] && kill -KILL $rapid_pid
   wait $rapid_pid
