@@ -1,7 +1,7 @@
 //! Where iceoryx2 keeps its files, and whether they are ours to use.
 //!
 //! iceoryx2 0.10 makes its folder (`/tmp/iceoryx2`) for the user who comes first, mode 0750, and its
-//! shared memory under names that anybody can foretell. Of another user's folder it only says
+//! shared memory under names that anybody can foretell. Of another user's folder it only reports
 //! `InternalError`; in one that is open to everybody it would use what lies there.
 
 use std::fs::{Metadata, Permissions};

@@ -12,7 +12,7 @@ use std::os::fd::{AsRawFd as _, BorrowedFd};
 /// A CAN frame takes about 1 KiB there.
 pub(super) const QUEUE: libc::c_int = 8 << 20;
 
-/// What the kernel says of one datagram.
+/// What the kernel reports about one datagram.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Datagram {
     /// Bytes that were written.

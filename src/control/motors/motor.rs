@@ -46,7 +46,7 @@ const COOLER: f64 = 5.0;
 /// See the module's comment.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Phase {
-    /// To be disabled; `told` is set once a frame was sent.
+    /// To be disabled; `reported` is set once a frame was sent.
     Off {
         reported: bool,
     },

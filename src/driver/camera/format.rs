@@ -243,7 +243,7 @@ pub(super) fn plain_name(name: &str) -> String {
         .to_lowercase()
 }
 
-/// The control called `wished`, if it takes `value`; otherwise the message.
+/// The control called `requested`, if it takes `value`; otherwise the message.
 pub(super) fn find_control<'a>(
     offered: &'a [ControlInfo],
     requested: &str,

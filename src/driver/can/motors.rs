@@ -182,7 +182,7 @@ impl Motors {
 
 impl Drop for Motors {
     /// Blocks for the cycle that is under way and until the motors report that they are off: some 20 ms, and a
-    /// tenth of a second more where one says nothing.
+    /// tenth of a second more where one is silent.
     fn drop(&mut self) {
         self.stop();
     }

@@ -2,7 +2,7 @@
 //!
 //! The library keeps what was announced until it expires, which by default is after two minutes. So a
 //! device that its driver does not receive from is queried again once a lease (RFC 6762, 10.4), and what does not
-//! answer by the end of the next is reported as removed. A goodbye is told one second after it came: the
+//! answer by the end of the next is reported as removed. A goodbye is reported one second after it came: the
 //! library keeps to RFC 6762, 10.1, in which that is the time for another host to object. mdns-sd 0.21
 //! cannot query an instance with a dot in its name again: that one is gone when it says goodbye, when its
 //! driver receives nothing more, or after two minutes.
