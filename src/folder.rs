@@ -115,7 +115,7 @@ impl Folder {
             }
             Ok(())
         };
-        let mut walk = Walk::new(missing, &mut check);
+        let mut walk = PathWalk::new(missing, &mut check);
         let at = walk.to(path)?;
         // A folder on the way need not be readable, this one must be.
         let flags = OFlags::DIRECTORY | OFlags::CLOEXEC;
@@ -260,7 +260,7 @@ pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
 
 /// A walk along a path, one part at a time: each is opened in the one before, so that nothing on the way can be
 /// exchanged between a check and a step. Links are followed.
-pub(crate) struct Walk<'a> {
+pub(crate) struct PathWalk<'a> {
     missing: Missing,
     /// Called for each folder, link and file on the way before it is entered or followed.
     check: &'a mut dyn FnMut(&Path, &Stat) -> Result<(), FolderError>,
@@ -269,7 +269,7 @@ pub(crate) struct Walk<'a> {
     followed: usize,
 }
 
-impl<'a> Walk<'a> {
+impl<'a> PathWalk<'a> {
     /// Creates what is `missing`, and walks as far as `check` allows.
     pub(crate) fn new(missing: Missing, check: &'a mut dyn FnMut(&Path, &Stat) -> Result<(), FolderError>) -> Self {
         Self { missing, check, shown: PathBuf::new(), followed: 0 }

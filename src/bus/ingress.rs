@@ -123,11 +123,11 @@ impl Ingress {
     ///
     /// # Errors
     /// When the system cannot watch the event service.
-    pub fn watch(self: &Arc<Self>) -> Result<Watch, BusError> {
-        let ear = Ear(Arc::clone(self));
-        // SAFETY: the ear keeps the descriptor's owner alive, and always names the same one.
-        let ear = unsafe { AsyncFd::register_with_interest(ear, Interest::READABLE) };
-        Ok(Watch { ear: ear.map_err(|error| topic_error(&self.topic, &error))? })
+    pub fn watch(self: &Arc<Self>) -> Result<Arrivals, BusError> {
+        let descriptor = Descriptor(Arc::clone(self));
+        // SAFETY: it keeps the owner of the descriptor alive, and always names the same one.
+        let descriptor = unsafe { AsyncFd::register_with_interest(descriptor, Interest::READABLE) };
+        Ok(Arrivals { descriptor: descriptor.map_err(|error| topic_error(&self.topic, &error))? })
     }
 }
 
@@ -159,16 +159,16 @@ impl Given {
 
 /// Wakes the reader of an ingress.
 #[derive(Debug)]
-pub struct Watch {
-    ear: AsyncFd<Ear>,
+pub struct Arrivals {
+    descriptor: AsyncFd<Descriptor>,
 }
 
-impl Watch {
+impl Arrivals {
     /// Returns when a sample may have come, at the latest after [`LOOK`]. Cancel-safe.
     pub async fn wait(&self) {
-        let Ok(Ok(mut ready)) = tokio::time::timeout(LOOK, self.ear.readable()).await else { return };
+        let Ok(Ok(mut ready)) = tokio::time::timeout(LOOK, self.descriptor.readable()).await else { return };
         // What is taken here was published before; the caller looks now.
-        if !matches!(contained(|| self.ear.get_ref().0.listener.try_wait(|_| {})), Ok(Ok(1..))) {
+        if !matches!(contained(|| self.descriptor.get_ref().0.listener.try_wait(|_| {})), Ok(Ok(1..))) {
             ready.clear_ready();
         }
     }
@@ -176,9 +176,9 @@ impl Watch {
 
 /// The event service's socket.
 #[derive(Debug)]
-struct Ear(Arc<Ingress>);
+struct Descriptor(Arc<Ingress>);
 
-impl AsRawFd for Ear {
+impl AsRawFd for Descriptor {
     fn as_raw_fd(&self) -> RawFd {
         // SAFETY: the descriptor belongs to the listener, which lives as long as `self` and neither
         // closes nor exchanges it before; it is only watched here.

@@ -49,7 +49,7 @@ use service::Service;
 pub use actions::{Actions, watch};
 pub use error::BusError;
 pub use inbox::{Foreign, Inbox};
-pub use ingress::{Given, Ingress, Watch};
+pub use ingress::{Arrivals, Given, Ingress};
 pub use place::memory as check_memory;
 pub use sigbus::lost;
 pub use topic::{TopicId, TopicSpec};

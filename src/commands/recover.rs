@@ -9,7 +9,7 @@ use serde::Serialize;
 use serde_json::json;
 
 use super::Format;
-use crate::episode::recover::{RecoverError, Recovered, Watch, finished, is_damaged, left_behind, recover};
+use crate::episode::recover::{ProgressFn, RecoverError, Recovered, finished, is_damaged, left_behind, recover};
 use crate::text;
 
 /// The outcome of all files together.
@@ -101,7 +101,7 @@ impl<O: Write, E: Write> Report<'_, O, E> {
         file: &Path,
         progress: bool,
         stop: &AtomicBool,
-        work: fn(&Path, &mut Watch<'_>) -> Result<T, RecoverError>,
+        work: fn(&Path, &mut ProgressFn<'_>) -> Result<T, RecoverError>,
     ) -> Result<T, RecoverError> {
         if stop.load(Ordering::Relaxed) {
             return Err(RecoverError::Interrupted(file.to_owned()));

@@ -51,7 +51,7 @@ pub struct Beside {
     pub difference: Difference,
 }
 
-struct Watch<'a> {
+struct Follower<'a> {
     grid: Grid,
     /// The next tick.
     tick: u64,
@@ -72,7 +72,7 @@ pub(super) fn compare(
     ended: &mut Ended<'_>,
 ) -> Result<Beside, CompareError> {
     let grid = Grid::new(Stamp(survey.begin_ns), bundle.control_hz);
-    let mut watch = Watch {
+    let mut watch = Follower {
         grid,
         tick: 0,
         pilot: Pilot::new(bundle, registry, WithoutMask::Hold, SEED),
@@ -122,7 +122,7 @@ pub(super) fn compare(
     Ok(watch.end())
 }
 
-impl Watch<'_> {
+impl Follower<'_> {
     fn tick(&mut self) {
         let (number, stamp) = (self.tick, self.grid.tick(self.tick));
         self.tick += 1;

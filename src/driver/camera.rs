@@ -34,7 +34,7 @@ use v4l::frameinterval::FrameIntervalEnum;
 use v4l::framesize::FrameSizeEnum;
 use v4l::video::Capture as _;
 
-use self::format::{Frame, Layout, Progress, fourcc_text};
+use self::format::{Frame, Layout, Numbering, fourcc_text};
 use self::node::{Node, Ring, open_error, setup_error};
 use super::{Agreed, DriverError, Reading, unblock};
 use crate::registry::CameraSpec;
@@ -55,7 +55,7 @@ pub struct Camera {
     /// `None` only while being dropped.
     ring: Option<AsyncFd<Ring>>,
     layout: Layout,
-    progress: Progress,
+    progress: Numbering,
     /// Rows without their padding, for cameras that pad them.
     compact: Vec<u8>,
     /// With the controls as they stood when it was started.
@@ -77,7 +77,7 @@ impl Camera {
         let ring = unsafe { AsyncFd::register_with_interest(ring, Interest::READABLE | Interest::ERROR) }
             .map_err(|error| DriverError::Retry(format!("the node cannot be polled: {}", io::Error::from(error))))?;
         let compact = Vec::with_capacity(if layout.is_padded() { layout.picture_bytes() } else { 0 });
-        Ok(Self { ring: Some(ring), layout, progress: Progress::default(), compact, agreed })
+        Ok(Self { ring: Some(ring), layout, progress: Numbering::default(), compact, agreed })
     }
 
     /// The next picture.

@@ -46,11 +46,11 @@ pub struct Launch {
 #[derive(Debug, Clone)]
 pub struct Spawner {
     /// `None` if the system gave no thread.
-    orders: Option<mpsc::Sender<Order>>,
+    orders: Option<mpsc::Sender<Request>>,
 }
 
 #[derive(Debug)]
-struct Order {
+struct Request {
     launch: Launch,
     reply: oneshot::Sender<io::Result<Started>>,
 }
@@ -69,9 +69,9 @@ impl Spawner {
     /// killed.
     #[must_use]
     pub fn start() -> Self {
-        let (orders, inbox) = mpsc::channel::<Order>();
+        let (orders, inbox) = mpsc::channel::<Request>();
         let serve = move || {
-            for Order { launch, reply } in inbox {
+            for Request { launch, reply } in inbox {
                 // A program that is no longer waited for is killed when it is dropped.
                 let _ = reply.send(start(&launch));
             }
@@ -88,7 +88,7 @@ impl Spawner {
         let program = launch.program.display().to_string();
         let (reply, answer) = oneshot::channel();
         let refused = || DriverError::Retry("the system gives no thread to start programs".to_owned());
-        self.orders.as_ref().ok_or_else(refused)?.send(Order { launch, reply }).map_err(|_| refused())?;
+        self.orders.as_ref().ok_or_else(refused)?.send(Request { launch, reply }).map_err(|_| refused())?;
         let started = answer.await.map_err(|_| refused())?;
         started.and_then(Child::new).map_err(|error| {
             let text = format!("{program}: {error}");

@@ -253,7 +253,7 @@ const LARGEST_ABOUT: u64 = 4 << 20;
 #[derive(Debug, Default)]
 pub(super) struct Owners {
     /// By their first chunk.
-    seen: Vec<Seen>,
+    seen: Vec<Mention>,
     /// Chunks so far.
     chunks: u64,
     /// Those that lie within a chunk of another.
@@ -262,7 +262,7 @@ pub(super) struct Owners {
 }
 
 #[derive(Debug)]
-struct Seen {
+struct Mention {
     episode: EpisodeId,
     /// Number of its last chunk.
     last: u64,
@@ -286,7 +286,7 @@ impl Owners {
         if let Some(seen) = self.seen.iter_mut().find(|seen| seen.episode == episode) {
             seen.last = last;
         } else if self.seen.len() < MOST {
-            self.seen.push(Seen { episode, last });
+            self.seen.push(Mention { episode, last });
         }
     }
 
@@ -304,12 +304,12 @@ impl Owners {
         if let Some(named) = named.filter(|named| is_there(named) || !checked && !self.is_unnamed) {
             return Ok(Owner::Episode(named));
         }
-        let outer: Vec<&Seen> = self.seen.iter().filter(|seen| !self.nested.contains(&seen.episode)).collect();
+        let outer: Vec<&Mention> = self.seen.iter().filter(|seen| !self.nested.contains(&seen.episode)).collect();
         if self.is_unnamed && (is_foreign || outer.is_empty()) {
             return Ok(Owner::Unnamed);
         }
         let begun = if outer.len() > 1 { beginnings(source, u64::MAX)? } else { Vec::new() };
-        let is_begun = |seen: &Seen| begun.iter().any(|(_, episode)| *episode == seen.episode);
+        let is_begun = |seen: &Mention| begun.iter().any(|(_, episode)| *episode == seen.episode);
         let lost = outer.iter().filter(|seen| !is_begun(seen)).max_by_key(|seen| seen.last);
         let owner = lost.or(outer.first()).copied().or(self.seen.first());
         Ok(Owner::of(owner.map(|seen| seen.episode)))

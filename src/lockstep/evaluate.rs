@@ -213,7 +213,8 @@ impl Bench<'_> {
             Some(Recording { recorder, request, library, .. }) => (Some(recorder), Some((request, library))),
             None => (None, None),
         };
-        let mut witness = Seen { pilot: Pilot::new(self.bundle, self.registry, WithoutMask::Hold, seed), recorder };
+        let mut witness =
+            Spectator { pilot: Pilot::new(self.bundle, self.registry, WithoutMask::Hold, seed), recorder };
         let mut request = Request::new(self.bundle);
         let mut chunk = vec![0.0; self.model.chunk_len()];
         for _ in 0..SETTLE {
@@ -315,12 +316,12 @@ fn axes(action: &[f32]) -> Option<[f64; AXES]> {
 }
 
 /// What follows the rig: the policy, and the recorder if there is one.
-struct Seen<'a> {
+struct Spectator<'a> {
     pilot: Pilot,
     recorder: Option<&'a mut Stepped>,
 }
 
-impl Taker for Seen<'_> {
+impl Taker for Spectator<'_> {
     fn take(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
         if let Some(recorder) = &mut self.recorder {
             recorder.take(topic, header, payload);

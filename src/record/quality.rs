@@ -190,7 +190,7 @@ impl Measures {
     }
 
     /// Takes a sample that belongs to the episode.
-    pub(super) fn sample(&mut self, id: ModalityId, seen: &Seen<'_>) {
+    pub(super) fn sample(&mut self, id: ModalityId, seen: &SampleFacts<'_>) {
         let Some(Some(lane)) = self.lanes.get(id.index()) else { return };
         let shown = seen.capture_ns.saturating_sub(lane.measured.latency_ns);
         let tick = self.nearest_tick(shown);
@@ -324,7 +324,7 @@ fn without_samples(presence: &Presence, id: ModalityId, from: u64, to: u64) -> u
 
 /// What is looked at of a sample.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Seen<'a> {
+pub(super) struct SampleFacts<'a> {
     /// Its number; of a file only the lower 32 bits.
     pub(super) seq: u64,
     /// When it was captured, ns on the clock of the episode.
@@ -389,7 +389,7 @@ impl Meter {
 
     /// Takes a sample whose frame waits for it until `deadline_ns`. Returns the time since the sample
     /// before it.
-    fn sample(&mut self, seen: &Seen<'_>, deadline_ns: u64) -> Option<(u64, u64)> {
+    fn sample(&mut self, seen: &SampleFacts<'_>, deadline_ns: u64) -> Option<(u64, u64)> {
         let first = self.seq.is_none();
         self.counts.samples += 1;
         self.counts.bytes += seen.payload.len() as u64;
@@ -418,7 +418,7 @@ impl Meter {
         self.was_present = present;
     }
 
-    fn time(&mut self, seen: &Seen<'_>) {
+    fn time(&mut self, seen: &SampleFacts<'_>) {
         let lateness = seen.recv_ns.saturating_sub(seen.capture_ns);
         self.lateness.push(lateness);
         let ahead = seen.capture_ns.saturating_sub(seen.recv_ns);
@@ -427,7 +427,7 @@ impl Meter {
         self.drift.push(seen.recv_ns.saturating_sub(self.begin_ns), signed(lateness).saturating_sub(signed(ahead)));
     }
 
-    fn compare(&mut self, seen: &Seen<'_>) {
+    fn compare(&mut self, seen: &SampleFacts<'_>) {
         if !self.compares {
             return;
         }

@@ -136,7 +136,7 @@ impl RecorderConfig {
 /// what the disk takes, unless the thread was [handed over](Self::hand_over).
 #[derive(Debug)]
 pub struct Recorder {
-    orders: Option<Sender<Order>>,
+    orders: Option<Sender<RecorderOrder>>,
     thread: Option<JoinHandle<()>>,
     ended: CancellationToken,
     episode: EpisodeWatch,
@@ -183,7 +183,7 @@ impl Recorder {
     /// # Errors
     /// When there is one in progress, or its file cannot be made.
     pub async fn start(&self, request: EpisodeRequest) -> Result<PathBuf, RecordError> {
-        self.ask(|reply| Order::Start(request, reply)).await
+        self.ask(|reply| RecorderOrder::Start(request, reply)).await
     }
 
     /// Fixes the end of the episode in progress, if there is one, to the moment `at`; an earlier end stays. Does
@@ -191,7 +191,7 @@ impl Recorder {
     pub fn end(&self, at: Stamp) {
         if let Some(orders) = &self.orders {
             // Without its thread there is no episode.
-            let _ = orders.send(Order::End(at));
+            let _ = orders.send(RecorderOrder::End(at));
         }
     }
 
@@ -210,7 +210,7 @@ impl Recorder {
     /// When there is none: one that its duration or the disk ended is reported by `What::Episode` alone.
     pub async fn stop_at(&self, at: Stamp) -> Result<EpisodeReport, RecordError> {
         self.end(at);
-        self.ask(Order::Await).await
+        self.ask(RecorderOrder::Await).await
     }
 
     /// Drops the last episode, `file`, if it is too short to be used and none has begun since; another file that
@@ -219,10 +219,10 @@ impl Recorder {
     /// # Errors
     /// When it is another episode, or the file cannot be removed.
     pub async fn drop_short(&self, file: PathBuf) -> Result<(), RecordError> {
-        self.ask(|reply| Order::Drop(file, reply)).await
+        self.ask(|reply| RecorderOrder::Drop(file, reply)).await
     }
 
-    async fn ask<T>(&self, order: impl FnOnce(Reply<T>) -> Order) -> Result<T, RecordError> {
+    async fn ask<T>(&self, order: impl FnOnce(Reply<T>) -> RecorderOrder) -> Result<T, RecordError> {
         let (reply, answer) = oneshot::channel();
         let orders = self.orders.as_ref().ok_or(RecordError::Ended)?;
         orders.send(order(reply)).map_err(|_| RecordError::Ended)?;
@@ -244,7 +244,7 @@ impl Drop for Recorder {
 type Reply<T> = oneshot::Sender<Result<T, RecordError>>;
 
 /// What the thread is asked for.
-enum Order {
+enum RecorderOrder {
     /// Begin an episode now.
     Start(EpisodeRequest, Reply<PathBuf>),
     /// Fix the end of the episode in progress to this moment: that at which it was asked for.
@@ -258,7 +258,7 @@ enum Order {
 /// The thread's own state.
 struct Writer {
     config: RecorderConfig,
-    inbox: Receiver<Order>,
+    inbox: Receiver<RecorderOrder>,
     events: broadcast::Receiver<Event>,
     streams: Streams,
     attached: Attached,
@@ -284,7 +284,7 @@ struct Writer {
 impl Writer {
     fn new(
         mut config: RecorderConfig,
-        inbox: Receiver<Order>,
+        inbox: Receiver<RecorderOrder>,
         events: broadcast::Receiver<Event>,
         episode: watch::Sender<Option<Arc<Episode>>>,
     ) -> Self {
@@ -384,23 +384,23 @@ impl Writer {
     fn take_orders(&mut self) -> bool {
         loop {
             match self.inbox.try_recv() {
-                Ok(Order::Start(request, reply)) => {
+                Ok(RecorderOrder::Start(request, reply)) => {
                     let started = self.start(&request);
                     // The requester may have ended.
                     let _ = reply.send(started);
                 }
-                Ok(Order::End(at)) => {
+                Ok(RecorderOrder::End(at)) => {
                     if let Some(session) = &mut self.session {
                         session.end_at(at);
                     }
                 }
-                Ok(Order::Await(reply)) => match &self.session {
+                Ok(RecorderOrder::Await(reply)) => match &self.session {
                     Some(_) => self.waiting.push(reply),
                     None => {
                         let _ = reply.send(Err(RecordError::Idle));
                     }
                 },
-                Ok(Order::Drop(file, reply)) => {
+                Ok(RecorderOrder::Drop(file, reply)) => {
                     let _ = reply.send(self.drop_short(file));
                 }
                 Err(TryRecvError::Empty) => return true,

@@ -29,7 +29,7 @@ use super::guard::Guard;
 use super::metadata::{self, Configuration, Ending};
 use super::provenance::{Attached, Units};
 use super::publishers::Publisher;
-use super::quality::{Frames, Measured, Measures, Seen};
+use super::quality::{Frames, Measured, Measures, SampleFacts};
 use super::streams::{Hole, MaskHistory};
 use super::verdict::{Facts, FileState, Judged, Losses, Missing, judge};
 use super::writeback::Writeback;
@@ -149,7 +149,7 @@ impl Session {
             return;
         }
         let flagged = header.flags & FLAG_ERROR != 0;
-        let seen = Seen {
+        let seen = SampleFacts {
             seq: header.seq,
             capture_ns: header.capture_ns,
             recv_ns: header.recv_ns,

@@ -17,7 +17,7 @@ use std::path::{Path, PathBuf};
 
 use rustix::fs::{FileType, Stat};
 
-use crate::folder::{FolderError, Missing, Walk};
+use crate::folder::{FolderError, Missing, PathWalk};
 
 /// Why the target of a path cannot be trusted. As text, the reason without the file's own name.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -100,7 +100,7 @@ pub fn distrust(path: &Path) -> io::Result<Option<Distrust>> {
         // Stops the walk.
         Err(FolderError::NoFolder(part.to_owned()))
     };
-    let walked = Walk::new(Missing::Refused, &mut check).to(&path);
+    let walked = PathWalk::new(Missing::Refused, &mut check).to(&path);
     if found.is_none() {
         walked?;
     }

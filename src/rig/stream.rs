@@ -160,7 +160,7 @@ impl Stream {
     async fn read(&self, source: &mut Source, notices: &mut Notices) -> Ended {
         self.report(Report::Opened(source.description(), Box::new(self.provenance(source)))).await;
         let patience = source.patience(self.spec.stall_after);
-        let mut progress = Progress::default();
+        let mut progress = StreamProgress::default();
         let stall = sleep_until(Instant::now() + self.spec.stall_after);
         tokio::pin!(stall);
         let silent = self.silence();
@@ -225,7 +225,7 @@ impl Stream {
     }
 
     /// Publishes a sample, and reports the first of a stream and the first after a stall.
-    async fn pass_on_sample(&self, reading: &Reading<'_>, progress: &mut Progress) {
+    async fn pass_on_sample(&self, reading: &Reading<'_>, progress: &mut StreamProgress) {
         if let Err(reason) = self.publish(reading)
             && !std::mem::replace(&mut progress.has_lost, true)
         {
@@ -241,7 +241,7 @@ impl Stream {
     }
 
     /// Hands the actuator the orders and the newest action that came since the last call.
-    async fn pass_on_orders(&self, source: &mut Source, controls: &mut Controlled, progress: &mut Progress) {
+    async fn pass_on_orders(&self, source: &mut Source, controls: &mut Controlled, progress: &mut StreamProgress) {
         if let Err(error) = controls.pass_on_orders(source) {
             self.report(Report::Refused(format!("an order is not carried out: {error}"))).await;
         }
@@ -340,7 +340,7 @@ impl Stream {
 
 /// What a stream has reported so far.
 #[derive(Debug, Default)]
-struct Progress {
+struct StreamProgress {
     pulse: Pulse,
     /// A sample could not be published.
     has_lost: bool,

@@ -19,7 +19,7 @@ use tokio::time::timeout;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
 use super::programs::{Environment, MARGIN, Programs, environment};
-use crate::bus::{Bus, Given, Ingress, Membership, Watch};
+use crate::bus::{Arrivals, Bus, Given, Ingress, Membership};
 use crate::driver::process::Launch;
 use crate::driver::{DriverError, Reading};
 use crate::registry::{Attachment, DeviceSpec, ProcessSpec};
@@ -62,7 +62,7 @@ pub(super) struct Worker {
     name: String,
     board: Arc<Board>,
     ingress: Arc<Ingress>,
-    watch: Watch,
+    watch: Arrivals,
     intake: Intake,
     /// The sample that is lent.
     given: Option<(Given, Judged)>,

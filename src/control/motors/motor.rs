@@ -24,7 +24,7 @@ use std::time::Duration;
 use super::fault::{Fault, Part};
 use super::notice::Notice;
 use super::notices::Notices;
-use super::watch::{Watch, is_near};
+use super::watch::{Supervision, is_near};
 use crate::control::can::CanFrame;
 use crate::control::damiao::codec::{self, Feedback, Mit, MotorStatus, Order, Ranges};
 use crate::control::damiao::parameter::{self, Parameter, Reply, TIMEOUT_UNIT_US, Value};
@@ -111,7 +111,7 @@ pub(super) struct Motor {
     timeout: u32,
     read: [f64; 3],
     warm: [bool; 2],
-    watch: Watch,
+    watch: Supervision,
     brake: Brake,
     /// When a parameter is read again, and which was.
     look: Option<Stamp>,
@@ -144,7 +144,7 @@ impl Motor {
             timeout: u32::try_from(units).unwrap_or(u32::MAX),
             read: [0.0; 3],
             warm: [false; 2],
-            watch: Watch::default(),
+            watch: Supervision::default(),
             brake: Brake::default(),
             look: None,
             looks: 0,

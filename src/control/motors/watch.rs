@@ -88,7 +88,7 @@ impl Spell {
 
 /// See the module's comment.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Watch {
+pub(super) struct Supervision {
     /// When its newest frame came.
     received: Option<Stamp>,
     jumps: u32,
@@ -116,7 +116,7 @@ pub(super) struct Commanded {
     pub(super) is_returning: bool,
 }
 
-impl Watch {
+impl Supervision {
     /// It was turned off: what it did is of the past.
     pub(super) fn reset(&mut self) {
         *self = Self { received: self.received, ..Self::default() };

@@ -382,7 +382,7 @@ impl Frame {
 
 /// Where in the stream we are.
 #[derive(Debug, Default)]
-pub(super) struct Progress {
+pub(super) struct Numbering {
     last_sequence: Option<u32>,
     /// The last capture time passed on.
     last_stamp: Stamp,
@@ -391,7 +391,7 @@ pub(super) struct Progress {
     lost: u64,
 }
 
-impl Progress {
+impl Numbering {
     /// A picture that is not passed on.
     pub(super) fn skip(&mut self, sequence: u32) {
         self.count(sequence);

@@ -3,9 +3,9 @@
 //! Thread `control` owns the adapter. It keeps the beat of the motors, runs [`MotorBus`], which decides, and waits on the
 //! topic of actions itself; here, on the runtime, is only the reading of its samples.
 //!
-//! Invariant: whatever ends the driver, the motors are ordered to turn off: see `beat`.
+//! Invariant: whatever ends the driver, the motors are ordered to turn off: see `control_loop`.
 
-mod beat;
+mod control_loop;
 mod powered;
 mod tally;
 
@@ -26,7 +26,7 @@ use crate::permission::Attended;
 use crate::provenance::{Format, Negotiated};
 use crate::registry::{CanSpec, DamiaoSpec, DeviceNode, MAX_MOTORS};
 use crate::sample::{Encoding, FLAG_DEVICE_TIME};
-use beat::{Beat, Sample, Shared};
+use control_loop::{ControlLoop, Sample, Shared};
 use powered::Powered;
 pub use tally::Punctuality;
 
@@ -87,8 +87,8 @@ impl Motors {
         let (reported, samples) = mpsc::channel(SAMPLES);
         let (notify, notices) = mpsc::channel(NOTICES);
         let shared = Arc::<Shared>::default();
-        let beat = Beat::new(powered, spec, reported, notify, Arc::clone(&shared));
-        let thread = std::thread::Builder::new().name(CONTROL_THREAD.to_owned()).spawn(move || beat.run());
+        let control_loop = ControlLoop::new(powered, spec, reported, notify, Arc::clone(&shared));
+        let thread = std::thread::Builder::new().name(CONTROL_THREAD.to_owned()).spawn(move || control_loop.run());
         let thread = thread.map_err(|error| DriverError::Retry(format!("no thread for the motors: {error}")))?;
         let format =
             Format::Messages { baud: None, channels: spec.motors.len() * SAMPLE_VALUES, hz: Some(f64::from(spec.hz)) };

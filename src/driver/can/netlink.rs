@@ -40,7 +40,7 @@ enum Need {
     /// It is down.
     Up,
     /// It is up with another bit rate, or has left the bus permanently.
-    Anew,
+    Restart,
 }
 
 /// Interfaces that were set down while they were in use, by their index; 0 is none. One that finds no room is brought up
@@ -109,7 +109,7 @@ pub(super) fn bring_up(name: &str, bitrate: u32) -> Result<Ready, LinkError> {
         }
         Need::Up if stays_down(details.index) => return Err(set_down(name)),
         Need::Up => {}
-        Need::Anew => {
+        Need::Restart => {
             tracing::warn!(interface = name, ?state.bitrate, requested = bitrate, "the interface is set up again");
             interface.bring_down().map_err(|error| not_set(name, bitrate, &state, &error))?;
         }
@@ -130,7 +130,7 @@ fn need(state: &Interface, bitrate: u32) -> Need {
     let stuck = state.bus_off && state.restart_ms.is_none_or(|ms| ms == 0);
     match (state.up, fits && !stuck) {
         (true, true) => Need::Nothing,
-        (true, false) => Need::Anew,
+        (true, false) => Need::Restart,
         (false, _) => Need::Up,
     }
 }
@@ -231,8 +231,8 @@ mod tests {
             (interface(true, Some(500_000), active, 0), Need::Nothing),
             (interface(true, None, active, 0), Need::Nothing),
             (interface(true, Some(500_000), off, 100), Need::Nothing),
-            (interface(true, Some(500_000), off, 0), Need::Anew),
-            (interface(true, Some(250_000), active, 100), Need::Anew),
+            (interface(true, Some(500_000), off, 0), Need::Restart),
+            (interface(true, Some(250_000), active, 100), Need::Restart),
             (interface(false, Some(500_000), CanState::Stopped, 0), Need::Up),
             (interface(false, None, CanState::Stopped, 0), Need::Up),
         ] {

@@ -16,11 +16,11 @@ use super::super::chunk_writer::{Channel, ChunkWriter, Sink, io_error};
 use super::super::reader::Entry;
 use super::super::record_iter::{Record, RecordIter, op};
 use super::report;
-use super::{Repaired, Watch, summary::Summary};
+use super::{ProgressFn, Repaired, summary::Summary};
 use crate::episode::{Failed, RECOVERED, ReadAt, SUMMARY, own};
 use crate::{text, time};
 
-/// Bytes read between two calls of a [`Watch`]; what is read in vain, in search of a chunk, counts too.
+/// Bytes read between two calls of a [`ProgressFn`]; what is read in vain, in search of a chunk, counts too.
 const WATCH_EVERY: u64 = 1 << 20;
 /// Bytes read at once where only their hash is wanted.
 const PIECE: usize = 256 << 10;
@@ -59,7 +59,7 @@ pub(super) struct Copied {
 }
 
 /// What a file holds. `None`: no MCAP file.
-pub(super) fn summary(file: impl ReadAt, size: u64, watch: &mut Watch<'_>) -> Result<Option<Summary>, Error> {
+pub(super) fn summary(file: impl ReadAt, size: u64, watch: &mut ProgressFn<'_>) -> Result<Option<Summary>, Error> {
     let file = Watched::new(file, size, watch);
     let Some(mut records) = RecordIter::new(&file, size).map_err(|error| file.error(error))? else { return Ok(None) };
     let mut summary = Summary::default();
@@ -80,7 +80,7 @@ pub(super) fn copy(
     size: u64,
     about: &About<'_>,
     sink: impl Sink,
-    watch: &mut Watch<'_>,
+    watch: &mut ProgressFn<'_>,
 ) -> Result<Option<Copied>, Error> {
     let file = Watched::new(file, size, watch);
     let recorded = about.failed.map_or(size, |failed| failed.at);
@@ -132,7 +132,7 @@ fn finish<S: Sink>(mut writer: ChunkWriter<S>, copied: &Copied, about: &About<'_
 }
 
 /// The SHA-256 of the first `size` bytes of `file`, hexadecimal.
-pub(super) fn sha256(file: &File, size: u64, watch: &mut Watch<'_>) -> Result<String, Error> {
+pub(super) fn sha256(file: &File, size: u64, watch: &mut ProgressFn<'_>) -> Result<String, Error> {
     let file = Watched::new(file, size, watch);
     let (mut hasher, mut piece) = (Sha256::new(), vec![0; PIECE]);
     let mut done = 0;
@@ -165,7 +165,7 @@ pub fn recover_bytes(bytes: &[u8]) -> Option<Vec<u8>> {
     Some(whole)
 }
 
-/// A file that has its [`Watch`] called while it is read, for whatever purpose.
+/// A file that has its [`ProgressFn`] called while it is read, for whatever purpose.
 struct Watched<'a, 'w, R> {
     file: R,
     size: u64,
@@ -174,11 +174,11 @@ struct Watched<'a, 'w, R> {
     /// Bytes read since the last call.
     read: Cell<u64>,
     interrupted: Cell<bool>,
-    watch: RefCell<&'a mut Watch<'w>>,
+    watch: RefCell<&'a mut ProgressFn<'w>>,
 }
 
 impl<'a, 'w, R> Watched<'a, 'w, R> {
-    fn new(file: R, size: u64, watch: &'a mut Watch<'w>) -> Self {
+    fn new(file: R, size: u64, watch: &'a mut ProgressFn<'w>) -> Self {
         let (done, read, interrupted) = (Cell::default(), Cell::default(), Cell::default());
         Self { file, size, done, read, interrupted, watch: RefCell::new(watch) }
     }

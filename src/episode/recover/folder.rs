@@ -15,7 +15,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use rustix::process::setpriority_process;
 
-use super::{Names, Outcome, RecoverError, Recovered, Source, Watch, recover};
+use super::{Names, Outcome, ProgressFn, RecoverError, Recovered, Source, recover};
 use crate::disk::Disk;
 use crate::episode::{self, Failed};
 use crate::status::{Board, Level, What};
@@ -48,7 +48,7 @@ pub fn finished(folder: &Path) -> io::Result<Vec<PathBuf>> {
 ///
 /// # Errors
 /// When it cannot be read, or `watch` ends it.
-pub fn is_damaged(path: &Path, watch: &mut Watch<'_>) -> Result<bool, RecoverError> {
+pub fn is_damaged(path: &Path, watch: &mut ProgressFn<'_>) -> Result<bool, RecoverError> {
     let (file, size) = episode::open(path)?;
     let failed = Failed::of(&file, size).map_err(|source| super::io_of(path, source))?;
     let source = Source { path, file, size, failed };

@@ -140,7 +140,7 @@ pub struct Repaired {
 }
 
 /// What is asked between two pieces of a long work: `done` of `size` bytes are read. It may wait.
-pub type Watch<'a> = dyn FnMut(u64, u64) -> ControlFlow<()> + 'a;
+pub type ProgressFn<'a> = dyn FnMut(u64, u64) -> ControlFlow<()> + 'a;
 
 /// Why a file was not repaired. It is as it was.
 #[derive(Debug, thiserror::Error)]
@@ -199,7 +199,7 @@ impl RecoverError {
 ///
 /// # Errors
 /// See [`RecoverError`]; the file is as it was.
-pub fn recover(path: &Path, watch: &mut Watch<'_>) -> Result<Recovered, RecoverError> {
+pub fn recover(path: &Path, watch: &mut ProgressFn<'_>) -> Result<Recovered, RecoverError> {
     let io = |source| io_of(path, source);
     if fs::symlink_metadata(path).map_err(io)?.is_symlink() {
         return Err(RecoverError::NotFile(path.to_owned()));
@@ -232,7 +232,7 @@ struct Source<'a> {
 }
 
 impl Source<'_> {
-    fn partial(&mut self, names: &Names, watch: &mut Watch<'_>) -> Result<Outcome, RecoverError> {
+    fn partial(&mut self, names: &Names, watch: &mut ProgressFn<'_>) -> Result<Outcome, RecoverError> {
         if self.size == 0 {
             fs::remove_file(self.path).map_err(|source| self.io(source))?;
             return Ok(Outcome::Empty { kept: None });
@@ -281,7 +281,7 @@ impl Source<'_> {
         Outcome::Unreadable { kept, failed: self.failed.as_ref().map(|failed| failed.why.clone()) }
     }
 
-    fn finished(&mut self, names: &Names, watch: &mut Watch<'_>) -> Result<Outcome, RecoverError> {
+    fn finished(&mut self, names: &Names, watch: &mut ProgressFn<'_>) -> Result<Outcome, RecoverError> {
         let Some(known) = self.read(watch)? else { return Err(RecoverError::NotMcap(self.path.to_owned())) };
         if self.failed.is_none() && known.is_whole() {
             return Ok(Outcome::Whole { to: self.path.to_owned() });
@@ -304,7 +304,7 @@ impl Source<'_> {
 
     /// Copies what can be read into a whole file of the name `to`; `None` if this is no MCAP file.
     /// After an error there is no such file.
-    fn copy(&self, to: &Path, sha256: String, watch: &mut Watch<'_>) -> Result<Option<Copied>, RecoverError> {
+    fn copy(&self, to: &Path, sha256: String, watch: &mut ProgressFn<'_>) -> Result<Option<Copied>, RecoverError> {
         let name = self.path.file_name().unwrap_or_default().to_string_lossy();
         let (time_ns, boot, failed) = (time::realtime_ns(), episode::boot_id(), self.failed.as_ref());
         let about = copy::About { name: &name, sha256, time_ns, boot, failed };
@@ -319,11 +319,11 @@ impl Source<'_> {
     }
 
     /// Reads the file without writing anything.
-    fn read(&self, watch: &mut Watch<'_>) -> Result<Option<Summary>, RecoverError> {
+    fn read(&self, watch: &mut ProgressFn<'_>) -> Result<Option<Summary>, RecoverError> {
         copy::summary(&self.file, self.size, watch).map_err(|error| self.error(error, self.path))
     }
 
-    fn sha256(&self, watch: &mut Watch<'_>) -> Result<String, RecoverError> {
+    fn sha256(&self, watch: &mut ProgressFn<'_>) -> Result<String, RecoverError> {
         copy::sha256(&self.file, self.size, watch).map_err(|error| self.error(error, self.path))
     }
 
@@ -342,7 +342,7 @@ impl Source<'_> {
         &self,
         names: &Names,
         sha256: &str,
-        watch: &mut Watch<'_>,
+        watch: &mut ProgressFn<'_>,
     ) -> Result<Option<(PathBuf, bool)>, RecoverError> {
         for finished in names.candidates() {
             let Ok((file, size)) = episode::open(&finished) else { continue };

@@ -13,7 +13,7 @@ use std::time::Duration;
 use serde_json::{Map, Value};
 
 use super::super::publishers::Publishers;
-use super::super::quality::{Frames, Measured, Measures, Quality, Seen, Spread};
+use super::super::quality::{Frames, Measured, Measures, Quality, SampleFacts, Spread};
 use super::super::session::SETTLE;
 use super::super::verdict::{Facts, FileState, Judged, Losses, Missing, judge};
 use super::ModalityReport;
@@ -128,7 +128,7 @@ impl Judge {
         if let Some(numbers) = self.numbers.get_mut(id.index()) {
             numbers.take(message.sequence);
         }
-        let seen = Seen {
+        let seen = SampleFacts {
             seq: message.sequence.into(),
             capture_ns: message.log_time,
             recv_ns: message.publish_time,

@@ -28,9 +28,17 @@ fn measures_at(hz: f64, kind: ModalityKind) -> Measures {
 }
 
 /// A sample captured `at` ms after the beginning and received `late` ms later.
-fn seen(seq: u64, at: u64, late: u64, payload: &[u8]) -> Seen<'_> {
+fn seen(seq: u64, at: u64, late: u64, payload: &[u8]) -> SampleFacts<'_> {
     let capture_ns = BEGIN + at * MS;
-    Seen { seq, capture_ns, recv_ns: capture_ns + late * MS, flagged: false, jpeg: false, payload, repeated: None }
+    SampleFacts {
+        seq,
+        capture_ns,
+        recv_ns: capture_ns + late * MS,
+        flagged: false,
+        jpeg: false,
+        payload,
+        repeated: None,
+    }
 }
 
 fn quality_at(measures: &Measures, end_ms: u64) -> Quality {
@@ -70,7 +78,7 @@ fn damaged_counts_flagged_samples_and_torn_pictures_once() {
     .enumerate()
     {
         let n = n as u64;
-        measures.sample(id(0), &Seen { flagged, jpeg, ..seen(n, n * 10, 1, payload) });
+        measures.sample(id(0), &SampleFacts { flagged, jpeg, ..seen(n, n * 10, 1, payload) });
     }
     let report = quality_at(&measures, 100);
     assert_eq!((report.samples, report.damaged, report.truncated, report.bytes), (5, 3, 2, 5 + 5 + 3 + 3 + 13));
@@ -211,7 +219,8 @@ fn a_clock_that_runs_differently_drifts_and_one_that_is_ahead_is_in_the_future()
             let error = i64::try_from(n * 33 * MS).unwrap() * ppm / 1_000_000;
             let capture_ns = at.checked_add_signed(error).unwrap();
             let recv_ns = at + 20 * MS + n % 7 * jitter_ms * MS;
-            let seen = Seen { seq: n, capture_ns, recv_ns, flagged: false, jpeg: false, payload: b"", repeated: None };
+            let seen =
+                SampleFacts { seq: n, capture_ns, recv_ns, flagged: false, jpeg: false, payload: b"", repeated: None };
             measures.sample(id(0), &seen);
         }
         quality_at(&measures, seconds * 1000)
@@ -311,7 +320,7 @@ proptest! {
     fn no_sample_makes_it_panic(samples in prop::collection::vec(any::<(u64, u64, u64, bool)>(), 0..40), end in any::<u64>()) {
         let mut measures = measures(ModalityKind::Image);
         for (seq, capture_ns, recv_ns, jpeg) in &samples {
-            let seen = Seen { seq: *seq, capture_ns: *capture_ns, recv_ns: *recv_ns, flagged: false, jpeg: *jpeg, payload: b"", repeated: None };
+            let seen = SampleFacts { seq: *seq, capture_ns: *capture_ns, recv_ns: *recv_ns, flagged: false, jpeg: *jpeg, payload: b"", repeated: None };
             measures.sample(id(0), &seen);
             measures.mask(*capture_ns, PhysicalMask(*seq));
             measures.missing(id(0), *seq, *recv_ns);

@@ -82,10 +82,11 @@ impl Presence {
         let Claim { path, file } = claim;
         let shared = Arc::new(Shared::default());
         let ended = CancellationToken::new();
-        let beat = Beat { _ended: ended.clone().drop_guard(), shared: Arc::clone(&shared), file, writer, board };
+        let heartbeat =
+            Heartbeat { _ended: ended.clone().drop_guard(), shared: Arc::clone(&shared), file, writer, board };
         let thread = std::thread::Builder::new()
             .name("mask".to_owned())
-            .spawn(move || beat.run())
+            .spawn(move || heartbeat.run())
             .map_err(|error| PresenceError::Io { path: path.clone(), error })?;
         let json = json_path(&path);
         Ok(Self { shared, thread: Some(thread), ended, path, json, json_failed: AtomicBool::new(false) })
@@ -147,7 +148,7 @@ impl Drop for Presence {
 }
 
 /// What the thread owns.
-struct Beat {
+struct Heartbeat {
     /// Dropped by a panic too, and before the file: nothing writes beside it once it is gone.
     _ended: DropGuard,
     shared: Arc<Shared>,
@@ -156,7 +157,7 @@ struct Beat {
     board: Arc<Board>,
 }
 
-impl Beat {
+impl Heartbeat {
     fn run(mut self) {
         match use_fifo(MASK_PRIORITY) {
             Ok(()) => tracing::debug!("thread mask runs under SCHED_FIFO"),

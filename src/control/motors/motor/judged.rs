@@ -1,4 +1,4 @@
-//! What a motor reports, judged by its [`Watch`](crate::control::motors::watch::Watch).
+//! What a motor reports, judged by its [`Supervision`](crate::control::motors::watch::Supervision).
 
 use super::{Motor, Phase};
 use crate::control::damiao::codec::{Feedback, MotorStatus, Ranges};

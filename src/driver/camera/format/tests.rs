@@ -120,7 +120,7 @@ fn damaged_pictures_are_flagged() {
 
 #[test]
 fn gaps_and_empty_pictures_are_lost_pictures() {
-    let mut progress = Progress::default();
+    let mut progress = Numbering::default();
     assert_eq!(progress.take(5), 0, "what came before the first is not known");
     assert_eq!(progress.take(6), 0);
     assert_eq!(progress.take(9), 2);
@@ -129,14 +129,14 @@ fn gaps_and_empty_pictures_are_lost_pictures() {
     progress.skip(14);
     assert_eq!(progress.take(15), 3);
     assert_eq!(progress.take(15), 0, "a driver that does not count");
-    let mut wrapping = Progress::default();
+    let mut wrapping = Numbering::default();
     wrapping.take(u32::MAX);
     assert_eq!(wrapping.take(1), 1);
 }
 
 #[test]
 fn the_kernels_time_is_used_where_it_can_be_true() {
-    let mut progress = Progress::default();
+    let mut progress = Numbering::default();
     assert_eq!(progress.stamp(&frame(0, Some(100)), Stamp(110)), (Stamp(100), true));
     assert_eq!(progress.stamp(&frame(1, None), Stamp(120)), (Stamp(120), false));
     assert_eq!(progress.stamp(&frame(2, Some(500)), Stamp(130)), (Stamp(130), false), "in the future");
@@ -163,7 +163,7 @@ proptest! {
     ) {
         const FRAME: u64 = 33;
         const BEGIN: u64 = 10_000;
-        let mut progress = Progress::default();
+        let mut progress = Numbering::default();
         let mut last = Stamp(0);
         let mut safe_from = 0;
         for number in 0..40_u64 {
@@ -189,7 +189,7 @@ proptest! {
 
 #[test]
 fn one_bad_first_stamp_does_not_shift_a_camera_whose_pictures_take_longer_than_a_frame() {
-    let mut progress = Progress::default();
+    let mut progress = Numbering::default();
     assert_eq!(progress.stamp(&frame(0, Some(999)), Stamp(100)), (Stamp(100), false), "in the future");
     let used: Vec<bool> =
         (1..10).map(|number| progress.stamp(&frame(0, Some(number * 33)), Stamp(100 + number * 33)).1).collect();

@@ -41,7 +41,7 @@ impl fmt::Display for Punctuality {
 
 /// See the module's comment.
 #[derive(Debug)]
-pub(super) struct Tally {
+pub(super) struct LoopStatistics {
     /// How late cycles began, ns.
     lateness: Histogram<u64>,
     /// Cycles that began early.
@@ -58,7 +58,7 @@ pub(super) struct Tally {
     pub(super) lost_samples: u64,
 }
 
-impl Tally {
+impl LoopStatistics {
     pub(super) fn new() -> Self {
         let (lateness, latency) = (statistics(), statistics());
         Self { lateness, early: 0, latency, lost_frames: 0, full: 0, unsent: 0, lost_samples: 0 }
@@ -116,14 +116,14 @@ mod tests {
 
     #[test]
     fn the_bounds_of_the_statistics_are_ones() {
-        let mut tally = Tally::new();
+        let mut tally = LoopStatistics::new();
         tally.late(Duration::MAX);
         assert_eq!(tally.punctuality().cycles, 1);
     }
 
     #[test]
     fn what_did_not_happen_is_not_told() {
-        let mut tally = Tally::new();
+        let mut tally = LoopStatistics::new();
         assert_eq!(tally.mishaps(&Counts::default()), None);
         tally.full = 3;
         let bus = Counts { actions: 9, faults: 1, ..Counts::default() };

@@ -119,7 +119,7 @@ pub(super) async fn fetch(clip: Clip, server: Server, reserve: Option<u64>) -> R
     let mut part = target.clone().into_os_string();
     part.push(".partial");
     let part = PathBuf::from(part);
-    let mut progress = Progress { device: clip.device.clone(), file: clip.name.file.clone(), reported: 0 };
+    let mut progress = FetchProgress { device: clip.device.clone(), file: clip.name.file.clone(), reported: 0 };
     let (mut failed, mut furthest) = (0, length(&part));
     loop {
         let attempted = async {
@@ -160,7 +160,7 @@ fn stays(reason: impl std::fmt::Display) -> Broken {
     Broken::Finally(Failure::Stays(reason.to_string()))
 }
 
-async fn attempt(clip: &Clip, server: &Server, mut part: Part, progress: &mut Progress) -> Result<(), Broken> {
+async fn attempt(clip: &Clip, server: &Server, mut part: Part, progress: &mut FetchProgress) -> Result<(), Broken> {
     let mut reply = http::get(server, &clip.path(), part.there, HEAD_LIMIT).await.map_err(off)?;
     match reply.status {
         StatusCode::PARTIAL_CONTENT if begins(&reply) == Some(part.there) => {}
@@ -322,13 +322,13 @@ fn length(path: &Path) -> u64 {
 
 /// Reports every tenth.
 #[derive(Debug)]
-struct Progress {
+struct FetchProgress {
     device: String,
     file: String,
     reported: u64,
 }
 
-impl Progress {
+impl FetchProgress {
     fn notify(&mut self, got: u64, whole: Option<u64>) {
         let Some(whole) = whole.filter(|whole| *whole > 0) else { return };
         let tenth = got.saturating_mul(10) / whole;

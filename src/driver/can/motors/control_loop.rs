@@ -21,7 +21,7 @@ use std::time::Duration;
 use tokio::sync::mpsc;
 
 use super::powered::Powered;
-use super::tally::{Punctuality, Tally};
+use super::tally::{LoopStatistics, Punctuality};
 use crate::action::{ActionSource, ActuatorNotice, Arming, MAX_ACTION, Order, OrderSlot};
 use crate::control::can::CanFrame;
 use crate::control::motors::{BusState, SAMPLE_VALUES};
@@ -97,7 +97,7 @@ impl Spell {
 
 /// The thread.
 #[derive(Debug)]
-pub(super) struct Beat {
+pub(super) struct ControlLoop {
     powered: Powered,
     cycle: Duration,
     samples: mpsc::Sender<Sample>,
@@ -115,10 +115,10 @@ pub(super) struct Beat {
     troubles: VecDeque<String>,
     /// An action that no frame was sent after.
     unsent: Option<Stamp>,
-    tally: Tally,
+    tally: LoopStatistics,
 }
 
-impl Beat {
+impl ControlLoop {
     pub(super) fn new(
         powered: Powered,
         spec: &DamiaoSpec,
@@ -140,7 +140,7 @@ impl Beat {
             strange: Spell::default(),
             troubles: VecDeque::with_capacity(TROUBLES),
             unsent: None,
-            tally: Tally::new(),
+            tally: LoopStatistics::new(),
         }
     }
 
